@@ -1,0 +1,201 @@
+"""Batched rotations on numpy arrays.
+
+A rotation is a unit quaternion, shape (..., 4) in the order w, x, y, z; `aRb` maps coordinates in frame b to coordinates
+in frame a. Tangent vectors, shape (..., 3) in radians, are ordered x, y, z and act on the right: `R * Exp(delta)`, as in
+gtsam.Rot3. All functions broadcast over the leading dimensions.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    import gtsam
+
+Array = NDArray[np.float64]
+
+# Below this angle (rad) the closed forms lose more digits to cancellation than their series truncate.
+_SMALL = 1e-2
+
+
+def identity(shape: int | tuple[int, ...] = ()) -> Array:
+    """Identity rotations, shape (*shape, 4)."""
+    shape = (shape,) if isinstance(shape, int) else shape
+    q = np.zeros((*shape, 4))
+    q[..., 0] = 1.0
+    return q
+
+
+def normalize(q: ArrayLike) -> Array:
+    """Unit quaternions along q."""
+    q = np.asarray(q, dtype=float)
+    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
+
+
+def inverse(q: ArrayLike) -> Array:
+    """aRb -> bRa."""
+    return np.asarray(q, dtype=float) * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def multiply(p: ArrayLike, q: ArrayLike) -> Array:
+    """aRb, bRc -> aRc."""
+    p, q = np.asarray(p, dtype=float), np.asarray(q, dtype=float)
+    pw, px, py, pz = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
+    qw, qx, qy, qz = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    out = np.empty(np.broadcast_shapes(p.shape, q.shape))
+    out[..., 0] = pw * qw - px * qx - py * qy - pz * qz
+    out[..., 1] = pw * qx + px * qw + py * qz - pz * qy
+    out[..., 2] = pw * qy - px * qz + py * qw + pz * qx
+    out[..., 3] = pw * qz + px * qy - py * qx + pz * qw
+    return out
+
+
+def compose(*rotations: ArrayLike) -> Array:
+    """Product of several rotations, left to right."""
+    out = np.asarray(rotations[0], dtype=float)
+    for q in rotations[1:]:
+        out = multiply(out, q)
+    return out
+
+
+def rotate(q: ArrayLike, v: ArrayLike) -> Array:
+    """Coordinates in a of the vectors v, shape (..., 3), given in b; q is aRb."""
+    q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
+    u = q[..., 1:]
+    t = 2.0 * cross(u, v)
+    return np.asarray(v + q[..., :1] * t + cross(u, t))
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Cross product of (..., 3) arrays (numpy's own spends most of its time moving axes)."""
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
+    bx, by, bz = b[..., 0], b[..., 1], b[..., 2]
+    out[..., 0] = ay * bz - az * by
+    out[..., 1] = az * bx - ax * bz
+    out[..., 2] = ax * by - ay * bx
+    return out
+
+
+def hat(v: ArrayLike) -> Array:
+    """Skew matrices, shape (..., 3, 3): hat(v) @ u = cross(v, u)."""
+    v = np.asarray(v, dtype=float)
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out
+
+
+def exp(phi: ArrayLike) -> Array:
+    """Rotation vectors, shape (..., 3), rad -> quaternions."""
+    phi = np.asarray(phi, dtype=float)
+    half = 0.5 * np.sqrt((phi * phi).sum(axis=-1))
+    out = np.empty((*phi.shape[:-1], 4))
+    out[..., 0] = np.cos(half)
+    out[..., 1:] = phi * (0.5 * np.sinc(half / np.pi))[..., None]
+    return out
+
+
+def log(q: ArrayLike) -> Array:
+    """Quaternions -> rotation vectors, shape (..., 3), of length pi at most."""
+    q = np.asarray(q, dtype=float)
+    w, v = q[..., 0], q[..., 1:]
+    sine = np.sqrt((v * v).sum(axis=-1))
+    angle = 2.0 * np.arctan2(sine, np.abs(w))
+    # angle / sine -> 2 / w at zero; the guard only avoids 0 / 0.
+    factor = np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
+    return np.asarray(v * (np.where(w < 0.0, -1.0, 1.0) * factor)[..., None])
+
+
+def matrix(q: ArrayLike) -> Array:
+    """Quaternions -> rotation matrices, shape (..., 3, 3)."""
+    q = np.asarray(q, dtype=float)
+    w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    out = np.empty((*q.shape[:-1], 3, 3))
+    out[..., 0, 0] = 1.0 - 2.0 * (y * y + z * z)
+    out[..., 0, 1] = 2.0 * (x * y - w * z)
+    out[..., 0, 2] = 2.0 * (x * z + w * y)
+    out[..., 1, 0] = 2.0 * (x * y + w * z)
+    out[..., 1, 1] = 1.0 - 2.0 * (x * x + z * z)
+    out[..., 1, 2] = 2.0 * (y * z - w * x)
+    out[..., 2, 0] = 2.0 * (x * z - w * y)
+    out[..., 2, 1] = 2.0 * (y * z + w * x)
+    out[..., 2, 2] = 1.0 - 2.0 * (x * x + y * y)
+    return out
+
+
+def from_matrix(r: ArrayLike) -> Array:
+    """Rotation matrices, shape (..., 3, 3) -> quaternions with w >= 0."""
+    r = np.asarray(r, dtype=float)
+    xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
+    wx, wy, wz = (r[..., 2, 1] - r[..., 1, 2]), (r[..., 0, 2] - r[..., 2, 0]), (r[..., 1, 0] - r[..., 0, 1])
+    xy, xz, yz = (r[..., 0, 1] + r[..., 1, 0]), (r[..., 0, 2] + r[..., 2, 0]), (r[..., 1, 2] + r[..., 2, 1])
+    # Four ways to the same quaternion, each scaled by one of its components; the largest one loses no digits.
+    ways = np.stack(
+        [
+            np.stack([1 + xx + yy + zz, wx, wy, wz], axis=-1),
+            np.stack([wx, 1 + xx - yy - zz, xy, xz], axis=-1),
+            np.stack([wy, xy, 1 - xx + yy - zz, yz], axis=-1),
+            np.stack([wz, xz, yz, 1 - xx - yy + zz], axis=-1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(np.diagonal(ways, axis1=-2, axis2=-1), axis=-1)
+    q = normalize(np.take_along_axis(ways, best[..., None, None], axis=-2)[..., 0, :])
+    return np.asarray(np.where(q[..., :1] < 0.0, -q, q))
+
+
+def right_jacobian(phi: ArrayLike) -> Array:
+    """J with Exp(phi + d) = Exp(phi) * Exp(J d) to first order, shape (..., 3, 3).
+
+    Solà, Deray, Atchuthan, "A micro Lie theory", 2018, eq. 143.
+    """
+    phi = np.asarray(phi, dtype=float)
+    square = (phi * phi).sum(axis=-1)[..., None, None]
+    angle = np.sqrt(square)
+    small = angle < _SMALL
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 0.5 - square / 24.0, (1.0 - np.cos(safe)) / safe**2)
+    b = np.where(small, 1.0 / 6.0 - square / 120.0, (safe - np.sin(safe)) / safe**3)
+    k = hat(phi)
+    return np.asarray(np.eye(3) - a * k + b * (k @ k))
+
+
+def right_jacobian_inverse(phi: ArrayLike) -> Array:
+    """Inverse of `right_jacobian`: Log(Exp(phi) * Exp(d)) = phi + Jinv d to first order (same source, eq. 144)."""
+    phi = np.asarray(phi, dtype=float)
+    square = (phi * phi).sum(axis=-1)[..., None, None]
+    angle = np.sqrt(square)
+    small = angle < _SMALL
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 1.0 / 12.0 + square / 720.0, 1.0 / safe**2 - 0.5 / (safe * np.tan(0.5 * safe)))
+    k = hat(phi)
+    return np.asarray(np.eye(3) + 0.5 * k + a * (k @ k))
+
+
+def interpolate(t: ArrayLike, q: ArrayLike, at: ArrayLike) -> Array:
+    """Attitudes at the times `at` on the constant-rate arcs between the samples (t, q), t increasing.
+
+    Outside the samples the nearest arc is followed on.
+    """
+    t, q, at = np.asarray(t, dtype=float), np.asarray(q, dtype=float), np.asarray(at, dtype=float)
+    i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+    arc = log(multiply(inverse(q[i]), q[i + 1]))
+    return multiply(q[i], exp(arc * ((at - t[i]) / (t[i + 1] - t[i]))[..., None]))
+
+
+def from_gtsam(rotations: list[gtsam.Rot3]) -> Array:
+    """gtsam rotations -> quaternions, shape (n, 4)."""
+    return from_matrix(np.array([r.matrix() for r in rotations]).reshape(-1, 3, 3))
+
+
+def to_gtsam(q: ArrayLike) -> gtsam.Rot3:
+    """One quaternion, shape (4,) -> gtsam.Rot3."""
+    import gtsam
+
+    w, x, y, z = np.asarray(q, dtype=float).tolist()
+    return gtsam.Rot3(w, x, y, z)

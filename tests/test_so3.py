@@ -1,0 +1,85 @@
+"""Rotations: group axioms, round trips and Jacobians, at random, near-zero and near-pi angles."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import so3
+
+RNG = np.random.default_rng(0)
+
+
+def _unit(n: int) -> np.ndarray:
+    v = RNG.normal(size=(n, 3))
+    return v / np.linalg.norm(v, axis=1, keepdims=True)
+
+
+TANGENTS = {
+    "random": _unit(200) * RNG.uniform(0.0, np.pi, size=(200, 1)),
+    "near zero": _unit(200) * 10.0 ** RNG.uniform(-12, -1, size=(200, 1)),
+    "around the series limit": _unit(200) * RNG.uniform(0.009, 0.011, size=(200, 1)),
+    "near pi": _unit(200) * (np.pi - 10.0 ** RNG.uniform(-6, -2, size=(200, 1))),
+    "zero": np.zeros((1, 3)),
+}
+each_kind = pytest.mark.parametrize("phi", TANGENTS.values(), ids=TANGENTS.keys())
+
+
+@each_kind
+def test_log_undoes_exp(phi: np.ndarray) -> None:
+    np.testing.assert_allclose(so3.log(so3.exp(phi)), phi, atol=1e-12)
+    np.testing.assert_allclose(so3.log(-so3.exp(phi)), phi, atol=1e-12)
+
+
+@each_kind
+def test_agrees_with_gtsam(phi: np.ndarray) -> None:
+    expected = np.array([gtsam.Rot3.Expmap(p).matrix() for p in phi])
+    np.testing.assert_allclose(so3.matrix(so3.exp(phi)), expected, atol=1e-9)
+    np.testing.assert_allclose(so3.from_gtsam([gtsam.Rot3.Expmap(p) for p in phi]), so3.from_matrix(expected))
+    np.testing.assert_allclose(so3.to_gtsam(so3.exp(phi)[0]).matrix(), expected[0], atol=1e-9)
+
+
+@each_kind
+def test_matrix_round_trip(phi: np.ndarray) -> None:
+    r = so3.matrix(so3.exp(phi))
+    np.testing.assert_allclose(so3.matrix(so3.from_matrix(r)), r, atol=1e-14)
+
+
+@each_kind
+def test_group_axioms(phi: np.ndarray) -> None:
+    p, q, r = so3.exp(phi), so3.exp(RNG.normal(size=phi.shape)), so3.exp(RNG.normal(size=phi.shape))
+    v = RNG.normal(size=phi.shape)
+    np.testing.assert_allclose(so3.compose(p, q, r), so3.multiply(p, so3.multiply(q, r)), atol=1e-14)
+    np.testing.assert_allclose(so3.multiply(p, so3.inverse(p)), so3.identity(len(p)), atol=1e-14)
+    np.testing.assert_allclose(so3.rotate(so3.multiply(p, q), v), so3.rotate(p, so3.rotate(q, v)), atol=1e-13)
+    np.testing.assert_allclose(so3.rotate(p, v), np.einsum("nij,nj->ni", so3.matrix(p), v), atol=1e-13)
+
+
+@each_kind
+def test_right_jacobian_against_differences(phi: np.ndarray) -> None:
+    step = 1e-6
+    for axis, d in enumerate(step * np.eye(3)):
+        forward = so3.log(so3.multiply(so3.inverse(so3.exp(phi)), so3.exp(phi + d)))
+        backward = so3.log(so3.multiply(so3.inverse(so3.exp(phi)), so3.exp(phi - d)))
+        np.testing.assert_allclose(so3.right_jacobian(phi)[..., axis], (forward - backward) / (2 * step), atol=1e-8)
+
+
+@each_kind
+def test_right_jacobian_inverse(phi: np.ndarray) -> None:
+    product = so3.right_jacobian(phi) @ so3.right_jacobian_inverse(phi)
+    np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-9)
+
+
+def test_broadcasts() -> None:
+    q, v = so3.exp(RNG.normal(size=(5, 1, 3))), RNG.normal(size=(7, 3))
+    assert so3.rotate(q, v).shape == (5, 7, 3)
+    assert so3.multiply(q, so3.exp(v)).shape == (5, 7, 4)
+    np.testing.assert_allclose(so3.rotate(q, v)[3, 2], so3.rotate(q[3, 0], v[2]))
+
+
+def test_interpolate_follows_constant_rates() -> None:
+    rate = np.array([0.3, -0.2, 0.5])
+    t = np.array([0.0, 0.5, 2.0])
+    at = np.array([-0.1, 0.0, 0.2, 0.5, 1.7, 2.0])
+    np.testing.assert_allclose(so3.interpolate(t, so3.exp(t[:, None] * rate), at), so3.exp(at[:, None] * rate), atol=1e-14)
