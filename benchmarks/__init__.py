@@ -1,1 +1,1 @@
-
+"""Benchmarks: ratios between alternatives timed in one run."""

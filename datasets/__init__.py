@@ -1,1 +1,1 @@
-
+"""Converters of public recordings to sessions; named scenarios."""

@@ -1,8 +1,8 @@
 """Batched rotations on numpy arrays.
 
-A rotation is a unit quaternion, shape (..., 4) in the order w, x, y, z; `aRb` maps coordinates in frame b to coordinates
-in frame a. Tangent vectors, shape (..., 3) in radians, are ordered x, y, z and act on the right: `R * Exp(delta)`, as in
-gtsam.Rot3. All functions broadcast over the leading dimensions.
+A rotation is a unit quaternion, shape (..., 4) in the order w, x, y, z; `aRb` maps coordinates in frame b to
+coordinates in frame a. Tangent vectors, shape (..., 3) in radians, are ordered x, y, z and act on the right:
+`R * Exp(delta)`, as in gtsam.Rot3. All functions broadcast over the leading dimensions.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def identity(shape: int | tuple[int, ...] = ()) -> Array:
 def normalize(q: ArrayLike) -> Array:
     """Unit quaternions along q."""
     q = np.asarray(q, dtype=float)
-    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
+    return q / np.linalg.norm(q, axis=-1, keepdims=True)
 
 
 def inverse(q: ArrayLike) -> Array:
@@ -66,7 +66,7 @@ def rotate(q: ArrayLike, v: ArrayLike) -> Array:
     q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
     u = q[..., 1:]
     t = 2.0 * cross(u, v)
-    return np.asarray(v + q[..., :1] * t + cross(u, t))
+    return v + q[..., :1] * t + cross(u, t)
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -108,7 +108,7 @@ def log(q: ArrayLike) -> Array:
     angle = 2.0 * np.arctan2(sine, np.abs(w))
     # angle / sine -> 2 / w at zero; the guard only avoids 0 / 0.
     factor = np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
-    return np.asarray(v * (np.where(w < 0.0, -1.0, 1.0) * factor)[..., None])
+    return v * (np.where(w < 0.0, -1.0, 1.0) * factor)[..., None]
 
 
 def matrix(q: ArrayLike) -> Array:
@@ -146,7 +146,7 @@ def from_matrix(r: ArrayLike) -> Array:
     )
     best = np.argmax(np.diagonal(ways, axis1=-2, axis2=-1), axis=-1)
     q = normalize(np.take_along_axis(ways, best[..., None, None], axis=-2)[..., 0, :])
-    return np.asarray(np.where(q[..., :1] < 0.0, -q, q))
+    return np.where(q[..., :1] < 0.0, -q, q)
 
 
 def right_jacobian(phi: ArrayLike) -> Array:
@@ -162,11 +162,11 @@ def right_jacobian(phi: ArrayLike) -> Array:
     a = np.where(small, 0.5 - square / 24.0, (1.0 - np.cos(safe)) / safe**2)
     b = np.where(small, 1.0 / 6.0 - square / 120.0, (safe - np.sin(safe)) / safe**3)
     k = hat(phi)
-    return np.asarray(np.eye(3) - a * k + b * (k @ k))
+    return np.eye(3) - a * k + b * (k @ k)
 
 
 def right_jacobian_inverse(phi: ArrayLike) -> Array:
-    """Inverse of `right_jacobian`: Log(Exp(phi) * Exp(d)) = phi + Jinv d to first order (same source, eq. 144)."""
+    """J with Log(Exp(phi) * Exp(d)) = phi + J d to first order (same source, eq. 144)."""
     phi = np.asarray(phi, dtype=float)
     square = (phi * phi).sum(axis=-1)[..., None, None]
     angle = np.sqrt(square)
@@ -174,7 +174,7 @@ def right_jacobian_inverse(phi: ArrayLike) -> Array:
     safe = np.where(small, 1.0, angle)
     a = np.where(small, 1.0 / 12.0 + square / 720.0, 1.0 / safe**2 - 0.5 / (safe * np.tan(0.5 * safe)))
     k = hat(phi)
-    return np.asarray(np.eye(3) + 0.5 * k + a * (k @ k))
+    return np.eye(3) + 0.5 * k + a * (k @ k)
 
 
 def interpolate(t: ArrayLike, q: ArrayLike, at: ArrayLike) -> Array:

@@ -1,1 +1,1 @@
-
+"""One module a method: recording to Problem."""

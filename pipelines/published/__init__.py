@@ -1,1 +1,1 @@
-
+"""The published solvers, as published."""

@@ -1,1 +1,1 @@
-
+"""Results as files: JSON, YAML, trajectories, HTML."""

@@ -1,1 +1,1 @@
-
+"""Simulators with exact physics, one a method."""

@@ -1,1 +1,1 @@
-
+"""Batch and incremental solvers of Problems."""

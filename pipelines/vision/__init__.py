@@ -1,1 +1,1 @@
-
+"""Pictures to tag corners, target offsets and poses with covariance."""

@@ -1,0 +1,109 @@
+"""Rotation of a gyro over any window, with its derivatives with respect to the gyro's bias and the window's end.
+
+A gyro sample is the mean rate over an interval centred on its stamp, so the rate is taken as linear between stamps
+(trapezoid). Inside a sample interval of rates w0, w1 = w0 + a T the rotation vector is
+w0 s + a s^2 / 2 + (w0 x a) s^3 / 12, the Magnus expansion of a linear rate (Iserles et al., Acta Numerica 2000).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from factors import so3
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Increments:
+    """Rotations over n windows: aRb with a the sensor at a window's start, b at its end.
+
+    Attributes:
+        duration: (n,), s.
+        wxyz: (n, 4), with `bias_hat` taken off the rates.
+        bias_jacobian: (n, 3, 3); for a bias near bias_hat the rotation is wxyz * Exp(J (bias - bias_hat)).
+        rate: (n, 3), rate at the window's end with bias_hat taken off, rad/s.
+    """
+
+    duration: Array
+    wxyz: Array
+    bias_jacobian: Array
+    rate: Array
+
+
+class GyroPath:
+    """A gyro stream integrated once; the rotation over any window then costs the same as a look-up.
+
+    Args:
+        t: (N,) stamps, s, increasing, N >= 2.
+        rate: (N, 3) angular rate, rad/s.
+        bias_hat: (3,) taken off all rates.
+    """
+
+    def __init__(self, t: ArrayLike, rate: ArrayLike, bias_hat: ArrayLike = (0.0, 0.0, 0.0)) -> None:
+        self.t = np.asarray(t, dtype=float)
+        self.bias_hat = np.asarray(bias_hat, dtype=float)
+        self._rate = np.asarray(rate, dtype=float) - self.bias_hat
+        if len(self.t) < 2 or self._rate.shape != (len(self.t), 3):
+            raise ValueError(f"needs stamps (N,) and rates (N, 3), N >= 2; got {self.t.shape} and {self._rate.shape}")
+        self._slope = np.diff(self._rate, axis=0) / np.diff(self.t)[:, None]
+        arcs = _arc(self._rate[:-1], self._slope, np.diff(self.t)[:, None])
+        self._attitude = np.concatenate([so3.identity(1), _running_product(so3.exp(arcs))])
+        # Integral of the attitude matrix, from which every window's bias Jacobian follows.
+        pieces = np.diff(self.t)[:, None, None] * so3.right_jacobian(-arcs)
+        self._integral = np.concatenate(
+            [np.zeros((1, 3, 3)), np.cumsum(so3.matrix(self._attitude[:-1]) @ pieces, axis=0)]
+        )
+
+    def attitude(self, at: ArrayLike) -> Array:
+        """Attitude (n, 4) of the sensor at the times, in its frame at the first stamp."""
+        return self._at(np.asarray(at, dtype=float))[0]
+
+    def increments(self, start: ArrayLike, stop: ArrayLike) -> Increments:
+        """Rotations over the windows [start, stop], (n,) each, s; a window may be empty or run backwards.
+
+        Beyond the first and the last stamp the outermost rates are continued; callers keep windows inside.
+        """
+        start, stop = np.asarray(start, dtype=float), np.asarray(stop, dtype=float)
+        q0, c0, _ = self._at(start)
+        q1, c1, rate = self._at(stop)
+        jacobian = -so3.matrix(so3.inverse(q1)) @ (c1 - c0)
+        return Increments(stop - start, so3.multiply(so3.inverse(q0), q1), jacobian, rate)
+
+    def _at(self, at: Array) -> tuple[Array, Array, Array]:
+        """Attitude, integral of the attitude matrix and rate at the times."""
+        i = np.clip(np.searchsorted(self.t, at, side="right") - 1, 0, len(self.t) - 2)
+        s = (at - self.t[i])[:, None]
+        w0, a = self._rate[i], self._slope[i]
+        arc = _arc(w0, a, s)
+        turn = so3.exp(arc)
+        integral = self._integral[i] + so3.matrix(self._attitude[i]) @ (s[..., None] * so3.right_jacobian(-arc))
+        speed = w0 + a * s + so3.cross(w0, a) * s**2 / 4.0
+        rate = np.einsum("nij,nj->ni", so3.right_jacobian(arc), speed)
+        return so3.multiply(self._attitude[i], turn), integral, rate
+
+
+def _arc(w0: Array, a: Array, s: Array) -> Array:
+    """Rotation vectors after the times s of rates w0 + a s."""
+    return w0 * s + a * (0.5 * s**2) + so3.cross(w0, a) * (s**3 / 12.0)
+
+
+def _running_product(q: Array) -> Array:
+    """q0, q0 q1, q0 q1 q2, ...: in blocks, vectorised over the blocks, so that the loop is as long as one block."""
+    n = len(q)
+    if n <= 64:
+        out = q.copy()
+        for i in range(1, n):
+            out[i] = so3.multiply(out[i - 1], q[i])
+        return so3.normalize(out)
+    length = int(np.sqrt(n))
+    blocks = -(-n // length)
+    grid = so3.identity((blocks, length))
+    grid.reshape(-1, 4)[:n] = q
+    for i in range(1, length):
+        grid[:, i] = so3.multiply(grid[:, i - 1], grid[:, i])
+    before = np.concatenate([so3.identity(1), _running_product(grid[:-1, -1])])
+    return so3.normalize(so3.multiply(before[:, None], grid).reshape(-1, 4)[:n])

@@ -1,0 +1,93 @@
+"""Gyro integration against fine stepping, closed forms and gtsam's own preintegration."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import so3
+from factors.preintegration import GyroPath
+
+
+def _stream(n: int = 400, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    t = np.cumsum(rng.uniform(0.004, 0.012, size=n))
+    rate = np.stack([np.sin(1.3 * t), 0.8 * np.cos(2.1 * t), 0.5 + 0.4 * np.sin(0.7 * t)], axis=1)
+    return t, rate
+
+
+def _fine(t: np.ndarray, rate: np.ndarray, start: float, stop: float, bias: np.ndarray) -> np.ndarray:
+    """The rotation by 20,000 constant-rate steps on the linearly interpolated rate."""
+    edges = np.linspace(start, stop, 20_001)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    w = np.stack([np.interp(middle, t, rate[:, k]) for k in range(3)], axis=1) - bias
+    q = so3.identity()
+    for turn in so3.exp(w * np.diff(edges)[:, None]):
+        q = so3.multiply(q, turn)
+    return q
+
+
+@pytest.mark.parametrize(("start", "stop"), [(0.1, 0.9), (0.5, 0.503), (0.31, 2.9)])
+def test_equals_fine_stepping(start: float, stop: float) -> None:
+    t, rate = _stream()
+    bias = np.array([0.01, -0.02, 0.005])
+    step = GyroPath(t, rate, bias).increments([start], [stop])
+    difference = so3.log(so3.multiply(so3.inverse(step.wxyz[0]), _fine(t, rate, start, stop, bias)))
+    assert np.abs(difference).max() < 5e-9  # the stepping itself: its steps straddle the stamps
+
+
+def test_constant_rate_is_exact_and_windows_compose() -> None:
+    rate = np.array([0.3, -1.0, 2.0])
+    path = GyroPath(np.linspace(0, 10, 1001), np.tile(rate, (1001, 1)))
+    np.testing.assert_allclose(so3.log(path.increments([1.234], [2.0]).wxyz[0]), rate * 0.766, atol=1e-12)
+    a, b, whole = (path.increments([x], [y]).wxyz[0] for x, y in [(0.5, 3.3), (3.3, 9.1), (0.5, 9.1)])
+    np.testing.assert_allclose(so3.matrix(so3.multiply(a, b)), so3.matrix(whole), atol=1e-12)
+    back = path.increments([3.3], [0.5]).wxyz[0]
+    np.testing.assert_allclose(so3.matrix(so3.multiply(a, back)), np.eye(3), atol=1e-12)
+
+
+def test_bias_jacobian_and_rate_against_differences() -> None:
+    t, rate = _stream()
+    start, stop = np.array([0.2, 1.0, 1.5, 2.0]), np.array([0.9, 1.002, 2.9, 1.95])
+    path = GyroPath(t, rate)
+    step = path.increments(start, stop)
+    h = 1e-5
+    for axis, d in enumerate(h * np.eye(3)):
+        turned = [GyroPath(t, rate, s * d).increments(start, stop).wxyz for s in (1, -1)]
+        numeric = so3.log(so3.multiply(so3.inverse(turned[1]), turned[0])) / (2 * h)
+        np.testing.assert_allclose(step.bias_jacobian[..., axis], numeric, atol=2e-4 * np.abs(numeric).max())
+    later, sooner = path.increments(start, stop + h).wxyz, path.increments(start, stop - h).wxyz
+    np.testing.assert_allclose(step.rate, so3.log(so3.multiply(so3.inverse(sooner), later)) / (2 * h), atol=2e-4)
+
+
+def test_agrees_with_gtsam_preintegration() -> None:
+    t, rate = _stream()
+    bias = np.array([0.01, -0.02, 0.005])
+    native = gtsam.PreintegratedAhrsMeasurements(gtsam.PreintegratedRotationParams(), bias)
+    middle = 0.5 * (rate[1:] + rate[:-1])
+    for w, dt in zip(middle[:100], np.diff(t)[:100], strict=True):
+        native.integrateMeasurement(w, dt)
+    step = GyroPath(t, rate, bias).increments(t[:1], t[100:101])
+    difference = so3.log(so3.multiply(so3.inverse(step.wxyz), so3.from_gtsam([native.deltaRij()])))
+    assert np.abs(difference).max() < 1e-5  # gtsam leaves out the coning term
+
+
+def test_long_streams_stay_unit_and_consistent() -> None:
+    rng = np.random.default_rng(3)
+    t = np.arange(200_000) * 1e-3
+    rate = rng.normal(scale=2.0, size=(200_000, 3))
+    path = GyroPath(t, rate)
+    edges = np.sort(rng.uniform(0, t[-1], size=500))
+    pieces = path.increments(edges[:-1], edges[1:]).wxyz
+    np.testing.assert_allclose(np.linalg.norm(pieces, axis=1), 1.0, atol=1e-14)
+    product = so3.identity()
+    for q in pieces:
+        product = so3.multiply(product, q)
+    whole = path.increments(edges[:1], edges[-1:]).wxyz[0]
+    np.testing.assert_allclose(so3.log(so3.multiply(so3.inverse(whole), product)), 0.0, atol=1e-12)
+
+
+def test_names_wrong_shapes() -> None:
+    with pytest.raises(ValueError, match=r"stamps \(N,\) and rates \(N, 3\)"):
+        GyroPath(np.arange(3.0), np.zeros((4, 3)))
