@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import gtsam
 import numpy as np
@@ -31,7 +31,7 @@ class Model(Protocol):
     def rows(self) -> int:
         """m, the rows of one measurement."""
 
-    def __call__(self, *blocks: Array) -> tuple[Array, Callable[[], tuple[Array, ...]]]:
+    def __call__(self, *blocks: Any, **_: Any) -> tuple[Array, Callable[[], tuple[Array, ...]]]:
         """Whitened residuals and, on demand, their Jacobians.
 
         A block is (n, 4), rotations as quaternions w, x, y, z, or (n, d), vectors. The residuals are (n, m); each
@@ -43,9 +43,9 @@ class Model(Protocol):
 class TruncatedLoss:
     """Truncated least squares on each measurement's whitened norm, with its graduated relaxation.
 
-    Beyond `gate` a measurement costs gate**2 / 2, whatever its size: it has no pull. `mu` = inf is that loss; a small mu
-    is a convex surrogate, and raising mu from outside leads from one to the other. Yang, Antonante, Tzoumas, Carlone,
-    "Graduated non-convexity for robust spatial perception", RA-L 2020, eqs. 13 and 14.
+    Beyond `gate` a measurement costs gate**2 / 2, whatever its size: it has no pull. `mu` = inf is that loss; a small
+    mu is a convex surrogate, and raising mu from outside leads from one to the other. Yang, Antonante, Tzoumas,
+    Carlone, "Graduated non-convexity for robust spatial perception", RA-L 2020, eqs. 13 and 14.
     """
 
     gate: float

@@ -1,0 +1,228 @@
+"""What a method hands to a solver, and what a solver hands back.
+
+A method writes its graph once, as a `Problem` that yields `Step`s in time order. The batch solver collects all steps and
+solves once; the incremental solver feeds them one by one to a smoother. Both, and the published solver of the method,
+return an `Estimate`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import so3
+from factors.vectorized import TruncatedLoss, VectorizedFactor
+
+if TYPE_CHECKING:
+    import gtsam
+
+Array = NDArray[np.float64]
+
+# Reported numbers (n,) of one variable and their Jacobian (n, d) with respect to its tangent.
+Coordinates = Callable[["gtsam.Values", int], tuple[Array, Array]]
+
+
+def vector_coordinates(values: gtsam.Values, key: int) -> tuple[Array, Array]:
+    """A vector variable, reported as it is."""
+    vector = np.asarray(values.atVector(key), dtype=float)
+    return vector, np.eye(len(vector))
+
+
+def rotation_vector_coordinates(values: gtsam.Values, key: int) -> tuple[Array, Array]:
+    """A Rot3 variable, reported as its rotation vector, rad."""
+    phi = so3.log(so3.from_gtsam([values.atRot3(key)])[0])
+    return phi, so3.right_jacobian_inverse(phi)
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One calibrated number as the contract lists it.
+
+    Attributes:
+        name: as in result.json.
+        unit: SI.
+        prior_sigma: sigma of its prior; 0 fixes it, None leaves it free.
+        prior_scale: the contract's default prior sigma, the yardstick for a free one.
+        require: the accuracy wanted, sigma.
+        extra_sigma: known error that the graph does not model, added in square to the reported sigma.
+    """
+
+    name: str
+    unit: str
+    prior_sigma: float | None
+    prior_scale: float
+    require: float
+    extra_sigma: float = 0.0
+
+    @property
+    def scale(self) -> float:
+        """Sigma against which this quantity's own is measured."""
+        return self.prior_sigma or self.prior_scale
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A calibration variable of the graph and the numbers it is reported as."""
+
+    key: int
+    quantities: tuple[Quantity, ...]
+    coordinates: Coordinates = vector_coordinates
+
+
+@dataclass(frozen=True)
+class Factor:
+    """A factor of the graph with the family it is accounted under in chi-square.
+
+    Attributes:
+        family: "vision", "gyro", "prior", ...
+        factor: a gtsam factor.
+        measurement: the vectorised factor behind it when it is a measurement that may be an outlier: the incremental
+            solver gates its innovation, reports plot its residuals.
+    """
+
+    family: str
+    factor: gtsam.NonlinearFactor
+    measurement: VectorizedFactor | None = None
+
+    @classmethod
+    def of(cls, family: str, measurement: VectorizedFactor) -> Factor:
+        """A measurement that may be an outlier."""
+        return cls(family, measurement.factor, measurement)
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one moment adds to the graph.
+
+    Attributes:
+        time: s from the session's start.
+        initial: the new variables, with values taken from the data around them (batch).
+        factors: the new factors.
+        predict: the new variables from the current estimate (incremental); None means `initial` serves.
+        timestamps: variable -> time of last use, s. A smoother with a window forgets a variable when its time leaves
+            the window; one that is named in no step is kept for good. Repeat a key to keep it alive.
+        stand_ins: parameter key -> variable that from now on holds its value, for parameters that move along.
+        keyframes: index range of the states this step adds, for `Problem.attitudes`.
+    """
+
+    time: float
+    initial: gtsam.Values
+    factors: Sequence[Factor]
+    predict: Callable[[gtsam.Values], gtsam.Values] | None = None
+    timestamps: Mapping[int, float] = field(default_factory=dict)
+    stand_ins: Mapping[int, int] = field(default_factory=dict)
+    keyframes: range = range(0)
+
+
+@dataclass(frozen=True)
+class Attitudes:
+    """A trajectory: times (n,), s from the session's start, and quaternions (n, 4), w x y z."""
+
+    time: Array
+    wxyz: Array
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The graph of one recording.
+
+    Attributes:
+        method: its name.
+        parameters: what is calibrated, in reporting order.
+        steps: yields the graph; its argument is how many measurements a step takes together (one when fed to a
+            smoother, many in batch, where fewer and larger factors are faster).
+        loss: shared by all measurements that may be outliers; the batch solver anneals it. None: no outliers expected.
+        attitudes: the trajectory at some keyframes, given values that hold them; None when the method has none.
+        attitude_name: what the trajectory is, e.g. "bRv".
+        advice: sentence for a weak direction, given its weights by parameter name.
+        dropped: measurements left out before solving, reason -> count.
+    """
+
+    method: str
+    parameters: tuple[Parameter, ...]
+    steps: Callable[[int], Iterator[Step]]
+    loss: TruncatedLoss | None = None
+    attitudes: Callable[[Sequence[int], gtsam.Values], Attitudes] | None = None
+    attitude_name: str = ""
+    advice: Callable[[Mapping[str, float]], str] | None = None
+    dropped: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """All reported numbers, in order."""
+        return tuple(q for p in self.parameters for q in p.quantities)
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Residuals of one family of measurements.
+
+    Attributes:
+        time: (n,) s.
+        whitened: (n, m), each of unit variance if the noise is as stated.
+        used: (n,) False for measurements rejected as outliers.
+    """
+
+    time: Array
+    whitened: Array
+    used: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ChiSquare:
+    """Sum of squared whitened residuals, its degrees of freedom and, per family, the same two."""
+
+    value: float
+    dof: float
+    families: Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class History:
+    """Estimates over time: times (k,), values and sigmas (k, n) in the order of Estimate.names."""
+
+    time: Array
+    values: Array
+    sigmas: Array
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A calibration by one solver; `names`, `values` (n,) and `covariance` (n, n) belong together.
+
+    Attributes:
+        solver: "batch", "incremental" or "published".
+        names: of the quantities this solver knows (a published one may know fewer than the problem has).
+        values: (n,).
+        covariance: (n, n), joint, of the reported numbers, everything else marginalised out. Rows of fixed quantities
+            are zero. Directions without any information have the variance of a very wide prior, never infinity.
+        converged: whether the solver says so; `message` says how or why not.
+        residuals: family -> residuals of measurements at the estimate (innovations for an incremental solver).
+        chi_square: None for solvers that have none.
+        history: values and sigmas over time, for solvers that work through time.
+        attitudes: the trajectory, if the method has one.
+        rejected: family -> number of measurements rejected as outliers.
+        seconds: phase -> wall time.
+    """
+
+    solver: str
+    names: tuple[str, ...]
+    values: Array
+    covariance: Array
+    converged: bool
+    message: str
+    residuals: Mapping[str, Residuals] = field(default_factory=dict)
+    chi_square: ChiSquare | None = None
+    history: History | None = None
+    attitudes: Attitudes | None = None
+    rejected: Mapping[str, int] = field(default_factory=dict)
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def sigmas(self) -> Array:
+        """(n,) standard deviations."""
+        return np.sqrt(np.diag(self.covariance))
