@@ -128,7 +128,7 @@ class VectorizedFactor:
         for column, kind in zip(self.columns, self.kinds, strict=True):
             keys = [column] if isinstance(column, int) else column
             if kind == "rotation":
-                xyzw = np.array([values.atRot3(k).toQuaternion().coeffs() for k in keys])
+                xyzw = np.array([values.atRot3(k).toQuaternion().coeffs() for k in keys])  # type: ignore[attr-defined]
                 block = xyzw[:, [3, 0, 1, 2]]
             else:
                 block = np.array([values.atVector(k) for k in keys])
@@ -193,4 +193,4 @@ def square_root(information: Array, projection: Array, square: float) -> tuple[A
     root = np.sqrt(np.where(known, eigenvalues, 0.0))
     R = root[:, None] * vectors.T * scale
     d = np.where(known, vectors.T @ (projection / scale), 0.0) / np.where(known, root, 1.0)
-    return R, d, float(np.sqrt(max(square - d @ d, 0.0)))
+    return R, d, max(square - float(d @ d), 0.0) ** 0.5

@@ -1,8 +1,8 @@
 """What a method hands to a solver, and what a solver hands back.
 
-A method writes its graph once, as a `Problem` that yields `Step`s in time order. The batch solver collects all steps and
-solves once; the incremental solver feeds them one by one to a smoother. Both, and the published solver of the method,
-return an `Estimate`.
+A method writes its graph once, as a `Problem` that yields `Step`s in time order. The batch solver collects all steps
+and solves once; the incremental solver feeds them one by one to a smoother. Both, and the published solver of the
+method, return an `Estimate`.
 """
 
 from __future__ import annotations
