@@ -1,0 +1,156 @@
+"""Cameras as sensor_msgs/msg/CameraInfo describes them: pixels to directions and back, exactly.
+
+Optical frame: x right, y down, z forward. Integer pixel coordinates are pixel centres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pipelines.errors import InputError
+
+Array = NDArray[np.float64]
+
+# Number of coefficients that each distortion model may come with; missing ones are zero.
+_COEFFICIENTS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (0, 4, 5, 8), "equidistant": (0, 4)}
+_NEWTON_STEPS = 30
+_PIXEL_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A camera with lens distortion.
+
+    Attributes:
+        width, height: picture size, px.
+        K: (3, 3) camera matrix, px, without skew.
+        distortion_model: `plumb_bob` (k1 k2 p1 p2 k3), `rational_polynomial` (k1 k2 p1 p2 k3 k4 k5 k6) or `equidistant`
+            (k1 k2 k3 k4); empty stands for plumb_bob.
+        coefficients: in ROS's order, which is OpenCV's; empty stands for no distortion.
+
+    Raises:
+        InputError: sizes, K or coefficients that no camera can have.
+
+    The models are those of OpenCV's calib3d and fisheye modules (J. Kannala, S. Brandt, 2006, for `equidistant`).
+    """
+
+    width: int
+    height: int
+    K: Array
+    distortion_model: str = "plumb_bob"
+    coefficients: Array = ()  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        K = np.asarray(self.K, dtype=float).reshape(3, 3)
+        d = np.asarray(self.coefficients, dtype=float).ravel()
+        model = self.distortion_model or "plumb_bob"
+        if self.width <= 0 or self.height <= 0 or not K.any():
+            raise InputError(
+                f"camera_info zero: picture {self.width}x{self.height}, K {K.ravel().tolist()}; "
+                "the camera was never calibrated: record a calibrated camera_info"
+            )
+        plain = np.array([[K[0, 0], 0.0, K[0, 2]], [0.0, K[1, 1], K[1, 2]], [0.0, 0.0, 1.0]])
+        if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0 or not np.array_equal(K, plain):
+            raise InputError(f"camera_info: K {K.ravel().tolist()} is not [fx 0 cx, 0 fy cy, 0 0 1] with fx, fy > 0")
+        if model not in _COEFFICIENTS:
+            raise InputError(f"camera_info: distortion model {model!r} is none of {', '.join(_COEFFICIENTS)}")
+        if d.size not in _COEFFICIENTS[model] or not np.isfinite(d).all():
+            raise InputError(f"camera_info: {model} takes {_COEFFICIENTS[model]} finite coefficients, not {d.tolist()}")
+        object.__setattr__(self, "K", K)
+        object.__setattr__(self, "distortion_model", model)
+        object.__setattr__(self, "coefficients", np.pad(d, (0, _COEFFICIENTS[model][-1] - d.size)))
+
+    @property
+    def focal(self) -> Array:
+        """(2,) focal lengths fx, fy in px."""
+        return np.array([self.K[0, 0], self.K[1, 1]])
+
+    @property
+    def centre(self) -> Array:
+        """(2,) principal point in px."""
+        return np.asarray(self.K[:2, 2])
+
+    def project(self, points: ArrayLike) -> Array:
+        """Pixels, shape (..., 2), of points in the optical frame, shape (..., 3), any unit; NaN behind the camera."""
+        points = np.asarray(points, dtype=float)
+        if self.distortion_model == "equidistant":
+            rho = np.hypot(points[..., 0], points[..., 1])
+            distorted, _ = self._angle(np.arctan2(rho, points[..., 2]))
+            scale = np.where(rho > 0, distorted / np.where(rho > 0, rho, 1.0), 1.0)
+            flat = points[..., :2] * scale[..., None]
+        else:
+            z = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
+            flat, _ = self._distort(points[..., :2] / z)
+        return np.asarray(flat * self.focal + self.centre)
+
+    def rays(self, pixels: ArrayLike) -> Array:
+        """Unit directions in the optical frame, shape (..., 3), of pixels, shape (..., 2).
+
+        Exact to 1e-9 px; NaN where the distortion model has no inverse.
+        """
+        flat = (np.asarray(pixels, dtype=float) - self.centre) / self.focal
+        if self.distortion_model == "equidistant":
+            return self._undistort_angle(flat)
+        ray = np.concatenate([self._undistort(flat), np.ones((*flat.shape[:-1], 1))], axis=-1)
+        return np.asarray(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
+
+    def _distort(self, u: Array) -> tuple[Array, Array]:
+        """Distorted z = 1 coordinates of undistorted ones, shape (..., 2), and the Jacobian, shape (..., 2, 2)."""
+        k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(self.coefficients, (0, 8 - len(self.coefficients)))
+        x, y = u[..., 0], u[..., 1]
+        r2 = x * x + y * y
+        over, under = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        radial = over / under
+        slope = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / under
+        out = np.stack(
+            [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y],
+            axis=-1,
+        )
+        J = np.empty((*u.shape, 2))
+        J[..., 0, 0] = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+        J[..., 0, 1] = J[..., 1, 0] = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+        J[..., 1, 1] = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+        return out, J
+
+    def _undistort(self, flat: Array) -> Array:
+        """Newton's iteration for the inverse of `_distort`; NaN where it does not reach the tolerance."""
+        if not self.coefficients.any():
+            return flat
+        u = flat.copy()
+        with np.errstate(all="ignore"):
+            for _ in range(_NEWTON_STEPS):
+                out, J = self._distort(u)
+                miss = out - flat
+                if np.nanmax(np.abs(miss) * self.focal, initial=0.0) < _PIXEL_TOLERANCE:
+                    break
+                det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+                u[..., 0] -= (J[..., 1, 1] * miss[..., 0] - J[..., 0, 1] * miss[..., 1]) / det
+                u[..., 1] -= (J[..., 0, 0] * miss[..., 1] - J[..., 1, 0] * miss[..., 0]) / det
+            out, J = self._distort(u)
+            # Beyond the radius where a polynomial turns back, a point has no image or a mirrored one.
+            good = (np.abs(out - flat) * self.focal < _PIXEL_TOLERANCE).all(axis=-1)
+            good &= (J[..., 0, 0] + J[..., 1, 1] > 0) & (J[..., 0, 0] * J[..., 1, 1] > J[..., 0, 1] * J[..., 1, 0])
+        return np.where(good[..., None], u, np.nan)
+
+    def _angle(self, theta: Array) -> tuple[Array, Array]:
+        """Distorted angle of the equidistant model, and its derivative."""
+        k1, k2, k3, k4 = self.coefficients
+        t2 = theta * theta
+        distorted = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+        return distorted, 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+
+    def _undistort_angle(self, flat: Array) -> Array:
+        radius = np.hypot(flat[..., 0], flat[..., 1])
+        theta = np.minimum(radius, np.pi)
+        with np.errstate(all="ignore"):
+            for _ in range(_NEWTON_STEPS):
+                distorted, slope = self._angle(theta)
+                theta = theta - (distorted - radius) / slope
+            distorted, slope = self._angle(theta)
+            miss = np.abs(distorted - radius) * self.focal.max()
+            theta = np.where((miss < _PIXEL_TOLERANCE) & (slope > 0) & (theta <= np.pi), theta, np.nan)
+        side = np.sinc(theta / np.pi) * theta / np.where(radius > 0, radius, 1.0)
+        return np.concatenate([flat * side[..., None], np.cos(theta)[..., None]], axis=-1)
