@@ -1,0 +1,155 @@
+"""Many messages of one topic into columns, all at once where they are alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.sessions.container import Rows, windows
+from pipelines.sessions.messages import Array, Definition, Layout, Leaf, at, numbers
+
+# Which numbers of a field, as indexes, given the message; None if the message has not got them.
+Order = Callable[[Any], Sequence[int] | None]
+
+# What every message with a header starts with: CDR encapsulation, then the stamp.
+_STAMP = {
+    order: np.dtype([("kind", "u1", 2), ("options", "u1", 2), ("sec", f"{order}i4"), ("nanosec", f"{order}u4")])
+    for order in "<>"
+}
+
+
+class Table:
+    """Columns filled from the messages of a topic, step by step. One whose values never change takes no memory."""
+
+    def __init__(self, rows: int, shapes: Mapping[str, tuple[int, ...]]) -> None:
+        self.filled = np.zeros(rows, dtype=bool)
+        self._t_ns = np.zeros(rows, dtype=np.int64)
+        self._log_ns = np.zeros(rows, dtype=np.int64)
+        self._shapes = shapes
+        self._constant: dict[str, Array] = {}
+        self._full: dict[str, Array] = {}
+        self._next = 0
+
+    def advance(self, log_ns: NDArray[np.int64], t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Take up the next messages: their log times, and their stamps (0: none). Returns their row numbers."""
+        rows = np.arange(self._next, self._next + len(log_ns))
+        self._next += len(log_ns)
+        self._log_ns[rows], self._t_ns[rows] = log_ns, t_ns
+        if not self._shapes:
+            self.filled[rows] = True
+        return rows
+
+    def put(self, rows: NDArray[np.int64], values: Mapping[str, NDArray[Any]]) -> None:
+        """Fill these rows: an array of shape (rows, numbers) for every column. Raises KeyError at another width."""
+        for name, column in values.items():
+            self._put(name, rows, column)
+        self.filled[rows] = True
+
+    def sorted(self) -> tuple[NDArray[np.int64], int, dict[str, Any]]:
+        """Stamps, how many of them are log times, and the columns, of the rows that were filled, by log time."""
+        by_log = (self._t_ns == 0) & self.filled
+        t_ns = np.where(by_log, self._log_ns, self._t_ns)
+        keep: Any = slice(None)
+        if not self.filled.all() or (np.diff(self._log_ns) < 0).any():
+            keep = np.argsort(self._log_ns, kind="stable")
+            keep = keep[self.filled[keep]]
+        t_ns = t_ns[keep]
+        columns = {
+            name: self._full[name][keep]
+            if name in self._full
+            else np.broadcast_to(constant, (len(t_ns), len(constant)))
+            for name, constant in self._constant.items()
+        }
+        shaped = {name: column.reshape(len(t_ns), *self._shapes[name]) for name, column in columns.items()}
+        return t_ns, int(np.count_nonzero(by_log)), shaped
+
+    def _put(self, name: str, rows: NDArray[np.int64], values: NDArray[Any]) -> None:
+        width = int(np.prod(self._shapes[name], dtype=int))
+        if values.shape[1] != width:
+            raise KeyError(f"{name}: {values.shape[1]} numbers instead of {width}")
+        constant = self._constant.setdefault(name, values[0].astype(float))
+        if name not in self._full:
+            if (values == constant).all():
+                return
+            self._full[name] = np.empty((len(self.filled), width))
+            self._full[name][:] = constant
+        self._full[name][rows] = values
+
+
+class Decoder:
+    """Takes fields, name -> (path in the message, order of its numbers or None), out of the messages of one channel.
+
+    A field the messages do not have is a KeyError or an AttributeError.
+    """
+
+    def __init__(self, definition: Definition, fields: Mapping[str, tuple[str, Order | None]]) -> None:
+        self._definition = definition
+        self._fields = fields
+        self._layout: Layout | None = None
+        self._plan: dict[str, tuple[Leaf, Any]] | None = None
+        self._started = False
+
+    def append(self, rows: Rows, table: Table) -> None:
+        """Append the messages to the table; those for which an order is None stay unfilled."""
+        if not len(rows.start):
+            return
+        into = table.advance(rows.log_ns, header_stamps(self._definition, rows))
+        if not self._fields:
+            return
+        if not self._started:
+            self._learn(rows.message(0))
+        alike = self._append_alike(rows, table, into)
+        for i in np.flatnonzero(~alike).tolist():
+            values = self._one(self._definition.decode(rows.message(i)))
+            if values is not None:
+                table.put(into[i : i + 1], values)
+
+    def _learn(self, first: bytes) -> None:
+        """Work out the layout of the first message and where in it the fields are."""
+        self._started = True
+        self._layout = self._definition.layout(first)
+        if self._layout is None:
+            return
+        message = self._definition.decode(first)
+        orders = {name: order(message) if order else slice(None) for name, (_, order) in self._fields.items()}
+        if None not in orders.values():
+            self._plan = {name: (self._layout.run(path), orders[name]) for name, (path, _) in self._fields.items()}
+
+    def _append_alike(self, rows: Rows, table: Table, into: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Append the messages that have the layout, all at once. Returns which ones those are."""
+        if self._layout is None or self._plan is None:
+            return np.zeros(len(rows.start), dtype=bool)
+        size = len(self._layout.first)
+        alike = rows.size == size
+        data = windows(rows.buffer, size)[rows.start[alike]].view(np.uint8).reshape(-1, size)
+        agrees = self._layout.agrees(data)
+        alike[alike] = agrees
+        data = data if agrees.all() else data[agrees]
+        if len(data):
+            table.put(into[alike], {name: run.of(data)[:, order] for name, (run, order) in self._plan.items()})
+        return alike
+
+    def _one(self, message: Any) -> dict[str, NDArray[Any]] | None:
+        values = {}
+        for name, (path, order) in self._fields.items():
+            chosen = order(message) if order else slice(None)
+            if chosen is None:
+                return None
+            values[name] = numbers(at(message, path))[None, chosen]
+        return values
+
+
+def header_stamps(definition: Definition, rows: Rows) -> NDArray[np.int64]:
+    """Header stamps of messages, ns; 0 where the stamp is zero or the type has none."""
+    stamps = np.zeros(len(rows.start), dtype=np.int64)
+    long = rows.size >= _STAMP["<"].itemsize
+    if definition.has_header and long.any():
+        heads = windows(rows.buffer, _STAMP["<"].itemsize)[rows.start[long]]
+        little, big = heads.view(_STAMP["<"]), heads.view(_STAMP[">"])
+        is_little = little["kind"][:, 1] == 1
+        sec = np.where(is_little, little["sec"], big["sec"])
+        stamps[long] = sec.astype(np.int64) * 1_000_000_000 + np.where(is_little, little["nanosec"], big["nanosec"])
+    return stamps

@@ -1,0 +1,250 @@
+"""ROS 2 messages as bytes: definitions, the layout of CDR, many messages at once.
+
+CDR has no field table: a string or a sequence moves everything after it. Messages of one topic, though, hardly ever
+differ in their strings and lengths. So the layout is worked out once, by walking a message along its definition, and
+serves every message with the same size, strings and lengths; the others are decoded one by one with rosbags.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache, reduce
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags.interfaces import Nodetype
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+
+from pipelines.errors import InputError
+
+Array = NDArray[np.float64]
+
+IMU = "sensor_msgs/msg/Imu"
+MAGNETIC_FIELD = "sensor_msgs/msg/MagneticField"
+JOINT_STATE = "sensor_msgs/msg/JointState"
+NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+VECTOR = "geometry_msgs/msg/Vector3Stamped"
+QUATERNION = "geometry_msgs/msg/QuaternionStamped"
+POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+TAG_DETECTIONS = "apriltag_msgs/msg/AprilTagDetectionArray"
+
+# Not among the types rosbags brings along.
+_APRILTAG_MSGS = {
+    "apriltag_msgs/msg/Point": "float64 x\nfloat64 y\n",
+    "apriltag_msgs/msg/AprilTagDetection": (
+        "string family\nint32 id\nint32 hamming\nfloat32 goodness\nfloat32 decision_margin\n"
+        "apriltag_msgs/Point centre\napriltag_msgs/Point[4] corners\nfloat64[9] homography\n"
+    ),
+    TAG_DETECTIONS: "std_msgs/Header header\napriltag_msgs/AprilTagDetection[] detections\n",
+}
+
+_CODES = {"bool": "u1", "byte": "u1", "char": "u1"}
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """A run of numbers in a message: where it starts, of which numpy type, how many."""
+
+    path: str
+    offset: int
+    dtype: np.dtype[Any]
+    count: int
+
+    def of(self, rows: NDArray[np.uint8], head: int = 0) -> NDArray[Any]:
+        """The numbers in rows of bytes, each `head` bytes and a message, as a view of shape (n, count)."""
+        strides = (rows.shape[1], self.dtype.itemsize)
+        return np.ndarray((len(rows), self.count), self.dtype, rows, head + self.offset, strides)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the numbers are in all messages that agree with the first one in size, strings and lengths."""
+
+    first: bytes
+    leaves: tuple[Leaf, ...]
+    fixed: tuple[tuple[int, int], ...]  # [start, end) of what has to be equal
+
+    def run(self, path: str) -> Leaf:
+        """All numbers at or below a field, as one run.
+
+        Raises KeyError if the message has no such field, or does not hold its numbers side by side.
+        """
+        found = [leaf for leaf in self.leaves if leaf.path == path or leaf.path.startswith((f"{path}.", f"{path}["))]
+        if not found:
+            raise KeyError(path)
+        end = found[0].offset
+        for leaf in found:
+            if leaf.offset != end or leaf.dtype != found[0].dtype:
+                raise KeyError(path)
+            end = leaf.offset + leaf.count * leaf.dtype.itemsize
+        return Leaf(path, found[0].offset, found[0].dtype, sum(leaf.count for leaf in found))
+
+    def agrees(self, messages: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Which of the messages, shape (n, size), have this layout."""
+        first = np.frombuffer(self.first, np.uint8)
+        same = np.ones(len(messages), dtype=bool)
+        for start, end in self.fixed:
+            same &= (messages[:, start:end] == first[start:end]).all(axis=1)
+        return same
+
+
+class Definition:
+    """A message type as its definition text tells it, not as we would expect it."""
+
+    def __init__(self, name: str, text: str) -> None:
+        self.name = name
+        self._store = get_typestore(Stores.EMPTY)
+        try:
+            self._store.register(get_types_from_msg(text, name))
+            self._store.get_msgdef(name)
+        except (TypesysError, KeyError, SyntaxError) as error:
+            reason = " ".join(str(error).split())
+            raise InputError(f"the definition of message type {name} cannot be read ({reason})") from error
+
+    @property
+    def has_header(self) -> bool:
+        """Whether its messages begin with a std_msgs/Header."""
+        return bool(self._store.fielddefs[self.name][1][0][1] == (Nodetype.NAME, "std_msgs/msg/Header"))
+
+    def decode(self, data: bytes) -> Any:
+        """One message, decoded by rosbags. Raises InputError."""
+        try:
+            return self._store.deserialize_cdr(data, self.name)
+        except SerdeError as error:
+            raise InputError(f"a message does not agree with the definition of {self.name} ({error})") from error
+
+    def encode(self, message: object) -> bytes:
+        """The CDR bytes of one message, little endian."""
+        return bytes(self._store.serialize_cdr(message, self.name, little_endian=True))
+
+    def new(self, kind: str, /, **fields: Any) -> Any:
+        """A message of this type or of one it holds: fields not given are zero, empty, or themselves new."""
+        values = {
+            field: fields[field] if field in fields else self._zero(what)
+            for field, what in self._store.fielddefs[kind][1]
+        }
+        return self._store.types[kind](**values)
+
+    def layout(self, data: bytes) -> Layout | None:
+        """The layout of a message, None if it is not one plain little- or big-endian CDR message."""
+        if data[:2] not in (b"\x00\x00", b"\x00\x01"):
+            return None
+        walk = _Walk(self._store.fielddefs, data)
+        try:
+            walk.struct(self.name, "")
+        except (IndexError, KeyError):
+            return None
+        # Up to three bytes of padding may follow.
+        if not 0 <= len(data) - walk.end <= 3:
+            return None
+        return Layout(data, tuple(walk.leaves), ((0, 2), *walk.fixed))
+
+    def _zero(self, kind: Any) -> Any:
+        node, what = kind
+        if node == Nodetype.NAME:
+            return self.new(what)
+        if node == Nodetype.BASE:
+            return "" if what[0] == "string" else 0
+        (inner, name), count = what
+        count = count if node == Nodetype.ARRAY else 0
+        if inner == Nodetype.NAME:
+            return [self.new(name) for _ in range(count)]
+        return [""] * count if name[0] == "string" else np.zeros(count, _CODES.get(name[0], name[0]))
+
+
+@lru_cache(maxsize=64)
+def definition(name: str, text: str) -> Definition:
+    """The definition of a type in the text of a recording. Raises InputError."""
+    return Definition(name, text)
+
+
+@lru_cache(maxsize=64)
+def definition_text(name: str) -> str:
+    """The text that a recording carries for a type, with all the types it is made of."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for own, text in _APRILTAG_MSGS.items():
+        store.register(get_types_from_msg(text, own))
+    return store.generate_msgdef(name, ros_version=2)[0]
+
+
+def known(name: str) -> Definition:
+    """The definition of a type as we write it."""
+    return definition(name, definition_text(name))
+
+
+def at(message: Any, path: str) -> Any:
+    """The field of a decoded message, by its path. Raises AttributeError."""
+    return reduce(getattr, path.split("."), message)
+
+
+def numbers(value: Any) -> Array:
+    """All numbers in a field of a decoded message, in order."""
+    if isinstance(value, list):
+        return np.concatenate([numbers(item) for item in value]) if value else np.empty(0)
+    if hasattr(value, "__dataclass_fields__"):
+        return np.concatenate([numbers(getattr(value, name)) for name in value.__dataclass_fields__ if name[0] != "_"])
+    return np.atleast_1d(np.asarray(value, dtype=float))
+
+
+class _Walk:
+    """Walks one message along its definition, noting the numbers and everything they depend on.
+
+    Raises IndexError when the message is too short and KeyError at something CDR has no numbers for.
+    """
+
+    def __init__(self, fielddefs: Any, data: bytes) -> None:
+        self.fielddefs, self.data = fielddefs, data
+        self.end = 4  # behind the encapsulation; alignment counts from here
+        self.leaves: list[Leaf] = []
+        self.fixed: list[tuple[int, int]] = []
+        self.order: Literal["<", ">"] = "<" if data[1] else ">"
+
+    def struct(self, name: str, path: str) -> None:
+        fields = self.fielddefs[name][1]
+        if not fields:
+            raise KeyError(name)
+        for field, kind in fields:
+            self.value(kind, f"{path}.{field}" if path else field)
+
+    def value(self, kind: Any, path: str) -> None:
+        node, what = kind
+        if node == Nodetype.NAME:
+            self.struct(what, path)
+        elif node == Nodetype.BASE:
+            self.base(what[0], path, 1)
+        else:
+            inner, count = what
+            self.items(inner, path, count if node == Nodetype.ARRAY else self.length())
+
+    def items(self, kind: Any, path: str, count: int) -> None:
+        node, what = kind
+        if node == Nodetype.BASE and what[0] != "string":
+            self.base(what[0], path, count)
+        else:
+            for i in range(count):
+                self.value(kind, f"{path}[{i}]")
+
+    def base(self, name: str, path: str, count: int) -> None:
+        if name == "string":
+            self.take(1, self.length(), fixed=True)
+        elif count:
+            dtype = np.dtype(_CODES.get(name, name)).newbyteorder(self.order)
+            start = self.take(dtype.itemsize, dtype.itemsize * count)
+            self.leaves.append(Leaf(path, start, dtype, count))
+
+    def length(self) -> int:
+        start = self.take(4, 4, fixed=True)
+        return int(np.frombuffer(self.data, f"{self.order}u4", 1, start)[0])
+
+    def take(self, align: int, size: int, fixed: bool = False) -> int:
+        start = 4 + -(-(self.end - 4) // align) * align
+        self.end = start + size
+        if self.end > len(self.data):
+            raise IndexError(self.end)
+        if fixed:
+            self.fixed.append((start, self.end))
+        return start

@@ -1,0 +1,271 @@
+"""Recordings as arrays.
+
+    recording = open_recording(Path("session.mcap"))
+    imu = recording.imu("/imu")         # imu.t_ns, imu.gyro, ...
+
+Time is header.stamp; log time stands in only where the stamp is zero, and the series counts those. Messages come in
+the order of their log times. Every method raises InputError, naming what is there, when the topic is missing or empty,
+holds another type, or cannot be decoded, and when a chunk of the file is damaged.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.errors import InputError
+from pipelines.sessions import messages, series
+from pipelines.sessions.container import McapFile, Rows
+from pipelines.sessions.decoding import Decoder, Order, Table, header_stamps
+from pipelines.sessions.messages import Definition
+
+AnySeries = TypeVar("AnySeries", bound=series.Series)
+
+# Topics whose first stamp may start a session. Positions and intrinsics may be stamped long before it.
+_TIMED = {
+    *(messages.IMU, messages.MAGNETIC_FIELD, messages.JOINT_STATE, messages.VECTOR, messages.QUATERNION, messages.POSE),
+    *(messages.COMPRESSED_IMAGE, messages.TAG_DETECTIONS),
+}
+
+
+@dataclass(frozen=True)
+class Topic:
+    """One topic of a recording."""
+
+    name: str
+    type: str
+    count: int
+    encoding: str
+
+
+def open_recording(path: Path | str) -> Recording:
+    """The recording in an MCAP file. Raises InputError when the file is missing, empty, no MCAP, cut or damaged."""
+    return Recording(Path(path))
+
+
+class Recording:
+    """An MCAP recording of ROS 2 messages. Holds positions in the file, not the messages."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = McapFile(path)
+        self.topics = self._list_topics()
+
+    def sha256(self) -> str:
+        """SHA-256 of the file, hexadecimal."""
+        with self.path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+
+    def attachment(self, name: str) -> bytes | None:
+        """The attachment of that name, None if there is none."""
+        return self._file.attachment(name)
+
+    @cached_property
+    def epoch_ns(self) -> int:
+        """Start of the session, Unix ns: the earliest first stamp of a sensor topic, else the first log time."""
+        timed = [topic.name for topic in self.topics.values() if topic.type in _TIMED and topic.count]
+        return min((self._first_stamp(name) for name in timed), default=self._file.first_ns)
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first message to the last, by their log times, s."""
+        return (self._file.last_ns - self._file.first_ns) * 1e-9
+
+    def imu(self, topic: str) -> series.ImuSeries:
+        """A sensor_msgs/msg/Imu topic."""
+        return self._series(series.ImuSeries, topic)
+
+    def magnetic(self, topic: str) -> series.MagneticSeries:
+        """A sensor_msgs/msg/MagneticField topic."""
+        return self._series(series.MagneticSeries, topic)
+
+    def vector(self, topic: str) -> series.VectorSeries:
+        """A geometry_msgs/msg/Vector3Stamped topic."""
+        return self._series(series.VectorSeries, topic)
+
+    def quaternion(self, topic: str) -> series.QuaternionSeries:
+        """A geometry_msgs/msg/QuaternionStamped topic."""
+        return self._series(series.QuaternionSeries, topic)
+
+    def poses(self, topic: str) -> series.PoseSeries:
+        """A geometry_msgs/msg/PoseWithCovarianceStamped topic, or attitudes alone from a QuaternionStamped one."""
+        self._require(topic, messages.POSE, messages.QUATERNION)
+        if self.topics[topic].type == messages.POSE:
+            return self._series(series.PoseSeries, topic)
+        attitude = self.quaternion(topic)
+        return series.PoseSeries(attitude.t_ns, attitude.wxyz, stamped_by_log=attitude.stamped_by_log)
+
+    def fixes(self, topic: str) -> series.FixSeries:
+        """A sensor_msgs/msg/NavSatFix topic."""
+        return self._series(series.FixSeries, topic)
+
+    def joints(self, topic: str, names: Sequence[str]) -> series.JointSeries:
+        """Positions of the named joints on a sensor_msgs/msg/JointState topic, whatever order the messages have."""
+        seen: dict[str, None] = {}
+
+        def order(message: Any) -> list[int] | None:
+            seen.update(dict.fromkeys(message.name))
+            if not set(names) <= set(message.name) or len(message.position) != len(message.name):
+                return None
+            return [message.name.index(name) for name in names]
+
+        self._require(topic, messages.JOINT_STATE)
+        table = Table(self.topics[topic].count, {"position": (len(names),)})
+        self._fill(table, topic, {"position": ("position", order)})
+        if not table.filled.any():
+            raise InputError(
+                f"{self.path}: topic {topic} has no message with positions of the joints {', '.join(names)}; "
+                f"its joints: {', '.join(seen) or 'none'}"
+            )
+        t_ns, by_log, columns = table.sorted()
+        without = int(np.count_nonzero(~table.filled))
+        return series.JointSeries(t_ns, columns["position"], tuple(names), by_log, without)
+
+    def camera_info(self, topic: str) -> series.CameraInfo:
+        """The first message of a sensor_msgs/msg/CameraInfo topic."""
+        for t_ns, _, message in self._decoded(topic, messages.CAMERA_INFO):
+            k, r, p = (np.array(values, dtype=float) for values in (message.k, message.r, message.p))
+            d = np.array(message.d, dtype=float)
+            return series.CameraInfo(
+                t_ns,
+                int(message.width),
+                int(message.height),
+                message.distortion_model,
+                d,
+                k.reshape(3, 3),
+                r.reshape(3, 3),
+                p.reshape(3, 4),
+                message.header.frame_id,
+            )
+        raise AssertionError("an empty topic has been refused")
+
+    def images(self, topic: str) -> Iterator[tuple[int, bytes]]:
+        """(stamp in ns, file) of the pictures on a sensor_msgs/msg/CompressedImage topic, one at a time."""
+        for t_ns, _, message in self._decoded(topic, messages.COMPRESSED_IMAGE):
+            yield t_ns, message.data.tobytes()
+
+    def detections(self, topic: str) -> series.DetectionSeries:
+        """An apriltag_msgs/msg/AprilTagDetectionArray topic, with corners as points or as plain numbers."""
+        stamps: list[int] = []
+        by_log = 0
+        frame, tag_id, corners, hamming, margin, family = [], [], [], [], [], []
+        for i, (t_ns, from_log, message) in enumerate(self._decoded(topic, messages.TAG_DETECTIONS)):
+            stamps.append(t_ns)
+            by_log += from_log
+            for found in message.detections:
+                frame.append(i)
+                tag_id.append(int(messages.numbers(found.id)[0]))
+                # (x, y) or (x, y, z) of each
+                corners.append(messages.numbers(found.corners).reshape(4, -1)[:, :2])
+                hamming.append(int(found.hamming))
+                margin.append(float(found.decision_margin))
+                family.append(found.family)
+        return series.DetectionSeries(
+            np.array(stamps, dtype=np.int64),
+            np.array(frame, dtype=np.int64),
+            np.array(tag_id, dtype=np.int64),
+            np.array(corners, dtype=float).reshape(-1, 4, 2),
+            np.array(hamming, dtype=np.int64),
+            np.array(margin, dtype=float),
+            np.array(family, dtype=np.str_),
+            by_log,
+        )
+
+    def stamps(self, topic: str) -> NDArray[np.int64]:
+        """Stamps, ns, of any topic in the order of the log times; log times where there is no header to be read."""
+        table = Table(self.topics[topic].count, {})
+        try:
+            self._require(topic)
+            self._fill(table, topic, {})
+        except InputError:
+            table = Table(self.topics[topic].count, {})
+            for rows in self._file.rows(self._channels(topic)):
+                table.advance(rows.log_ns, np.zeros_like(rows.log_ns))
+        return table.sorted()[0]
+
+    # -- behind the methods above
+
+    def _list_topics(self) -> dict[str, Topic]:
+        topics: dict[str, Topic] = {}
+        for number, channel in self._file.channels.items():
+            schema = self._file.schemas.get(channel.schema_id)
+            kind = schema.name if schema else ""
+            encoding = f"{channel.message_encoding}/{schema.encoding if schema else ''}"
+            before = topics.get(channel.topic)
+            if before and (before.type, before.encoding) != (kind, encoding):
+                raise InputError(
+                    f"{self.path}: topic {channel.topic} has messages of two types, {before.type} and {kind}"
+                )
+            count = self._file.counts.get(number, 0) + (before.count if before else 0)
+            topics[channel.topic] = Topic(channel.topic, kind, count, encoding)
+        return dict(sorted(topics.items()))
+
+    def _require(self, topic: str, *types: str) -> None:
+        """Raise InputError unless the topic is there, has messages, and one of the types."""
+        found = self.topics.get(topic)
+        if found is None:
+            there = ", ".join(f"{name} ({t.type})" for name, t in self.topics.items()) or "none"
+            ros1 = " (a ROS 1 recording)" if self._file.profile == "ros1" else ""
+            raise InputError(
+                f"{self.path}: no topic {topic} ({' or '.join(types)}); topics there{ros1}: {there}; "
+                "`topics:` in the config can rename"
+            )
+        if types and found.type not in types:
+            raise InputError(f"{self.path}: topic {topic} holds {found.type}, needed is {' or '.join(types)}")
+        if found.encoding != "cdr/ros2msg":
+            raise InputError(
+                f"{self.path}: topic {topic} has the encoding {found.encoding}, needed is cdr/ros2msg (ROS 2, as "
+                "`ros2 bag record -s mcap` writes it)"
+            )
+        if not found.count:
+            raise InputError(f"{self.path}: topic {topic} has no messages")
+
+    def _channels(self, topic: str) -> set[int]:
+        return {number for number, channel in self._file.channels.items() if channel.topic == topic}
+
+    def _rows(self, topic: str) -> Iterator[tuple[Definition, Rows]]:
+        for rows in self._file.rows(self._channels(topic)):
+            schema = self._file.schemas[self._file.channels[rows.channel].schema_id]
+            try:
+                yield messages.definition(schema.name, schema.data.decode()), rows
+            except (InputError, UnicodeDecodeError) as error:
+                raise InputError(f"{self.path}: topic {topic}: {error}") from error
+
+    def _decoded(self, topic: str, *types: str) -> Iterator[tuple[int, bool, Any]]:
+        """(stamp, whether it is the log time, message) one by one, in file order."""
+        self._require(topic, *types)
+        for definition, rows in self._rows(topic):
+            stamps = header_stamps(definition, rows)
+            for i, (t_ns, log_ns) in enumerate(zip(stamps.tolist(), rows.log_ns.tolist(), strict=True)):
+                yield t_ns or log_ns, not t_ns, definition.decode(rows.message(i))
+
+    def _first_stamp(self, topic: str) -> int:
+        return next(t_ns for t_ns, _, _ in self._decoded(topic))
+
+    def _series(self, kind: type[AnySeries], topic: str) -> AnySeries:
+        self._require(topic, kind.TYPE)
+        table = Table(self.topics[topic].count, {name: column.shape for name, column in kind.COLUMNS.items()})
+        self._fill(table, topic, {name: (column.path, _always(column.order)) for name, column in kind.COLUMNS.items()})
+        t_ns, by_log, columns = table.sorted()
+        return kind(t_ns, stamped_by_log=by_log, **columns)
+
+    def _fill(self, table: Table, topic: str, fields: Mapping[str, tuple[str, Order | None]]) -> None:
+        decoders: dict[int, Decoder] = {}
+        try:
+            for definition, rows in self._rows(topic):
+                if rows.channel not in decoders:
+                    decoders[rows.channel] = Decoder(definition, fields)
+                decoders[rows.channel].append(rows, table)
+        except (KeyError, AttributeError) as error:
+            raise InputError(f"{self.path}: the messages on {topic} have no usable field {error}") from error
+
+
+def _always(order: tuple[int, ...] | None) -> Order | None:
+    return (lambda _: order) if order else None
