@@ -1,0 +1,89 @@
+"""A gyro bias that walks, with its mean over the session as the reported parameter.
+
+The bias is constant over stretches, one node each, joined by the random walk. A second chain carries the mean of the
+bias up to the end of each stretch, so that batch and smoothers with a window report the same session mean without
+holding every node.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from pipelines.methods.base import Array, Factor
+
+# A stretch may bend the angle by this fraction of what gyro noise does over it ...
+_FRACTION = 0.2
+# ... and is never longer than this, s, so that the bias over time can be seen.
+_LONGEST = 10.0
+# The mean follows from the nodes without error; what is left to it keeps the arithmetic well conditioned, rad/s.
+_MEAN_SIGMA = 1e-9
+
+
+@dataclass(frozen=True)
+class WalkingBias:
+    """Nodes of a bias over [0, duration].
+
+    Attributes:
+        edges: (J + 1,) s, ends of the stretches.
+        walk: rad/s/sqrt(s).
+    """
+
+    edges: Array
+    walk: float
+
+    @classmethod
+    def over(cls, start: float, stop: float, walk: float, density: float) -> WalkingBias:
+        """Stretches short enough for the walk (rad/s/sqrt(s)) to stay below gyro noise (rad/s/sqrt(Hz))."""
+        if walk <= 0.0:
+            return cls(np.array([start, stop]), 0.0)
+        longest = min(_LONGEST, _FRACTION * np.sqrt(3.0) * density / walk)
+        count = max(1, int(np.ceil((stop - start) / max(longest, 1e-3))))
+        return cls(np.linspace(start, stop, count + 1), walk)
+
+    @property
+    def nodes(self) -> int:
+        """Number of nodes."""
+        return len(self.edges) - 1
+
+    def node_at(self, time: Array) -> Array:
+        """Index of the node in force at the times."""
+        return np.clip(np.searchsorted(self.edges, time, side="right") - 1, 0, self.nodes - 1)
+
+    def key(self, node: int) -> int:
+        """Variable of a node, (3,) rad/s."""
+        return int(gtsam.symbol("b", node))
+
+    def mean_key(self, node: int) -> int:
+        """Variable of the mean up to the end of a node's stretch; the first stretch's mean is its node."""
+        return self.key(0) if node == 0 else int(gtsam.symbol("m", node))
+
+    def walk_factor(self, node: int) -> Factor:
+        """Joins a node to the one before it."""
+        spacing = 0.5 * (self.edges[node + 1] - self.edges[node - 1])
+        noise = gtsam.noiseModel.Isotropic.Sigma(3, self.walk * float(np.sqrt(spacing)))
+        return Factor("bias walk", gtsam.BetweenFactorVector(self.key(node - 1), self.key(node), np.zeros(3), noise))
+
+    def mean_factor(self, node: int) -> Factor:
+        """Defines the mean at the end of a node's stretch from the one before and the node (native, linear)."""
+        whole = self.edges[node + 1] - self.edges[0]
+        share = float((self.edges[node + 1] - self.edges[node]) / whole)
+        # Within the stretch the walk's own mean departs from the node's constant by this much.
+        departure = self.walk * np.sqrt((self.edges[node + 1] - self.edges[node]) / 12.0) * share
+        keys = (self.mean_key(node), self.mean_key(node - 1), self.key(node))
+        zeros = gtsam.Values()
+        for key in keys:
+            zeros.insert(key, np.zeros(3))
+        linear = gtsam.JacobianFactor(
+            keys[0],
+            np.eye(3),
+            keys[1],
+            -(1.0 - share) * np.eye(3),
+            keys[2],
+            -share * np.eye(3),
+            np.zeros(3),
+            gtsam.noiseModel.Isotropic.Sigma(3, float(np.hypot(departure, _MEAN_SIGMA))),
+        )
+        return Factor("definition", gtsam.LinearContainerFactor(linear, zeros))

@@ -1,0 +1,197 @@
+"""Batch: all steps in one graph, solved once.
+
+The outer loop is our own, since gtsam's optimizers copy all values into Python at every call of a Python factor, which
+makes them quadratic in the number of variables. Linearising, ordering and elimination stay gtsam's.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factors.vectorized import TruncatedLoss
+from pipelines.methods.base import Estimate, Factor, Problem, Residuals
+from pipelines.solvers.marginals import chi_square, joint_covariance, reported
+
+# Frames in one vectorised factor: past this the Jacobians' zeros cost more than the Python calls they save.
+_CHUNK = 20
+_MOST_ITERATIONS = 60
+# A step that lowers the error (unit: half a squared sigma) by less moved nothing by more than 0.005 sigma, and the
+# next one would move it by the square of that.
+_ERROR_TOLERANCE = 1e-5
+# Below this mean pull of outliers on plain least squares, in sigmas a measurement, good measurements stay inside the
+# gate and the outliers can be cut off at once.
+_MILD_PULL = 0.5
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Values at a minimum, and how it was reached."""
+
+    values: gtsam.Values
+    converged: bool
+    message: str
+    iterations: int
+
+
+def solve_batch(problem: Problem) -> Estimate:
+    """The maximum a-posteriori estimate with the joint marginal covariance of its parameters.
+
+    Outliers are found by graduated non-convexity on the problem's truncated loss: the final solution is plain least
+    squares on the measurements inside the gate, so its covariance and chi-square mean what they say.
+
+    Raises:
+        IndeterminateError: states other than the parameters are not determined; names the variable.
+    """
+    start = time.perf_counter()
+    factors: list[Factor] = []
+    values = gtsam.Values()
+    stand_ins: dict[int, int] = {}
+    keyframes: list[int] = []
+    for step in problem.steps(_CHUNK):
+        factors.extend(step.factors)
+        values.insert(step.initial)
+        stand_ins.update(step.stand_ins)
+        keyframes.extend(step.keyframes)
+    built = time.perf_counter()
+    shared = [stand_ins.get(p.key, p.key) for p in problem.parameters]
+    solution = optimize(factors, values, shared, problem.loss)
+    solved = time.perf_counter()
+    values = solution.values
+    graph = graph_of(factors)
+    ordering = elimination_ordering(graph, shared)
+    linear = graph.linearize(values)
+    marginal = joint_covariance(problem, linear, ordering, values, stand_ins)
+    residuals = _residuals(factors, values)
+    summary = chi_square(factors, linear, ordering, values)
+    done = time.perf_counter()
+    return Estimate(
+        solver="batch",
+        names=tuple(q.name for q in problem.quantities),
+        values=reported(problem, values, stand_ins),
+        covariance=marginal,
+        converged=solution.converged,
+        message=solution.message,
+        residuals=residuals,
+        chi_square=summary,
+        attitudes=problem.attitudes(keyframes, values) if problem.attitudes else None,
+        rejected={family: int((~r.used).sum()) for family, r in residuals.items()},
+        seconds={"build": built - start, "solve": solved - built, "marginals": done - solved},
+    )
+
+
+def graph_of(factors: Sequence[Factor]) -> gtsam.NonlinearFactorGraph:
+    """The gtsam graph of the factors, in their order."""
+    graph = gtsam.NonlinearFactorGraph()
+    for f in factors:
+        graph.add(f.factor)
+    return graph
+
+
+def elimination_ordering(graph: gtsam.NonlinearFactorGraph, shared: Sequence[int]) -> gtsam.Ordering:
+    """Nested dissection of the chain with the shared variables last, which suits chains with a few common variables."""
+    last = set(shared)
+    ordering = gtsam.Ordering()
+    metis = gtsam.Ordering.MetisNonlinearFactorGraph(graph)
+    for i in range(metis.size()):
+        if metis.at(i) not in last:
+            ordering.push_back(metis.at(i))
+    for key in shared:
+        ordering.push_back(key)
+    return ordering
+
+
+def optimize(
+    factors: Sequence[Factor], values: gtsam.Values, shared: Sequence[int], loss: TruncatedLoss | None
+) -> Solution:
+    """Minimise; with a loss: plain least squares first, and the graduated relaxation only if it leaves outliers."""
+    graph = graph_of(factors)
+    ordering = elimination_ordering(graph, shared)
+    if loss is None:
+        return _minimize(graph, values, ordering)
+    loss.mu = 0.0
+    plain = _minimize(graph, values, ordering)
+    values, iterations = plain.values, plain.iterations
+    norms = np.concatenate([np.linalg.norm(r.whitened, axis=1) for r in _residuals(factors, values).values()])
+    outlying = norms[norms > loss.gate]
+    if outlying.sum() > _MILD_PULL * len(norms):
+        loss.mu = loss.gate**2 / (2.0 * float(outlying.max()) ** 2 - loss.gate**2)
+        while loss.mu < 1e3:
+            relaxed = _minimize(graph, values, ordering, most=2)
+            values, iterations = relaxed.values, iterations + relaxed.iterations
+            loss.mu *= 4.0
+    loss.mu = np.inf
+    if len(outlying) == 0:
+        return plain
+    final = _minimize(graph, values, ordering)
+    return Solution(final.values, final.converged, final.message, iterations + final.iterations)
+
+
+def _minimize(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering, most: int = _MOST_ITERATIONS
+) -> Solution:
+    """Gauss-Newton steps, damped (Levenberg-Marquardt) only when a full step fails."""
+    error = graph.error(values)
+    if not np.isfinite(error):
+        return Solution(values, False, "the residuals at the start are not finite", 0)
+    damping = 0.0
+    for iteration in range(1, most + 1):
+        linear = graph.linearize(values)
+        while True:
+            candidate = _step(linear, values, ordering, damping)
+            new_error = graph.error(candidate) if candidate is not None else np.inf
+            if new_error <= error + _ERROR_TOLERANCE:
+                break
+            damping = max(10.0 * damping, 1e-6)
+            if damping > 1e8:
+                return Solution(values, False, f"no step lowers the error of {error:.6g}", iteration)
+        assert candidate is not None
+        values, fall, error = candidate, error - new_error, new_error
+        damping = damping / 10.0 if damping > 1e-6 else 0.0
+        if fall < _ERROR_TOLERANCE + 1e-10 * error and damping == 0.0:
+            return Solution(values, True, f"converged after {iteration} iterations", iteration)
+    return Solution(values, False, f"not converged after {most} iterations", most)
+
+
+def _step(
+    linear: gtsam.GaussianFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering, damping: float
+) -> gtsam.Values | None:
+    """Values after one (damped) step; None when the system is singular."""
+    try:
+        if damping > 0.0:
+            linear = _damped(linear, damping)
+        return values.retract(linear.optimize(ordering))
+    except RuntimeError:
+        return None
+
+
+def _damped(linear: gtsam.GaussianFactorGraph, damping: float) -> gtsam.GaussianFactorGraph:
+    """The system with each unknown held by `damping` times its own information."""
+    out = gtsam.GaussianFactorGraph(linear)
+    diagonal = linear.hessianDiagonal()
+    for key in linear.keyVector():
+        scale = np.sqrt(damping * np.maximum(diagonal.at(key), 1e-6))
+        out.add(gtsam.JacobianFactor(key, np.diag(scale), np.zeros(len(scale))))
+    return out
+
+
+def _residuals(factors: Sequence[Factor], values: gtsam.Values) -> dict[str, Residuals]:
+    """Residuals of all measurements, by family, in time order of the steps."""
+    gathered: dict[str, list[Residuals]] = {}
+    for f in factors:
+        if f.measurement is not None:
+            whitened = f.measurement.residuals(values)
+            used = f.measurement.used(values)
+            gathered.setdefault(f.family, []).append(Residuals(f.measurement.model.time, whitened, used))
+    return {
+        family: Residuals(
+            np.concatenate([p.time for p in parts]),
+            np.concatenate([p.whitened for p in parts]),
+            np.concatenate([p.used for p in parts]),
+        )
+        for family, parts in gathered.items()
+    }
