@@ -1,0 +1,261 @@
+"""AprilTags in pictures, with corners to a few hundredths of a pixel and their covariance.
+
+OpenCV's ArucoDetector finds and reads the tags. Their edges are then measured anew: along each of the four edges the
+grey profile across it is cut in many places, the place of the step in each profile follows from its area (its first
+moment, which the integration over pixels leaves unbiased), a line goes through these places in the space of directions,
+where lens distortion does not bend it, and the corners are where the lines meet.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.errors import InputError
+from pipelines.vision.camera import Camera
+
+Array = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+
+# OpenCV's picture of 36h11 is turned by 180 degrees: its corners 0, 1, 2, 3 (clockwise from its top left) are the
+# official bottom right, bottom left, top left, top right. This order makes them the library's.
+_OFFICIAL = [1, 0, 3, 2]
+
+_CUTS = 48  # profiles across an edge
+_SAMPLES = 25  # grey values in a profile
+_CELLS = 8  # a tag's black square is this many cells wide
+_REACH_CELLS = 0.45  # profiles end half way to the next cell's edge, whose blur must stay outside
+_REACH_PX = 6.0
+_ROUNDS = 4
+_CONTRAST = 8.0  # least difference of white and black, grey levels
+_CORRELATION_PX = 1.5  # cuts closer than this share their noise (bilinear sampling of white noise)
+# Error of a step's place at one px of reach, from the pixel grid; it falls with the reach (measured on rendered tags).
+_GRID_ERROR = 0.03
+# A corner that could not be measured keeps OpenCV's place and this sigma, px.
+_PLAIN_SIGMA = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """The tags found in one picture.
+
+    Attributes:
+        ids: (n,) tag ids.
+        corners: (n, 4, 2) px, in the AprilTag library's order: bottom left, bottom right, top right, top left of the
+            official picture. Integer coordinates are pixel centres.
+        covariance: (n, 4, 2, 2) px^2 of each corner, from the scatter of the edge points about their lines.
+    """
+
+    ids: NDArray[np.int64]
+    corners: Array
+    covariance: Array
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+def detect(picture: Picture, family: str = "36h11", camera: Camera | None = None) -> Detections:
+    """Finds the tags of a family in a grey picture, shape (height, width), and measures their corners.
+
+    With a camera the edges are straight in space; without, they are taken as straight in the picture.
+
+    Raises:
+        InputError: the family is not 36h11, or the camera's picture has another size.
+    """
+    if family != "36h11":
+        raise InputError(f"tag_family {family!r}: only 36h11 is supported")
+    height, width = picture.shape
+    if camera is None:
+        camera = Camera(width, height, np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]]))
+    elif (camera.width, camera.height) != (width, height):
+        raise InputError(f"pictures are {width}x{height}, camera_info says {camera.width}x{camera.height}")
+    found, ids, _ = _detector().detectMarkers(picture)
+    if ids is None or not len(ids):
+        return Detections(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)))
+    corners = np.concatenate(found).astype(float)[:, _OFFICIAL]
+    return Detections(np.asarray(ids, dtype=np.int64).ravel(), *_refine(picture, corners, camera))
+
+
+@cache
+def _detector() -> Any:
+    import cv2
+
+    parameters = cv2.aruco.DetectorParameters()
+    # Small tags: more pixels a cell when the bits are read, and 4 of 36 bits may be wrong (36h11 tells 5 wrong ones).
+    parameters.perspectiveRemovePixelPerCell = 8
+    parameters.errorCorrectionRate = 0.8
+    return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11), parameters)
+
+
+def _refine(picture: Picture, plain: Array, camera: Camera) -> tuple[Array, Array]:
+    """Corners, (n, 4, 2), and covariances from the edges; edge k runs from corner k to corner k + 1."""
+    n = len(plain)
+    corners = plain
+    centre = np.repeat(plain.mean(axis=1), 4, axis=0)
+    blur = np.full(4 * n, np.inf)
+    for _ in range(_ROUNDS):
+        start, end = corners.reshape(-1, 2), np.roll(corners, -1, axis=1).reshape(-1, 2)
+        cuts = _cut(picture, start, end, centre, blur)
+        blur = cuts.blur
+        line, variance = _fit(camera, cuts, start, end)
+        line, variance = line.reshape(n, 4, 3), variance.reshape(n, 4, 2)
+        # Corner k lies on edge k (at its start) and on edge k - 1 (at its end).
+        meet = np.cross(np.roll(line, 1, axis=1), line)
+        with np.errstate(all="ignore"):
+            corners = camera.project(meet * np.sign(meet[..., 2:]))
+        lost = ~(np.linalg.norm(corners - plain, axis=-1) < _limit(plain))
+        lost |= ~np.isfinite(variance[..., 0] + np.roll(variance[..., 1], 1, axis=1))
+        corners = np.where(lost[..., None], plain, corners)
+    covariance = _corner_covariance(cuts.normal.reshape(n, 4, 2), variance)
+    covariance[lost] = _PLAIN_SIGMA**2 * np.eye(2)
+    return corners, covariance
+
+
+def _limit(plain: Array) -> Array:
+    """How far (n, 1) px the edges may move a corner: half a cell and what a blurred or small tag may need."""
+    side = np.linalg.norm(plain - np.roll(plain, 1, axis=1), axis=-1).mean(axis=1, keepdims=True)
+    return np.asarray(np.clip(0.5 * side / _CELLS, 2.0, 5.0))
+
+
+@dataclass(frozen=True, eq=False)
+class _Cuts:
+    """The step's place in each profile of each edge.
+
+    Attributes:
+        points: (e, c, 2) px.
+        weights: (e, c) 0 or 1.
+        normal: (e, 2) outward.
+        pitch: (e,) px between cuts.
+        reach: (e,) px, half the length of the profiles.
+        blur: (e,) sigma of the step, px.
+        level_variance: (e,) px^2, what noise in the black and white levels does to a point.
+    """
+
+    points: Array
+    weights: Array
+    normal: Array
+    pitch: Array
+    reach: Array
+    blur: Array
+    level_variance: Array
+
+
+def _cut(picture: Picture, start: Array, end: Array, centre: Array, blur: Array) -> _Cuts:
+    """Cuts profiles across the edges from `start` to `end`, (e, 2), of tags about `centre`; black is inside.
+
+    The levels are those beyond the step's `blur`, (e,) px; with infinite blur, the ends of the profiles.
+    """
+    length = np.linalg.norm(end - start, axis=1)
+    along = (end - start) / length[:, None]
+    normal = np.stack([along[:, 1], -along[:, 0]], axis=1)
+    middle = 0.5 * (start + end)
+    depth = ((middle - centre) * normal).sum(axis=1)
+    normal *= np.sign(depth)[:, None]
+    reach = np.clip(_REACH_CELLS * 2 * np.abs(depth) / _CELLS, 1.2, _REACH_PX)
+    inset = np.minimum(reach + 1.0, 0.3 * length)
+    s = np.linspace(-0.5, 0.5, _CUTS)
+    feet = middle[:, None] + (s * (length - 2 * inset)[:, None])[..., None] * along[:, None]
+    unit = np.linspace(-1.0, 1.0, _SAMPLES)
+    t = reach[:, None] * unit
+    grey, inside = _sample(picture, feet[:, :, None] + t[:, None, :, None] * normal[:, None, None])
+    weights = inside.all(axis=2).astype(float)
+
+    # The step with its blur lies within `near`; beyond it are the levels.
+    near = np.minimum(3.0 * blur + 0.7, reach)
+    beyond = np.abs(unit) >= (near / reach)[:, None] * (1 - 1e-9)
+    black, black_noise = _level(grey, beyond & (unit < 0), s)
+    white, white_noise = _level(grey, beyond & (unit > 0), s)
+    contrast = white - black
+    weights *= contrast > _CONTRAST
+    share = np.where(beyond[:, None], unit < 0, (white[..., None] - grey) / np.maximum(contrast, _CONTRAST)[..., None])
+    # The area of the black share is the length of the profile's black part (trapezoidal rule).
+    step = 2 * reach / (_SAMPLES - 1)
+    place = step[:, None] * share.sum(axis=2) - reach[:, None] - 0.5 * step[:, None]
+    points = feet + place[..., None] * normal[:, None]
+
+    mean = (share * weights[..., None]).sum(axis=1) / np.maximum(weights.sum(axis=1), 1.0)[:, None]
+    slope, middle_t = -np.diff(mean), 0.5 * (t[:, 1:] + t[:, :-1])
+    about = (slope * middle_t).sum(axis=1)
+    sigma = np.sqrt(np.maximum((slope * middle_t**2).sum(axis=1) - about**2, 0.1))
+    level = np.median(np.maximum(contrast, _CONTRAST), axis=1)
+    level_variance = (near / level) ** 2 * (black_noise**2 + white_noise**2)
+    return _Cuts(points, weights, normal, (length - 2 * inset) / (_CUTS - 1), reach, sigma, level_variance)
+
+
+def _sample(picture: Picture, where: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Grey values between the pixels (bilinear), and whether the place lies in the picture."""
+    height, width = picture.shape
+    x, y = where[..., 0], where[..., 1]
+    column, row = np.floor(x).astype(np.intp), np.floor(y).astype(np.intp)
+    inside = (column >= 0) & (column < width - 1) & (row >= 0) & (row < height - 1)
+    column, row = np.clip(column, 0, width - 2), np.clip(row, 0, height - 2)
+    right, down = x - column, y - row
+    flat = picture.ravel()
+    i = row * width + column
+    a, b, c, d = (flat[i + k].astype(float) for k in (0, 1, width, width + 1))
+    upper, lower = a + (b - a) * right, c + (d - c) * right
+    return upper + (lower - upper) * down, inside
+
+
+def _level(grey: Array, where: NDArray[np.bool_], s: Array) -> tuple[Array, Array]:
+    """Grey level beside each cut, (e, c), smoothed along the edge by a straight line, and its scatter from cut to cut.
+
+    The mean of the samples `where`, (e, samples). The line goes through medians, so that dirt does not pull it.
+    """
+    beside = (grey * where[:, None]).sum(axis=2) / where.sum(axis=1)[:, None]
+    third = len(s) // 3
+    first, last = np.median(beside[:, :third], axis=1), np.median(beside[:, -third:], axis=1)
+    slope = (last - first) / (s[-third:].mean() - s[:third].mean())
+    level = np.median(beside - slope[:, None] * s, axis=1)[:, None] + slope[:, None] * s
+    noise = 1.4826 * np.median(np.abs(beside - level), axis=1)
+    return level, noise
+
+
+def _fit(camera: Camera, cuts: _Cuts, start: Array, end: Array) -> tuple[Array, Array]:
+    """Planes through the camera's centre, (e, 3) unit normals, and the lines' variance, px^2, at start and end, (e, 2).
+
+    Total least squares on the directions of the points, reweighted (Tukey's biweight) against dirt on the edge.
+    """
+    rays = camera.rays(cuts.points)
+    weights = cuts.weights * np.isfinite(rays[..., 0])
+    rays = np.where(weights[..., None] > 0, rays, 0.0)
+    # Pixels per radian across the edge, near enough for weights and variances.
+    scale = float(camera.focal.mean())
+    w = weights
+    for _ in range(3):
+        moment = np.einsum("ec,eci,ecj->eij", w, rays, rays)
+        normal = np.linalg.eigh(moment)[1][..., 0]
+        miss = scale * np.einsum("eci,ei->ec", rays, normal)
+        spread = 1.4826 * np.median(np.abs(np.where(weights > 0, miss, 0.0)), axis=1) + 1e-3
+        w = weights * np.clip(1 - (miss / (4.7 * spread[:, None])) ** 2, 0, 1) ** 2
+    return normal, _line_variance(cuts, w, miss, start, end)
+
+
+def _line_variance(cuts: _Cuts, w: Array, miss: Array, start: Array, end: Array) -> Array:
+    """Variance of the line across itself at the edge's ends; neighbours closer than a pixel share their noise."""
+    length = np.linalg.norm(end - start, axis=1)
+    along = (end - start) / length[:, None]
+    at = ((cuts.points - start[:, None]) * along[:, None]).sum(axis=2)
+    total = np.maximum(w.sum(axis=1), 1e-9)
+    mean = (w * at).sum(axis=1) / total
+    square = np.maximum((w * (at - mean[:, None]) ** 2).sum(axis=1) / total, 1e-9)
+    # Levels come from medians, which are pi / 2 times as uncertain as means.
+    noise = (w * miss**2).sum(axis=1) / np.maximum(total - 2, 1.0) + 0.5 * np.pi * cuts.level_variance
+    independent = np.maximum(total * np.minimum(cuts.pitch / _CORRELATION_PX, 1.0), 1.0)
+    ends = np.stack([-mean, length - mean], axis=1)
+    variance = (noise / independent)[:, None] * (1 + ends**2 / square[:, None]) + (
+        _GRID_ERROR / cuts.reach[:, None]
+    ) ** 2
+    return np.where(total[:, None] > 0.5 * _CUTS, variance, np.inf)
+
+
+def _corner_covariance(normal: Array, variance: Array) -> Array:
+    """(n, 4, 2, 2) from the normals of the edges, (n, 4, 2), and their lines' variances at start and end, (n, 4, 2)."""
+    lines = np.stack([np.roll(normal, 1, axis=1), normal], axis=2)
+    across = np.stack([np.roll(variance[..., 1], 1, axis=1), variance[..., 0]], axis=2)
+    inverse = np.linalg.inv(lines)
+    return np.asarray(np.einsum("nkij,nkj,nklj->nkil", inverse, across, inverse))
