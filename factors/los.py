@@ -8,8 +8,8 @@ With the passive matrices Rx(a) = Exp(a ex)^T of CN102288133B, azimuth eta and e
 
     cRm = Ry(camera_roll) Rz(collimation) Rx(eps + px) Ry(axis_nonperpendicularity) Rz(eta + dz) Rx(-gx) Ry(-gy),
 
-dz = pz - gz. The LOS error (phx, phz) says that the target lies along (tan phz, 1, -tan phx) in c. Source: methods page,
-section 1.
+dz = pz - gz. The LOS error (phx, phz) says that the target lies along (tan phz, 1, -tan phx) in c. Source: methods
+page, section 1.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class GimbalPath:
             raise ValueError(f"needs stamps (G,) and angles (G, 2), G >= 4; got {self.t.shape} and {self.angles.shape}")
 
     def weights(self, at: ArrayLike) -> tuple[NDArray[np.intp], Array, Array]:
-        """Which samples (n, 4) the angles at the times are made of, with which weights, and the weights of the rates."""
+        """The four samples (n, 4) around each time, their weights in the angles and their weights in the rates."""
         at = np.asarray(at, dtype=float)
         first = np.clip(np.searchsorted(self.t, at, side="right") - 2, 0, len(self.t) - 4)
         samples = first[:, None] + np.arange(4)
@@ -94,8 +94,9 @@ class LosDirectionFactor:
 
     Predicted: phz = atan2(dx, dy), phx = -atan2(dz, dy) with d = cRm tRm^T ey and, as a third row, the camera's roll
     about its line of sight, the twist about y that takes the target's texture to its picture: the rotation part of the
-    picture's local similarity. Blocks: tRm at the stamps (rotations), the mounting angles `names` (rad), and with `paths`
-    the gyro bias (3, rad/s) and the time offset (1, s; positive when the picture was taken later than its stamp says).
+    picture's local similarity. Blocks: tRm at the stamps (rotations), the mounting angles `names` (rad), and with
+    `paths` the gyro bias (3, rad/s) and the time offset (1, s; positive when the picture was taken later than its stamp
+    says).
 
     Attributes:
         time: (n,) stamps of the pictures, s.
