@@ -1,0 +1,145 @@
+"""Properties of the indexer's factor: the mean over a window against brute force, Jacobians, batches."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from factors import so3
+from factors.earth import earth_rate
+from factors.indexer import (
+    AxisPath,
+    IndexerAverageFactor,
+    PlatformRates,
+    base_from_platform,
+    gyro_edges,
+    gyro_means,
+    mounting,
+    mounting_angles,
+)
+from factors.vectorized import Array, Kind
+from tests.numerics import assert_jacobians_match, assert_rows_are_independent
+
+RNG = np.random.default_rng(3)
+N = 9
+BASE_RATE = so3.rotate(so3.exp([0.3, -0.2, 0.9]), earth_rate(0.7))
+KINDS: list[Kind] = [3, 3, 3, 1]
+
+
+def _angles(t: Array) -> tuple[Array, Array]:
+    """Both axes moving at once, with ripple."""
+    return 0.4 * t + 0.2 * np.sin(0.9 * t), 1.0 - 0.3 * t + 0.3 * np.cos(0.5 * t)
+
+
+def _brute_force(start: float, stop: float, epsilon: float) -> Array:
+    """Mean inertial rate of t over the window from rotation increments of the platform against inertial space."""
+    t = np.linspace(start, stop, 20001)
+    iRbase = so3.exp(t[:, None] * BASE_RATE)
+    iRt = so3.multiply(iRbase, base_from_platform(*_angles(t), epsilon))
+    return so3.log(so3.multiply(so3.inverse(iRt[:-1]), iRt[1:])).sum(axis=0) / (stop - start)
+
+
+def _rates(n: int = N, spread: float = 0.3) -> PlatformRates:
+    start = np.linspace(1.0, 20.0, n)
+    parts = RNG.normal(scale=spread, size=(3, n, 3))
+    return PlatformRates(start, start + 2.0, *parts, np.tile(np.eye(3), (n, 1, 1)))
+
+
+def _rows(rates: PlatformRates, rows: np.ndarray) -> PlatformRates:
+    return PlatformRates(*[getattr(rates, name)[rows] for name in PlatformRates.__dataclass_fields__])
+
+
+@pytest.mark.parametrize("epsilon", [0.0, 2e-3, -0.4])
+def test_mean_rate_equals_brute_force_for_any_motion_and_epsilon(epsilon: float) -> None:
+    t = np.linspace(0.0, 30.0, 30001)
+    start, stop = np.array([0.0, 3.21, 10.0004]), np.array([3.2, 11.77, 29.9999])
+    rates = AxisPath(t, *_angles(t), BASE_RATE).rates(start, stop)
+    mean = rates.fixed + np.cos(epsilon) * rates.cosine + np.sin(epsilon) * rates.sine
+    expected = [_brute_force(a, b, epsilon) for a, b in zip(start, stop, strict=True)]
+    np.testing.assert_allclose(mean, expected, atol=3e-9)
+
+
+@pytest.mark.parametrize("rate_hz", [0.5, 7.0, 1000.0])
+def test_whole_turns_are_exact_at_any_encoder_rate(rate_hz: float) -> None:
+    """About one axis only the ends count, and the earth's rate across the axis averages out."""
+    speed, turns = np.deg2rad(10.0), 3
+    t = np.arange(0.0, 120.0, 1.0 / rate_hz)
+    rates = AxisPath(t, speed * t, np.full_like(t, 0.2), BASE_RATE).rates([1.3], [1.3 + turns * 36.0])
+    expected = (speed + BASE_RATE[0]) * np.array([[np.cos(0.2), -np.sin(0.2), 0.0]])
+    np.testing.assert_allclose((rates.fixed + rates.cosine), expected, atol=2e-11 + 4e-9 * (rate_hz < 1.0))
+
+
+def test_covariance_of_the_mean_matches_monte_carlo() -> None:
+    t = np.arange(0.0, 12.0, 0.05)
+    sigma = 1e-4
+    outer, inner = 0.5 * t, np.full_like(t, 0.6)
+    window = np.array([1.013]), np.array([10.72])
+    means = []
+    for _ in range(1500):
+        noisy = [a + sigma * RNG.standard_normal(len(t)) for a in (outer, inner)]
+        rates = AxisPath(t, *noisy, np.zeros(3)).rates(*window)
+        means.append((rates.fixed + rates.cosine)[0])
+    expected = AxisPath(t, outer, inner, np.zeros(3)).rates(*window).covariance[0] * sigma**2
+    # Noise between the ends moves the direction of the outer axis, by its mean over the window: far less.
+    np.testing.assert_allclose(np.cov(np.array(means).T), expected, atol=0.12 * expected.max())
+
+
+def test_windows_outside_the_stamps_are_refused() -> None:
+    path = AxisPath([0.0, 1.0], [0.0, 1.0], [0.0, 0.0], BASE_RATE)
+    for start, stop in [(-0.1, 0.5), (0.5, 1.1), (0.5, 0.5)]:
+        with pytest.raises(ValueError, match="within"):
+            path.rates([start], [stop])
+
+
+def test_angles_make_the_mounting_of_the_publication_and_come_back() -> None:
+    theta = RNG.uniform(-1.2, 1.2, size=(50, 3))
+    passive = [so3.matrix(so3.inverse(so3.exp(theta[:, i : i + 1] * e))) for i, e in enumerate(np.eye(3))]
+    np.testing.assert_allclose(
+        so3.matrix(so3.inverse(mounting(theta))), passive[0] @ passive[1] @ passive[2], atol=1e-12
+    )
+    np.testing.assert_allclose(mounting_angles(mounting(theta)), theta, atol=1e-12)
+
+
+def test_gyro_mean_is_the_integral_between_sample_edges() -> None:
+    t = np.array([0.0, 1.0, 2.0, 4.0, 5.0])
+    np.testing.assert_allclose(gyro_edges(t), [-0.5, 0.5, 1.5, 3.0, 4.5, 5.5])
+    rate = np.arange(15.0).reshape(5, 3)
+    mean = gyro_means(t, rate, np.array([1]), np.array([4]))
+    np.testing.assert_allclose(mean[0], (rate[1] + 1.5 * rate[2] + 1.5 * rate[3]) / 4.0)
+
+
+def _blocks(size: float, tilt: bool) -> list[Array]:
+    shapes = [(3, 1.0), (3, 0.05), (3, 0.1), (1, 0.3)] + ([(3, 0.5)] if tilt else [])
+    return [np.tile(RNG.normal(scale=size * spread, size=width), (N, 1)) for width, spread in shapes]
+
+
+@pytest.mark.parametrize("tilt", [False, True])
+@pytest.mark.parametrize("size", [1.0, 1e-9], ids=["random", "near zero"])
+def test_jacobians(size: float, tilt: bool) -> None:
+    model = IndexerAverageFactor(np.arange(float(N)), RNG.normal(size=(N, 3)), _rates(), RNG.normal(size=(N, 3, 3)))
+    assert_jacobians_match(model, [*KINDS, 3][: 4 + tilt], _blocks(size, tilt))
+
+
+def test_jacobians_near_the_singular_angle() -> None:
+    model = IndexerAverageFactor(np.arange(float(N)), RNG.normal(size=(N, 3)), _rates(), RNG.normal(size=(N, 3, 3)))
+    blocks = _blocks(0.1, True)
+    blocks[0] = np.tile([0.3, np.pi / 2 - 1e-4, -0.2], (N, 1))
+    assert_jacobians_match(model, [*KINDS, 3], blocks)
+
+
+def test_rows_are_independent() -> None:
+    rates, gyro, root = _rates(), RNG.normal(size=(N, 3)), RNG.normal(size=(N, 3, 3))
+    assert_rows_are_independent(
+        lambda rows: IndexerAverageFactor(np.arange(float(N))[rows], gyro[rows], _rows(rates, rows), root[rows]),
+        _blocks(1.0, True),
+    )
+
+
+def test_residual_vanishes_at_the_truth() -> None:
+    theta, bias, scale, epsilon, tilt = _blocks(0.3, True)
+    rates = _rates()
+    w = so3.rotate(so3.exp(tilt), rates.fixed + np.cos(epsilon) * rates.cosine + np.sin(epsilon) * rates.sine)
+    gyro = (1.0 + scale) * so3.rotate(so3.inverse(mounting(theta)), w) + bias
+    model = IndexerAverageFactor(np.arange(float(N)), gyro, rates, np.tile(np.eye(3), (N, 1, 1)))
+    np.testing.assert_allclose(model(theta, bias, scale, epsilon, tilt)[0], 0.0, atol=1e-14)
+    assert np.abs(model(theta + 1e-3, bias, scale, epsilon, tilt)[0]).max() > 1e-5
