@@ -135,7 +135,7 @@ def _nearest(found: Detections, tag_id: int, corners: np.ndarray) -> np.ndarray:
 def test_published_tags_in_photos(shared_data: Path) -> None:
     errors = []
     for photo in sorted((shared_data / "apriltag_photos").glob("*.jpg")):
-        found = detect(cv2.imread(str(photo), cv2.IMREAD_GRAYSCALE))
+        found = detect(np.asarray(cv2.imread(str(photo), cv2.IMREAD_GRAYSCALE)))
         for tag_id, corners in _published(photo.with_suffix(".txt")):
             width = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).mean()
             if width >= 20:

@@ -33,8 +33,9 @@ _REACH_PX = 6.0
 _ROUNDS = 4
 _CONTRAST = 8.0  # least difference of white and black, grey levels
 _CORRELATION_PX = 1.5  # cuts closer than this share their noise (bilinear sampling of white noise)
-# Error of a step's place at one px of reach, from the pixel grid; it falls with the reach (measured on rendered tags).
-_GRID_ERROR = 0.03
+# Systematic error of a line, px, when the profile is just as long as the blurred step; where it is cut short, levels
+# and neighbouring cells mix. Measured on rendered tags; it grows with the power 1.5 of (length of step / profile).
+_CUT_SHORT = 0.01
 # A corner that could not be measured keeps OpenCV's place and this sigma, px.
 _PLAIN_SIGMA = 0.8
 
@@ -130,7 +131,7 @@ class _Cuts:
         weights: (e, c) 0 or 1.
         normal: (e, 2) outward.
         pitch: (e,) px between cuts.
-        reach: (e,) px, half the length of the profiles.
+        fullness: (e,) the share of the profile that the blurred step needs; more than 1: cut short.
         blur: (e,) sigma of the step, px.
         level_variance: (e,) px^2, what noise in the black and white levels does to a point.
     """
@@ -139,7 +140,7 @@ class _Cuts:
     weights: Array
     normal: Array
     pitch: Array
-    reach: Array
+    fullness: Array
     blur: Array
     level_variance: Array
 
@@ -165,7 +166,7 @@ def _cut(picture: Picture, start: Array, end: Array, centre: Array, blur: Array)
     weights = inside.all(axis=2).astype(float)
 
     # The step with its blur lies within `near`; beyond it are the levels.
-    near = np.minimum(3.0 * blur + 0.7, reach)
+    near = np.minimum(_needed(blur), reach)
     beyond = np.abs(unit) >= (near / reach)[:, None] * (1 - 1e-9)
     black, black_noise = _level(grey, beyond & (unit < 0), s)
     white, white_noise = _level(grey, beyond & (unit > 0), s)
@@ -183,7 +184,14 @@ def _cut(picture: Picture, start: Array, end: Array, centre: Array, blur: Array)
     sigma = np.sqrt(np.maximum((slope * middle_t**2).sum(axis=1) - about**2, 0.1))
     level = np.median(np.maximum(contrast, _CONTRAST), axis=1)
     level_variance = (near / level) ** 2 * (black_noise**2 + white_noise**2)
-    return _Cuts(points, weights, normal, (length - 2 * inset) / (_CUTS - 1), reach, sigma, level_variance)
+    return _Cuts(
+        points, weights, normal, (length - 2 * inset) / (_CUTS - 1), _needed(sigma) / reach, sigma, level_variance
+    )
+
+
+def _needed(blur: Array) -> Array:
+    """Half the length, px, of a step blurred by a Gaussian of sigma `blur` px, with room to be off centre."""
+    return 3.0 * blur + 0.7
 
 
 def _sample(picture: Picture, where: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -248,7 +256,7 @@ def _line_variance(cuts: _Cuts, w: Array, miss: Array, start: Array, end: Array)
     independent = np.maximum(total * np.minimum(cuts.pitch / _CORRELATION_PX, 1.0), 1.0)
     ends = np.stack([-mean, length - mean], axis=1)
     variance = (noise / independent)[:, None] * (1 + ends**2 / square[:, None]) + (
-        _GRID_ERROR / cuts.reach[:, None]
+        _CUT_SHORT * cuts.fullness[:, None] ** 1.5
     ) ** 2
     return np.where(total[:, None] > 0.5 * _CUTS, variance, np.inf)
 
