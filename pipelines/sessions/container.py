@@ -122,6 +122,11 @@ class McapFile:
                 for channel in sorted(wanted):
                     yield self._locate(stream, block, channel, buffer)
 
+    @property
+    def attachments(self) -> tuple[str, ...]:
+        """Names of the attachments."""
+        return tuple(self._attachments)
+
     def attachment(self, name: str) -> bytes | None:
         """Content of the attachment of that name (the last one, if there are several), or None."""
         if name not in self._attachments:

@@ -34,6 +34,9 @@ _TIMED = {
     *(messages.COMPRESSED_IMAGE, messages.TAG_DETECTIONS),
 }
 
+# Message and schema encoding as ROS 2 records.
+ENCODING = "cdr/ros2msg"
+
 
 @dataclass(frozen=True)
 class Topic:
@@ -62,6 +65,16 @@ class Recording:
         """SHA-256 of the file, hexadecimal."""
         with self.path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
+
+    @property
+    def profile(self) -> str:
+        """The profile the recorder gave, `ros2` for ROS 2."""
+        return self._file.profile
+
+    @property
+    def attachments(self) -> tuple[str, ...]:
+        """Names of the attachments."""
+        return self._file.attachments
 
     def attachment(self, name: str) -> bytes | None:
         """The attachment of that name, None if there is none."""
@@ -211,17 +224,17 @@ class Recording:
         """Raise InputError unless the topic is there, has messages, and one of the types."""
         found = self.topics.get(topic)
         if found is None:
-            there = ", ".join(f"{name} ({t.type})" for name, t in self.topics.items()) or "none"
-            ros1 = " (a ROS 1 recording)" if self._file.profile == "ros1" else ""
+            there = ", ".join(f"{name} ({t.type.split('/')[-1]})" for name, t in self.topics.items()) or "none"
+            ros1 = " (a ROS 1 recording)" if self.profile == "ros1" else ""
             raise InputError(
                 f"{self.path}: no topic {topic} ({' or '.join(types)}); topics there{ros1}: {there}; "
                 "`topics:` in the config can rename"
             )
         if types and found.type not in types:
             raise InputError(f"{self.path}: topic {topic} holds {found.type}, needed is {' or '.join(types)}")
-        if found.encoding != "cdr/ros2msg":
+        if found.encoding != ENCODING:
             raise InputError(
-                f"{self.path}: topic {topic} has the encoding {found.encoding}, needed is cdr/ros2msg (ROS 2, as "
+                f"{self.path}: topic {topic} has the encoding {found.encoding}, needed is {ENCODING} (ROS 2, as "
                 "`ros2 bag record -s mcap` writes it)"
             )
         if not found.count:
