@@ -49,20 +49,22 @@ def base_from_platform(outer: ArrayLike, inner: ArrayLike, epsilon: ArrayLike = 
 
 @dataclass(frozen=True)
 class PlatformRates:
-    """Mean inertial rate of the platform, in t, over n windows: fixed + cos(epsilon) cosine + sin(epsilon) sine.
+    """Mean inertial rate of the platform, in t, over n adjoining windows.
+
+    With the axes' deviation epsilon it is fixed + cos(epsilon) cosine + sin(epsilon) sine, exactly.
 
     Attributes:
-        start, stop: (n,) s.
-        fixed, cosine, sine: (n, 3) rad/s. Exact for any epsilon, since baseRt is linear in its cosine and sine.
-        covariance: (n, 3, 3) of the mean for encoder noise of 1 rad, independent from sample to sample, at both ends.
+        edges: (n + 1,) s, where the windows begin and end.
+        fixed, cosine, sine: (n, 3) rad/s.
+        noise: (3 n, 2 (n + 1)) 1/s, change of the means, window by window, with encoder noise of 1 rad a sample: columns
+            are the outer and the inner encoder at each edge, one after the other.
     """
 
-    start: Array
-    stop: Array
+    edges: Array
     fixed: Array
     cosine: Array
     sine: Array
-    covariance: Array
+    noise: Array
 
 
 class AxisPath:
@@ -90,32 +92,31 @@ class AxisPath:
         at = np.asarray(at, dtype=float)
         return np.stack([np.interp(at, self.t, a) for a in self._angles.T], axis=1)
 
-    def rates(self, start: ArrayLike, stop: ArrayLike) -> PlatformRates:
-        """Mean rates over the windows [start, stop], (n,) each, s, within the stamps.
+    def rates(self, edges: ArrayLike) -> PlatformRates:
+        """Mean rates over the adjoining windows between the edges, (n + 1,), s, increasing, within the stamps.
 
         Raises:
-            ValueError: a window reaches beyond the stamps or is empty.
+            ValueError: an edge lies beyond the stamps, or a window is empty.
         """
-        start, stop = np.asarray(start, dtype=float), np.asarray(stop, dtype=float)
-        if (start < self.t[0]).any() or (stop > self.t[-1]).any() or (stop <= start).any():
+        edges = np.asarray(edges, dtype=float)
+        if edges[0] < self.t[0] or edges[-1] > self.t[-1] or (np.diff(edges) <= 0.0).any():
             raise ValueError(f"windows must lie within [{self.t[0]}, {self.t[-1]}] s and not be empty")
-        begin, noise_begin = self._at(start)
-        end, noise_end = self._at(stop)
-        duration = (stop - start)[:, None, None]
-        mean = (end - begin) / duration
-        return PlatformRates(start, stop, mean[:, 0], mean[:, 1], mean[:, 2], (noise_begin + noise_end) / duration**2)
-
-    def _at(self, at: Array) -> tuple[Array, Array]:
-        """Integral of the three parts up to the times, and the covariance of the angle there per encoder variance."""
-        i = np.clip(np.searchsorted(self.t, at, side="right") - 1, 0, len(self.t) - 2)
-        share = (at - self.t[i]) / (self.t[i + 1] - self.t[i])
+        i = np.clip(np.searchsorted(self.t, edges, side="right") - 1, 0, len(self.t) - 2)
+        share = (edges - self.t[i]) / (self.t[i + 1] - self.t[i])
         angles = self._angles[i] + share[:, None] * (self._angles[i + 1] - self._angles[i])
-        integral = self._integral[i] + self._arc(at - self.t[i], self._angles[i], angles)
-        # Interpolation averages the noise of two samples.
-        variance = (1.0 - share) ** 2 + share**2
-        outer_axis = np.stack([np.cos(angles[:, 1]), -np.sin(angles[:, 1]), np.zeros(len(at))], axis=1)
-        axes = outer_axis[:, :, None] * outer_axis[:, None, :] + np.outer(_EZ, _EZ)
-        return integral, variance[:, None, None] * axes
+        integral = self._integral[i] + self._arc(edges - self.t[i], self._angles[i], angles)
+        duration = np.diff(edges)[:, None, None]
+        mean = np.diff(integral, axis=0) / duration
+        # The axes in t at the edges; interpolation averages the noise of two samples.
+        spread = np.sqrt((1.0 - share) ** 2 + share**2)
+        axes = np.zeros((len(edges), 3, 2))
+        axes[:, 0, 0], axes[:, 1, 0], axes[:, 2, 1] = np.cos(angles[:, 1]), -np.sin(angles[:, 1]), 1.0
+        axes *= spread[:, None, None]
+        n = len(edges) - 1
+        noise = np.zeros((n, 3, n + 1, 2))
+        noise[np.arange(n), :, np.arange(n)] = -axes[:-1] / duration
+        noise[np.arange(n), :, np.arange(1, n + 1)] = axes[1:] / duration
+        return PlatformRates(edges, mean[:, 0], mean[:, 1], mean[:, 2], noise.reshape(3 * n, 2 * (n + 1)))
 
     def _arc(self, duration: Array, begin: Array, end: Array) -> Array:
         """Integrals (n, part, 3) of the platform's rate while both axes turn uniformly from begin to end (n, 2)."""
@@ -146,11 +147,12 @@ def gyro_edges(t: Array) -> Array:
     return np.concatenate([[2.0 * t[0] - middle[0]], middle, [2.0 * t[-1] - middle[-1]]])
 
 
-def gyro_means(t: Array, rate: Array, first: NDArray[np.intp], last: NDArray[np.intp]) -> Array:
-    """Mean gyro rate (n, 3) over the samples first..last-1 of each window, weighed with their intervals."""
-    edges = gyro_edges(t)
-    total = np.concatenate([np.zeros((1, 3)), np.cumsum(rate * np.diff(edges)[:, None], axis=0)])
-    return np.asarray((total[last] - total[first]) / (edges[last] - edges[first])[:, None])
+def gyro_means(t: Array, rate: Array, cuts: NDArray[np.intp]) -> Array:
+    """Mean gyro rates (n, 3) over the samples from cut to cut (n + 1,), each weighed with its interval."""
+    edges = gyro_edges(t)[cuts[0] : cuts[-1] + 1]
+    moved = rate[cuts[0] : cuts[-1]] * np.diff(edges)[:, None]
+    at = cuts - cuts[0]
+    return np.asarray(np.add.reduceat(moved, at[:-1], axis=0) / np.diff(edges[at])[:, None])
 
 
 @dataclass(frozen=True)
@@ -164,17 +166,27 @@ class IndexerAverageFactor:
     against the encoders' account of it, w = Exp(tilt) w_encoders, for errors that come again with every turn.
 
     Attributes:
-        time: (n,) ends of the windows, s.
         gyro: (n, 3) mean rates, rad/s.
-        rates: the platform's mean rates.
-        sqrt_information: (n, 3, 3) of the difference, in t.
+        rates: the platform's mean rates over the same windows.
+        sqrt_information: (3 n, 3 n) of the difference, in t: neighbours share the encoder noise at their common edge.
     """
 
-    time: Array
     gyro: Array
     rates: PlatformRates
     sqrt_information: Array
     rows: int = 3
+
+    @classmethod
+    def of(cls, gyro: Array, rates: PlatformRates, density: float, encoder: float) -> IndexerAverageFactor:
+        """From gyro noise (rad/s/sqrt(Hz), angle random walk in each window) and encoder noise (rad, at the edges)."""
+        covariance = encoder**2 * rates.noise @ rates.noise.T
+        covariance += np.diag(np.repeat(density**2 / np.diff(rates.edges), 3))
+        return cls(gyro, rates, np.linalg.inv(np.linalg.cholesky(covariance)))
+
+    @property
+    def time(self) -> Array:
+        """(n,) ends of the windows, s."""
+        return self.rates.edges[1:]
 
     def __call__(self, theta: Array, bias: Array, scale: Array, epsilon: Array, tilt: Array | None = None) -> Residuals:
         """Residual sqrt_information * (tRm (gyro - bias) / (1 + scale) - Exp(tilt) w), (n, 3)."""
@@ -187,21 +199,22 @@ class IndexerAverageFactor:
 
         def jacobians() -> tuple[Array, ...]:
             matrix = so3.matrix(tRm)
-            by_corrected = self.sqrt_information @ matrix
-            by_scale = -by_corrected * (corrected / (1.0 + scale))[:, None, :]
             by_epsilon = -np.sin(epsilon) * self.rates.cosine + np.cos(epsilon) * self.rates.sine
-            blocks = (
-                -by_corrected @ so3.hat(corrected) @ _angle_axes(theta),
-                -by_corrected / (1.0 + scale)[:, None, :],
-                by_scale,
-                -self.sqrt_information @ so3.rotate(turn, by_epsilon)[..., None],
-            )
-            if tilt is None:
-                return blocks
-            by_tilt = self.sqrt_information @ so3.matrix(turn) @ so3.hat(encoders) @ so3.right_jacobian(tilt)
-            return (*blocks, by_tilt)
+            blocks = [
+                -matrix @ so3.hat(corrected) @ _angle_axes(theta),
+                -matrix / (1.0 + scale)[:, None, :],
+                -matrix * (corrected / (1.0 + scale))[:, None, :],
+                -so3.rotate(turn, by_epsilon)[..., None],
+            ]
+            if tilt is not None:
+                blocks.append(so3.matrix(turn) @ so3.hat(encoders) @ so3.right_jacobian(tilt))
+            return tuple(self._whiten(block) for block in blocks)
 
-        return np.einsum("nij,nj->ni", self.sqrt_information, error), jacobians
+        return self._whiten(error[..., None])[..., 0], jacobians
+
+    def _whiten(self, block: Array) -> Array:
+        """sqrt_information times a block (n, 3, d), all windows together."""
+        return np.asarray((self.sqrt_information @ block.reshape(-1, block.shape[2])).reshape(block.shape))
 
 
 def _angle_axes(theta: Array) -> Array:

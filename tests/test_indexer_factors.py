@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -40,22 +42,23 @@ def _brute_force(start: float, stop: float, epsilon: float) -> Array:
 
 
 def _rates(n: int = N, spread: float = 0.3) -> PlatformRates:
-    start = np.linspace(1.0, 20.0, n)
+    edges = np.linspace(1.0, 20.0, n + 1)
     parts = RNG.normal(scale=spread, size=(3, n, 3))
-    return PlatformRates(start, start + 2.0, *parts, np.tile(np.eye(3), (n, 1, 1)))
+    return PlatformRates(edges, parts[0], parts[1], parts[2], np.zeros((3 * n, 2 * n + 2)))
 
 
-def _rows(rates: PlatformRates, rows: np.ndarray) -> PlatformRates:
-    return PlatformRates(*[getattr(rates, name)[rows] for name in PlatformRates.__dataclass_fields__])
+def _model(gyro: Array, rates: PlatformRates) -> IndexerAverageFactor:
+    return IndexerAverageFactor(gyro, rates, RNG.normal(size=(3 * N, 3 * N)))
 
 
 @pytest.mark.parametrize("epsilon", [0.0, 2e-3, -0.4])
 def test_mean_rate_equals_brute_force_for_any_motion_and_epsilon(epsilon: float) -> None:
     t = np.linspace(0.0, 30.0, 30001)
-    start, stop = np.array([0.0, 3.21, 10.0004]), np.array([3.2, 11.77, 29.9999])
-    rates = AxisPath(t, *_angles(t), BASE_RATE).rates(start, stop)
+    edges = np.array([0.0, 3.21, 11.7704, 29.9999])
+    outer, inner = _angles(t)
+    rates = AxisPath(t, outer, inner, BASE_RATE).rates(edges)
     mean = rates.fixed + np.cos(epsilon) * rates.cosine + np.sin(epsilon) * rates.sine
-    expected = [_brute_force(a, b, epsilon) for a, b in zip(start, stop, strict=True)]
+    expected = [_brute_force(a, b, epsilon) for a, b in pairwise(edges)]
     np.testing.assert_allclose(mean, expected, atol=3e-9)
 
 
@@ -64,7 +67,7 @@ def test_whole_turns_are_exact_at_any_encoder_rate(rate_hz: float) -> None:
     """About one axis only the ends count, and the earth's rate across the axis averages out."""
     speed, turns = np.deg2rad(10.0), 3
     t = np.arange(0.0, 120.0, 1.0 / rate_hz)
-    rates = AxisPath(t, speed * t, np.full_like(t, 0.2), BASE_RATE).rates([1.3], [1.3 + turns * 36.0])
+    rates = AxisPath(t, speed * t, np.full_like(t, 0.2), BASE_RATE).rates([1.3, 1.3 + turns * 36.0])
     expected = (speed + BASE_RATE[0]) * np.array([[np.cos(0.2), -np.sin(0.2), 0.0]])
     np.testing.assert_allclose((rates.fixed + rates.cosine), expected, atol=2e-11 + 4e-9 * (rate_hz < 1.0))
 
@@ -73,22 +76,23 @@ def test_covariance_of_the_mean_matches_monte_carlo() -> None:
     t = np.arange(0.0, 12.0, 0.05)
     sigma = 1e-4
     outer, inner = 0.5 * t, np.full_like(t, 0.6)
-    window = np.array([1.013]), np.array([10.72])
+    edges = np.array([1.013, 6.2, 10.72])
     means = []
     for _ in range(1500):
         noisy = [a + sigma * RNG.standard_normal(len(t)) for a in (outer, inner)]
-        rates = AxisPath(t, *noisy, np.zeros(3)).rates(*window)
-        means.append((rates.fixed + rates.cosine)[0])
-    expected = AxisPath(t, outer, inner, np.zeros(3)).rates(*window).covariance[0] * sigma**2
+        rates = AxisPath(t, noisy[0], noisy[1], np.zeros(3)).rates(edges)
+        means.append((rates.fixed + rates.cosine).ravel())
+    noise = AxisPath(t, outer, inner, np.zeros(3)).rates(edges).noise
+    expected = noise @ noise.T * sigma**2
     # Noise between the ends moves the direction of the outer axis, by its mean over the window: far less.
     np.testing.assert_allclose(np.cov(np.array(means).T), expected, atol=0.12 * expected.max())
 
 
 def test_windows_outside_the_stamps_are_refused() -> None:
     path = AxisPath([0.0, 1.0], [0.0, 1.0], [0.0, 0.0], BASE_RATE)
-    for start, stop in [(-0.1, 0.5), (0.5, 1.1), (0.5, 0.5)]:
+    for edges in [(-0.1, 0.5), (0.5, 1.1), (0.5, 0.5)]:
         with pytest.raises(ValueError, match="within"):
-            path.rates([start], [stop])
+            path.rates(edges)
 
 
 def test_angles_make_the_mounting_of_the_publication_and_come_back() -> None:
@@ -104,8 +108,8 @@ def test_gyro_mean_is_the_integral_between_sample_edges() -> None:
     t = np.array([0.0, 1.0, 2.0, 4.0, 5.0])
     np.testing.assert_allclose(gyro_edges(t), [-0.5, 0.5, 1.5, 3.0, 4.5, 5.5])
     rate = np.arange(15.0).reshape(5, 3)
-    mean = gyro_means(t, rate, np.array([1]), np.array([4]))
-    np.testing.assert_allclose(mean[0], (rate[1] + 1.5 * rate[2] + 1.5 * rate[3]) / 4.0)
+    mean = gyro_means(t, rate, np.array([1, 4, 5]))
+    np.testing.assert_allclose(mean, [(rate[1] + 1.5 * rate[2] + 1.5 * rate[3]) / 4.0, rate[4]])
 
 
 def _blocks(size: float, tilt: bool) -> list[Array]:
@@ -116,23 +120,39 @@ def _blocks(size: float, tilt: bool) -> list[Array]:
 @pytest.mark.parametrize("tilt", [False, True])
 @pytest.mark.parametrize("size", [1.0, 1e-9], ids=["random", "near zero"])
 def test_jacobians(size: float, tilt: bool) -> None:
-    model = IndexerAverageFactor(np.arange(float(N)), RNG.normal(size=(N, 3)), _rates(), RNG.normal(size=(N, 3, 3)))
+    model = _model(RNG.normal(size=(N, 3)), _rates())
     assert_jacobians_match(model, [*KINDS, 3][: 4 + tilt], _blocks(size, tilt))
 
 
 def test_jacobians_near_the_singular_angle() -> None:
-    model = IndexerAverageFactor(np.arange(float(N)), RNG.normal(size=(N, 3)), _rates(), RNG.normal(size=(N, 3, 3)))
+    model = _model(RNG.normal(size=(N, 3)), _rates())
     blocks = _blocks(0.1, True)
     blocks[0] = np.tile([0.3, np.pi / 2 - 1e-4, -0.2], (N, 1))
     assert_jacobians_match(model, [*KINDS, 3], blocks)
 
 
-def test_rows_are_independent() -> None:
-    rates, gyro, root = _rates(), RNG.normal(size=(N, 3)), RNG.normal(size=(N, 3, 3))
-    assert_rows_are_independent(
-        lambda rows: IndexerAverageFactor(np.arange(float(N))[rows], gyro[rows], _rows(rates, rows), root[rows]),
-        _blocks(1.0, True),
-    )
+def test_windows_without_encoder_noise_are_independent() -> None:
+    gyro, rates, blocks = RNG.normal(size=(N, 3)), _rates(), _blocks(1.0, True)
+
+    def model(rows: np.ndarray) -> IndexerAverageFactor:
+        edges = np.append(rates.edges[rows], rates.edges[rows[-1] + 1])
+        some = PlatformRates(
+            edges, rates.fixed[rows], rates.cosine[rows], rates.sine[rows], np.zeros((3 * len(rows), 1))
+        )
+        return IndexerAverageFactor.of(gyro[rows], some, 1e-3, 0.0)
+
+    assert_rows_are_independent(model, blocks)
+
+
+def test_encoder_noise_at_a_common_edge_cancels_in_the_sum() -> None:
+    """The mean over two adjoining windows is as noisy as that over one window as long as both."""
+    t = np.arange(0.0, 12.0, 0.05)
+    path = AxisPath(t, 0.5 * t, np.full_like(t, 0.3), np.zeros(3))
+    split = IndexerAverageFactor.of(np.zeros((2, 3)), path.rates([1.0, 4.02, 9.0]), 1e-4, 3e-4)
+    whole = IndexerAverageFactor.of(np.zeros((1, 3)), path.rates([1.0, 9.0]), 1e-4, 3e-4)
+    covariances = [np.linalg.inv(f.sqrt_information.T @ f.sqrt_information) for f in (split, whole)]
+    mean = np.hstack([np.eye(3) * 3.02 / 8.0, np.eye(3) * 4.98 / 8.0])
+    np.testing.assert_allclose(mean @ covariances[0] @ mean.T, covariances[1], atol=1e-9 * covariances[1].max())
 
 
 def test_residual_vanishes_at_the_truth() -> None:
@@ -140,6 +160,6 @@ def test_residual_vanishes_at_the_truth() -> None:
     rates = _rates()
     w = so3.rotate(so3.exp(tilt), rates.fixed + np.cos(epsilon) * rates.cosine + np.sin(epsilon) * rates.sine)
     gyro = (1.0 + scale) * so3.rotate(so3.inverse(mounting(theta)), w) + bias
-    model = IndexerAverageFactor(np.arange(float(N)), gyro, rates, np.tile(np.eye(3), (N, 1, 1)))
-    np.testing.assert_allclose(model(theta, bias, scale, epsilon, tilt)[0], 0.0, atol=1e-14)
+    model = IndexerAverageFactor.of(gyro, rates, 1.0, 0.0)
+    np.testing.assert_allclose(model(theta, bias, scale, epsilon, tilt)[0], 0.0, atol=1e-13)
     assert np.abs(model(theta + 1e-3, bias, scale, epsilon, tilt)[0]).max() > 1e-5
