@@ -56,7 +56,7 @@ class PlatformRates:
     Attributes:
         edges: (n + 1,) s, where the windows begin and end.
         fixed, cosine, sine: (n, 3) rad/s.
-        noise: (3 n, 2 (n + 1)) 1/s, change of the means, window by window, with encoder noise of 1 rad a sample: columns
+        noise: (3 n, 2 (n + 1)) 1/s, change of the means with encoder noise of 1 rad a sample: columns
             are the outer and the inner encoder at each edge, one after the other.
     """
 
