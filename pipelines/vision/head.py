@@ -1,0 +1,138 @@
+"""Poses of a body of tags over a stream of pictures; attitudes of a helmet's tag board from them."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.errors import InputError
+from pipelines.vision.camera import Camera
+from pipelines.vision.pose import BodyPose, TagBody, estimate_pose
+from pipelines.vision.tags import Picture, detect
+
+Array = NDArray[np.float64]
+
+# A picture's own attitude settles the flips of the pictures up to this much later.
+_FRESH_NS = 200_000_000
+# Above this many sigmas of reprojection error, and above this many px, the tags do not fit the body's layout.
+_MISFIT_SIGMAS, _MISFIT_PX = 5.0, 0.5
+
+UNREADABLE = "picture does not decode"
+UNSEEN = "no tag of the body seen"
+AMBIGUOUS = "planar flip could not be told"
+MISFIT = "tags do not fit the layout"
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What one picture shows of a body: its stamp, all tag ids in it, the pose, and why that cannot be used, if so."""
+
+    t_ns: int
+    ids: NDArray[np.int64]
+    pose: BodyPose | None
+    problem: str | None
+
+
+@dataclass(frozen=True, eq=False)
+class BoardAttitudes:
+    """Attitudes of a tag board.
+
+    Attributes:
+        t_ns: (K,) stamps, Unix ns.
+        cRh: (K, 4) attitude of the board's frame h in the camera's optical frame c.
+        covariance: (K, 3, 3) rad^2, of delta in `cRh * Exp(delta)`, delta in h.
+        dropped: reason -> number of pictures.
+    """
+
+    t_ns: NDArray[np.int64]
+    cRh: Array
+    covariance: Array
+    dropped: dict[str, int]
+
+
+def body_poses(
+    images: Iterable[tuple[int, bytes]], camera: Camera, body: TagBody, sigma_px: float | None = None
+) -> Iterator[Sight]:
+    """Poses of a body of tags, picture by picture; nothing is kept but the last attitude that needed no help.
+
+    Args:
+        images: stamps (ns) and encoded pictures (PNG, JPEG, ...), in time order.
+        camera: the camera; pictures of another size raise InputError.
+        body: the tags and where they are on the body.
+        sigma_px: as in `estimate_pose`.
+    """
+    last_t, last_cRb = 0, None
+    for t_ns, encoded in images:
+        picture = decode(encoded)
+        if picture is None:
+            yield Sight(t_ns, np.zeros(0, dtype=np.int64), None, UNREADABLE)
+            continue
+        found = detect(picture, body.family, camera)
+        fresh = last_cRb is not None and 0 <= t_ns - last_t <= _FRESH_NS
+        pose = estimate_pose(camera, body, found, sigma_px, expected=last_cRb if fresh else None)
+        problem = _problem(pose, sigma_px)
+        if pose is not None and problem is None and pose.decided:
+            last_t, last_cRb = t_ns, pose.cRb
+        yield Sight(t_ns, found.ids, pose, problem)
+
+
+def decode(encoded: bytes) -> Picture | None:
+    """The grey picture in a PNG, JPEG, ... file; None when it does not decode."""
+    import cv2
+
+    data = np.frombuffer(encoded, dtype=np.uint8)
+    picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
+    return None if picture is None else np.asarray(picture)
+
+
+def _problem(pose: BodyPose | None, sigma_px: float | None) -> str | None:
+    if pose is None:
+        return UNSEEN
+    if pose.rms_px > max(_MISFIT_SIGMAS * (sigma_px or 0.0), _MISFIT_PX):
+        return MISFIT
+    return AMBIGUOUS if pose.ambiguous else None
+
+
+def board_attitudes(
+    images: Iterable[tuple[int, bytes]], camera: Camera, board: TagBody, sigma_px: float | None = None
+) -> BoardAttitudes:
+    """Attitudes of a helmet's tag board in the camera's optical frame, from pictures (arguments as in `body_poses`).
+
+    Raises:
+        InputError: no pictures, none that decodes, no tag of the board ever seen, or no attitude that can be used.
+    """
+    t_ns: list[int] = []
+    attitudes: list[Array] = []
+    covariances: list[Array] = []
+    dropped: Counter[str] = Counter()
+    seen: set[int] = set()
+    for sight in body_poses(images, camera, board, sigma_px):
+        seen.update(sight.ids.tolist())
+        if sight.problem is not None or sight.pose is None:
+            dropped[sight.problem or UNSEEN] += 1
+            continue
+        t_ns.append(sight.t_ns)
+        attitudes.append(sight.pose.cRb)
+        covariances.append(sight.pose.covariance[:3, :3])
+    if not t_ns:
+        raise InputError(_why_nothing(dropped, seen, board))
+    return BoardAttitudes(np.array(t_ns, dtype=np.int64), np.array(attitudes), np.array(covariances), dict(dropped))
+
+
+def _why_nothing(dropped: Counter[str], seen: set[int], board: TagBody) -> str:
+    count = dropped.total()
+    if not count:
+        return "no pictures on the image topic: record it, or name it in the config"
+    if dropped[UNREADABLE] == count:
+        return f"none of the {count} pictures decodes: they must be PNG or JPEG"
+    if not seen & set(board.ids.tolist()):
+        return (
+            f"no tag of the board in any of {count} pictures: tags seen {sorted(seen) or 'none'}, "
+            f"the config names {board.ids.tolist()}"
+        )
+    reasons = ", ".join(f"{reason} ({n})" for reason, n in dropped.most_common())
+    return f"no attitude of the tag board from {count} pictures: {reasons}; check the board's sizes and positions"
