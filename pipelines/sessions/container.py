@@ -21,7 +21,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Header, Schema
-from mcap.stream_reader import CRCValidationError, get_chunk_data_stream
+from mcap.stream_reader import get_chunk_data_stream
 from numpy.typing import NDArray
 
 from pipelines.errors import InputError
@@ -29,7 +29,9 @@ from pipelines.errors import InputError
 MAGIC = b"\x89MCAP0\r\n"
 _HEAD = struct.Struct("<BQ")
 _COMPRESSIONS = ("", "zstd", "lz4")
-_BROKEN = (McapError, CRCValidationError, zstandard.ZstdError, struct.error, RuntimeError, MemoryError, ValueError)
+# What the mcap package, the compressors and the reading of numbers raise on damaged bytes. A failed checksum and text
+# that is no UTF-8 are ValueErrors, lz4's own error is a RuntimeError.
+_BROKEN = (McapError, zstandard.ZstdError, struct.error, ValueError, RuntimeError, OverflowError, MemoryError)
 _RAW_BLOCK = 1 << 20
 _OTHER_FORMATS = {
     b"#ROSBAG": "a ROS 1 bag; convert it to ROS 2 and MCAP first",
@@ -94,19 +96,24 @@ class McapFile:
         self.schemas: dict[int, Schema] = {}
         self.counts: dict[int, int] = {}
         self.first_ns, self.last_ns = 0, 0
+        self._stated: int | None = None
         self._blocks: list[_Block] = []
         self._attachments: dict[str, int] = {}
         with self._open() as stream:
             self._check_magic(stream)
             self._walk(stream)
             for block in self._blocks:
-                if not block.index_at or not block.index_at.keys() <= self.channels.keys():
+                if block.is_chunk and not (block.index_at and block.index_at.keys() <= self.channels.keys()):
                     self._walk_block(stream, block)
         for block in self._blocks:
             for channel, count in block.counts.items():
                 if channel not in self.channels or self.channels[channel].schema_id not in {0, *self.schemas}:
                     raise InputError(f"{path}: damaged, it has messages of channel {channel} but does not define it")
                 self.counts[channel] = self.counts.get(channel, 0) + count
+        if self._stated not in (None, sum(self.counts.values())):
+            raise InputError(
+                f"{path}: damaged, {sum(self.counts.values())} messages where it should have {self._stated}"
+            )
 
     def rows(self, channels: set[int]) -> Iterator[Rows]:
         """The messages of these channels, block by block in file order, every chunk checked against its CRC.
@@ -171,7 +178,7 @@ class McapFile:
                 )
             try:
                 self._take(stream, opcode, head, position, end)
-            except (struct.error, McapError, UnicodeDecodeError) as error:
+            except _BROKEN as error:
                 raise InputError(f"{self.path}: damaged, the record at byte {position} cannot be read") from error
             position = end
         stream.seek(position)
@@ -191,6 +198,8 @@ class McapFile:
                 self._extend(first, last)
         elif opcode == Opcode.MESSAGE_INDEX:
             channel, length = struct.unpack("<HI", stream.read(6))
+            if body + 6 + length != end or not self._blocks:
+                raise ValueError("message index of another size, or of no chunk")
             block = self._blocks[-1]
             if length:
                 block.counts[channel] = length // 16
@@ -202,6 +211,8 @@ class McapFile:
             channel = int(message["channel"])
             block.counts[channel] = block.counts.get(channel, 0) + 1
             self._extend(int(message["log_ns"]), int(message["log_ns"]))
+        elif opcode == Opcode.STATISTICS:
+            (self._stated,) = struct.unpack("<Q", stream.read(8))
         elif opcode == Opcode.ATTACHMENT:
             _, _, length = struct.unpack("<QQI", stream.read(20))
             self._attachments[stream.read(length).decode()] = position

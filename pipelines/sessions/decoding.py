@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.sessions.container import Rows, windows
-from pipelines.sessions.messages import Array, Definition, Layout, Leaf, at, numbers
+from pipelines.sessions.messages import Array, Definition, Layout, Leaf, at
 
 # Which numbers of a field, as indexes, given the message; None if the message has not got them.
 Order = Callable[[Any], Sequence[int] | None]
@@ -19,6 +19,9 @@ _STAMP = {
     order: np.dtype([("kind", "u1", 2), ("options", "u1", 2), ("sec", f"{order}i4"), ("nanosec", f"{order}u4")])
     for order in "<>"
 }
+
+# A topic with more kinds of messages than this (frame names, say) has its further ones decoded one by one.
+_MAX_LAYOUTS = 8
 
 
 class Table:
@@ -79,57 +82,65 @@ class Table:
         self._full[name][rows] = values
 
 
+class _Plan(NamedTuple):
+    """Where the fields are in messages of a layout: a run of numbers, and their order. No layout: nowhere."""
+
+    layout: Layout | None
+    fields: dict[str, tuple[Leaf, Any]]
+
+
 class Decoder:
     """Takes fields, name -> (path in the message, order of its numbers or None), out of the messages of one channel.
 
-    A field the messages do not have is a KeyError or an AttributeError.
+    A field the messages do not have is a KeyError or an AttributeError, a message that cannot be read a MessageError.
     """
 
     def __init__(self, definition: Definition, fields: Mapping[str, tuple[str, Order | None]]) -> None:
         self._definition = definition
         self._fields = fields
-        self._layout: Layout | None = None
-        self._plan: dict[str, tuple[Leaf, Any]] | None = None
-        self._started = False
+        self._plans: list[_Plan] = []
 
     def append(self, rows: Rows, table: Table) -> None:
         """Append the messages to the table; those for which an order is None stay unfilled."""
         if not len(rows.start):
             return
         into = table.advance(rows.log_ns, header_stamps(self._definition, rows))
-        if not self._fields:
-            return
-        if not self._started:
-            self._learn(rows.message(0))
-        alike = self._append_alike(rows, table, into)
-        for i in np.flatnonzero(~alike).tolist():
+        left = np.arange(len(into) if self._fields else 0)
+        for plan in self._plans:
+            left = left[~self._append_alike(plan, rows, left, table, into)]
+        while len(left) and len(self._plans) < _MAX_LAYOUTS:
+            self._plans.append(self._plan(rows.message(left[0])))
+            left = left[~self._append_alike(self._plans[-1], rows, left, table, into)]
+        for i in left.tolist():
             values = self._one(self._definition.decode(rows.message(i)))
             if values is not None:
                 table.put(into[i : i + 1], values)
 
-    def _learn(self, first: bytes) -> None:
-        """Work out the layout of the first message and where in it the fields are."""
-        self._started = True
-        self._layout = self._definition.layout(first)
-        if self._layout is None:
-            return
-        message = self._definition.decode(first)
+    def _plan(self, data: bytes) -> _Plan:
+        """Work out the layout of a message and where in it the fields are."""
+        layout = self._definition.layout(data)
+        if layout is None:
+            return _Plan(None, {})
+        message = self._definition.decode(data)
         orders = {name: order(message) if order else slice(None) for name, (_, order) in self._fields.items()}
-        if None not in orders.values():
-            self._plan = {name: (self._layout.run(path), orders[name]) for name, (path, _) in self._fields.items()}
+        if None in orders.values():
+            return _Plan(None, {})
+        return _Plan(layout, {name: (layout.run(path), orders[name]) for name, (path, _) in self._fields.items()})
 
-    def _append_alike(self, rows: Rows, table: Table, into: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Append the messages that have the layout, all at once. Returns which ones those are."""
-        if self._layout is None or self._plan is None:
-            return np.zeros(len(rows.start), dtype=bool)
-        size = len(self._layout.first)
-        alike = rows.size == size
-        data = windows(rows.buffer, size)[rows.start[alike]].view(np.uint8).reshape(-1, size)
-        agrees = self._layout.agrees(data)
+    def _append_alike(
+        self, plan: _Plan, rows: Rows, left: NDArray[np.int64], table: Table, into: NDArray[np.int64]
+    ) -> NDArray[np.bool_]:
+        """Append those of the messages `left` that have the layout, all at once. Returns which ones those are."""
+        if plan.layout is None or not len(left):
+            return np.zeros(len(left), dtype=bool)
+        size = len(plan.layout.first)
+        alike = rows.size[left] == size
+        data = windows(rows.buffer, size)[rows.start[left[alike]]].view(np.uint8).reshape(-1, size)
+        agrees = plan.layout.agrees(data)
         alike[alike] = agrees
         data = data if agrees.all() else data[agrees]
         if len(data):
-            table.put(into[alike], {name: run.of(data)[:, order] for name, (run, order) in self._plan.items()})
+            table.put(into[left[alike]], {name: run.of(data)[:, order] for name, (run, order) in plan.fields.items()})
         return alike
 
     def _one(self, message: Any) -> dict[str, NDArray[Any]] | None:
@@ -138,7 +149,7 @@ class Decoder:
             chosen = order(message) if order else slice(None)
             if chosen is None:
                 return None
-            values[name] = numbers(at(message, path))[None, chosen]
+            values[name] = self._definition.numbers(at(message, path))[None, chosen]
         return values
 
 

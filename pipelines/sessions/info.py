@@ -80,8 +80,9 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
     if able:
         raise InputError(f"{recording.path}: the topics serve {' and '.join(able)}; choose with --method")
     ros1 = " (a ROS 1 recording)" if recording.profile == "ros1" else ""
+    there = f"topics there{ros1}: {', '.join(recording.topics) or 'none'}"
     raise InputError(
-        f"{recording.path}: no usable topics for any method; topics there{ros1}: {', '.join(recording.topics) or 'none'}; "
+        f"{recording.path}: no usable topics for any method; {there}; "
         "`alidade info` tells what each method needs, `topics:` in the config can rename"
     )
 

@@ -17,8 +17,6 @@ from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
-from pipelines.errors import InputError
-
 Array = NDArray[np.float64]
 
 IMU = "sensor_msgs/msg/Imu"
@@ -92,6 +90,10 @@ class Layout:
         return same
 
 
+class MessageError(Exception):
+    """A message or a definition that cannot be read; who reads knows the topic and the file."""
+
+
 class Definition:
     """A message type as its definition text tells it, not as we would expect it."""
 
@@ -103,29 +105,38 @@ class Definition:
             self._store.get_msgdef(name)
         except (TypesysError, KeyError, SyntaxError) as error:
             reason = " ".join(str(error).split())
-            raise InputError(f"the definition of message type {name} cannot be read ({reason})") from error
+            raise MessageError(f"the definition of message type {name} cannot be read ({reason})") from error
 
     @property
     def has_header(self) -> bool:
         """Whether its messages begin with a std_msgs/Header."""
-        return bool(self._store.fielddefs[self.name][1][0][1] == (Nodetype.NAME, "std_msgs/msg/Header"))
+        members = self._store.fielddefs[self.name][1]
+        return bool(members and members[0][1] == (Nodetype.NAME, "std_msgs/msg/Header"))
 
     def decode(self, data: bytes) -> Any:
-        """One message, decoded by rosbags. Raises InputError."""
+        """One message, decoded by rosbags. Raises MessageError."""
         try:
             return self._store.deserialize_cdr(data, self.name)
         except SerdeError as error:
-            raise InputError(f"a message does not agree with the definition of {self.name} ({error})") from error
+            raise MessageError(f"a message does not agree with the definition of {self.name} ({error})") from error
+
+    def numbers(self, value: Any) -> Array:
+        """All numbers in a field of a decoded message, in order."""
+        if isinstance(value, list):
+            return np.concatenate([self.numbers(item) for item in value]) if value else np.empty(0)
+        if hasattr(value, "__msgtype__"):
+            members = self._store.get_msgdef(value.__msgtype__).fields
+            return np.concatenate([self.numbers(getattr(value, name)) for name, _ in members])
+        return np.atleast_1d(np.asarray(value, dtype=float))
 
     def encode(self, message: object) -> bytes:
         """The CDR bytes of one message, little endian."""
         return bytes(self._store.serialize_cdr(message, self.name, little_endian=True))
 
-    def new(self, kind: str, /, **fields: Any) -> Any:
+    def new(self, kind: str, /, **given: Any) -> Any:
         """A message of this type or of one it holds: fields not given are zero, empty, or themselves new."""
         values = {
-            field: fields[field] if field in fields else self._zero(what)
-            for field, what in self._store.fielddefs[kind][1]
+            name: given[name] if name in given else self._zero(what) for name, what in self._store.fielddefs[kind][1]
         }
         return self._store.types[kind](**values)
 
@@ -158,7 +169,7 @@ class Definition:
 
 @lru_cache(maxsize=64)
 def definition(name: str, text: str) -> Definition:
-    """The definition of a type in the text of a recording. Raises InputError."""
+    """The definition of a type in the text of a recording. Raises MessageError."""
     return Definition(name, text)
 
 
@@ -181,15 +192,6 @@ def at(message: Any, path: str) -> Any:
     return reduce(getattr, path.split("."), message)
 
 
-def numbers(value: Any) -> Array:
-    """All numbers in a field of a decoded message, in order."""
-    if isinstance(value, list):
-        return np.concatenate([numbers(item) for item in value]) if value else np.empty(0)
-    if hasattr(value, "__dataclass_fields__"):
-        return np.concatenate([numbers(getattr(value, name)) for name in value.__dataclass_fields__ if name[0] != "_"])
-    return np.atleast_1d(np.asarray(value, dtype=float))
-
-
 class _Walk:
     """Walks one message along its definition, noting the numbers and everything they depend on.
 
@@ -204,11 +206,11 @@ class _Walk:
         self.order: Literal["<", ">"] = "<" if data[1] else ">"
 
     def struct(self, name: str, path: str) -> None:
-        fields = self.fielddefs[name][1]
-        if not fields:
+        members = self.fielddefs[name][1]
+        if not members:
             raise KeyError(name)
-        for field, kind in fields:
-            self.value(kind, f"{path}.{field}" if path else field)
+        for member, kind in members:
+            self.value(kind, f"{path}.{member}" if path else member)
 
     def value(self, kind: Any, path: str) -> None:
         node, what = kind

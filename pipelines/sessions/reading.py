@@ -24,7 +24,7 @@ from pipelines.errors import InputError
 from pipelines.sessions import messages, series
 from pipelines.sessions.container import McapFile, Rows
 from pipelines.sessions.decoding import Decoder, Order, Table, header_stamps
-from pipelines.sessions.messages import Definition
+from pipelines.sessions.messages import Definition, MessageError
 
 AnySeries = TypeVar("AnySeries", bound=series.Series)
 
@@ -143,7 +143,7 @@ class Recording:
 
     def camera_info(self, topic: str) -> series.CameraInfo:
         """The first message of a sensor_msgs/msg/CameraInfo topic."""
-        for t_ns, _, message in self._decoded(topic, messages.CAMERA_INFO):
+        for t_ns, _, message, _ in self._decoded(topic, messages.CAMERA_INFO):
             k, r, p = (np.array(values, dtype=float) for values in (message.k, message.r, message.p))
             d = np.array(message.d, dtype=float)
             return series.CameraInfo(
@@ -161,7 +161,7 @@ class Recording:
 
     def images(self, topic: str) -> Iterator[tuple[int, bytes]]:
         """(stamp in ns, file) of the pictures on a sensor_msgs/msg/CompressedImage topic, one at a time."""
-        for t_ns, _, message in self._decoded(topic, messages.COMPRESSED_IMAGE):
+        for t_ns, _, message, _ in self._decoded(topic, messages.COMPRESSED_IMAGE):
             yield t_ns, message.data.tobytes()
 
     def detections(self, topic: str) -> series.DetectionSeries:
@@ -169,14 +169,14 @@ class Recording:
         stamps: list[int] = []
         by_log = 0
         frame, tag_id, corners, hamming, margin, family = [], [], [], [], [], []
-        for i, (t_ns, from_log, message) in enumerate(self._decoded(topic, messages.TAG_DETECTIONS)):
+        for i, (t_ns, from_log, message, definition) in enumerate(self._decoded(topic, messages.TAG_DETECTIONS)):
             stamps.append(t_ns)
             by_log += from_log
             for found in message.detections:
                 frame.append(i)
-                tag_id.append(int(messages.numbers(found.id)[0]))
+                tag_id.append(int(definition.numbers(found.id)[0]))
                 # (x, y) or (x, y, z) of each
-                corners.append(messages.numbers(found.corners).reshape(4, -1)[:, :2])
+                corners.append(definition.numbers(found.corners).reshape(4, -1)[:, :2])
                 hamming.append(int(found.hamming))
                 margin.append(float(found.decision_margin))
                 family.append(found.family)
@@ -248,19 +248,23 @@ class Recording:
             schema = self._file.schemas[self._file.channels[rows.channel].schema_id]
             try:
                 yield messages.definition(schema.name, schema.data.decode()), rows
-            except (InputError, UnicodeDecodeError) as error:
+            except (MessageError, UnicodeDecodeError) as error:
                 raise InputError(f"{self.path}: topic {topic}: {error}") from error
 
-    def _decoded(self, topic: str, *types: str) -> Iterator[tuple[int, bool, Any]]:
-        """(stamp, whether it is the log time, message) one by one, in file order."""
+    def _decoded(self, topic: str, *types: str) -> Iterator[tuple[int, bool, Any, Definition]]:
+        """(stamp, whether it is the log time, message, its definition) one by one, in file order."""
         self._require(topic, *types)
         for definition, rows in self._rows(topic):
             stamps = header_stamps(definition, rows)
             for i, (t_ns, log_ns) in enumerate(zip(stamps.tolist(), rows.log_ns.tolist(), strict=True)):
-                yield t_ns or log_ns, not t_ns, definition.decode(rows.message(i))
+                try:
+                    message = definition.decode(rows.message(i))
+                except MessageError as error:
+                    raise InputError(f"{self.path}: topic {topic}: {error}") from error
+                yield t_ns or log_ns, not t_ns, message, definition
 
     def _first_stamp(self, topic: str) -> int:
-        return next(t_ns for t_ns, _, _ in self._decoded(topic))
+        return next(t_ns for t_ns, *_ in self._decoded(topic))
 
     def _series(self, kind: type[AnySeries], topic: str) -> AnySeries:
         self._require(topic, kind.TYPE)
@@ -276,8 +280,10 @@ class Recording:
                 if rows.channel not in decoders:
                     decoders[rows.channel] = Decoder(definition, fields)
                 decoders[rows.channel].append(rows, table)
+        except MessageError as error:
+            raise InputError(f"{self.path}: topic {topic}: {error}") from error
         except (KeyError, AttributeError) as error:
-            raise InputError(f"{self.path}: the messages on {topic} have no usable field {error}") from error
+            raise InputError(f"{self.path}: topic {topic}: the messages have no usable field {error}") from error
 
 
 def _always(order: tuple[int, ...] | None) -> Order | None:

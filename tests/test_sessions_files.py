@@ -1,0 +1,441 @@
+"""Files: written and read back, of every container form, broken ones, and ones that others wrote."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.writer import CompressionType, IndexType, Writer
+from rosbags.highlevel import AnyReader
+
+from pipelines.errors import InputError
+from pipelines.sessions import container, messages, series
+from pipelines.sessions.reading import open_recording
+from pipelines.sessions.writing import write_session
+
+T0 = 1_700_000_000_123_456_789
+
+
+def session(n: int = 2000) -> dict[str, series.Topic]:
+    """One topic of every kind, at rates and phases of their own."""
+    rng = np.random.default_rng(8)
+
+    def stamps(step: int, phase: int = 0) -> np.ndarray[Any, Any]:
+        return T0 + phase + step * np.arange(max(1, n * 1_000_000 // step))
+
+    imu, slow = stamps(1_000_000), stamps(33_333_333, 777)
+    frames = np.repeat(np.arange(len(slow)), rng.integers(0, 4, len(slow)))
+    count = len(frames)
+    return {
+        "/imu": series.ImuSeries(
+            imu,
+            rng.normal(size=(n, 3)),
+            rng.normal(size=(n, 3)),
+            rng.normal(size=(n, 4)),
+            gyro_cov=np.diag([1e-6, 2e-6, 3e-6]),
+            wxyz_cov=rng.normal(size=(n, 3, 3)),
+            frame_id="imu_link",
+        ),
+        "/mag": series.MagneticSeries(slow, rng.normal(size=(len(slow), 3)), frame_id="mag"),
+        "/joints": series.JointSeries(stamps(5_000_000), rng.normal(size=(n // 5, 2)), ("azimuth", "elevation")),
+        "/vector": series.VectorSeries(slow, np.where(rng.random((len(slow), 3)) < 0.2, np.nan, 1.5)),
+        "/quaternion": series.QuaternionSeries(slow, rng.normal(size=(len(slow), 4))),
+        "/pose": series.PoseSeries(slow, rng.normal(size=(len(slow), 4)), cov=rng.normal(size=(len(slow), 6, 6))),
+        "/fix": series.FixSeries(
+            slow,
+            rng.normal(size=len(slow)),
+            rng.normal(size=len(slow)),
+            rng.normal(size=len(slow)),
+            status=np.array(-1.0),
+        ),
+        "/camera_info": series.CameraInfo(
+            T0, 640, 480, "plumb_bob", rng.normal(size=5), rng.normal(size=(3, 3)), np.eye(3), rng.normal(size=(3, 4))
+        ),
+        "/image": series.ImageSeries(slow, [rng.bytes(int(k)) for k in rng.integers(0, 90_000, len(slow))]),
+        "/tags": series.DetectionSeries(
+            slow,
+            frames,
+            rng.integers(0, 500, count),
+            rng.normal(size=(count, 4, 2)),
+            np.zeros(count, dtype=np.int64),
+            np.float32(rng.normal(size=count)).astype(float),
+            np.full(count, "tag36h11"),
+        ),
+    }
+
+
+def read_all(path: Path) -> dict[str, Any]:
+    recording = open_recording(path)
+    return {
+        "/imu": recording.imu("/imu"),
+        "/mag": recording.magnetic("/mag"),
+        "/joints": recording.joints("/joints", ("azimuth", "elevation")),
+        "/vector": recording.vector("/vector"),
+        "/quaternion": recording.quaternion("/quaternion"),
+        "/pose": recording.poses("/pose"),
+        "/fix": recording.fixes("/fix"),
+        "/camera_info": recording.camera_info("/camera_info"),
+        "/image": list(recording.images("/image")),
+        "/tags": recording.detections("/tags"),
+    }
+
+
+def assert_same(found: dict[str, Any], made: dict[str, Any]) -> None:
+    assert found.keys() == made.keys()
+    for topic, one in made.items():
+        if isinstance(one, series.ImageSeries):
+            assert found[topic] == list(zip(one.t_ns.tolist(), one.data, strict=True))
+            continue
+        for name, value in vars(one).items():
+            if name != "frame_id":
+                np.testing.assert_array_equal(getattr(found[topic], name), value, err_msg=f"{topic} {name}")
+
+
+def test_a_session_written_and_read_back_is_identical(tmp_path: Path) -> None:
+    made = session()
+    path = tmp_path / "s.mcap"
+    write_session(path, made, {"alidade.yaml": b"method: los\n", "truth.json": b"{}"})
+    assert_same(read_all(path), made)
+    recording = open_recording(path)
+    assert recording.attachments == ("alidade.yaml", "truth.json")
+    assert recording.attachment("alidade.yaml") == b"method: los\n"
+    assert recording.attachment("else") is None
+    assert recording.epoch_ns == T0
+    assert recording.duration_s == pytest.approx(1.999, abs=1e-9)
+    assert [p.name for p in tmp_path.iterdir()] == ["s.mcap"]
+
+
+def test_what_we_write_is_sound_for_the_mcap_package_and_for_rosbags(tmp_path: Path) -> None:
+    made = session(300)
+    path = tmp_path / "s.mcap"
+    write_session(path, made, {"alidade.yaml": b"method: los\n"})
+    total = sum(1 if isinstance(one, series.CameraInfo) else len(one) for one in made.values())
+    for kind in (make_reader, NonSeekingReader):
+        with path.open("rb") as stream:
+            logged = [m.log_time for _, _, m in kind(stream, validate_crcs=True).iter_messages(log_time_order=False)]
+        assert len(logged) == total
+        assert logged == sorted(logged)
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == total
+    assert len(summary.chunk_indexes) == summary.statistics.chunk_count
+    imu = made["/imu"]
+    assert isinstance(imu, series.ImuSeries)
+    with AnyReader([path]) as reader:
+        wanted = [c for c in reader.connections if c.topic == "/imu"]
+        for i, (connection, _, raw) in enumerate(reader.messages(wanted)):
+            message: Any = reader.deserialize(raw, connection.msgtype)
+            assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == imu.t_ns[i]
+            assert message.header.frame_id == "imu_link"
+            q, w = message.orientation, message.angular_velocity
+            assert [q.w, q.x, q.y, q.z, w.x, w.y, w.z] == [*imu.wxyz[i], *imu.gyro[i]]
+        assert i == 299
+
+
+def rewrite(source: Path, path: Path, order: Any = list, **options: Any) -> Path:
+    """The same messages through the mcap package's own writer, with options of its."""
+    with source.open("rb") as stream, path.open("wb") as out:
+        reader = make_reader(stream)
+        writer = Writer(out, **options)
+        writer.start("ros2")
+        channels: dict[int, int] = {}
+        for schema, channel, message in order(reader.iter_messages()):
+            if channel.id not in channels:
+                assert schema is not None
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, "cdr", number)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"compression": CompressionType.LZ4},
+        {"compression": CompressionType.NONE},
+        {"compression": CompressionType.ZSTD, "chunk_size": 3000},
+        {"use_chunking": False},
+        {"index_types": IndexType.NONE},
+        {"index_types": IndexType.NONE, "repeat_channels": False, "repeat_schemas": False, "use_statistics": False},
+        {"index_types": IndexType.MESSAGE, "repeat_channels": False, "repeat_schemas": False},
+        {"enable_crcs": False},
+        {"order": lambda all_messages: sorted(all_messages, key=lambda m: (m[1].id, m[2].log_time))},
+        {"order": lambda all_messages: list(all_messages)[::-1], "chunk_size": 3000},
+    ],
+    ids=lambda options: " ".join(options),
+)
+def test_every_form_of_the_container_reads_the_same(options: dict[str, Any], tmp_path: Path) -> None:
+    made = session(200)
+    write_session(tmp_path / "s.mcap", made)
+    found = read_all(rewrite(tmp_path / "s.mcap", tmp_path / "t.mcap", **options))
+    # Pictures and detections come in file order.
+    found["/image"].sort()
+    if options.get("chunk_size") and "order" in options:
+        del found["/tags"], made["/tags"]
+    assert_same(found, made)
+
+
+def test_backward_stamps_stay_in_the_order_they_were_logged(tmp_path: Path) -> None:
+    t = T0 + np.array([0, 10, 30, 20, 40])
+    write_session(tmp_path / "s.mcap", {"/v": series.VectorSeries(t, np.arange(15.0).reshape(5, 3))})
+    found = open_recording(tmp_path / "s.mcap").vector("/v")
+    np.testing.assert_array_equal(found.t_ns, t)
+
+
+def test_a_failed_write_leaves_nothing(tmp_path: Path) -> None:
+    def pictures() -> Any:
+        yield b"one"
+        raise OSError("camera unplugged")
+
+    topic = series.ImageSeries(T0 + np.arange(2), pictures())
+    with pytest.raises(OSError, match="unplugged"):
+        write_session(tmp_path / "s.mcap", {"/image": topic})
+    assert not list(tmp_path.iterdir())
+
+
+def test_series_of_wrong_shape_are_refused() -> None:
+    with pytest.raises(ValueError, match="t_ns"):
+        series.VectorSeries(np.arange(3.0), np.zeros((3, 3)))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="broadcast"):
+        series.VectorSeries(np.arange(3), np.zeros((2, 3)))
+
+
+# -- broken files
+
+
+@pytest.fixture
+def imu_file(tmp_path: Path) -> Path:
+    """Uncompressed, so that damage is silent but for the checksum."""
+    write_session(tmp_path / "z.mcap", {"/imu": session(300)["/imu"]}, {"alidade.yaml": b"method: head\n"})
+    return rewrite(tmp_path / "z.mcap", tmp_path / "s.mcap", compression=CompressionType.NONE, chunk_size=20_000)
+
+
+def damage(path: Path, at: int) -> Path:
+    data = bytearray(path.read_bytes())
+    data[at] ^= 1
+    other = path.with_name("damaged.mcap")
+    other.write_bytes(data)
+    return other
+
+
+def test_a_flipped_bit_in_a_chunk_is_found(imu_file: Path) -> None:
+    gyro = open_recording(imu_file).imu("/imu").gyro
+    at = imu_file.read_bytes().find(gyro[150].tobytes())
+    broken = open_recording(damage(imu_file, at))
+    with pytest.raises(InputError, match=r"chunk at byte \d+ is damaged.*crc"):
+        broken.imu("/imu")
+
+
+def test_a_flipped_bit_in_a_compressed_chunk_is_found(imu_file: Path) -> None:
+    compressed = imu_file.with_name("z.mcap")
+    data = compressed.read_bytes()
+    found = 0
+    for at in range(data.find(b"zstd") + 20, len(data) // 2, len(data) // 20):
+        with pytest.raises(InputError, match="damaged"):
+            open_recording(damage(compressed, at)).imu("/imu")
+        found += 1
+    assert found > 5
+
+
+def test_a_flipped_bit_in_a_message_index_is_found(imu_file: Path) -> None:
+    t_ns = open_recording(imu_file).imu("/imu").t_ns
+    entry = imu_file.read_bytes().rfind(int(t_ns[3]).to_bytes(8, "little"))
+    broken = open_recording(damage(imu_file, entry + 9))
+    with pytest.raises(InputError, match="message index of the chunk at byte"):
+        broken.imu("/imu")
+
+
+def test_a_flipped_bit_in_the_config_is_found(imu_file: Path) -> None:
+    path = imu_file.with_name("z.mcap")
+    broken = open_recording(damage(path, path.read_bytes().find(b"method: head")))
+    with pytest.raises(InputError, match=r"alidade\.yaml is damaged"):
+        broken.attachment("alidade.yaml")
+
+
+def test_a_file_cut_anywhere_is_known_for_it(imu_file: Path) -> None:
+    data = imu_file.read_bytes()
+    cut = imu_file.with_name("cut.mcap")
+    for size in [9, 20, 1000, len(data) // 2, len(data) - 300, len(data) - 8, len(data) - 1]:
+        cut.write_bytes(data[:size])
+        with pytest.raises(InputError, match="truncated"):
+            open_recording(cut)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "the file is empty"),
+        (b"hello, this is text", "not an MCAP file"),
+        (b"#ROSBAG V2.0\n" + b"\0" * 50, "not an MCAP file, but a ROS 1 bag"),
+        (b"SQLite format 3\0" + b"\0" * 50, "not an MCAP file, but a rosbag2 SQLite file"),
+        (container.MAGIC, "truncated"),
+        (container.MAGIC + b"\xff" * 60, "truncated or damaged"),
+        (container.MAGIC + b"\x07" + (6).to_bytes(8, "little") + b"\0" * 60, "damaged"),
+    ],
+)
+def test_what_is_no_recording_is_one_clear_line(content: bytes, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        open_recording(path)
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def test_missing_file_and_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be opened"):
+        open_recording(tmp_path / "none.mcap")
+    with pytest.raises(InputError, match="a folder"):
+        open_recording(tmp_path)
+
+
+def test_random_damage_is_an_input_error_or_harmless(imu_file: Path) -> None:
+    """Whatever byte is hit: an InputError, or the right gyro; never another exception."""
+    rng = np.random.default_rng(11)
+    compressed = imu_file.with_name("z.mcap")
+    good = open_recording(compressed).imu("/imu")
+    size = compressed.stat().st_size
+    places = [*rng.integers(0, size, 150).tolist(), *range(0, 600, 3), *range(size - 900, size, 5)]
+    errors = [error_of(damage(compressed, at), good.gyro) for at in places]
+    assert None in errors
+    assert any(errors)
+    assert not any("\n" in error for error in errors if error)
+
+
+def error_of(path: Path, gyro: np.ndarray[Any, Any]) -> str | None:
+    """The InputError of reading a damaged file; None if it gives the gyro all the same."""
+    try:
+        np.testing.assert_array_equal(open_recording(path).imu("/imu").gyro, gyro)
+    except InputError as error:
+        return str(error)
+    return None
+
+
+# -- topics
+
+
+def test_missing_topic_lists_what_is_there(tmp_path: Path) -> None:
+    write_session(tmp_path / "s.mcap", session(10))
+    recording = open_recording(tmp_path / "s.mcap")
+    with pytest.raises(InputError, match=r"no topic /head/imu \(sensor_msgs/msg/Imu\).*/imu \(Imu\).*`topics:`"):
+        recording.imu("/head/imu")
+    with pytest.raises(
+        InputError, match="topic /mag holds sensor_msgs/msg/MagneticField, needed is sensor_msgs/msg/Imu"
+    ):
+        recording.imu("/mag")
+    with pytest.raises(InputError, match=r"topic /mag holds .*PoseWithCovarianceStamped or .*QuaternionStamped"):
+        recording.poses("/mag")
+
+
+def test_topic_without_messages(tmp_path: Path) -> None:
+    empty = series.VectorSeries(np.empty(0, dtype=np.int64), np.empty((0, 3)))
+    write_session(tmp_path / "s.mcap", {"/v": empty, "/w": session(10)["/vector"]})
+    with pytest.raises(InputError, match="topic /v has no messages"):
+        open_recording(tmp_path / "s.mcap").vector("/v")
+
+
+def test_attitudes_without_covariance_are_accepted_as_poses(tmp_path: Path) -> None:
+    made = session(100)["/quaternion"]
+    assert isinstance(made, series.QuaternionSeries)
+    write_session(tmp_path / "s.mcap", {"/q": made})
+    poses = open_recording(tmp_path / "s.mcap").poses("/q")
+    np.testing.assert_array_equal(poses.wxyz, made.wxyz)
+    assert not poses.cov.any()
+
+
+def test_images_are_taken_one_at_a_time(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    taken = []
+
+    def pictures() -> Any:
+        for i in range(200):
+            taken.append(i)
+            yield rng.bytes(60_000)
+
+    write_session(tmp_path / "s.mcap", {"/i": series.ImageSeries(T0 + np.arange(200), pictures())})
+    assert taken == list(range(200))
+    images = open_recording(tmp_path / "s.mcap").images("/i")
+    t_ns, data = next(images)
+    assert (t_ns, zlib.crc32(data)) == (T0, zlib.crc32(np.random.default_rng(0).bytes(60_000)))
+
+
+# -- files that others wrote
+
+
+def test_contract_recordings(shared_data: Path) -> None:
+    folder = shared_data / "contract"
+    head = open_recording(folder / "head_mounts.mcap")
+    assert len(head.imu("/head/imu")) == 30001
+    assert len(head.imu("/platform/imu")) == 12001
+    assert len(head.poses("/vision/attitude")) == 1797
+    assert head.epoch_ns == 1_795_176_000_000_000_000
+    assert head.duration_s == pytest.approx(60.0)
+    los = open_recording(folder / "los_images_tag.mcap")
+    assert los.camera_info("/camera/camera_info").width == 640
+    assert sum(data[:2] in (b"\xff\xd8", b"\x89P") for _, data in los.images("/camera/image/compressed")) == 600
+    assert len(los.joints("/gimbal/joint_states", ("azimuth", "elevation"))) == 6001
+    cube = open_recording(folder / "cube_nominal.mcap")
+    tags = cube.detections("/tag_detections")
+    assert len(tags) == 3307
+    assert set(tags.tag_id.tolist()) <= set(range(16, 22))
+    assert len(cube.fixes("/reference/fix")) == 166
+
+
+def test_contract_recordings_agree_with_rosbags_own_reader(shared_data: Path) -> None:
+    path = shared_data / "contract" / "head_mounts.mcap"
+    poses = open_recording(path).poses("/vision/attitude")
+    with AnyReader([path]) as reader:
+        wanted = [c for c in reader.connections if c.topic == "/vision/attitude"]
+        for i, (connection, _, raw) in enumerate(reader.messages(wanted)):
+            message: Any = reader.deserialize(raw, connection.msgtype)
+            q = message.pose.pose.orientation
+            assert [q.w, q.x, q.y, q.z] == poses.wxyz[i].tolist()
+            np.testing.assert_array_equal(message.pose.covariance.reshape(6, 6), poses.cov[i])
+            assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == poses.t_ns[i]
+    assert i + 1 == len(poses)
+
+
+@pytest.mark.parametrize(
+    ("name", "topic", "message"),
+    [
+        ("compressed", "/imu", "no topic /imu .*a ROS 1 recording.*/diagnostics"),
+        ("compressed", "/tf", "holds tf2_msgs/TFMessage"),
+        ("ros2_talker", "/imu", "no topic /imu.*/rosout"),
+        ("ros2_only_topics", "/imu", "no topic /imu"),
+        ("ros2_service_events", "/imu", "no topic /imu"),
+        ("ros2_wrong_encoding", "/test_topic", "holds test_msgs/msg/BasicTypes"),
+    ],
+)
+def test_files_without_our_topics(name: str, topic: str, message: str, shared_data: Path) -> None:
+    recording = open_recording(shared_data / "mcap_files" / f"{name}.mcap")
+    for other in recording.topics:
+        assert len(recording.stamps(other)) == recording.topics[other].count
+    with pytest.raises(InputError, match=message):
+        recording.imu(topic)
+
+
+def test_wrong_encoding_is_named(tmp_path: Path) -> None:
+    with (tmp_path / "s.mcap").open("wb") as out:
+        writer = Writer(out)
+        writer.start("ros2")
+        schema = writer.register_schema(messages.IMU, "ros2msg", messages.definition_text(messages.IMU).encode())
+        writer.add_message(writer.register_channel("/imu", "json", schema), T0, b"{}", T0)
+        writer.finish()  # type: ignore[no-untyped-call]
+    with pytest.raises(InputError, match=r"topic /imu has the encoding json/ros2msg, needed is cdr/ros2msg"):
+        open_recording(tmp_path / "s.mcap").imu("/imu")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("chunk_not_closed", "truncated or damaged"), ("zstd_chunk_with_padding", "does not define it")],
+)
+def test_broken_files_of_others(name: str, message: str, shared_data: Path) -> None:
+    with pytest.raises(InputError, match=message):
+        open_recording(shared_data / "mcap_files" / f"{name}.mcap")
