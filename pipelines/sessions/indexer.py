@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,10 +36,10 @@ JOINTS = ("outer_x", "inner_z")
 class IndexerData:
     """What an indexer session has measured. Times are s from epoch_ns (Unix ns), strictly increasing.
 
-    gyro_t (N,), gyro (N, 3) rad/s: rate w_im of the IMU on the indexer, in m. encoder_t (M,), outer (M,), inner (M,) rad:
-    axis angles as recorded, wrapped or continuous. latitude_deg: from /fix or the config, None if unknown. attitude
-    (N, 4): nRm as the INS puts it out with each gyro sample, unit, or None. gyro_density, rad/s/sqrt(Hz): from the
-    covariances of the messages, None if they say nothing. dropped: reason -> messages.
+    gyro_t (N,), gyro (N, 3) rad/s: rate w_im of the IMU on the indexer, in m. encoder_t (M,), outer (M,), inner (M,)
+    rad: axis angles as recorded, wrapped or continuous. latitude_deg: from /fix or the config, None if unknown.
+    attitude (N, 4): nRm as the INS puts it out with each gyro sample, unit, or None. gyro_density, rad/s/sqrt(Hz): from
+    the covariances of the messages, None if they say nothing. dropped: reason -> messages.
     """
 
     epoch_ns: int
@@ -56,8 +57,8 @@ class IndexerData:
 def read_indexer(recording: Recording, config: Config) -> IndexerData:
     """Read and check an indexer session.
 
-    Raises InputError when a topic is missing or unusable, see pipelines.sessions.checks, and when gyro and encoders have
-    no time in common. A missing latitude is left to the method, which knows whether it is needed.
+    Raises InputError when a topic is missing or unusable, see pipelines.sessions.checks, and when gyro and encoders
+    have no time in common. A missing latitude is left to the method, which knows whether it is needed.
     """
     dropped: dict[str, int] = {}
     epoch = recording.epoch_ns
@@ -100,14 +101,8 @@ def write_indexer(
     """
     gyro_ns, encoder_ns = nanoseconds(data.gyro_t, data.epoch_ns), nanoseconds(data.encoder_t, data.epoch_ns)
     variance = 0.0 if data.gyro_density is None else data.gyro_density**2 / np.median(np.diff(data.gyro_t))
-    imu = series.ImuSeries(
-        gyro_ns,
-        data.gyro,
-        wxyz=data.attitude,
-        wxyz_cov=None if data.attitude is None else np.zeros((3, 3)),
-        gyro_cov=variance * np.eye(3),
-        frame_id="imu",
-    )
+    orientation: dict[str, Any] = {} if data.attitude is None else {"wxyz": data.attitude, "wxyz_cov": np.zeros((3, 3))}
+    imu = series.ImuSeries(gyro_ns, data.gyro, gyro_cov=variance * np.eye(3), frame_id="imu", **orientation)
     angles = np.column_stack([data.outer, data.inner])
     topics: dict[str, series.Topic] = {
         TOPICS["imu"].name: imu,
