@@ -72,7 +72,7 @@ def test_what_is_missing_is_named_and_renames_are_honoured(tmp_path: Path) -> No
     assert head[0] == "/head/imu (sensor_msgs/msg/Imu)"
     assert head[1].endswith("/camera/camera_info (sensor_msgs/msg/CameraInfo) and head.board in the config")
     assert resolve_method(None, recording, config) == "indexer"
-    with pytest.raises(InputError, match="no usable topics for any method; topics there: .*/xsens"):
+    with pytest.raises(InputError, match=r"no usable topics for any method; topics there: .*/xsens"):
         resolve_method(None, recording, NONE)
 
 

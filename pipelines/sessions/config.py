@@ -149,8 +149,9 @@ def load_config(attachment: bytes | None, override: Path | None = None) -> Confi
     except ValidationError as error:
         # An unknown key explains more than what follows from it.
         first = min(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
-        path = first["loc"]
-        where = str(override) if _has(more, path) else f"attachment {ATTACHMENT}"
+        path = tuple(part for part in first["loc"] if part != "[key]")
+        said = path[:-1] if first["type"] == "missing" else path
+        where = str(override) if _has(more, said) else f"attachment {ATTACHMENT}"
         raise InputError(f"{where}: {_explain(path, first)}") from error
     for key in config.topics.keys() - TOPICS.keys():
         where = str(override) if _has(more, ("topics", key)) else f"attachment {ATTACHMENT}"
@@ -216,16 +217,18 @@ _SECTIONS = {"topics", "noise", "priors", "require", "indexer", "cube", "head", 
 
 
 def _has(content: Any, path: tuple[int | str, ...]) -> bool:
-    """Whether the content says something at the path, or at the nearest key above it that it could."""
+    """Whether the content says something at the path, or something that has no keys on the way to it."""
     for i, key in enumerate(path):
-        if not isinstance(content, Mapping) or key not in content:
-            return i > 0 and not isinstance(content, Mapping)
+        if not isinstance(content, Mapping):
+            return i > 0
+        if key not in content:
+            return False
         content = content[key]
     return True
 
 
 def _explain(path: tuple[int | str, ...], error: Any) -> str:
-    key = ".".join(str(part) for part in path if part != "[key]")
+    key = ".".join(str(part) for part in path)
     if error["type"] == "extra_forbidden":
         return f"unknown key {key}{nearest(str(path[-1]), _known_at(path[:-1]))}"
     given = error["input"]
