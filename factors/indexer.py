@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +23,7 @@ from factors import so3
 
 Array = NDArray[np.float64]
 Residuals = tuple[Array, Callable[[], tuple[Array, ...]]]
+Option = Literal["scale", "epsilon", "tilt"]
 
 _EX, _EY, _EZ = np.eye(3)
 # Nodes of two-point Gauss quadrature on [0, 1], weights 1/2.
@@ -157,58 +159,62 @@ def gyro_means(t: Array, rate: Array, cuts: NDArray[np.intp]) -> Array:
 
 @dataclass(frozen=True)
 class IndexerAverageFactor:
-    """Mean gyro rate over n windows against the mean the encoders and the earth's rate say.
+    """Mean gyro rate over n adjoining windows against the mean that the encoders and the earth's rate say.
 
         gyro = (1 + scale) * mRt w + bias,    w = fixed + cos(epsilon) cosine + sin(epsilon) sine
 
-    compared in frame t, where encoder noise has fixed directions. Blocks: theta (3, rad), gyro bias (3, rad/s), gyro
-    scale error (3), epsilon (1, rad) and, if wanted, tilt (3, rad): a small rotation of the true platform rate
-    against the encoders' account of it, w = Exp(tilt) w_encoders, for errors that come again with every turn.
+    compared in frame t, where encoder noise has fixed directions. Blocks: theta (3, rad), gyro bias (3, rad/s), then
+    the options: "scale" (3), the gyro's scale error; "epsilon" (1, rad); "tilt" (3, rad), a small rotation of the true
+    platform rate against the encoders' account of it, w -> Exp(tilt) w, for errors that come again with every turn.
 
     Attributes:
         gyro: (n, 3) mean rates, rad/s.
         rates: the platform's mean rates over the same windows.
         sqrt_information: (3 n, 3 n) of the difference, in t: neighbours share the encoder noise at their common edge.
+        options: those that are variables, in the order of their blocks; the others are zero.
     """
 
     gyro: Array
     rates: PlatformRates
     sqrt_information: Array
+    options: tuple[Option, ...] = ()
     rows: int = 3
 
     @classmethod
-    def of(cls, gyro: Array, rates: PlatformRates, density: float, encoder: float) -> IndexerAverageFactor:
+    def of(
+        cls, gyro: Array, rates: PlatformRates, density: float, encoder: float, options: tuple[Option, ...] = ()
+    ) -> IndexerAverageFactor:
         """From gyro noise (rad/s/sqrt(Hz), angle random walk in each window) and encoder noise (rad, at the edges)."""
         covariance = encoder**2 * rates.noise @ rates.noise.T
         covariance += np.diag(np.repeat(density**2 / np.diff(rates.edges), 3))
-        return cls(gyro, rates, np.linalg.inv(np.linalg.cholesky(covariance)))
+        return cls(gyro, rates, np.linalg.inv(np.linalg.cholesky(covariance)), options)
 
     @property
     def time(self) -> Array:
         """(n,) ends of the windows, s."""
         return self.rates.edges[1:]
 
-    def __call__(self, theta: Array, bias: Array, scale: Array, epsilon: Array, tilt: Array | None = None) -> Residuals:
+    def __call__(self, theta: Array, bias: Array, *more: Array) -> Residuals:
         """Residual sqrt_information * (tRm (gyro - bias) / (1 + scale) - Exp(tilt) w), (n, 3)."""
+        given = dict(zip(self.options, more, strict=True))
+        gain = 1.0 + given.get("scale", np.zeros(3))
+        epsilon, tilt = given.get("epsilon", np.zeros(1)), given.get("tilt", np.zeros(3))
         tRm = mounting(theta)
-        corrected = (self.gyro - bias) / (1.0 + scale)
+        corrected = (self.gyro - bias) / gain
         encoders = self.rates.fixed + np.cos(epsilon) * self.rates.cosine + np.sin(epsilon) * self.rates.sine
-        turn = so3.identity() if tilt is None else so3.exp(tilt)
-        platform = so3.rotate(turn, encoders)
-        error = so3.rotate(tRm, corrected) - platform
+        turn = so3.exp(tilt)
+        error = so3.rotate(tRm, corrected) - so3.rotate(turn, encoders)
 
         def jacobians() -> tuple[Array, ...]:
-            matrix = so3.matrix(tRm)
+            by_gyro = so3.matrix(tRm) / np.broadcast_to(gain, theta.shape)[:, None, :]
             by_epsilon = -np.sin(epsilon) * self.rates.cosine + np.cos(epsilon) * self.rates.sine
-            blocks = [
-                -matrix @ so3.hat(corrected) @ _angle_axes(theta),
-                -matrix / (1.0 + scale)[:, None, :],
-                -matrix * (corrected / (1.0 + scale))[:, None, :],
-                -so3.rotate(turn, by_epsilon)[..., None],
-            ]
-            if tilt is not None:
-                blocks.append(so3.matrix(turn) @ so3.hat(encoders) @ so3.right_jacobian(tilt))
-            return tuple(self._whiten(block) for block in blocks)
+            blocks: dict[Option, Array] = {
+                "scale": -by_gyro * corrected[:, None, :],
+                "epsilon": -so3.rotate(turn, by_epsilon)[..., None],
+                "tilt": so3.matrix(turn) @ so3.hat(encoders) @ so3.right_jacobian(tilt),
+            }
+            by_theta = -so3.matrix(tRm) @ so3.hat(corrected) @ _angle_axes(theta)
+            return tuple(self._whiten(block) for block in (by_theta, -by_gyro, *(blocks[o] for o in self.options)))
 
         return self._whiten(error[..., None])[..., 0], jacobians
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,6 +13,7 @@ from factors.earth import earth_rate
 from factors.indexer import (
     AxisPath,
     IndexerAverageFactor,
+    Option,
     PlatformRates,
     base_from_platform,
     gyro_edges,
@@ -25,7 +27,8 @@ from tests.numerics import assert_jacobians_match, assert_rows_are_independent
 RNG = np.random.default_rng(3)
 N = 9
 BASE_RATE = so3.rotate(so3.exp([0.3, -0.2, 0.9]), earth_rate(0.7))
-KINDS: list[Kind] = [3, 3, 3, 1]
+KINDS: list[Kind] = [3, 3, 3, 1, 3]
+OPTIONS: tuple[Option, ...] = ("scale", "epsilon", "tilt")
 
 
 def _angles(t: Array) -> tuple[Array, Array]:
@@ -48,7 +51,7 @@ def _rates(n: int = N, spread: float = 0.3) -> PlatformRates:
 
 
 def _model(gyro: Array, rates: PlatformRates) -> IndexerAverageFactor:
-    return IndexerAverageFactor(gyro, rates, RNG.normal(size=(3 * N, 3 * N)))
+    return IndexerAverageFactor(gyro, rates, RNG.normal(size=(3 * N, 3 * N)), OPTIONS)
 
 
 @pytest.mark.parametrize("epsilon", [0.0, 2e-3, -0.4])
@@ -112,34 +115,40 @@ def test_gyro_mean_is_the_integral_between_sample_edges() -> None:
     np.testing.assert_allclose(mean, [(rate[1] + 1.5 * rate[2] + 1.5 * rate[3]) / 4.0, rate[4]])
 
 
-def _blocks(size: float, tilt: bool) -> list[Array]:
-    shapes = [(3, 1.0), (3, 0.05), (3, 0.1), (1, 0.3)] + ([(3, 0.5)] if tilt else [])
+def _blocks(size: float) -> list[Array]:
+    shapes = [(3, 1.0), (3, 0.05), (3, 0.1), (1, 0.3), (3, 0.5)]
     return [np.tile(RNG.normal(scale=size * spread, size=width), (N, 1)) for width, spread in shapes]
 
 
-@pytest.mark.parametrize("tilt", [False, True])
 @pytest.mark.parametrize("size", [1.0, 1e-9], ids=["random", "near zero"])
-def test_jacobians(size: float, tilt: bool) -> None:
-    model = _model(RNG.normal(size=(N, 3)), _rates())
-    assert_jacobians_match(model, [*KINDS, 3][: 4 + tilt], _blocks(size, tilt))
+def test_jacobians(size: float) -> None:
+    assert_jacobians_match(_model(RNG.normal(size=(N, 3)), _rates()), KINDS, _blocks(size))
+
+
+@pytest.mark.parametrize("options", [(), ("scale",), ("tilt", "epsilon")])
+def test_jacobians_with_some_options(options: tuple[Option, ...]) -> None:
+    model = replace(_model(RNG.normal(size=(N, 3)), _rates()), options=options)
+    blocks = dict(zip(("theta", "bias", *OPTIONS), zip(KINDS, _blocks(0.3), strict=True), strict=True))
+    kinds, values = zip(*[blocks[name] for name in ("theta", "bias", *options)], strict=True)
+    assert_jacobians_match(model, list(kinds), list(values))
 
 
 def test_jacobians_near_the_singular_angle() -> None:
     model = _model(RNG.normal(size=(N, 3)), _rates())
-    blocks = _blocks(0.1, True)
+    blocks = _blocks(0.1)
     blocks[0] = np.tile([0.3, np.pi / 2 - 1e-4, -0.2], (N, 1))
-    assert_jacobians_match(model, [*KINDS, 3], blocks)
+    assert_jacobians_match(model, KINDS, blocks)
 
 
 def test_windows_without_encoder_noise_are_independent() -> None:
-    gyro, rates, blocks = RNG.normal(size=(N, 3)), _rates(), _blocks(1.0, True)
+    gyro, rates, blocks = RNG.normal(size=(N, 3)), _rates(), _blocks(1.0)
 
     def model(rows: np.ndarray) -> IndexerAverageFactor:
         edges = np.append(rates.edges[rows], rates.edges[rows[-1] + 1])
         some = PlatformRates(
             edges, rates.fixed[rows], rates.cosine[rows], rates.sine[rows], np.zeros((3 * len(rows), 1))
         )
-        return IndexerAverageFactor.of(gyro[rows], some, 1e-3, 0.0)
+        return IndexerAverageFactor.of(gyro[rows], some, 1e-3, 0.0, OPTIONS)
 
     assert_rows_are_independent(model, blocks)
 
@@ -156,10 +165,10 @@ def test_encoder_noise_at_a_common_edge_cancels_in_the_sum() -> None:
 
 
 def test_residual_vanishes_at_the_truth() -> None:
-    theta, bias, scale, epsilon, tilt = _blocks(0.3, True)
+    theta, bias, scale, epsilon, tilt = _blocks(0.3)
     rates = _rates()
     w = so3.rotate(so3.exp(tilt), rates.fixed + np.cos(epsilon) * rates.cosine + np.sin(epsilon) * rates.sine)
     gyro = (1.0 + scale) * so3.rotate(so3.inverse(mounting(theta)), w) + bias
-    model = IndexerAverageFactor.of(gyro, rates, 1.0, 0.0)
+    model = IndexerAverageFactor.of(gyro, rates, 1.0, 0.0, OPTIONS)
     np.testing.assert_allclose(model(theta, bias, scale, epsilon, tilt)[0], 0.0, atol=1e-13)
     assert np.abs(model(theta + 1e-3, bias, scale, epsilon, tilt)[0]).max() > 1e-5
