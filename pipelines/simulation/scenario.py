@@ -1,0 +1,60 @@
+"""Scenario files: a simulator's settings in YAML."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TypeVar
+
+from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
+
+from pipelines.errors import InputError
+from pipelines.sessions.config import nearest
+
+Model = TypeVar("Model", bound=BaseModel)
+
+# Installed beside this file; in a source tree among the data sets.
+_FOLDERS = (Path(__file__).parent / "scenarios", Path(__file__).parents[2] / "datasets" / "scenarios")
+
+
+def load_scenario(model: type[Model], name_or_path: str | Path) -> Model:
+    """The scenario of that name (a shipped one, `head_nominal`) or in that file, as the simulator's model.
+
+    Raises:
+        InputError: no such scenario, unreadable YAML, an unknown key or a value that does not fit.
+    """
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    path = _find(name_or_path)
+    try:
+        content = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+        return model.model_validate({} if content is None else content)
+    except (OSError, UnicodeDecodeError, YAMLError) as error:
+        raise InputError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from error
+    except ValidationError as error:
+        raise InputError(f"{path}: {_explain(error.errors()[0], model)}") from error
+
+
+def _find(name_or_path: str | Path) -> Path:
+    path = Path(name_or_path)
+    if path.is_file():
+        return path
+    shipped = {p.stem: p for folder in _FOLDERS for p in sorted(folder.glob("*.yaml"))}
+    if str(name_or_path) in shipped:
+        return shipped[str(name_or_path)]
+    raise InputError(f"no scenario file {name_or_path}; give a file or one of {', '.join(sorted(shipped))}")
+
+
+def _explain(error: ErrorDetails, model: type[BaseModel]) -> str:
+    """One line about the first thing pydantic rejected."""
+    where = ".".join(str(part) for part in error["loc"])
+    if error["type"] != "extra_forbidden":
+        return f"{where or 'the scenario'}: {error['msg']} (got {error['input']!r})"
+    return f"unknown key {where}{nearest(str(error['loc'][-1]), _keys(model))}"
+
+
+def _keys(model: type[BaseModel]) -> list[str]:
+    """The keys of the model and of the models inside it."""
+    schema = model.model_json_schema()
+    return [key for part in (schema, *schema.get("$defs", {}).values()) for key in part.get("properties", {})]
