@@ -12,17 +12,18 @@ from numpy.typing import NDArray
 from pipelines.errors import InputError
 from pipelines.vision.camera import Camera
 from pipelines.vision.pose import BodyPose, TagBody, estimate_pose
-from pipelines.vision.tags import Picture, detect
+from pipelines.vision.tags import Detections, Picture, detect
 
 Array = NDArray[np.float64]
 
 # A picture's own attitude settles the flips of the pictures up to this much later.
 _FRESH_NS = 200_000_000
-# Above this many sigmas of reprojection error, and above this many px, the tags do not fit the body's layout.
-_MISFIT_SIGMAS, _MISFIT_PX = 5.0, 0.5
+# The tags do not fit the body's layout when the reprojection error is above this many sigmas, this many px and this
+# share of a tag's side (a layout made by hand is good to half a per cent; a tag in another's place is not).
+_MISFIT_SIGMAS, _MISFIT_PX, _MISFIT_SHARE = 5.0, 0.5, 0.03
 
 UNREADABLE = "picture does not decode"
-UNSEEN = "no tag of the body seen"
+UNSEEN = "no tag of the body seen well"
 AMBIGUOUS = "planar flip could not be told"
 MISFIT = "tags do not fit the layout"
 
@@ -74,7 +75,7 @@ def body_poses(
         found = detect(picture, body.family, camera)
         fresh = last_cRb is not None and 0 <= t_ns - last_t <= _FRESH_NS
         pose = estimate_pose(camera, body, found, sigma_px, expected=last_cRb if fresh else None)
-        problem = _problem(pose, sigma_px)
+        problem = _problem(pose, found, sigma_px)
         if pose is not None and problem is None and pose.decided:
             last_t, last_cRb = t_ns, pose.cRb
         yield Sight(t_ns, found.ids, pose, problem)
@@ -89,10 +90,12 @@ def decode(encoded: bytes) -> Picture | None:
     return None if picture is None else np.asarray(picture)
 
 
-def _problem(pose: BodyPose | None, sigma_px: float | None) -> str | None:
+def _problem(pose: BodyPose | None, found: Detections, sigma_px: float | None) -> str | None:
     if pose is None:
         return UNSEEN
-    if pose.rms_px > max(_MISFIT_SIGMAS * (sigma_px or 0.0), _MISFIT_PX):
+    corners = found.corners[np.isin(found.ids, pose.ids)]
+    side = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean())
+    if pose.rms_px > max(_MISFIT_SIGMAS * (sigma_px or 0.0), _MISFIT_PX, _MISFIT_SHARE * side):
         return MISFIT
     return AMBIGUOUS if pose.ambiguous else None
 

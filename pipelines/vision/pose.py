@@ -30,6 +30,8 @@ _AMBIGUOUS = 1e-3
 _SAME = 1e-4
 # Directions this near to the camera's own plane (cosine) have no z = 1 coordinates to start from.
 _FORWARD = 0.05
+# Tags with a corner less certain than this (sigma, px) only count when there are no better ones.
+_POOR_PX = 0.25
 # A tag is wrong when the fit is this many sigmas off with it, and this many times better without it.
 _WRONG_SIGMAS, _WRONG_GAIN = 5.0, 4.0
 
@@ -119,7 +121,7 @@ def estimate_pose(
     sigma_px: float | None = None,
     expected: ArrayLike | None = None,
 ) -> BodyPose | None:
-    """The body's pose from the corners of its tags; None when no tag of it is seen (or only ids seen twice).
+    """The body's pose from the corners of its tags; None when none is seen well (or only ids that are seen twice).
 
     Reprojection errors are minimised by pycolmap, with the camera's distortion; each tag's two planar solutions
     (T. Collins, A. Bartoli, "Infinitesimal plane-based pose estimation", 2014; OpenCV's IPPE_SQUARE) are the starts.
@@ -163,10 +165,12 @@ class _Noise:
 def _matched(camera: Camera, body: TagBody, detections: Detections, use: Sequence[int]) -> tuple[TagBody, Array, float]:
     """The body's tags that are seen, their corners, (n, 4, 2) px, and the mean variance of these, px^2."""
     seen = np.array([int(np.flatnonzero(detections.ids == i)[0]) for i in use], dtype=np.intp)
-    forward = (camera.rays(detections.corners[seen])[..., 2] > _FORWARD).all(axis=1)
-    seen = seen[forward]
-    keep = np.array([int(np.flatnonzero(body.ids == i)[0]) for i in detections.ids[seen]], dtype=np.intp)
     variances = np.diagonal(detections.covariance[seen], axis1=-2, axis2=-1)
+    worst = variances.max(axis=(1, 2))
+    good = np.isfinite(worst) & ((worst < _POOR_PX**2) | (worst == worst.min(initial=np.inf)))
+    good &= (camera.rays(detections.corners[seen])[..., 2] > _FORWARD).all(axis=1)
+    seen, variances = seen[good], variances[good]
+    keep = np.array([int(np.flatnonzero(body.ids == i)[0]) for i in detections.ids[seen]], dtype=np.intp)
     return _part(body, keep), detections.corners[seen], float(variances.mean()) if len(seen) else 0.0
 
 
@@ -274,7 +278,8 @@ def _refine(camera: Camera, tags: TagBody, pixels: Array, cRb: Array, position: 
 
     options = pycolmap.AbsolutePoseRefinementOptions()
     options.gradient_tolerance = 1e-8
-    options.loss_function_scale = 1e6  # its loss is Cauchy's; this wide it is least squares
+    # Its loss is Cauchy's. This wide (px) it is least squares; much wider, its log(1 + r^2 / scale^2) loses the digits.
+    options.loss_function_scale = 100.0
     corners = tags.corners
     start = pycolmap.Rigid3d(pycolmap.Rotation3d(so3.matrix(cRb)), position)
     found = pycolmap.refine_absolute_pose(

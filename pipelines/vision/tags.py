@@ -36,8 +36,6 @@ _CORRELATION_PX = 1.5  # cuts closer than this share their noise (bilinear sampl
 # Systematic error of a line, px, when the profile is just as long as the blurred step; where it is cut short, levels
 # and neighbouring cells mix. Measured on rendered tags; it grows with the power 1.5 of (length of step / profile).
 _CUT_SHORT = 0.01
-# A corner that could not be measured keeps OpenCV's place and this sigma, px.
-_PLAIN_SIGMA = 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +46,9 @@ class Detections:
         ids: (n,) tag ids.
         corners: (n, 4, 2) px, in the AprilTag library's order: bottom left, bottom right, top right, top left of the
             official picture. Integer coordinates are pixel centres.
-        covariance: (n, 4, 2, 2) px^2 of each corner, from the scatter of the edge points about their lines.
+        covariance: (n, 4, 2, 2) px^2 of each corner, from the scatter of the edge points about their lines. Infinite
+            where an edge could not be measured (outside the picture, too blurred, seen too flat): that corner is
+            OpenCV's, which may be off by pixels.
     """
 
     ids: NDArray[np.int64]
@@ -112,7 +112,7 @@ def _refine(picture: Picture, plain: Array, camera: Camera) -> tuple[Array, Arra
         lost |= ~np.isfinite(variance[..., 0] + np.roll(variance[..., 1], 1, axis=1))
         corners = np.where(lost[..., None], plain, corners)
     covariance = _corner_covariance(cuts.normal.reshape(n, 4, 2), variance)
-    covariance[lost] = _PLAIN_SIGMA**2 * np.eye(2)
+    covariance[lost] = np.inf * np.ones((2, 2))
     return corners, covariance
 
 
