@@ -1,0 +1,501 @@
+"""The indexer method: mounting of an IMU against the axes of a two-axis indexer, from mean gyro rates.
+
+The recording is cut into groups of adjoining windows: a group for every whole turn, for what is left of a run, for
+every move between positions and for every dwell. A window ends where the driven axis has turned by an eighth of a turn.
+Each group is one factor on the mounting and the gyro's bias in force. Methods page, section 2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import so3
+from factors.earth import EARTH_RATE, earth_rate
+from factors.indexer import (
+    AxisPath,
+    IndexerAverageFactor,
+    Option,
+    PlatformRates,
+    base_from_platform,
+    gyro_edges,
+    gyro_means,
+    mounting,
+    mounting_angles,
+)
+from factors.vectorized import VectorizedFactor
+from pipelines.errors import InputError
+from pipelines.methods.base import Array, Attitudes, Factor, Parameter, Problem, Quantity, Step
+from pipelines.methods.priors import vector_prior
+from pipelines.methods.walking_bias import WalkingBias
+from pipelines.sessions.config import Config, check_names
+from pipelines.sessions.indexer import IndexerData
+from pipelines.sessions.indexer_runs import AxisMotion, Run, axis_motion
+
+THETA = ("theta_x", "theta_y", "theta_z")
+BIAS = ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")
+SCALE = ("gyro_scale_x", "gyro_scale_y", "gyro_scale_z")
+NONPERPENDICULARITY = ("axis_nonperpendicularity",)
+NAMES = (*THETA, *BIAS, *SCALE, *NONPERPENDICULARITY)
+
+_KEYS: dict[str, int] = {
+    name: int(gtsam.symbol(c, 0)) for name, c in zip(("theta", "scale", "epsilon"), "TSE", strict=True)
+}
+
+# Windows end where the driven axes have turned by this much, rad: short enough to see the earth's rate come and go.
+_WINDOW_ANGLE = np.pi / 4
+# Less than this over, rad, does not make a window of its own.
+_CRUMB = 2e-3
+# Groups and windows of fewer gyro samples than this are the crumbs of rounding.
+_FEWEST_SAMPLES = 4
+# A gyro that departs from the encoders by more than this share of the rate is not the gyro of this axis.
+_DISAGREEMENT = 0.01
+# A bias that does not walk walks this little, rad/s/sqrt(s), so that a smoother can forget the groups behind it.
+_LEAST_WALK = 1e-12
+# So many groups stay in a smoother whatever its window, s: a schedule of four positions, to be linearised anew when its
+# later positions move the angles that its earlier ones left open.
+_KEPT = 64
+# Encoder errors are in part slow (harmonics) if the config's noise is this much larger than the scatter at rest.
+_SLOW = 2.0
+# The other axis stands at the same angle when it differs by less than half of this, deg.
+_SAME_ANGLE_DEG = 5.0
+# Of the trajectory, Hz.
+_ATTITUDE_RATE = 10.0
+
+
+@dataclass(frozen=True)
+class Group:
+    """Adjoining windows of one run and what was measured in them.
+
+    Attributes:
+        kind: "turn" for a whole turn, "move" for less, "dwell".
+        run: the run it is part of.
+        gyro: (n, 3) mean rates in m, rad/s.
+        rates: the platform's mean rates.
+    """
+
+    kind: str
+    run: Run
+    gyro: Array
+    rates: PlatformRates
+
+    @property
+    def duration(self) -> float:
+        """Length, s."""
+        return float(self.rates.edges[-1] - self.rates.edges[0])
+
+    @property
+    def mean_gyro(self) -> Array:
+        """(3,) mean rate over the whole group, rad/s."""
+        return np.asarray(np.diff(self.rates.edges) @ self.gyro / self.duration)
+
+    @property
+    def mean_platform(self) -> Array:
+        """(3,) mean rate of the platform over the whole group with perpendicular axes, in t, rad/s."""
+        return np.asarray(np.diff(self.rates.edges) @ (self.rates.fixed + self.rates.cosine) / self.duration)
+
+    @property
+    def position(self) -> tuple[str, int] | None:
+        """The axis that turns and at which angle the other stands, in steps; None when not one axis turns alone."""
+        if self.run.axis not in ("outer", "inner"):
+            return None
+        steps = round(360.0 / _SAME_ANGLE_DEG)
+        return self.run.axis, round(np.rad2deg(self.run.other) / _SAME_ANGLE_DEG) % steps
+
+
+@dataclass(frozen=True)
+class _Model:
+    """The recording prepared for the graph: what every step needs."""
+
+    data: IndexerData
+    motion: AxisMotion
+    groups: tuple[Group, ...]
+    bias: WalkingBias
+    density: float
+    encoder: float
+    slow: float  # sigma of the platform's tilt that comes again with every turn, rad; 0: none
+    parameters: tuple[Parameter, ...]
+    theta_guess: Array
+    bias_guess: Array
+    frames: NDArray[np.intp]  # (F,) indexes of the gyro samples whose attitude the trajectory holds
+    frame_edges: NDArray[np.intp]  # (groups + 1,) which of them come with a group
+
+    @property
+    def options(self) -> tuple[Option, ...]:
+        """The factor's options that are parameters."""
+        given = {p.key for p in self.parameters}
+        names: tuple[Option, ...] = ("scale", "epsilon")
+        return tuple(name for name in names if _KEYS[name] in given)
+
+
+def problem(data: IndexerData, config: Config) -> Problem:
+    """The graph of an indexer recording.
+
+    Raises:
+        InputError: an unknown parameter in the config, no rotation, no latitude although the windows need it, or gyro
+            and encoders that disagree.
+    """
+    model, dropped = _prepare(data, config)
+    return Problem(
+        method="indexer",
+        parameters=model.parameters,
+        steps=partial(_steps, model),
+        attitudes=partial(_attitudes, model) if len(model.frames) else None,
+        attitude_name="nRb",
+        advice=_advice,
+        dropped=dropped,
+    )
+
+
+def compensated(data: IndexerData, config: Config, values: Mapping[str, float]) -> tuple[Attitudes, Attitudes]:
+    """The carrier's attitude nRb from the INS's, without and with the calibration, at all gyro samples.
+
+    nRb = nRm mRt tRb(outer, inner); without calibration mRt is the identity and the axes are perpendicular.
+
+    Args:
+        data: a session with the attitude nRm that the INS puts out.
+        config: of the session.
+        values: calibrated parameters by name, those of `calibration.yaml`.
+
+    Raises:
+        InputError: the session holds no attitude.
+    """
+    check_names(values, NAMES, "parameters")
+    if data.attitude is None:
+        raise InputError(
+            f"topic {config.topic('imu')}: no orientation in its messages; validation needs the INS's attitude"
+        )
+    motion = axis_motion(data)
+    rows = np.flatnonzero((data.gyro_t >= motion.t[0]) & (data.gyro_t <= motion.t[-1]))
+    theta = np.array([values.get(name, 0.0) for name in THETA])
+    epsilon = values.get(NONPERPENDICULARITY[0], 0.0)
+    before = _carrier(data, motion, rows, np.zeros(3), 0.0)
+    return Attitudes(data.gyro_t[rows], before), Attitudes(
+        data.gyro_t[rows], _carrier(data, motion, rows, theta, epsilon)
+    )
+
+
+def validate(data: IndexerData, config: Config, values: Mapping[str, float]) -> tuple[Array, Array, Array]:
+    """Times (n,), s, and the error of the attitude output nRb, (n, 3) rad about the carrier's axes, before and after.
+
+    The carrier is the indexer's base; it stands still at the config's `indexer.base_attitude`.
+
+    Raises:
+        InputError: as `compensated`.
+    """
+    before, after = compensated(data, config, values)
+    bRn = so3.inverse(np.array(config.indexer.base_attitude))
+    return before.time, so3.log(so3.multiply(bRn, before.wxyz)), so3.log(so3.multiply(bRn, after.wxyz))
+
+
+def groups_of(data: IndexerData, config: Config, motion: AxisMotion) -> tuple[Group, ...]:
+    """The groups of a recording in time order; none shares an encoder sample with another."""
+    nRbase = np.array(config.indexer.base_attitude)
+    latitude = data.latitude_deg
+    earth = np.zeros(3) if latitude is None else earth_rate(np.deg2rad(latitude))
+    path = AxisPath(motion.t, motion.angles[:, 0], motion.angles[:, 1], so3.rotate(so3.inverse(nRbase), earth))
+    edges = gyro_edges(data.gyro_t)
+    groups: list[Group] = []
+    free_from = -np.inf
+    for run in motion.runs:
+        for kind, borders in _borders(motion, run):
+            inside = np.flatnonzero((edges >= max(run.start, free_from)) & (edges <= run.stop))
+            if len(inside) <= _FEWEST_SAMPLES:
+                continue
+            nearest = np.searchsorted(0.5 * (edges[1:] + edges[:-1]), borders)
+            cuts = np.unique(np.clip(nearest, inside[0], inside[-1]))
+            cuts = cuts[np.concatenate([[True], np.diff(cuts) >= _FEWEST_SAMPLES])]
+            if len(cuts) < 2:
+                continue
+            groups.append(Group(kind, run, gyro_means(data.gyro_t, data.gyro, cuts), path.rates(edges[cuts])))
+            # The last edge lies between two encoder samples; the next group starts behind them.
+            after = np.searchsorted(motion.t, edges[cuts[-1]], side="right") + 1
+            free_from = motion.t[min(after, len(motion.t) - 1)]
+    return tuple(groups)
+
+
+def _borders(motion: AxisMotion, run: Run) -> Iterator[tuple[str, Array]]:
+    """For each group of a run its kind and the times at which its windows begin and end."""
+    if run.axis == "none":
+        yield "dwell", np.array([run.start, run.stop])
+        return
+    first, last = np.searchsorted(motion.t, [run.start, run.stop])
+    rows = slice(first, last + 1)
+    t, angles = motion.t[rows], motion.angles[rows]
+    driven = {"outer": [0], "inner": [1]}.get(run.axis, [0, 1])
+    path = np.maximum.accumulate(np.abs(angles[:, driven] - angles[0, driven]).sum(axis=1))
+    # The ends are the run's, at rest; a crossing searched for in a resting encoder would pick its noise.
+    levels = np.arange(_WINDOW_ANGLE, path[-1] - _CRUMB, _WINDOW_ANGLE)
+    borders = np.concatenate([[run.start], np.interp(levels, path, t), [run.stop]])
+    per_turn = round(2.0 * np.pi / _WINDOW_ANGLE)
+    for first in range(0, len(borders) - 1, per_turn):
+        turned = path[-1] - first * _WINDOW_ANGLE
+        yield "turn" if turned > 2.0 * np.pi - _CRUMB else "move", borders[first : first + per_turn + 1]
+
+
+def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]:
+    parameters = _parameters(config)
+    motion = axis_motion(data)
+    density = config.noise.pick("gyro_density", data.gyro_density)
+    encoder = config.noise.pick("encoder", None)
+    groups = groups_of(data, config, motion)
+    if not any(g.kind != "dwell" for g in groups):
+        raise InputError("indexer: no turn or move is free of gaps in the stamps; record again")
+    if data.latitude_deg is None:
+        shortest = max(float(np.diff(g.rates.edges).max()) for g in groups)
+        if density / np.sqrt(shortest) < EARTH_RATE:
+            raise InputError(
+                f"indexer: the earth's rate shows in windows of {shortest:.3g} s and the latitude is not known; "
+                f"record {config.topic('fix')} or give latitude_deg in the config"
+            )
+    groups, disagreeing = _agreeing(groups, config)
+    theta_guess, bias_guess = _guess(groups)
+    starts = np.array([g.rates.edges[0] for g in groups])
+    walk = max(config.noise.pick("gyro_bias_walk", None), _LEAST_WALK)
+    scatter = _scatter(motion)
+    frames = _frames(data, motion)
+    reasons = {
+        "turn cut by a gap in the stamps (what lies before and after is used)": _cut_turns(motion),
+        "turn in which gyro and encoder disagree by more than 1 %": disagreeing,
+    }
+    dropped = {**data.dropped, **{reason: number for reason, number in reasons.items() if number}}
+    model = _Model(
+        data=data,
+        motion=motion,
+        groups=groups,
+        bias=WalkingBias(np.append(starts, groups[-1].rates.edges[-1]), walk),
+        density=density,
+        encoder=encoder,
+        slow=float(np.sqrt(encoder**2 - scatter**2)) if encoder > _SLOW * scatter else 0.0,
+        parameters=parameters,
+        theta_guess=theta_guess,
+        bias_guess=bias_guess,
+        frames=frames,
+        frame_edges=np.append(0, np.searchsorted(data.gyro_t[frames], np.append(starts[1:], np.inf))),
+    )
+    return model, dropped
+
+
+def _parameters(config: Config) -> tuple[Parameter, ...]:
+    """The method's parameters with their priors; options only where the config gives them a prior other than 0."""
+    check_names(config.priors, NAMES, "priors")
+    check_names(config.require, NAMES, "require")
+
+    def several(names: Sequence[str], unit: str, scale: float, require: float, default: float) -> tuple[Quantity, ...]:
+        return tuple(
+            Quantity(name, unit, config.priors.get(name, default), scale, config.require.get(name, require))
+            for name in names
+        )
+
+    bias_key = WalkingBias(np.zeros(2), 0.0).key(0)
+    parameters = [
+        Parameter(_KEYS["theta"], several(THETA, "rad", 0.1, 5e-5, 0.1)),
+        Parameter(bias_key, several(BIAS, "rad/s", 1e-3, 1e-5, 1e-3)),
+    ]
+    if any(config.priors.get(name, 0.0) != 0.0 for name in SCALE):
+        parameters.append(Parameter(_KEYS["scale"], several(SCALE, "1", 0.01, 1e-3, 0.0)))
+    if config.priors.get(NONPERPENDICULARITY[0], 0.0) != 0.0:
+        parameters.append(Parameter(_KEYS["epsilon"], several(NONPERPENDICULARITY, "rad", 1e-2, 5e-5, 0.0)))
+    return tuple(parameters)
+
+
+def _agreeing(groups: tuple[Group, ...], config: Config) -> tuple[tuple[Group, ...], int]:
+    """The groups whose gyro follows the encoders, and how many do not.
+
+    Fits gyro = A w + b over all groups, so that neither mounting nor bias counts as disagreement.
+
+    Raises:
+        InputError: the gyro turns against the encoder of an axis, or at a rate that differs by more than 1 % and by
+            more than the priors of the gyro's scale allow.
+    """
+    w = np.array([g.mean_platform for g in groups])
+    gyro = np.array([g.mean_gyro for g in groups])
+    moving = np.array([g.position is not None for g in groups])
+    speed = np.linalg.norm(w, axis=1)
+    weight = np.array([g.duration for g in groups])
+    for _ in range(10):
+        A, b = _fit(w, gyro, weight)
+        misfit = np.linalg.norm(gyro - w @ A.T - b, axis=1)
+        # Least absolute misfit: one damaged turn does not bend the fit.
+        weight = np.array([g.duration for g in groups]) / np.maximum(misfit, 1e-4 * speed.max())
+    allowed = _DISAGREEMENT + 3.0 * max(
+        [np.inf if config.priors.get(name, 0.0) is None else config.priors.get(name, 0.0) or 0.0 for name in SCALE]
+    )
+    for axis, name in (("outer", "outer_x"), ("inner", "inner_z")):
+        mine = [i for i, g in enumerate(groups) if g.run.axis == axis]
+        if not mine:
+            continue
+        unit = w[mine] / speed[mine, None]
+        along = float(np.median(((unit @ A.T) * unit).sum(axis=1)))
+        gain = float(np.median(np.linalg.norm(unit @ A.T, axis=1)))
+        if along < 0.0:
+            raise InputError(
+                f"indexer: gyro and encoder of the axis {name} disagree in sign; check the directions of both"
+            )
+        if abs(gain - 1.0) > allowed:
+            raise InputError(
+                f"indexer: about the axis {name} the gyro turns at {100.0 * gain:.4g} % of the encoder's rate, more "
+                "than 1 % off; check units and gear, or free the gyro's scale (priors: gyro_scale_x ...)"
+            )
+    good = ~moving | (misfit <= _DISAGREEMENT * np.maximum(speed, 0.1 * speed.max()))
+    return tuple(g for g, ok in zip(groups, good, strict=True) if ok), int((~good).sum())
+
+
+def _fit(w: Array, gyro: Array, weight: Array) -> tuple[Array, Array]:
+    """A (3, 3) near the identity and b (3,) near zero with gyro = A w + b in weighted least squares."""
+    rows = np.column_stack([w, np.ones(len(w))])
+    # What no rotation excites stays with the prior: a mounting of some degrees, a bias below 1e-3 rad/s.
+    hold = 1e-6 * weight.sum() * np.array([*[np.mean((w**2).sum(axis=1))] * 3, 1.0])
+    normal = (rows * weight[:, None]).T @ rows + np.diag(hold)
+    right = (rows * weight[:, None]).T @ gyro
+    right[:3] += np.diag(hold[:3])
+    solution = np.linalg.solve(normal, right)
+    return np.asarray(solution[:3].T), np.asarray(solution[3])
+
+
+def _guess(groups: tuple[Group, ...]) -> tuple[Array, Array]:
+    """First guess of theta (3,) and the bias (3,): the rotation that best takes the platform's rates to the gyro's."""
+    w = np.array([g.mean_platform for g in groups])
+    gyro = np.array([g.mean_gyro for g in groups])
+    weight = np.array([g.duration for g in groups])
+    b = _fit(w, gyro, weight)[1]
+    moment = ((gyro - b) * weight[:, None]).T @ w
+    # A trace of the identity decides what one axis alone leaves open.
+    u, _, vt = np.linalg.svd(moment + 1e-6 * np.linalg.norm(moment) * np.eye(3))
+    mRt = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return mounting_angles(so3.inverse(so3.from_matrix(mRt))), b
+
+
+def _scatter(motion: AxisMotion) -> float:
+    """Noise from encoder sample to encoder sample while the axes rest, rad; 0 if they never do."""
+    spread = []
+    for run in motion.runs:
+        if run.axis == "none":
+            rows = slice(*np.searchsorted(motion.t, [run.start, run.stop]))
+            second = np.diff(motion.angles[rows], n=2, axis=0)[3:-3]
+            if len(second):
+                spread.append(np.sqrt((second**2).mean() / 6.0))
+    return float(np.median(spread)) if spread else 0.0
+
+
+def _cut_turns(motion: AxisMotion) -> int:
+    """Number of gaps during which an axis turned."""
+    return sum(
+        any(run.axis != "none" and (run.stop in (start,) or run.start in (stop,)) for run in motion.runs)
+        for start, stop in motion.gaps
+    )
+
+
+def _steps(model: _Model, chunk: int) -> Iterator[Step]:
+    """A step for every group; in batch (chunk > 1) its factor is handed over compressed."""
+    seen: set[tuple[str, int]] = set()
+    for i, group in enumerate(model.groups):
+        initial = gtsam.Values()
+        factors: list[Factor] = []
+        if i == 0:
+            _begin(model, initial, factors)
+        stand_ins = _bias_step(model, i, initial, factors)
+        factors.append(_measurement(model, i, seen, initial, factors, compress=chunk > 1))
+        yield Step(
+            time=float(group.rates.edges[-1]),
+            initial=initial,
+            factors=factors,
+            timestamps=_timestamps(model, i),
+            stand_ins=stand_ins,
+            keyframes=range(int(model.frame_edges[i]), int(model.frame_edges[i + 1])),
+        )
+
+
+def _begin(model: _Model, initial: gtsam.Values, factors: list[Factor]) -> None:
+    """The calibration variables and their priors."""
+    guesses = {_KEYS["theta"]: model.theta_guess, model.bias.key(0): model.bias_guess}
+    for parameter in model.parameters:
+        size = len(parameter.quantities)
+        initial.insert(parameter.key, guesses.get(parameter.key, np.zeros(size)))
+        factors.append(vector_prior(parameter, np.zeros(size)))
+
+
+def _bias_step(model: _Model, i: int, initial: gtsam.Values, factors: list[Factor]) -> dict[int, int]:
+    """Adds the bias of a group and the mean so far; returns what holds the reported bias from now on."""
+    if i == 0:
+        return {}
+    initial.insert(model.bias.key(i), model.bias_guess)
+    initial.insert(model.bias.mean_key(i), model.bias_guess)
+    factors += [model.bias.walk_factor(i), model.bias.mean_factor(i)]
+    return {model.bias.key(0): model.bias.mean_key(i)}
+
+
+def _measurement(
+    model: _Model, i: int, seen: set[tuple[str, int]], initial: gtsam.Values, factors: list[Factor], compress: bool
+) -> Factor:
+    """The factor of a group; adds the tilt of its position when that is new."""
+    group = model.groups[i]
+    options = model.options
+    columns = [_KEYS["theta"], model.bias.key(i), *(_KEYS[name] for name in options)]
+    if model.slow > 0.0 and group.position is not None:
+        axis, step = group.position
+        key = int(gtsam.symbol("o" if axis == "outer" else "i", step))
+        if group.position not in seen:
+            seen.add(group.position)
+            initial.insert(key, np.zeros(3))
+            noise = gtsam.noiseModel.Isotropic.Sigma(3, model.slow)
+            factors.append(Factor("prior", gtsam.PriorFactorVector(key, np.zeros(3), noise)))
+        options, columns = (*options, "tilt"), [*columns, key]
+    average = IndexerAverageFactor.of(group.gyro, group.rates, model.density, model.encoder, options)
+    kinds = [3, 3, *(1 if name == "epsilon" else 3 for name in options)]
+    return Factor.of(group.kind, VectorizedFactor(average, columns, kinds, compress=compress))
+
+
+def _timestamps(model: _Model, i: int) -> dict[int, float]:
+    """The biases of the last groups stay alive, and so does the mean so far; what the groups share never ages."""
+    now = float(model.groups[i].rates.edges[-1])
+    keys = [model.bias.key(k) for k in range(max(0, i + 1 - _KEPT), i + 1)]
+    keys += [model.bias.mean_key(k) for k in range(max(0, i - 1), i + 1)]
+    return dict.fromkeys(keys, now)
+
+
+def _frames(data: IndexerData, motion: AxisMotion) -> NDArray[np.intp]:
+    """Gyro samples for the trajectory; none when the INS puts out no attitude."""
+    if data.attitude is None:
+        return np.empty(0, dtype=np.intp)
+    stride = max(1, round(1.0 / (_ATTITUDE_RATE * float(np.median(np.diff(data.gyro_t))))))
+    return np.flatnonzero((data.gyro_t >= motion.t[0]) & (data.gyro_t <= motion.t[-1]))[::stride]
+
+
+def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) -> Attitudes:
+    """The carrier's attitude nRb."""
+    rows = model.frames[list(keyframes)]
+    epsilon = float(values.atVector(_KEYS["epsilon"])[0]) if "epsilon" in model.options else 0.0
+    theta = np.asarray(values.atVector(_KEYS["theta"]))
+    return Attitudes(model.data.gyro_t[rows], _carrier(model.data, model.motion, rows, theta, epsilon))
+
+
+def _carrier(data: IndexerData, motion: AxisMotion, rows: NDArray[np.intp], theta: Array, epsilon: float) -> Array:
+    """nRb = nRm mRt tRb at gyro samples."""
+    assert data.attitude is not None
+    outer, inner = (np.interp(data.gyro_t[rows], motion.t, angle) for angle in motion.angles.T)
+    mRb = so3.multiply(so3.inverse(mounting(theta)), so3.inverse(base_from_platform(outer, inner, epsilon)))
+    return so3.multiply(data.attitude[rows], mRb)
+
+
+def _advice(weights: Mapping[str, float]) -> str:
+    """The motion that would make a weak direction observable."""
+    strongest = {name for name, w in weights.items() if abs(w) > 0.3}
+    if strongest & set(NONPERPENDICULARITY):
+        return "the axes' right angle needs turns about both axes, the outer one with the inner at 0 and at 180 degrees"
+    if strongest & set(SCALE):
+        return (
+            "the gyro's scale needs turns about each of its axes: the outer axis with the inner at 0 and at 90 degrees"
+        )
+    if "theta_x" in strongest:
+        return "theta_x needs turns about the inner axis, forward and back (positions 3 and 4), or the moves recorded"
+    if "theta_z" in strongest:
+        return "theta_z needs turns about the outer axis, forward and back (positions 1 and 2)"
+    if "theta_y" in strongest:
+        return "theta_y needs whole turns about either axis, forward and back"
+    return "the gyro bias needs turns forward and back, or longer dwells"
