@@ -277,7 +277,7 @@ def _refine(camera: Camera, tags: TagBody, pixels: Array, cRb: Array, position: 
     import pycolmap
 
     options = pycolmap.AbsolutePoseRefinementOptions()
-    options.gradient_tolerance = 1e-8
+    options.gradient_tolerance = 1e-5
     # Its loss is Cauchy's. This wide (px) it is least squares; much wider, its log(1 + r^2 / scale^2) loses the digits.
     options.loss_function_scale = 100.0
     corners = tags.corners

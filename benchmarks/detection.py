@@ -1,0 +1,119 @@
+"""Pictures per second of tag detection, and corner errors beside OpenCV's: `python -m benchmarks.detection`."""
+
+from __future__ import annotations
+
+import time
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import so3
+from pipelines.simulation.rendering import Picture, Renderer, expose, tag_quad
+from pipelines.vision.camera import Camera
+from pipelines.vision.tags import detect
+
+Array = NDArray[np.float64]
+
+_FACING = so3.exp([np.pi, 0.0, 0.0])
+_SIZE = 0.1
+_CORNERS = 0.5 * _SIZE * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+_OFFICIAL = [1, 0, 3, 2]  # of OpenCV's corners
+# distance (m), blur (px), noise (grey levels)
+_CASES = {"near": (0.4, 0.6, 2.0), "far": (1.7, 0.7, 2.0), "blurred": (0.6, 2.0, 2.0), "noisy": (0.5, 0.7, 8.0)}
+_PICTURES = 40
+
+
+def _aruco(method: int) -> cv2.aruco.ArucoDetector:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = method
+    return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11), parameters)
+
+
+def _by_opencv(detector: cv2.aruco.ArucoDetector, picture: Picture) -> Array | None:
+    corners, ids, _ = detector.detectMarkers(picture)
+    return None if ids is None or len(ids) != 1 else np.asarray(corners[0][0][_OFFICIAL], dtype=float)
+
+
+def _pictures(camera: Camera, case: tuple[float, float, float]) -> list[tuple[Picture, Array]]:
+    """Rendered tags and their true corners."""
+    distance, blur, noise = case
+    renderer, out = Renderer(camera), []
+    for k in range(_PICTURES):
+        rng = np.random.default_rng(k)
+        z = distance * rng.uniform(0.8, 1.2)
+        room = np.maximum(np.array([300.0, 220.0]) - 0.8 * _SIZE * 600 / z, 5.0)
+        position = np.append(rng.uniform(-1, 1, 2) * room / 600 * z, z)
+        tilt, roll = rng.normal(scale=0.3, size=2), rng.uniform(-np.pi, np.pi)
+        cRt = so3.compose(so3.exp([*tilt, 0.0]), so3.exp([0.0, 0.0, roll]), _FACING)
+        light = renderer.radiance([tag_quad(k, _SIZE, cRt, position)], 60.0)
+        out.append((expose(light, blur, noise, rng), camera.project(position + so3.rotate(cRt, _CORNERS))))
+    return out
+
+
+def corner_errors() -> None:
+    """Prints RMS error and bias, px per axis, of each way to find corners."""
+    K = np.array([[600.0, 0, 320.3], [0, 605.0, 239.1], [0, 0, 1]])
+    camera = Camera(640, 480, K, "plumb_bob", np.array([-0.25, 0.1, 1e-3, -5e-4, 0.02]))
+    detectors = {
+        "plain": _aruco(cv2.aruco.CORNER_REFINE_NONE),
+        "SUBPIX": _aruco(cv2.aruco.CORNER_REFINE_SUBPIX),
+        "APRILTAG": _aruco(cv2.aruco.CORNER_REFINE_APRILTAG),
+    }
+    print(f"corner error, px per axis: RMS (bias), {_PICTURES} pictures each")
+    print(f"{'':10s}" + "".join(f"{name:>20s}" for name in [*detectors, "alidade"]))
+    for name, case in _CASES.items():
+        pictures = _pictures(camera, case)
+        row = [_summary([(_by_opencv(d, picture), true) for picture, true in pictures]) for d in detectors.values()]
+        row.append(_summary([(_by_us(camera, picture), true) for picture, true in pictures]))
+        print(f"{name:10s}" + "".join(f"{cell:>20s}" for cell in row))
+
+
+def _by_us(camera: Camera, picture: Picture) -> Array | None:
+    found = detect(picture, camera=camera)
+    return found.corners[0] if len(found) == 1 else None
+
+
+def _summary(pairs: list[tuple[Array | None, Array]]) -> str:
+    errors = np.array([found - true for found, true in pairs if found is not None])
+    return f"{np.sqrt((errors**2).mean()):.3f} ({errors.mean():+.3f})"
+
+
+def speed(rounds: int = 40) -> None:
+    """Prints pictures/s on one core for a 1280x960 picture of a tag cube before a textured background."""
+    K = np.array([[1150.0, 0, 641.3], [0, 1150.0, 477.8], [0, 0, 1]])
+    camera = Camera(1280, 960, K, "plumb_bob", np.array([-0.2, 0.05, 0.0, 0.0, 0.0]))
+    rng = np.random.default_rng(0)
+    cRb, position = so3.multiply(so3.exp([0.6, -0.5, 0.3]), _FACING), np.array([0.05, 0.02, 0.6])
+    # Three faces of a cube: z, x and y of the body stick out of them.
+    faces = so3.exp([[0.0, 0, 0], [0, np.pi / 2, 0], [-np.pi / 2, 0, 0]])
+    out = so3.rotate(faces, [0.0, 0.0, 0.08])
+    quads = [tag_quad(16 + k, 0.12, so3.multiply(cRb, faces[k]), position + so3.rotate(cRb, out[k])) for k in range(3)]
+    clutter = cv2.GaussianBlur(rng.normal(scale=200.0, size=(960, 1280)), (0, 0), 4.0) + 90.0
+    renderer = Renderer(camera)
+    start = time.perf_counter()
+    light = renderer.radiance(quads, clutter)
+    rendering = time.perf_counter() - start
+    picture = expose(light, 0.7, 2.0, rng)
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    plain = _aruco(cv2.aruco.CORNER_REFINE_NONE)
+    opencv, ours = (
+        float(np.median([_seconds(run, picture) for _ in range(rounds)]))
+        for run in (plain.detectMarkers, lambda p: detect(p, camera=camera))
+    )
+    cv2.setNumThreads(threads)
+    print(f"1280x960, tags {detect(picture, camera=camera).ids.tolist()} before clutter, one core:")
+    print(f"  OpenCV plain {1 / opencv:.0f} pictures/s, with refined corners {1 / ours:.0f} pictures/s")
+    print(f"  rendering {1e3 * rendering:.0f} ms a picture")
+
+
+def _seconds(run: object, picture: Picture) -> float:
+    start = time.process_time()
+    run(picture)  # type: ignore[operator]
+    return time.process_time() - start
+
+
+if __name__ == "__main__":
+    corner_errors()
+    speed()
