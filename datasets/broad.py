@@ -64,7 +64,7 @@ def read_trial(path: Path) -> Trial:
     from scipy.io import loadmat
 
     try:
-        content = loadmat(path)
+        content = loadmat(str(path), appendmat=False)
         gyro = content["imu_gyr"]
         return Trial(
             t=np.arange(len(gyro)) / float(content["sampling_rate"].item()),
