@@ -7,7 +7,7 @@ Python call for 20 measurements costs little more than for one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -82,6 +82,26 @@ class TruncatedLoss:
         return self.gate**2 * self.mu / (self.mu + 1.0), self.gate**2 * (self.mu + 1.0) / self.mu
 
 
+class _Evaluation:
+    """A model's residuals at some values, and its Jacobians once asked for."""
+
+    def __init__(self, variables: list[Any], residuals: Array, linearize: Callable[[], tuple[Array, ...]]) -> None:
+        self.variables = variables
+        self.residuals = residuals
+        self._linearize: Callable[[], tuple[Array, ...]] | None = linearize
+        self._jacobians: tuple[Array, ...] = ()
+
+    def jacobians(self) -> tuple[Array, ...]:
+        if self._linearize is not None:
+            self._jacobians, self._linearize = self._linearize(), None
+        return self._jacobians
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Whether two values of a variable, Rot3 or vector, are equal to the last bit."""
+    return bool(a.equals(b, 0.0)) if isinstance(a, gtsam.Rot3) else a.tobytes() == b.tobytes()
+
+
 @dataclass
 class VectorizedFactor:
     """A model tied to variables: what a gtsam graph takes (`.factor`) and what reports ask for (`.residuals`).
@@ -119,31 +139,49 @@ class VectorizedFactor:
         unknowns = sum(3 if kind == "rotation" else kind for kind in self.kinds)
         rows = unknowns + 1 if self.compress else len(self.model.time) * self.model.rows
         self.factor = gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), self.keys, self._evaluate)
+        self._reads = [
+            (key, kind == "rotation")
+            for column, kind in zip(self.columns, self.kinds, strict=True)
+            for key in ([column] if isinstance(column, int) else column)
+        ]
+        self._last: _Evaluation | None = None
 
     def residuals(self, values: gtsam.Values) -> Array:
         """Whitened residuals (n, m) at the values, outliers included."""
-        return self.model(*self._gather(values))[0]
+        return self._at(values).residuals
 
     def used(self, values: gtsam.Values) -> NDArray[np.bool_]:
         """Which of the n measurements lie inside the gate."""
         square = (self.residuals(values) ** 2).sum(axis=1)
         return np.ones(len(square), dtype=bool) if self.loss is None else square < self.loss.gate**2
 
-    def _gather(self, values: gtsam.Values) -> list[Array]:
+    def _at(self, values: gtsam.Values) -> _Evaluation:
+        """The model at the values.
+
+        The last evaluation is kept: a solver asks for the error, then for the Jacobians at the same values, and a
+        smoother asks again and again while its linearisation point stays.
+        """
+        variables = [values.atRot3(k) if rotation else values.atVector(k) for k, rotation in self._reads]
+        if self._last is None or not all(map(_same, variables, self._last.variables)):
+            self._last = _Evaluation(variables, *self.model(*self._blocks(variables)))
+        return self._last
+
+    def _blocks(self, variables: list[Any]) -> Iterator[Array]:
+        """For each column its variables' values, (n, 4) or (n, d)."""
         n = len(self.model.time)
-        blocks = []
+        start = 0
         for column, kind in zip(self.columns, self.kinds, strict=True):
-            keys = [column] if isinstance(column, int) else column
+            stop = start + (1 if isinstance(column, int) else len(column))
             if kind == "rotation":
-                xyzw = np.array([values.atRot3(k).toQuaternion().coeffs() for k in keys])  # type: ignore[attr-defined]
-                block = xyzw[:, [3, 0, 1, 2]]
+                block = np.array([r.toQuaternion().coeffs() for r in variables[start:stop]])[:, [3, 0, 1, 2]]
             else:
-                block = np.array([values.atVector(k) for k in keys])
-            blocks.append(np.broadcast_to(block, (n, block.shape[1])))
-        return blocks
+                block = np.array(variables[start:stop])
+            yield np.broadcast_to(block, (n, block.shape[1]))
+            start = stop
 
     def _evaluate(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        residuals, linearize = self.model(*self._gather(values))
+        evaluation = self._at(values)
+        residuals = evaluation.residuals
         square = (residuals * residuals).sum(axis=1)
         if jacobians is None:
             if self.loss is None and not self.compress:
@@ -152,7 +190,7 @@ class VectorizedFactor:
             error = np.zeros(self.factor.dim())
             error[0] = np.sqrt(cost.sum())
             return error
-        blocks = linearize()
+        blocks = evaluation.jacobians()
         if self.loss is not None:
             root = np.sqrt(self.loss.weight(square))[:, None]
             residuals = root * residuals

@@ -101,7 +101,8 @@ class Step:
     Attributes:
         time: s from the session's start.
         initial: the new variables, with values taken from the data around them (batch).
-        factors: the new factors.
+        factors: the new factors. Those that are no measurements must by themselves determine the new variables: the
+            innovation of a measurement is judged against that prediction.
         predict: the new variables from the current estimate (incremental); None means `initial` serves.
         timestamps: variable -> time of last use, s. A smoother with a window forgets a variable when its time leaves
             the window; one that is named in no step is kept for good. Repeat a key to keep it alive.

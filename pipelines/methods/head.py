@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from factors import so3
 from factors.attitude import VisionAttitudeFactor, ahrs_factors
 from factors.chi_square import gate
+from factors.earth import EARTH_RATE
 from factors.preintegration import GyroPath
-from factors.vectorized import TruncatedLoss, VectorizedFactor
+from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
 from pipelines.errors import InputError
 from pipelines.methods.base import (
     Array,
@@ -33,10 +34,11 @@ from pipelines.methods.base import (
 )
 from pipelines.methods.priors import rotation_prior, vector_prior
 from pipelines.methods.walking_bias import WalkingBias
-from pipelines.sessions.config import Config
+from pipelines.sessions.config import Config, first_given
 from pipelines.sessions.head import HeadData
 
-EARTH_RATE = 7.292115e-5
+# Noise where neither the config nor the messages give it (contract's defaults).
+_GYRO_DENSITY, _BIAS_WALK, _PLATFORM_DENSITY, _VISION_SIGMA = 5.0e-5, 1.0e-6, 1.0e-5, 8.7e-3
 
 # Without vision for longer than this, s, a keyframe is set in between: gtsam corrects an increment for the bias to
 # first order only.
@@ -97,12 +99,14 @@ def _prepare(data: HeadData, config: Config) -> _Model:
             f"at least {_FEWEST_FRAMES} are needed: check the topics and their clocks"
         )
     vision_t, measured = data.vision_t[inside], data.vision_wxyz[inside]
-    density = config.noise.pick("gyro_density", data.gyro_density)
+    density = first_given(config.noise.gyro_density, data.gyro_density, _GYRO_DENSITY)
     platform_density = 0.0
     platform = None
     if data.platform_t is not None and data.platform_gyro is not None:
         platform = GyroPath(data.platform_t, data.platform_gyro)
-        platform_density = config.noise.pick("platform_gyro_density", data.platform_gyro_density)
+        platform_density = first_given(
+            config.noise.platform_gyro_density, data.platform_gyro_density, _PLATFORM_DENSITY
+        )
     sqrt_information = _sqrt_information(data.vision_cov, inside, config)
 
     bRi = so3.identity(len(vision_t)) if platform is None else so3.inverse(platform.attitude(vision_t))
@@ -110,6 +114,7 @@ def _prepare(data: HeadData, config: Config) -> _Model:
     sigma = float(1.0 / np.median(np.linalg.norm(sqrt_information, axis=(1, 2)) / np.sqrt(3.0)))
     bias_hat, vRh = _guess(data, vision_t, iRh, sigma)
     time, vision = _keyframes(vision_t)
+    walk = first_given(config.noise.gyro_bias_walk, _BIAS_WALK)
     return _Model(
         time=time,
         vision=vision,
@@ -119,7 +124,7 @@ def _prepare(data: HeadData, config: Config) -> _Model:
         helmet=GyroPath(data.head_t, data.head_gyro, bias_hat),
         platform=platform,
         variance_rate=density**2 + platform_density**2,
-        bias=WalkingBias.over(time[0], time[-1], config.noise.pick("gyro_bias_walk", None), density),
+        bias=WalkingBias.over(time[0], time[-1], walk, density),
         bias_hat=bias_hat,
         loss=TruncatedLoss(gate(3)),
         parameters=_parameters(config, platform is not None),
@@ -130,7 +135,7 @@ def _prepare(data: HeadData, config: Config) -> _Model:
 def _sqrt_information(covariance: Array | None, inside: NDArray[np.bool_], config: Config) -> Array:
     """(n, 3, 3): from the config, else from the messages, else the default."""
     if covariance is None or config.noise.vision_attitude is not None:
-        sigma = config.noise.pick("vision_attitude", None)
+        sigma = first_given(config.noise.vision_attitude, _VISION_SIGMA)
         return np.broadcast_to(np.eye(3) / sigma, (int(inside.sum()), 3, 3))
     root: Array = np.linalg.cholesky(np.linalg.inv(covariance[inside]))
     return np.swapaxes(root, 1, 2)
@@ -291,14 +296,14 @@ def _vision_factor(model: _Model, keyframes: range) -> list[Factor]:
     rows_model = VisionAttitudeFactor(
         model.time[seen], model.measured[rows], model.sqrt_information[rows], model.helmet, model.platform
     )
-    columns = [
+    columns: list[int | list[int]] = [
         [_state(k) for k in seen],
         [model.bias.key(_node(model, k)) for k in seen],
         _CAMERA_KEY,
         _HELMET_KEY,
         _OFFSET_KEY,
     ]
-    kinds = ["rotation", 3, "rotation", "rotation", 1]
+    kinds: list[Kind] = ["rotation", 3, "rotation", "rotation", 1]
     return [Factor.of("vision", VectorizedFactor(rows_model, columns, kinds, model.loss))]
 
 
@@ -323,7 +328,7 @@ def _predict(model: _Model, keyframes: range, initial: gtsam.Values, current: gt
     out = gtsam.Values()
     previous = _node(model, keyframes.start - 1)
     bias = current.atVector(model.bias.key(previous))
-    for key in initial.keys():  # noqa: SIM118 (gtsam.Values is no mapping)
+    for key in initial.keys():
         if gtsam.Symbol(key).chr() in (ord("b"), ord("m")):
             out.insert(key, bias)
     attitude = so3.from_gtsam([current.atRot3(_state(keyframes.start - 1))])[0]

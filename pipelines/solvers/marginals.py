@@ -77,65 +77,75 @@ def reported_covariance(
 
 
 def chi_square(
+    problem: Problem,
     factors: Sequence[Factor],
     linear: gtsam.GaussianFactorGraph,
     ordering: gtsam.Ordering,
     values: gtsam.Values,
+    covariance: Array,
 ) -> ChiSquare:
-    """Sum of squares of the factors other than priors, with the degrees of freedom of each family.
+    """Sum of squares of measurements and processes (not of priors) and its degrees of freedom, whole and by family.
 
-    A family's degrees of freedom are its rows less its share of the unknowns, the trace of A S A' (A its whitened
-    Jacobian, S the joint covariance), here the mean of |A dx|^2 over samples dx of the posterior (fixed seed).
+    The whole: rows used, less unknowns, plus what the priors contribute to the unknowns. The families' shares are
+    sampled, the largest family's taken as what is left of the whole.
     """
-    families: dict[str, list[int]] = {}
-    for i, f in enumerate(factors):
-        families.setdefault(f.family, []).append(i)
-    try:
-        shares = _shares(families, linear, ordering)
-    except RuntimeError:  # singular: unknowns without information have no share
-        shares = dict.fromkeys(families, 0.0)
-    summary: dict[str, tuple[float, float]] = {}
-    for family, members in families.items():
-        if family in ("prior", "definition"):
+    value: dict[str, float] = {}
+    rows = 0
+    for f in factors:
+        if f.family in ("prior", "definition"):
+            rows += f.factor.dim() if f.family == "definition" else 0
             continue
-        value = rows = 0.0
-        for i in members:
-            measurement = factors[i].measurement
-            if measurement is None:
-                value += 2.0 * factors[i].factor.error(values)
-                rows += factors[i].factor.dim()
-            else:
-                used = measurement.used(values)
-                value += float((measurement.residuals(values)[used] ** 2).sum())
-                rows += measurement.model.rows * int(used.sum())
-        summary[family] = (value, rows - shares[family])
-    return ChiSquare(sum(v for v, _ in summary.values()), sum(d for _, d in summary.values()), summary)
+        if f.measurement is None:
+            square, count = 2.0 * f.factor.error(values), f.factor.dim()
+        else:
+            used = f.measurement.used(values)
+            square = float((f.measurement.residuals(values)[used] ** 2).sum())
+            count = f.measurement.model.rows * int(used.sum())
+        value[f.family] = value.get(f.family, 0.0) + square
+        rows += count
+    dof = rows - values.dim() + _from_priors(problem, covariance)
+    families = _family_dof([f.family for f in factors], linear, ordering)
+    largest = max(value, key=lambda family: families[family])
+    families[largest] = dof - sum(families[family] for family in value if family != largest)
+    return ChiSquare(sum(value.values()), dof, {family: (value[family], families[family]) for family in value})
 
 
-def _shares(
-    families: Mapping[str, Sequence[int]], linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
+def _from_priors(problem: Problem, covariance: Array) -> float:
+    """How many unknowns the priors determine: the sum of posterior over prior variance."""
+    share = 0.0
+    for q, variance in zip(problem.quantities, np.diag(covariance), strict=True):
+        if q.prior_sigma == 0.0:
+            share += 1.0
+        elif q.prior_sigma is not None:
+            share += min((variance - q.extra_sigma**2) / q.prior_sigma**2, 1.0)
+    return share
+
+
+def _family_dof(
+    families: Sequence[str], linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
 ) -> dict[str, float]:
-    """Number of unknowns each family determines."""
-    bayes_net = linear.eliminateSequential(ordering)
-    mean = bayes_net.optimize()
-    graphs = {family: gtsam.GaussianFactorGraph() for family in families}
-    for family, members in families.items():
-        for i in members:
-            graphs[family].add(linear.at(i))
-    at_mean = {family: graph.error(mean) for family, graph in graphs.items()}
-    sizes = {key: len(mean.at(key)) for key in linear.keyVector()}
-    shares = dict.fromkeys(families, 0.0)
+    """Expected sum of squares of each family: that of simulated unit noise after solving for the same unknowns."""
+    try:
+        bayes_net = linear.eliminateSequential(ordering)
+    except RuntimeError:  # singular: no sampling
+        return dict.fromkeys(families, 0.0)
+    rows = [gtsam.JacobianFactor(linear.at(i)) for i in range(len(families))]
+    zero = gtsam.VectorValues.Zero(bayes_net.optimize())
+    offsets = [factor.error_vector(zero) for factor in rows]
+    # Rejected measurements and free priors have empty rows, which are no measurements.
+    counted = [factor.jacobian()[0].any(axis=1) for factor in rows]
+    dof = dict.fromkeys(families, 0.0)
     generator = np.random.default_rng(0)
     for _ in range(_SAMPLES):
-        white = gtsam.VectorValues()
-        for key, size in sizes.items():
-            white.insert(key, generator.standard_normal(size))
-        departure = bayes_net.backSubstitute(white)
-        for family, graph in graphs.items():
-            # error is half the square; a pair mirrored at the optimum has no linear term
-            pair = graph.error(mean.add(departure)) + graph.error(mean.subtract(departure))
-            shares[family] += (pair - 2.0 * at_mean[family]) / _SAMPLES
-    return shares
+        noise = [generator.standard_normal(len(offset)) * mask for offset, mask in zip(offsets, counted, strict=True)]
+        projection = gtsam.VectorValues.Zero(zero)
+        for factor, y in zip(rows, noise, strict=True):
+            factor.transposeMultiplyAdd(1.0, y, projection)
+        x = bayes_net.backSubstitute(bayes_net.backSubstituteTranspose(projection))
+        for family, factor, y, offset in zip(families, rows, noise, offsets, strict=True):
+            left = factor.error_vector(x) - offset - y
+            dof[family] += float(left @ left) / _SAMPLES
+    return dof
 
 
 def _explain(message: str) -> str:
