@@ -182,11 +182,30 @@ class IndexerAverageFactor:
 
     @classmethod
     def of(
-        cls, gyro: Array, rates: PlatformRates, density: float, encoder: float, options: tuple[Option, ...] = ()
+        cls,
+        gyro: Array,
+        rates: PlatformRates,
+        density: float,
+        encoder: float,
+        options: tuple[Option, ...] = (),
+        wander: float = 0.0,
     ) -> IndexerAverageFactor:
-        """From gyro noise (rad/s/sqrt(Hz), angle random walk in each window) and encoder noise (rad, at the edges)."""
+        """From the noise of the sensors.
+
+        Args:
+            gyro, rates, options: as the attributes.
+            density: gyro noise, rad/s/sqrt(Hz): angle random walk in each window.
+            encoder: white encoder noise at the edges, rad.
+            wander: error of the encoders' account of the platform's attitude, about any axis, rad, that changes from
+                edge to edge: it turns the platform between the edges, and its mean turns the rate.
+        """
         covariance = encoder**2 * rates.noise @ rates.noise.T
         covariance += np.diag(np.repeat(density**2 / np.diff(rates.edges), 3))
+        ends = np.diff(np.eye(len(rates.edges)), axis=0) / np.diff(rates.edges)[:, None]
+        covariance += wander**2 * np.kron(ends @ ends.T, np.eye(3))
+        across = so3.hat(rates.fixed + rates.cosine)
+        for i, block in enumerate(across @ np.swapaxes(across, 1, 2)):
+            covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += wander**2 * block
         return cls(gyro, rates, np.linalg.inv(np.linalg.cholesky(covariance)), options)
 
     @property

@@ -147,6 +147,11 @@ class LosDirectionFactor:
 
         return residual, jacobians
 
+    def camera(self, angles: Array) -> Array:
+        """cRm (n, 4) at the stamps and mounting angles (n, d), rad."""
+        turned = self._camera(so3.identity(len(angles)), angles, self.gimbal)
+        return so3.from_matrix(turned[:, :3].transpose(2, 0, 1))
+
     def predict(self, tRm: Array, angles: Array) -> Array:
         """phx, phz and roll, (n, 3), rad, at attitudes tRm (n, 4) and angles (n, d)."""
         return _picture(self._camera(tRm, angles, self.gimbal)[:, :3])

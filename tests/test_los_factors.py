@@ -41,8 +41,7 @@ def _blocks(names: tuple[str, ...], size: float, off: float, dt: float | None) -
     rng = np.random.default_rng(2)
     angles = np.broadcast_to(size * rng.normal(size=len(names)), (N, len(names)))
     level = LosDirectionFactor(TIMES, np.zeros((N, 3)), np.tile(np.eye(3), (N, 1, 1)), GIMBAL.at(TIMES)[0], names)
-    cRm = level._camera(so3.identity(N), angles, level.gimbal)[:, :3].transpose(2, 0, 1)
-    tRm = so3.multiply(so3.exp(off * rng.normal(size=(N, 3))), so3.from_matrix(cRm))
+    tRm = so3.multiply(so3.exp(off * rng.normal(size=(N, 3))), level.camera(angles))
     if dt is None:
         return [tRm, angles]
     return [tRm, angles, GYRO.bias_hat + rng.normal(scale=0.02, size=(N, 3)), np.full((N, 1), dt)]

@@ -82,4 +82,6 @@ def test_interpolate_follows_constant_rates() -> None:
     rate = np.array([0.3, -0.2, 0.5])
     t = np.array([0.0, 0.5, 2.0])
     at = np.array([-0.1, 0.0, 0.2, 0.5, 1.7, 2.0])
-    np.testing.assert_allclose(so3.interpolate(t, so3.exp(t[:, None] * rate), at), so3.exp(at[:, None] * rate), atol=1e-14)
+    np.testing.assert_allclose(
+        so3.interpolate(t, so3.exp(t[:, None] * rate), at), so3.exp(at[:, None] * rate), atol=1e-14
+    )

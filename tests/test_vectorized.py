@@ -110,7 +110,7 @@ def test_outliers_lose_their_pull_and_no_more() -> None:
     assert factor.factor.error(truth) == pytest.approx(clean.factor.error(truth) + 40 * 0.5)
 
 
-@pytest.mark.parametrize("mu", [1e-4, 0.1, 1.0, 30.0, np.inf])
+@pytest.mark.parametrize("mu", [0.0, 1e-4, 0.1, 1.0, 30.0, np.inf])
 def test_loss_weight_is_the_slope_of_its_cost(mu: float) -> None:
     loss = TruncatedLoss(gate=3.0, mu=mu)
     square = np.linspace(0.01, 200.0, 4001) + 1e-4

@@ -3,6 +3,10 @@
 The recording is cut into groups of adjoining windows: a group for every whole turn, for what is left of a run, for
 every move between positions and for every dwell. A window ends where the driven axis has turned by an eighth of a turn.
 Each group is one factor on the mounting and the gyro's bias in force. Methods page, section 2.
+
+The config's encoder noise may be larger than the scatter of a resting encoder shows. The rest is slow: harmonics of
+the encoder, wobble of the axes, errors that come again with every turn. Then a whole turn is a single window, over which
+they cancel but for a constant tilt of the axis, an unknown of each position.
 """
 
 from __future__ import annotations
@@ -62,6 +66,8 @@ _LEAST_WALK = 1e-12
 _KEPT = 64
 # Encoder errors are in part slow (harmonics) if the config's noise is this much larger than the scatter at rest.
 _SLOW = 2.0
+# Encoder errors below this, rad, are beneath notice.
+_NO_ERROR = 1e-8
 # The other axis stands at the same angle when it differs by less than half of this, deg.
 _SAME_ANGLE_DEG = 5.0
 # Of the trajectory, Hz.
@@ -118,7 +124,7 @@ class _Model:
     bias: WalkingBias
     density: float
     encoder: float
-    slow: float  # sigma of the platform's tilt that comes again with every turn, rad; 0: none
+    slow: float  # sigma of the errors that come again with every turn, rad; 0: none
     parameters: tuple[Parameter, ...]
     theta_guess: Array
     bias_guess: Array
@@ -193,7 +199,7 @@ def validate(data: IndexerData, config: Config, values: Mapping[str, float]) -> 
     return before.time, so3.log(so3.multiply(bRn, before.wxyz)), so3.log(so3.multiply(bRn, after.wxyz))
 
 
-def groups_of(data: IndexerData, config: Config, motion: AxisMotion) -> tuple[Group, ...]:
+def groups_of(data: IndexerData, config: Config, motion: AxisMotion, split: bool = True) -> tuple[Group, ...]:
     """The groups of a recording in time order; none shares an encoder sample with another."""
     nRbase = np.array(config.indexer.base_attitude)
     latitude = data.latitude_deg
@@ -204,6 +210,8 @@ def groups_of(data: IndexerData, config: Config, motion: AxisMotion) -> tuple[Gr
     free_from = -np.inf
     for run in motion.runs:
         for kind, borders in _borders(motion, run):
+            if not split:
+                borders = borders[[0, -1]]
             inside = np.flatnonzero((edges >= max(run.start, free_from)) & (edges <= run.stop))
             if len(inside) <= _FEWEST_SAMPLES:
                 continue
@@ -243,7 +251,9 @@ def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]
     motion = axis_motion(data)
     density = config.noise.pick("gyro_density", data.gyro_density)
     encoder = config.noise.pick("encoder", None)
-    groups = groups_of(data, config, motion)
+    scatter = _scatter(motion)
+    slow = float(np.sqrt(encoder**2 - scatter**2)) if encoder > max(_SLOW * scatter, _NO_ERROR) else 0.0
+    groups = groups_of(data, config, motion, split=slow == 0.0)
     if not any(g.kind != "dwell" for g in groups):
         raise InputError("indexer: no turn or move is free of gaps in the stamps; record again")
     if data.latitude_deg is None:
@@ -257,7 +267,6 @@ def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]
     theta_guess, bias_guess = _guess(groups)
     starts = np.array([g.rates.edges[0] for g in groups])
     walk = max(config.noise.pick("gyro_bias_walk", None), _LEAST_WALK)
-    scatter = _scatter(motion)
     frames = _frames(data, motion)
     reasons = {
         "turn cut by a gap in the stamps (what lies before and after is used)": _cut_turns(motion),
@@ -270,8 +279,8 @@ def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]
         groups=groups,
         bias=WalkingBias(np.append(starts, groups[-1].rates.edges[-1]), walk),
         density=density,
-        encoder=encoder,
-        slow=float(np.sqrt(encoder**2 - scatter**2)) if encoder > _SLOW * scatter else 0.0,
+        encoder=scatter if slow > 0.0 else encoder,
+        slow=slow,
         parameters=parameters,
         theta_guess=theta_guess,
         bias_guess=bias_guess,
@@ -446,7 +455,8 @@ def _measurement(
             noise = gtsam.noiseModel.Isotropic.Sigma(3, model.slow)
             factors.append(Factor("prior", gtsam.PriorFactorVector(key, np.zeros(3), noise)))
         options, columns = (*options, "tilt"), [*columns, key]
-    average = IndexerAverageFactor.of(group.gyro, group.rates, model.density, model.encoder, options)
+    wander = model.slow if group.kind == "move" else 0.0
+    average = IndexerAverageFactor.of(group.gyro, group.rates, model.density, model.encoder, options, wander)
     kinds = [3, 3, *(1 if name == "epsilon" else 3 for name in options)]
     return Factor.of(group.kind, VectorizedFactor(average, columns, kinds, compress=compress))
 

@@ -9,12 +9,12 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any, cast
 
 import gtsam
 import numpy as np
 
 from factors.chi_square import gate
-from factors.vectorized import VectorizedFactor
 from pipelines.methods.base import (
     Array,
     Attitudes,
@@ -61,7 +61,7 @@ class _Smoother:
         if self._lagged is None:
             self._plain.update(graph_of(factors), values)
         else:
-            self._lagged.update(graph_of(factors), values, {**stamps})
+            self._lagged.update(graph_of(factors), values, cast(Any, stamps))
 
     def estimate(self) -> gtsam.Values:
         """Current values of all variables held."""
@@ -234,7 +234,7 @@ class _Run:
             self.history.append((now, numbers, np.sqrt(np.diag(self._covariance(values)))))
 
     def _covariance(self, values: gtsam.Values) -> Array:
-        information: Array = np.linalg.inv(self.smoother.covariance(self.keys))
+        information = np.asarray(np.linalg.inv(self.smoother.covariance(self.keys)), dtype=float)
         return reported_covariance(self.problem.parameters, information, values, self.keys)
 
     def finish(self, seconds: float) -> Estimate:
