@@ -5,8 +5,8 @@ every move between positions and for every dwell. A window ends where the driven
 Each group is one factor on the mounting and the gyro's bias in force. Methods page, section 2.
 
 The config's encoder noise may be larger than the scatter of a resting encoder shows. The rest is slow: harmonics of
-the encoder, wobble of the axes, errors that come again with every turn. Then a whole turn is a single window, over which
-they cancel but for a constant tilt of the axis, an unknown of each position.
+the encoder, wobble of the axes, errors that come again with every turn. Then a whole turn is a single window, over
+which they cancel but for a constant tilt of the axis, an unknown of each position.
 """
 
 from __future__ import annotations
