@@ -1,0 +1,296 @@
+"""Whether a calibration can be trusted: what the recording determined, and whether its residuals fit the noise stated.
+
+    assessment = assess(problem.quantities, estimate.covariance, estimate.chi_square, problem.advice)
+    assessment.status, assessment.headline
+
+The rules are those of the contract, section Verdicts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.chi_square import quantile
+from pipelines.methods.base import Array, ChiSquare, Quantity
+
+Verdict = Literal["fixed", "observable", "prior", "weak", "unobservable"]
+Status = Literal["calibrated", "weak", "inconsistent", "unobservable"]
+Advice = Callable[[Mapping[str, float]], str]
+
+# A sigma of this fraction of its prior says that the recording added next to nothing.
+_UNCHANGED = 0.9
+# Tails outside the 99.9 % interval of chi-square.
+_TAIL = 5e-4
+# Weights of a direction below this are left out.
+_SMALL_WEIGHT = 0.1
+# Directions whose sigmas lie this close together may be mixed at will.
+_ALIKE = 0.9
+# Sigma, in prior scales, of what is not a number.
+_UNKNOWN = 1e4
+
+_DEFAULT_ADVICE = "vary the motion while recording, record longer, or give these parameters a tighter prior"
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A combination of parameters that the recording leaves weak or unobservable.
+
+    Attributes:
+        verdict: "weak" or "unobservable".
+        sigma_ratio: its sigma over that of its prior.
+        weights: parameter -> component of the unit vector, in units of the priors' sigmas; strongest first, small ones
+            dropped.
+        advice: what to do about it.
+    """
+
+    verdict: Verdict
+    sigma_ratio: float
+    weights: Mapping[str, float]
+    advice: str
+
+    @property
+    def label(self) -> str:
+        """The parameters that trade against each other."""
+        first, *others = self.weights
+        return f"{first} against {', '.join(others)}" if others else first
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A sum of squared whitened residuals, its degrees of freedom and its 99.9 % interval."""
+
+    value: float
+    dof: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, value: float, dof: float) -> Fit:
+        """With its interval."""
+        return cls(value, dof, quantile(_TAIL, dof), quantile(1.0 - _TAIL, dof))
+
+    @property
+    def noise_factor(self) -> float:
+        """By what the noise stated would have to be multiplied to make the value the expected one."""
+        return float(np.sqrt(self.value / max(self.dof, 1.0)))
+
+    @property
+    def excess(self) -> float:
+        """Value above expectation, in standard deviations."""
+        return float((self.value - self.dof) / np.sqrt(2.0 * max(self.dof, 1.0)))
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """Chi-square of the whole and of each family of measurements."""
+
+    total: Fit
+    families: Mapping[str, Fit]
+
+    @property
+    def too_large(self) -> bool:
+        """Residuals larger than the noise explains, or no number at all."""
+        fit = self.total
+        return not np.isfinite(fit.value) or (fit.dof > 0.0 and fit.value > fit.high)
+
+    @property
+    def too_small(self) -> bool:
+        """Residuals smaller than the noise explains."""
+        return self.total.value < self.total.low
+
+    @property
+    def message(self) -> str | None:
+        """A sentence when the residuals do not fit the noise."""
+        total = self.total
+        if not np.isfinite(total.value):
+            return "chi-square is not a number: the solver did not end at a usable estimate"
+        sums = f"chi-square {total.value:.5g} for {total.dof:.5g} degrees of freedom"
+        if self.too_large:
+            return (
+                f"{sums} is above its upper bound {total.high:.5g}: {self._worst(1.0)} fits worst; either the noise "
+                "stated is too small or the model lacks something (time offset, sign of an axis, scale)"
+            )
+        if self.too_small:
+            return (
+                f"{sums} is below its lower bound {total.low:.5g}: the noise stated is too large; {self._worst(-1.0)}"
+            )
+        return None
+
+    def _worst(self, sign: float) -> str:
+        families = self.families or {"the whole": self.total}
+        family, fit = max(families.items(), key=lambda item: sign * item[1].excess)
+        return f"{family} (its noise would have to be {fit.noise_factor:.2g} times as large)"
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """The verdict on an estimate.
+
+    Attributes:
+        status: the first that applies of unobservable, inconsistent, weak, calibrated.
+        verdicts: parameter -> verdict, in the order of the quantities.
+        directions: weak and unobservable ones, worst first.
+        covariance: (n, n), the one judged: symmetric and finite whatever was given.
+        consistency: None when the solver has no chi-square.
+        headline: the verdict in one sentence.
+    """
+
+    status: Status
+    verdicts: Mapping[str, Verdict]
+    directions: tuple[Direction, ...]
+    covariance: Array
+    consistency: Consistency | None
+    headline: str
+
+    @property
+    def sigmas(self) -> Array:
+        """(n,) standard deviations."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the status does not say: for now, residuals smaller than the noise stated."""
+        message = self.consistency.message if self.consistency and self.consistency.too_small else None
+        return (message,) if message else ()
+
+
+def assess(
+    quantities: Sequence[Quantity], covariance: Array, chi_square: ChiSquare | None, advice: Advice | None
+) -> Assessment:
+    """The verdict on an estimate with this joint covariance (n, n) of the quantities; never fails on a singular one.
+
+    A direction moves a parameter by its share of that parameter's sigma. A direction is beyond what is required when
+    its share of some parameter's sigma is larger than this parameter's `require`, or when it is the largest share of a
+    sigma that is; no direction is blamed for parameters that are all as good as wanted. It is then unobservable if its
+    sigma is 0.9 of its prior's or more, else weak.
+
+    Args:
+        quantities: what is reported; those with prior 0 are fixed and take no part.
+        covariance: of the reported numbers, rows and columns as the quantities.
+        chi_square: of the residuals, if the solver has one.
+        advice: the method's sentence for a direction, given its weights by parameter name.
+    """
+    covariance = _finite(quantities, covariance)
+    sigmas = np.sqrt(np.diag(covariance))
+    verdicts = {q.name: _verdict(q, float(s)) for q, s in zip(quantities, sigmas, strict=True)}
+    directions = _directions(quantities, covariance, advice)
+    consistency = _consistency(chi_square)
+    status = _status([*verdicts.values(), *(d.verdict for d in directions)], consistency)
+    headline = _headline(status, verdicts, directions, consistency)
+    return Assessment(status, verdicts, directions, covariance, consistency, headline)
+
+
+def _finite(quantities: Sequence[Quantity], covariance: Array) -> Array:
+    """The covariance with fixed quantities at zero and what is no variance made very wide and uncorrelated."""
+    covariance = np.asarray(covariance, dtype=float).reshape(len(quantities), len(quantities))
+    covariance = 0.5 * (covariance + covariance.T)
+    fixed = np.array([q.prior_sigma == 0.0 for q in quantities], dtype=bool)
+    variance = np.diag(covariance)
+    bad = ~(np.isfinite(variance) & (variance >= 0.0))
+    wide = np.array([(_UNKNOWN * q.prior_scale) ** 2 for q in quantities])
+    out = np.where(np.isfinite(covariance) & ~np.logical_or.outer(bad, bad), covariance, 0.0)
+    out[np.diag_indices_from(out)] = np.where(bad, wide, variance)
+    return np.where(np.logical_or.outer(fixed, fixed), 0.0, out)
+
+
+def _verdict(quantity: Quantity, sigma: float) -> Verdict:
+    if quantity.prior_sigma == 0.0:
+        return "fixed"
+    unchanged = sigma >= _UNCHANGED * quantity.scale
+    if sigma <= quantity.require:
+        return "prior" if unchanged else "observable"
+    return "unobservable" if unchanged else "weak"
+
+
+def _directions(quantities: Sequence[Quantity], covariance: Array, advice: Advice | None) -> tuple[Direction, ...]:
+    """Weak and unobservable eigen-directions of the prior-scaled covariance, worst first."""
+    estimated = [i for i, q in enumerate(quantities) if q.prior_sigma != 0.0]
+    if not estimated:
+        return ()
+    names = [quantities[i].name for i in estimated]
+    scale = np.array([quantities[i].scale for i in estimated])
+    require = np.array([quantities[i].require for i in estimated])
+    scaled = covariance[np.ix_(estimated, estimated)] / np.outer(scale, scale)
+    eigenvalues, vectors = np.linalg.eigh(scaled)
+    ratios = np.sqrt(np.maximum(eigenvalues, 0.0))
+    shares = np.abs(vectors) * np.outer(scale, ratios)
+    beyond = shares > require[:, None]
+    for i in np.flatnonzero(np.sqrt(np.diag(scaled)) * scale > require):
+        beyond[i, np.argmax(shares[i])] = True
+    bad = np.flatnonzero(beyond.any(axis=0))[::-1]
+    found = []
+    for group in _alike(ratios[bad]):
+        basis = vectors[:, bad[group]]
+        verdict: Verdict = "unobservable" if ratios[bad[group]][0] >= _UNCHANGED else "weak"
+        for vector in _plainest(basis).T:
+            weights = _weights(names, vector)
+            ratio = float(np.sqrt(max(vector @ scaled @ vector, 0.0)))
+            found.append(Direction(verdict, ratio, weights, advice(weights) if advice else _DEFAULT_ADVICE))
+    return tuple(found)
+
+
+def _alike(ratios: Array) -> list[NDArray[np.intp]]:
+    """Indices of falling ratios in runs of nearly equal ones, whose eigenvectors are arbitrary, of one verdict each."""
+    falls = ratios[1:] < _ALIKE * ratios[:-1]
+    changes = (ratios[1:] >= _UNCHANGED) != (ratios[:-1] >= _UNCHANGED)
+    return [run for run in np.split(np.arange(len(ratios)), np.flatnonzero(falls | changes) + 1) if len(run)]
+
+
+def _plainest(basis: Array) -> Array:
+    """Orthonormal basis (n, k) of the same space with as few large components as can be.
+
+    Quartimax rotation (Neuhaus, Wrigley 1954): maximises the sum of the fourth powers of the components.
+    """
+    rotation = np.eye(basis.shape[1])
+    for _ in range(100):
+        turned = basis @ rotation
+        u, _, vt = np.linalg.svd(basis.T @ turned**3)
+        rotation = u @ vt
+    return basis @ rotation
+
+
+def _weights(names: Sequence[str], vector: Array) -> dict[str, float]:
+    """The components worth naming, strongest first and that one positive."""
+    order = np.argsort(-np.abs(vector), kind="stable")
+    sign = 1.0 if vector[order[0]] >= 0.0 else -1.0
+    return {names[i]: sign * float(vector[i]) for i in order if abs(vector[i]) >= _SMALL_WEIGHT}
+
+
+def _consistency(chi_square: ChiSquare | None) -> Consistency | None:
+    if chi_square is None:
+        return None
+    families = {family: Fit.of(value, dof) for family, (value, dof) in chi_square.families.items()}
+    return Consistency(Fit.of(chi_square.value, chi_square.dof), families)
+
+
+def _status(verdicts: Sequence[Verdict], consistency: Consistency | None) -> Status:
+    if "unobservable" in verdicts:
+        return "unobservable"
+    if consistency is not None and consistency.too_large:
+        return "inconsistent"
+    return "weak" if "weak" in verdicts else "calibrated"
+
+
+def _headline(
+    status: Status,
+    verdicts: Mapping[str, Verdict],
+    directions: Sequence[Direction],
+    consistency: Consistency | None,
+) -> str:
+    if status == "calibrated":
+        estimated = sum(verdict != "fixed" for verdict in verdicts.values())
+        by_prior = [name for name, verdict in verdicts.items() if verdict == "prior"]
+        but = f", {', '.join(by_prior)} by prior alone" if by_prior else ""
+        return f"Calibrated: all {estimated} parameters are as accurate as required{but}."
+    if status == "inconsistent" and consistency is not None:
+        return f"Inconsistent: {consistency.message}."
+    named = "; ".join(dict.fromkeys(f"{d.label} ({d.advice})" for d in directions if d.verdict == status))
+    if not named:
+        named = ", ".join(name for name, verdict in verdicts.items() if verdict == status)
+    word = "Not observable" if status == "unobservable" else "Less accurate than required"
+    return f"{word}: {named}."

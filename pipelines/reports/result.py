@@ -1,0 +1,267 @@
+"""What a calibration is to the reports, and result.json.
+
+calibration = Calibration(problem, estimate, assess(...), session_facts(...), ...)
+result_json(calibration)            # the contract's text of result.json
+"""
+
+from __future__ import annotations
+
+import math
+import platform
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import metadata
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from pipelines.methods.base import Estimate, Problem, Quantity
+from pipelines.observability import Assessment, Fit, Status, Verdict
+from pipelines.sessions.info import SessionFacts
+
+if TYPE_CHECKING:
+    import plotly.graph_objects
+
+_PACKAGES = ("alidade", "gtsam", "numpy", "opencv-contrib-python-headless", "pycolmap")
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A figure of the report.
+
+    Attributes:
+        title: in a few words.
+        caption: what is seen, units included.
+        figure: a plotly figure.
+    """
+
+    title: str
+    caption: str
+    figure: plotly.graph_objects.Figure
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Everything the reports tell about one calibration.
+
+    Attributes:
+        problem: the method's.
+        estimate: by any solver; its names are a part of the problem's.
+        assessment: of that estimate.
+        recording: name of the file.
+        sha256: of the file.
+        facts: about the recording; its epoch is the zero of all times.
+        config_text: the config in force, YAML.
+        truth: parameter -> value, when known; other keys are ignored.
+        software: package -> version.
+        seconds: phase -> wall time, beside those of the estimate.
+        plots: makes the method's own figures.
+    """
+
+    problem: Problem
+    estimate: Estimate
+    assessment: Assessment
+    recording: str
+    sha256: str
+    facts: SessionFacts
+    config_text: str = ""
+    truth: Mapping[str, object] | None = None
+    software: Mapping[str, str] = field(default_factory=lambda: software_versions())
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    plots: Callable[[Calibration], Sequence[Plot]] | None = None
+
+    @property
+    def parameters(self) -> tuple[ParameterResult, ...]:
+        """The parameters as result.json lists them."""
+        rows = zip(
+            quantities_of(self.problem, self.estimate), self.estimate.values, self.assessment.sigmas, strict=True
+        )
+        return tuple(
+            ParameterResult(
+                name=q.name,
+                value=float(value),
+                sigma=float(sigma),
+                unit=q.unit,
+                prior_sigma=q.prior_sigma,
+                require=q.require,
+                observability=self.assessment.verdicts[q.name],
+            )
+            for q, value, sigma in rows
+        )
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Messages in the recording by topic, and measurements used by family."""
+        topics = {topic.name: topic.count for topic in self.facts.topics}
+        families = {family: int(r.used.sum()) for family, r in self.estimate.residuals.items()}
+        return {**topics, **families}
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Reason -> number of measurements left out, outliers included."""
+        outliers = {f"{family}: outliers": n for family, n in self.estimate.rejected.items() if n}
+        return {**self.problem.dropped, **outliers}
+
+    @property
+    def timing(self) -> dict[str, float]:
+        """Phase -> s of wall time."""
+        return {**self.seconds, **self.estimate.seconds}
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader has to know beside the headline."""
+        trouble = () if self.estimate.converged else (f"the solver did not converge: {self.estimate.message}",)
+        return (*trouble, *self.assessment.warnings)
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
+
+
+class ParameterResult(_Record):
+    """One parameter; SI."""
+
+    name: str
+    value: float
+    sigma: float
+    unit: str
+    prior_sigma: float | None
+    require: float
+    observability: Verdict
+
+
+class CovarianceResult(_Record):
+    """Joint covariance of the parameters, in the order given."""
+
+    order: list[str]
+    matrix: list[list[float]]
+
+
+class DirectionResult(_Record):
+    """A direction that is weak or unobservable."""
+
+    sigma_ratio: float
+    weights: dict[str, float]
+    advice: str
+
+
+class FitResult(_Record):
+    """Chi-square of a family with its 99.9 % interval; null where there is none."""
+
+    value: float | None
+    dof: float | None
+    low: float | None
+    high: float | None
+
+
+class ChiSquareResult(FitResult):
+    """Chi-square of the whole."""
+
+    families: dict[str, FitResult]
+
+
+class SessionResult(_Record):
+    """What went in."""
+
+    sha256: str
+    duration_s: float
+    counts: dict[str, int]
+    dropped: dict[str, int]
+
+
+class TruthResult(_Record):
+    """A parameter's true value and the error of the estimate; in sigmas unless it is fixed."""
+
+    value: float
+    error: float
+    error_sigmas: float | None
+
+
+class Result(_Record):
+    """result.json."""
+
+    schema_name: Annotated[Literal["alidade.result/1"], Field(alias="schema")] = "alidade.result/1"
+    method: str
+    solver: str
+    status: Status
+    parameters: list[ParameterResult]
+    covariance: CovarianceResult
+    null_directions: list[DirectionResult]
+    chi_square: ChiSquareResult
+    session: SessionResult
+    software: dict[str, str]
+    timing_s: dict[str, float]
+    headline: str
+    notes: list[str]
+    truth: dict[str, TruthResult] | None = None
+
+
+def result(calibration: Calibration) -> Result:
+    """result.json as a model. Raises pydantic's ValidationError if a number is not finite."""
+    c, a = calibration, calibration.assessment
+    return Result(
+        method=c.problem.method,
+        solver=c.estimate.solver,
+        status=a.status,
+        parameters=list(c.parameters),
+        covariance=CovarianceResult(order=list(c.estimate.names), matrix=a.covariance.tolist()),
+        null_directions=[
+            DirectionResult(sigma_ratio=d.sigma_ratio, weights=dict(d.weights), advice=d.advice) for d in a.directions
+        ],
+        chi_square=_chi_square(a),
+        session=SessionResult(sha256=c.sha256, duration_s=c.facts.duration_s, counts=c.counts, dropped=c.dropped),
+        software=dict(c.software),
+        timing_s=c.timing,
+        headline=a.headline,
+        notes=list(c.notes),
+        truth=truth_errors(c) if c.truth is not None else None,
+    )
+
+
+def result_json(calibration: Calibration) -> str:
+    """The text of result.json; without truth it has no key `truth`."""
+    model = result(calibration)
+    return model.model_dump_json(by_alias=True, indent=1, exclude={"truth"} if model.truth is None else None) + "\n"
+
+
+def truth_errors(calibration: Calibration) -> dict[str, TruthResult]:
+    """Parameter -> truth and error, for those whose truth is known."""
+    known = calibration.truth or {}
+    found = {}
+    for p in calibration.parameters:
+        truth = known.get(p.name)
+        if isinstance(truth, int | float) and math.isfinite(truth):
+            error = p.value - truth
+            found[p.name] = TruthResult(
+                value=truth, error=error, error_sigmas=error / p.sigma if p.sigma > 0.0 else None
+            )
+    return found
+
+
+def quantities_of(problem: Problem, estimate: Estimate) -> tuple[Quantity, ...]:
+    """The quantities of an estimate, in its order; a published solver may know fewer than the problem has."""
+    known = {q.name: q for q in problem.quantities}
+    return tuple(known[name] for name in estimate.names)
+
+
+def software_versions() -> dict[str, str]:
+    """Versions of what computed the result."""
+    versions = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            versions[package] = "not installed"
+    return versions
+
+
+def _chi_square(assessment: Assessment) -> ChiSquareResult:
+    if assessment.consistency is None:
+        return ChiSquareResult(value=None, dof=None, low=None, high=None, families={})
+    families = {family: FitResult(**_numbers(fit)) for family, fit in assessment.consistency.families.items()}
+    return ChiSquareResult(**_numbers(assessment.consistency.total), families=families)
+
+
+def _numbers(fit: Fit) -> dict[str, float | None]:
+    numbers = {"value": fit.value, "dof": fit.dof, "low": fit.low, "high": fit.high}
+    return {name: number if math.isfinite(number) else None for name, number in numbers.items()}
