@@ -130,7 +130,7 @@ def simulate_indexer(scenario: IndexerScenario, seed: int) -> tuple[IndexerData,
     )
     white = noise.gyro_density * np.sqrt(scenario.gyro_rate_hz) * rng.standard_normal((len(gyro_t), 3))
     encoder_t = _recorded(sample_times(duration, scenario.encoder_rate_hz, scenario.encoder_phase), drives, scenario)
-    outer, inner = _encoders(scenario, _angles(scenario, drives, encoder_t), phases, rng)
+    outer, inner = _encoders(scenario, _commanded(scenario, drives, encoder_t), rng)
     attitude = None
     if scenario.attitude_noise_arcsec is not None:
         error = scenario.attitude_noise_arcsec * ARCSEC * rng.standard_normal((len(gyro_t), 3))
@@ -209,8 +209,8 @@ def _recorded(t: Array, drives: list[_Drive], scenario: IndexerScenario) -> Arra
     return t[keep]
 
 
-def _angles(scenario: IndexerScenario, drives: list[_Drive], t: Array) -> Array:
-    """True axis angles (2, N), rad. Ripple comes with the angle, as cogging does, and vanishes over whole turns."""
+def _commanded(scenario: IndexerScenario, drives: list[_Drive], t: Array) -> Array:
+    """Axis angles (2, N), rad, that the drives follow. Ripple comes with the angle, as cogging does."""
     angles = np.zeros((2, len(t)))
     for drive in drives:
         moving = slice(int(np.searchsorted(t, drive.start)), None)
@@ -220,10 +220,19 @@ def _angles(scenario: IndexerScenario, drives: list[_Drive], t: Array) -> Array:
     return angles
 
 
+def _angles(scenario: IndexerScenario, drives: list[_Drive], phases: Array, t: Array) -> Array:
+    """True axis angles (2, N), rad. The drives follow the encoders, and with them the encoders' harmonics."""
+    commanded = _commanded(scenario, drives, t)
+    angles = commanded.copy()
+    for order, amplitude in enumerate(scenario.encoder_harmonics_arcsec, start=1):
+        angles -= amplitude * ARCSEC * np.sin(order * commanded + phases[:, order, None])
+    return angles
+
+
 def _attitude(scenario: IndexerScenario, drives: list[_Drive], phases: Array, t: Array) -> Array:
     """nRm, shape (N, 4)."""
     ex, ey, ez = np.eye(3)
-    outer, inner = _angles(scenario, drives, t)[..., None]
+    outer, inner = _angles(scenario, drives, phases, t)[..., None]
     k, w = scenario.wobble_per_turn, scenario.wobble_arcsec * ARCSEC
     a, b = k * outer + phases[0, 0], k * inner + phases[1, 0]
     outer_axis = so3.exp(w * (np.cos(a) * ey + np.sin(a) * ez))
@@ -235,11 +244,9 @@ def _attitude(scenario: IndexerScenario, drives: list[_Drive], phases: Array, t:
     return so3.compose(np.array(scenario.base_attitude), baseRt, tRm)
 
 
-def _encoders(scenario: IndexerScenario, angles: Array, phases: Array, rng: np.random.Generator) -> Array:
-    """Encoder readings (2, M), rad, of the true angles."""
-    read = angles + scenario.noise.encoder * rng.standard_normal(angles.shape)
-    for order, amplitude in enumerate(scenario.encoder_harmonics_arcsec, start=1):
-        read = read + amplitude * ARCSEC * np.sin(order * angles + phases[:, order, None])
+def _encoders(scenario: IndexerScenario, commanded: Array, rng: np.random.Generator) -> Array:
+    """Encoder readings (2, M), rad."""
+    read = commanded + scenario.noise.encoder * rng.standard_normal(commanded.shape)
     step = 2.0 * np.pi / 2**scenario.encoder_bits
     read = step * np.round(read / step)
     return (read + np.pi) % (2.0 * np.pi) - np.pi if scenario.encoder_wrapped else read
@@ -256,4 +263,4 @@ def _truth(scenario: IndexerScenario, bias: Array) -> dict[str, float]:
         for name, vector in vectors.items()
         for axis, value in zip("xyz", vector, strict=True)
     }
-    return truth | {"axis_nonperpendicularity": scenario.axis_nonperpendicularity_arcsec * ARCSEC}
+    return truth | {"axis_nonperpendicularity": float(scenario.axis_nonperpendicularity_arcsec * ARCSEC)}
