@@ -88,7 +88,7 @@ def test_los_errors_are_exact_to_a_tenth_of_a_pixel(renderer: Renderer, kind: st
         if kind == "tag"
         else (_wall(), np.array([0, 0, 1.0]))
     )
-    cRw = _cameras(14, rng, 2.0 if kind == "tag" else 3.0)
+    cRw = _cameras(10, rng, 2.0 if kind == "tag" else 3.0)
     found = los_errors(_pictures(renderer, quad, cRw, rng), CAMERA)
     assert not found.dropped
     error = found.error - _expected(cRw, middle)

@@ -19,8 +19,8 @@ from pipelines.vision.camera import Camera
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
-# Each pixel on an edge of the texture is integrated over this many by this many parts of its area.
-_PARTS = 4
+# A pixel is integrated over n by n parts of its area: (n, contrast of the texture in it, grey levels, up to which).
+_PARTS = ((1, 20.0), (2, 80.0), (4, np.inf))
 
 
 @cache
@@ -123,10 +123,14 @@ class Renderer:
         seen &= ((texel > -width) & (texel < size + width)).all(axis=1)
         share, grey = np.zeros(len(q)), np.zeros(len(q))
         at = np.flatnonzero(seen)
-        flat, level = _flat(quad.texture, texel[at], width[at])
-        share[at[flat]], grey[at[flat]] = 1.0, level[flat]
-        at = at[~flat]
-        share[at], grey[at] = _integrate(quad.texture, q[at], qx[at], qy[at])
+        table = np.pad(quad.texture.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+        contrast, level = _contrast(quad.texture, texel[at], width[at])
+        share[at], grey[at] = 1.0, level
+        least = 0.0
+        for parts, most in _PARTS:
+            part = at[(contrast > least) & (contrast <= most)]
+            share[part], grey[part] = _integrate(quad.texture, table, q[part], qx[part], qy[part], parts)
+            least = most
         return share.reshape(shape), grey.reshape(shape)
 
 
@@ -146,26 +150,30 @@ def _ray_to_texel(quad: Quad) -> Array:
     return np.asarray(np.stack([u, v, normal]) * np.sign(reach))
 
 
-def _flat(texture: Array, texel: Array, width: Array) -> tuple[NDArray[np.bool_], Array]:
-    """Which pixels see one grey level only (texels of at least a pixel, equal at the footprint's corners), and it."""
+def _contrast(texture: Array, texel: Array, width: Array) -> tuple[Array, Array]:
+    """The texture's contrast within each pixel, and its grey level where that is zero.
+
+    Zero is certain: texels are larger than the footprint then. Infinite on the quad's border.
+    """
     rows, columns = texture.shape
     # The footprint lies within this box even when it is turned by 45 degrees.
     reach = 0.75 * width + 1e-9
     low, high = texel - reach, texel + reach
-    inside = (low >= 0).all(axis=1) & (high < (columns, rows)).all(axis=1) & (reach < 0.5).all(axis=1)
+    inside = (low >= 0).all(axis=1) & (high < (columns, rows)).all(axis=1)
+    small = (reach < 0.5).all(axis=1)
     i0, i1 = (np.clip(p, 0, (columns - 1, rows - 1)).astype(np.intp) for p in (low, high))
     grey = texture.ravel()
     corners = [grey[r * columns + c] for r in (i0[:, 1], i1[:, 1]) for c in (i0[:, 0], i1[:, 0])]
-    same = np.logical_and.reduce([corners[0] == c for c in corners[1:]])
-    return inside & same, corners[0]
+    contrast = np.maximum.reduce(corners) - np.minimum.reduce(corners)
+    # Between the corners of a wide footprint there are more texels; their contrast is guessed from the corners'.
+    contrast = np.where(small, contrast, np.maximum(2.0 * contrast, 1.0))
+    return np.where(inside, contrast, np.inf), corners[0]
 
 
-def _integrate(texture: Array, q: Array, qx: Array, qy: Array) -> tuple[Array, Array]:
-    """Share and mean grey of pixels whose footprint is not flat: the mean over the parts of their area."""
+def _integrate(texture: Array, table: Array, q: Array, qx: Array, qy: Array, parts: int) -> tuple[Array, Array]:
+    """Share and mean grey of pixels: the mean over parts by parts of their area; `table`: the summed texture."""
     rows, columns = texture.shape
-    table = np.zeros((rows + 1, columns + 1))
-    table[1:, 1:] = texture.cumsum(axis=0).cumsum(axis=1)
-    offsets = (np.arange(_PARTS) + 0.5) / _PARTS - 0.5
+    offsets = (np.arange(parts) + 0.5) / parts - 0.5
     share, grey = np.zeros(len(q)), np.zeros(len(q))
     for x in offsets:
         for y in offsets:
@@ -173,14 +181,14 @@ def _integrate(texture: Array, q: Array, qx: Array, qy: Array) -> tuple[Array, A
             texel = p[:, :2] / p[:, 2:]
             reach_x, reach_y = (d[:, :2] / p[:, 2:] - texel * (d[:, 2:] / p[:, 2:]) for d in (qx, qy))
             # A box with the footprint's own spread along each axis of the texture.
-            width = np.maximum(np.sqrt(reach_x**2 + reach_y**2) / _PARTS, 1e-9)
+            width = np.maximum(np.sqrt(reach_x**2 + reach_y**2) / parts, 1e-9)
             low = np.clip(texel - 0.5 * width, 0, (columns, rows))
             high = np.clip(texel + 0.5 * width, 0, (columns, rows))
             total = _box_sum(table, low, high)
             area = 1.0 / width.prod(axis=1)
             share += (high - low).prod(axis=1) * area
             grey += total * area
-    return share / _PARTS**2, grey / np.maximum(share, 1e-12)
+    return share / parts**2, grey / np.maximum(share, 1e-12)
 
 
 def _box_sum(table: Array, low: Array, high: Array) -> Array:
