@@ -112,19 +112,20 @@ class Consistency:
         sums = f"chi-square {total.value:.5g} for {total.dof:.5g} degrees of freedom"
         if self.too_large:
             return (
-                f"{sums} is above its upper bound {total.high:.5g}: {self._worst(1.0)} fits worst; either the noise "
-                "stated is too small or the model lacks something (time offset, sign of an axis, scale)"
+                f"{sums} is above its upper bound {total.high:.5g}: the noise stated is too small, most of all for "
+                f"{self._worst(1.0)}, or the model lacks something (time offset, sign of an axis, scale)"
             )
         if self.too_small:
             return (
-                f"{sums} is below its lower bound {total.low:.5g}: the noise stated is too large; {self._worst(-1.0)}"
+                f"{sums} is below its lower bound {total.low:.5g}: the noise stated is too large, most of all for "
+                f"{self._worst(-1.0)}"
             )
         return None
 
     def _worst(self, sign: float) -> str:
         families = self.families or {"the whole": self.total}
         family, fit = max(families.items(), key=lambda item: sign * item[1].excess)
-        return f"{family} (its noise would have to be {fit.noise_factor:.2g} times as large)"
+        return f"{family} (it would have to be {fit.noise_factor:.2g} times as large)"
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,150 @@
+"""calibration.yaml: the result for people and for programs that apply it.
+
+saved = load_calibration(Path("out/calibration.yaml"))
+saved.value("gyro_bias_x"), saved.rotations["helmet_mount"]
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping
+from io import StringIO
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from factors import so3
+from pipelines.errors import InputError
+from pipelines.methods.base import rotation_vector_coordinates
+from pipelines.observability import Status, Verdict
+from pipelines.reports.formulas import FORMULAS, ROTATIONS
+from pipelines.reports.result import Calibration
+
+_HEAD = """\
+# Calibration by alidade. Units are SI and radians, quaternions w x y z. aRb maps coordinates in b to coordinates in a,
+# Exp turns a rotation vector into a rotation. Do not apply parameters whose verdict is weak or unobservable.
+"""
+# More digits than any sigma needs, fewer than tire the eye.
+_DIGITS = 12
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False, populate_by_name=True)
+
+
+class SavedParameter(_Record):
+    """A parameter; SI."""
+
+    value: float
+    sigma: float
+    unit: str
+    verdict: Verdict
+
+
+class SavedRotation(_Record):
+    """A rotation made of three parameters: its name in the formulas and its quaternion."""
+
+    name: str
+    wxyz: tuple[float, float, float, float]
+
+
+class SavedRecording(_Record):
+    """What it was calibrated on."""
+
+    file: str
+    sha256: str
+    start: str
+
+
+class SavedCalibration(_Record):
+    """calibration.yaml."""
+
+    schema_name: Annotated[Literal["alidade.calibration/1"], Field(alias="schema")] = "alidade.calibration/1"
+    method: str
+    solver: str
+    status: Status
+    recording: SavedRecording
+    parameters: dict[str, SavedParameter]
+    rotations: dict[str, SavedRotation] = {}
+    formulas: list[str] = []
+
+    def value(self, name: str) -> float:
+        """Value of a parameter. Raises InputError if the calibration has none of that name."""
+        if name not in self.parameters:
+            raise InputError(f"the calibration has no parameter {name}; it has {', '.join(self.parameters)}")
+        return self.parameters[name].value
+
+
+def calibration_yaml(calibration: Calibration) -> str:
+    """The text of calibration.yaml."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.comments import CommentedMap
+
+    content = saved(calibration).model_dump(by_alias=True, mode="json")
+    for section in ("parameters", "rotations"):
+        for name, entry in content[section].items():
+            content[section][name] = CommentedMap(entry)
+            content[section][name].fa.set_flow_style()  # one line each
+    yaml = YAML()
+    yaml.width = 200
+    text = StringIO()
+    yaml.dump(content, text)
+    return _HEAD + text.getvalue()
+
+
+def saved(calibration: Calibration) -> SavedCalibration:
+    """What calibration.yaml says."""
+    method = calibration.problem.method
+    parameters = {
+        p.name: SavedParameter(value=_rounded(p.value), sigma=_rounded(p.sigma), unit=p.unit, verdict=p.observability)
+        for p in calibration.parameters
+    }
+    start = datetime.datetime.fromtimestamp(calibration.facts.epoch_ns // 1_000_000_000, datetime.UTC)
+    return SavedCalibration(
+        method=method,
+        solver=calibration.estimate.solver,
+        status=calibration.assessment.status,
+        recording=SavedRecording(file=calibration.recording, sha256=calibration.sha256, start=start.isoformat()),
+        parameters=parameters,
+        rotations=_rotations(calibration),
+        formulas=list(FORMULAS.get(method, ())),
+    )
+
+
+def load_calibration(path: Path) -> SavedCalibration:
+    """Read calibration.yaml. Raises InputError when the file cannot be used."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        content: Any = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+        return SavedCalibration.model_validate(content)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be opened ({error.strerror})") from error
+    except (UnicodeDecodeError, YAMLError) as error:
+        raise InputError(
+            f"{path}: unreadable YAML; a calibration.yaml as `alidade calibrate` writes it is needed"
+        ) from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "the whole"
+        raise InputError(f"{path}: not a calibration.yaml: {where}: {first['msg']}") from error
+
+
+def _rotations(calibration: Calibration) -> dict[str, SavedRotation]:
+    """The parameters that are rotation vectors, as quaternions."""
+    values: Mapping[str, float] = {p.name: p.value for p in calibration.parameters}
+    found = {}
+    for parameter in calibration.problem.parameters:
+        names = [q.name for q in parameter.quantities]
+        if parameter.coordinates is rotation_vector_coordinates and all(name in values for name in names):
+            name = names[0].rsplit("_", 1)[0]
+            w, x, y, z = (_rounded(v) for v in so3.exp(np.array([values[n] for n in names])).tolist())
+            found[name] = SavedRotation(name=ROTATIONS.get(name, name), wxyz=(w, x, y, z))
+    return found
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{_DIGITS}g}")

@@ -1,0 +1,100 @@
+"""Figures of the head method's report: attitude against vision, and against the truth where it is known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factors import so3
+from pipelines.methods.base import Array, Attitudes
+from pipelines.reports.plots import COLORS, add_line, add_points, figure
+from pipelines.reports.result import Calibration, Plot
+from pipelines.sessions.head import HeadData
+
+_AXES = "xyz"
+
+
+def head_plots(data: HeadData, calibration: Calibration) -> list[Plot]:
+    """Attitude bRv with what vision says of it, and their differences; nothing without a trajectory."""
+    attitudes = calibration.estimate.attitudes
+    if attitudes is None or len(attitudes.time) < 2:
+        return []
+    order = np.argsort(attitudes.time, kind="stable")
+    attitudes = Attitudes(attitudes.time[order], attitudes.wxyz[order])
+    seen = _from_vision(data, calibration, attitudes)
+    plots = [_attitude(attitudes, seen), _difference(attitudes, seen)]
+    error = _against_truth(data, attitudes, seen)
+    return [error, *plots] if error else plots
+
+
+def _from_vision(data: HeadData, calibration: Calibration, attitudes: Attitudes) -> Attitudes:
+    """bRv that each vision frame alone stands for, with the mounts and the time offset found."""
+    values = dict(zip(calibration.estimate.names, calibration.estimate.values.tolist(), strict=True))
+
+    def mount(name: str) -> Array:
+        return so3.exp(np.array([values.get(f"{name}_{axis}", 0.0) for axis in _AXES]))
+
+    time = data.vision_t + values.get("time_offset", 0.0)
+    inside = (time >= attitudes.time[0]) & (time <= attitudes.time[-1])
+    cRh = data.vision_wxyz[inside]
+    bRv = so3.compose(so3.inverse(mount("camera_mount")), cRh, so3.inverse(mount("helmet_mount")))
+    return Attitudes(time[inside], bRv)
+
+
+def _attitude(attitudes: Attitudes, seen: Attitudes) -> Plot:
+    out = figure("rotation vector of bRv, deg", height=360)
+    fused, vision = _vectors(attitudes.wxyz), _vectors(seen.wxyz)
+    for i, axis in enumerate(_AXES):
+        add_points(out, seen.time, vision[:, i], f"vision {axis}", COLORS[i], 3)
+    for i, axis in enumerate(_AXES):
+        add_line(out, attitudes.time, fused[:, i], f"fused {axis}", COLORS[i])
+    out.update_traces(selector={"mode": "markers"}, opacity=0.45)
+    return Plot(
+        "Attitude of the helmet on the platform",
+        "Lines: attitude bRv from gyros and vision together. Points: from vision alone, turned by the mounts found.",
+        out,
+    )
+
+
+def _difference(attitudes: Attitudes, seen: Attitudes) -> Plot:
+    delta = _delta(attitudes, seen)
+    rms = float(np.sqrt((delta**2).mean()))
+    out = figure("vision minus fused, deg")
+    for i, axis in enumerate(_AXES):
+        add_points(out, seen.time, delta[:, i], axis, COLORS[i], 3)
+    near = max(4.0 * float(np.median(np.abs(delta))) / 0.6745, 1e-3)
+    out.update_yaxes(range=[-2.0 * near, 2.0 * near])
+    return Plot(
+        "Vision against the fused attitude",
+        f"Difference about the axes of the helmet IMU, {rms:.3g} deg RMS per axis; outliers may lie outside the axis.",
+        out,
+    )
+
+
+def _against_truth(data: HeadData, attitudes: Attitudes, seen: Attitudes) -> Plot | None:
+    if data.truth_t is None or data.truth_wxyz is None or len(data.truth_t) < 2:
+        return None
+    truth = Attitudes(data.truth_t, data.truth_wxyz)
+    errors = {"vision alone": _error(truth, seen), "fused": _error(truth, attitudes)}
+    out = figure("attitude error, deg")
+    for (name, (time, angle)), color in zip(errors.items(), ("#9ab6cc", COLORS[1]), strict=True):
+        add_points(out, time, angle, name, color, 3)
+    said = ", ".join(f"{name} {float(np.sqrt((angle**2).mean())):.3g} deg RMS" for name, (_, angle) in errors.items())
+    return Plot("Attitude against the truth", f"Angle between attitude and truth: {said}.", out)
+
+
+def _error(truth: Attitudes, attitudes: Attitudes) -> tuple[Array, Array]:
+    """Times within the truth's, and the angles to it there, deg."""
+    inside = (attitudes.time >= truth.time[0]) & (attitudes.time <= truth.time[-1])
+    some = Attitudes(attitudes.time[inside], attitudes.wxyz[inside])
+    return some.time, np.linalg.norm(_delta(truth, some), axis=1)
+
+
+def _delta(attitudes: Attitudes, others: Attitudes) -> Array:
+    """Rotation vectors, deg, from the attitudes, taken at the others' times, to the others."""
+    at = so3.interpolate(attitudes.time, attitudes.wxyz, others.time)
+    return np.rad2deg(so3.log(so3.multiply(so3.inverse(at), others.wxyz)))
+
+
+def _vectors(wxyz: Array) -> Array:
+    """Rotation vectors, deg."""
+    return np.rad2deg(so3.log(wxyz))

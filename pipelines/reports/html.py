@@ -1,0 +1,93 @@
+"""report.html: one file that opens offline.
+
+The page forbids itself any access to the network (Content-Security-Policy), so a report seen anywhere shows what it
+shows here.
+"""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import dataclass
+
+from pipelines.reports.formulas import FORMULAS
+from pipelines.reports.plots import common_plots
+from pipelines.reports.result import Calibration, Plot, quantities_of, truth_errors
+from pipelines.reports.units import human_unit, to_digits_of
+
+# Beyond so many sigmas of its prior a number says nothing.
+_MEANINGLESS = 10.0
+_NAMES = {"los": "Line of sight", "indexer": "Indexer", "head": "Helmet", "cube": "Tag cube"}
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A parameter as people read it."""
+
+    name: str
+    value: str
+    sigma: str
+    unit: str
+    prior: str
+    require: str
+    verdict: str
+    error: str
+
+
+def report_html(calibration: Calibration) -> str:
+    """The report as one HTML text."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from plotly.offline import get_plotlyjs
+
+    environment = Environment(
+        loader=PackageLoader("pipelines.reports"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    own = list(calibration.plots(calibration)) if calibration.plots else []
+    plots = [*own, *common_plots(calibration)]
+    facts = calibration.facts
+    return environment.get_template("report.html").render(
+        c=calibration,
+        method=_NAMES.get(calibration.problem.method, calibration.problem.method),
+        start=datetime.datetime.fromtimestamp(facts.epoch_ns // 1_000_000_000, datetime.UTC),
+        rows=_rows(calibration),
+        formulas=FORMULAS.get(calibration.problem.method, ()),
+        plots=[(plot.title, plot.caption, _div(plot, i)) for i, plot in enumerate(plots)],
+        plotly_js=get_plotlyjs() if plots else "",
+    )
+
+
+def _rows(calibration: Calibration) -> list[_Row]:
+    errors = truth_errors(calibration)
+    rows = []
+    quantities = quantities_of(calibration.problem, calibration.estimate)
+    for q, p in zip(quantities, calibration.parameters, strict=True):
+        unit, factor = human_unit(q)
+        known = p.sigma < _MEANINGLESS * q.scale
+        error = errors.get(p.name)
+        in_sigmas = f" ({error.error_sigmas:+.1f} σ)" if error and error.error_sigmas is not None and known else ""
+        rows.append(
+            _Row(
+                name=p.name,
+                value=to_digits_of(factor * p.value, factor * p.sigma) if known else "unknown",
+                sigma=to_digits_of(factor * p.sigma, factor * p.sigma) if known else "unknown",
+                unit=unit,
+                prior="free" if p.prior_sigma is None else f"{factor * p.prior_sigma:.3g}",
+                require=f"{factor * p.require:.3g}",
+                verdict=p.observability,
+                error=to_digits_of(factor * error.error, factor * p.sigma) + in_sigmas if error and known else "",
+            )
+        )
+    return rows
+
+
+def _div(plot: Plot, number: int) -> str:
+    """The figure as a part of a page that already has plotly.js."""
+    return plot.figure.to_html(
+        full_html=False,
+        include_plotlyjs=False,
+        div_id=f"plot{number}",
+        config={"responsive": True, "displaylogo": False, "modeBarButtonsToRemove": ["lasso2d", "select2d"]},
+    )

@@ -1,0 +1,230 @@
+"""Figures of any method's report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import cycle
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.methods.base import Array, History, Residuals
+from pipelines.reports.result import Calibration, Plot, quantities_of
+from pipelines.reports.units import human_unit
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
+
+# Okabe, Ito: told apart by the colour-blind too. The last is kept for what was rejected.
+COLORS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#8a7300", "#555555", "#7f3fbf", "#a0522d")
+REJECTED = "#d11d1d"
+
+_MOST_POINTS = 3000
+# Numbers are written into the correlation map up to this many parameters.
+_MOST_LABELLED = 12
+# The estimates' axis shows what came after this part of the recording.
+_SETTLED = 0.1
+
+
+def figure(y_title: str, height: int = 320, x_title: str = "time, s") -> go.Figure:
+    """An empty figure in the report's style."""
+    import plotly.graph_objects as go
+
+    out = go.Figure()
+    out.update_layout(
+        template="plotly_white",
+        height=height,
+        margin={"l": 56, "r": 12, "t": 12, "b": 44},
+        legend={"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0.0},
+        font={"family": "system-ui, sans-serif", "size": 13},
+        xaxis={"title": {"text": x_title}},
+        yaxis={"title": {"text": y_title}},
+    )
+    return out
+
+
+def thin(count: int) -> slice:
+    """Every n-th of so many points, so that no trace has more than a few thousand."""
+    return slice(None, None, max(1, -(-count // _MOST_POINTS)))
+
+
+def add_points(out: go.Figure, time: Array, values: Array, name: str, color: str, size: int = 4) -> None:
+    """Scatter values (n,) over time, thinned."""
+    some = thin(len(time))
+    out.add_scatter(
+        x=np.round(time[some], 4),
+        y=values[some].astype(np.float32),
+        mode="markers",
+        name=name,
+        marker={"color": color, "size": size},
+    )
+
+
+def add_line(
+    out: go.Figure, time: Array, values: Array, name: str, color: str, dash: str | None = None, shown: bool = True
+) -> None:
+    """A line over time, thinned."""
+    some = thin(len(time))
+    out.add_scatter(
+        x=np.round(time[some], 4),
+        y=values[some].astype(np.float32),
+        mode="lines",
+        name=name,
+        showlegend=shown,
+        line={"color": color, "width": 1.5, "dash": dash},
+    )
+
+
+def common_plots(calibration: Calibration) -> list[Plot]:
+    """Estimates over time, residuals or innovations, correlations."""
+    estimate = calibration.estimate
+    history = estimate.history
+    plots = _histories(calibration, history) if history is not None and len(history.time) else []
+    for family, residuals in estimate.residuals.items():
+        if len(residuals.time):
+            plots.append(_residuals(family, residuals, estimate.solver == "incremental"))
+            if estimate.solver == "incremental":
+                plots.append(_squares(family, residuals))
+    correlation = _correlation(calibration)
+    return [*plots, correlation] if correlation else plots
+
+
+def _residuals(family: str, residuals: Residuals, innovations: bool) -> Plot:
+    what = "innovation" if innovations else "residual"
+    out = figure(f"{what}, sigmas")
+    used = residuals.used
+    width = residuals.whitened.shape[1]
+    for i, color in zip(range(width), cycle(COLORS)):
+        add_points(out, residuals.time[used], residuals.whitened[used, i], f"component {i + 1}", color, 3)
+    if not used.all():
+        far = np.linalg.norm(residuals.whitened[~used], axis=1)
+        add_points(out, residuals.time[~used], far, "rejected (length)", REJECTED, 6)
+    for bound in (-3.0, 3.0):
+        out.add_hline(y=bound, line={"color": "#888888", "width": 1, "dash": "dot"})
+    if not used.all():
+        out.update_yaxes(range=_view(residuals.whitened[used]))
+    share = float((np.abs(residuals.whitened[used]) > 3.0).mean()) if used.any() else 0.0
+    return Plot(
+        f"{what.capitalize()}s of {family}",
+        f"{int(used.sum())} measurements used, {int((~used).sum())} rejected as outliers. In units of their sigma: "
+        f"{100.0 * share:.2g} % lie beyond 3 (dotted), 0.27 % would be normal.",
+        out,
+    )
+
+
+def _view(used: Array) -> list[float]:
+    """Range of an axis that shows what was used, and of the rejected what is not far off."""
+    reach = max(6.0, 1.2 * float(np.abs(used).max(initial=0.0)))
+    return [-reach, 2.0 * reach]
+
+
+def _squares(family: str, residuals: Residuals) -> Plot:
+    """Normalised innovation squared with its running mean."""
+    time, rows = residuals.time[residuals.used], residuals.whitened[residuals.used]
+    square = (rows**2).sum(axis=1)
+    width = max(1, min(100, len(square) // 10))
+    mean = np.convolve(square, np.full(width, 1.0 / width), mode="valid")
+    out = figure("innovation squared (NIS)")
+    add_points(out, time, square, "NIS", "#9ab6cc", 3)
+    add_line(out, time[width - 1 :], mean, f"mean of {width}", COLORS[0])
+    out.add_hline(y=rows.shape[1], line={"color": "#888888", "width": 1, "dash": "dot"})
+    return Plot(
+        f"Innovations squared of {family}",
+        f"The mean should stay at {rows.shape[1]} (dotted): above it the noise stated is too small or the model lacks "
+        "something at that time, below it the noise stated is too large.",
+        out,
+    )
+
+
+def _histories(calibration: Calibration, history: History) -> list[Plot]:
+    """One figure per variable: its numbers over time with a band of one sigma."""
+    column = {name: i for i, name in enumerate(calibration.estimate.names)}
+    plots = []
+    for parameter in calibration.problem.parameters:
+        quantities = [q for q in parameter.quantities if q.name in column and q.prior_sigma != 0.0]
+        groups = {human_unit(q): [r for r in quantities if human_unit(r) == human_unit(q)] for q in quantities}
+        for (unit, factor), members in groups.items():
+            out = figure(unit)
+            settled = history.time >= history.time[0] + _SETTLED * np.ptp(history.time)
+            reach = []
+            for q, color in zip(members, cycle(COLORS)):
+                values = factor * history.values[:, column[q.name]]
+                sigmas = factor * history.sigmas[:, column[q.name]]
+                _band(out, history.time, values, sigmas, color)
+                add_line(out, history.time, values, q.name, color)
+                reach += [(values - 2.0 * sigmas)[settled].min(), (values + 2.0 * sigmas)[settled].max()]
+                truth = (calibration.truth or {}).get(q.name)
+                if isinstance(truth, int | float):
+                    out.add_hline(y=factor * truth, line={"color": color, "width": 1, "dash": "dash"})
+            out.update_yaxes(range=[min(reach), max(reach)])
+            plots.append(
+                Plot(
+                    f"{_common_name([q.name for q in members])} over time",
+                    f"Estimate at each moment from what was recorded until then, {unit}; the band is one sigma"
+                    + (", dashed is the truth." if calibration.truth else "."),
+                    out,
+                )
+            )
+    return plots
+
+
+def _band(out: go.Figure, time: Array, values: Array, sigmas: Array, color: str) -> None:
+    some = thin(2 * len(time))
+    x = np.concatenate([time[some], time[some][::-1]])
+    y = np.concatenate([(values + sigmas)[some], (values - sigmas)[some][::-1]])
+    out.add_scatter(
+        x=np.round(x, 4),
+        y=y.astype(np.float32),
+        fill="toself",
+        fillcolor=color,
+        opacity=0.18,
+        line={"width": 0},
+        hoverinfo="skip",
+        showlegend=False,
+    )
+
+
+def _common_name(names: Sequence[str]) -> str:
+    """What the names of one variable have in common, for a title."""
+    if len(names) == 1:
+        return names[0]
+    common = names[0]
+    while common and not all(name.startswith(common) for name in names):
+        common = common[:-1]
+    return common.rstrip("_") or ", ".join(names)
+
+
+def _correlation(calibration: Calibration) -> Plot | None:
+    import plotly.graph_objects as go
+
+    quantities = quantities_of(calibration.problem, calibration.estimate)
+    sigmas = calibration.assessment.sigmas
+    shown: NDArray[np.intp] = np.flatnonzero(sigmas > 0.0)
+    if len(shown) < 2:
+        return None
+    covariance = calibration.assessment.covariance[np.ix_(shown, shown)]
+    correlation = np.clip(covariance / np.outer(sigmas[shown], sigmas[shown]), -1.0, 1.0)
+    names = [quantities[i].name for i in shown]
+    out = figure("", height=max(320, 130 + 24 * len(names)), x_title="")
+    out.add_trace(
+        go.Heatmap(
+            z=correlation.astype(np.float32),
+            x=names,
+            y=names,
+            zmin=-1.0,
+            zmax=1.0,
+            colorscale="RdBu",
+            reversescale=True,
+            colorbar={"thickness": 10, "x": 1.01},
+            texttemplate="%{z:.1f}" if len(names) <= _MOST_LABELLED else None,
+            hovertemplate="%{y}, %{x}: %{z:.3f}<extra></extra>",
+        )
+    )
+    out.update_xaxes(tickangle=-60, automargin=True, showgrid=False)
+    out.update_yaxes(autorange="reversed", automargin=True, showgrid=False)
+    return Plot(
+        "Correlation of the parameters",
+        "Near +1 or -1 two parameters trade against each other: their errors are not independent.",
+        out,
+    )

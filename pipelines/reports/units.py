@@ -1,0 +1,36 @@
+"""Numbers as people read them: degrees, arc seconds, milliseconds, with as many digits as the sigma warrants."""
+
+from __future__ import annotations
+
+import math
+
+from pipelines.methods.base import Quantity
+
+# What is wanted to better than this, rad or rad/s, is read in arc seconds or degrees per hour.
+_FINE = 2e-4
+
+
+def human_unit(quantity: Quantity) -> tuple[str, float]:
+    """The unit to show a quantity in, and what to multiply its SI number by."""
+    fine = quantity.require < _FINE
+    match quantity.unit:
+        case "rad":
+            return ("arcsec", math.degrees(1.0) * 3600.0) if fine else ("deg", math.degrees(1.0))
+        case "rad/s":
+            return ("deg/h", math.degrees(1.0) * 3600.0) if fine else ("deg/s", math.degrees(1.0))
+        case "s":
+            return "ms", 1e3
+        case "T":
+            return "nT", 1e9
+        case other:
+            return other, 1.0
+
+
+def to_digits_of(value: float, sigma: float) -> str:
+    """A number with the digits down to the second one of its sigma; six digits where the sigma is zero."""
+    if not (sigma > 0.0 and math.isfinite(sigma)):
+        return f"{value:.6g}"
+    decimals = 1 - math.floor(math.log10(sigma))
+    if decimals > 9:
+        return f"{value:.2e}"
+    return f"{value:.{max(decimals, 0)}f}"
