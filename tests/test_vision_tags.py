@@ -110,6 +110,15 @@ def test_tags_cut_by_the_picture_border_keep_honest_corners(renderer: Renderer) 
         assert (np.abs(error) < 5.0 * np.sqrt(np.diagonal(found.covariance[0], axis1=1, axis2=2))).all()
 
 
+def test_tags_whose_white_margin_nearly_touches_the_border_are_found() -> None:
+    # The margin's outline, a quad too, comes as near as 2 to 8 px to the upper and lower borders.
+    pinhole = Camera(640, 480, np.array([[600.0, 0, 320], [0, 600.0, 240], [0, 0, 1]]))
+    renderer = Renderer(pinhole)
+    for z in (0.1574, 0.1588, 0.1603, 0.1618):
+        light = renderer.radiance([tag_quad(5, SIZE, FACING, np.array([0.0, 0.0, z]))])
+        assert detect(expose(light, 0.6, 1.0, np.random.default_rng(0)), camera=pinhole).ids.tolist() == [5]
+
+
 def test_empty_pictures_and_wrong_questions() -> None:
     blank = np.full((480, 640), 90, dtype=np.uint8)
     assert len(detect(blank)) == 0

@@ -89,6 +89,10 @@ def _detector() -> Any:
     # Small tags: more pixels a cell when the bits are read, and 4 of 36 bits may be wrong (36h11 tells 5 wrong ones).
     parameters.perspectiveRemovePixelPerCell = 8
     parameters.errorCorrectionRate = 0.8
+    # The outline of the white margin, 0.03 to 0.04 of the tag's perimeter away, is another quad: by default the two are
+    # taken for one, and the tag is lost when the outline comes near the picture's border.
+    parameters.minMarkerDistanceRate = 0.03
+    parameters.minDistanceToBorder = 0
     return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11), parameters)
 
 
