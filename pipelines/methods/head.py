@@ -34,11 +34,8 @@ from pipelines.methods.base import (
 )
 from pipelines.methods.priors import rotation_prior, vector_prior
 from pipelines.methods.walking_bias import WalkingBias
-from pipelines.sessions.config import Config, first_given
+from pipelines.sessions.config import DEFAULT_NOISE, Config, check_names, first_given
 from pipelines.sessions.head import HeadData
-
-# Noise where neither the config nor the messages give it (contract's defaults).
-_GYRO_DENSITY, _BIAS_WALK, _PLATFORM_DENSITY, _VISION_SIGMA = 5.0e-5, 1.0e-6, 1.0e-5, 8.7e-3
 
 # Without vision for longer than this, s, a keyframe is set in between: gtsam corrects an increment for the bias to
 # first order only.
@@ -63,6 +60,7 @@ class _Model:
     helmet: GyroPath
     platform: GyroPath | None
     variance_rate: float  # rad^2 / s of an increment, both gyros
+    scale_error: float  # sigma of an increment per angle turned
     bias: WalkingBias
     bias_hat: Array
     loss: TruncatedLoss
@@ -99,13 +97,13 @@ def _prepare(data: HeadData, config: Config) -> _Model:
             f"at least {_FEWEST_FRAMES} are needed: check the topics and their clocks"
         )
     vision_t, measured = data.vision_t[inside], data.vision_wxyz[inside]
-    density = first_given(config.noise.gyro_density, data.gyro_density, _GYRO_DENSITY)
+    density = first_given(config.noise.gyro_density, data.gyro_density, DEFAULT_NOISE.gyro_density)
     platform_density = 0.0
     platform = None
     if data.platform_t is not None and data.platform_gyro is not None:
         platform = GyroPath(data.platform_t, data.platform_gyro)
         platform_density = first_given(
-            config.noise.platform_gyro_density, data.platform_gyro_density, _PLATFORM_DENSITY
+            config.noise.platform_gyro_density, data.platform_gyro_density, DEFAULT_NOISE.platform_gyro_density
         )
     sqrt_information = _sqrt_information(data.vision_cov, inside, config)
 
@@ -114,7 +112,7 @@ def _prepare(data: HeadData, config: Config) -> _Model:
     sigma = float(1.0 / np.median(np.linalg.norm(sqrt_information, axis=(1, 2)) / np.sqrt(3.0)))
     bias_hat, vRh = _guess(data, vision_t, iRh, sigma)
     time, vision = _keyframes(vision_t)
-    walk = first_given(config.noise.gyro_bias_walk, _BIAS_WALK)
+    walk = first_given(config.noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk)
     return _Model(
         time=time,
         vision=vision,
@@ -124,6 +122,7 @@ def _prepare(data: HeadData, config: Config) -> _Model:
         helmet=GyroPath(data.head_t, data.head_gyro, bias_hat),
         platform=platform,
         variance_rate=density**2 + platform_density**2,
+        scale_error=first_given(config.noise.gyro_scale, DEFAULT_NOISE.gyro_scale),
         bias=WalkingBias.over(time[0], time[-1], walk, density),
         bias_hat=bias_hat,
         loss=TruncatedLoss(gate(3)),
@@ -135,7 +134,7 @@ def _prepare(data: HeadData, config: Config) -> _Model:
 def _sqrt_information(covariance: Array | None, inside: NDArray[np.bool_], config: Config) -> Array:
     """(n, 3, 3): from the config, else from the messages, else the default."""
     if covariance is None or config.noise.vision_attitude is not None:
-        sigma = first_given(config.noise.vision_attitude, _VISION_SIGMA)
+        sigma = first_given(config.noise.vision_attitude, DEFAULT_NOISE.vision_attitude)
         return np.broadcast_to(np.eye(3) / sigma, (int(inside.sum()), 3, 3))
     root: Array = np.linalg.cholesky(np.linalg.inv(covariance[inside]))
     return np.swapaxes(root, 1, 2)
@@ -196,12 +195,16 @@ def _parameters(config: Config, platform: bool) -> tuple[Parameter, ...]:
         return tuple(quantity(f"{name}_{axis}", unit, scale, require, fixed, extra) for axis in "xyz")
 
     bias_key = WalkingBias(np.zeros(2), 0.0).key(0)
-    return (
+    parameters = (
         Parameter(bias_key, triple(_BIAS, "rad/s", 0.05, 2e-3, extra=0.0 if platform else EARTH_RATE)),
         Parameter(_HELMET_KEY, triple(_HELMET, "rad", 0.35, 1e-2), rotation_vector_coordinates),
         Parameter(_CAMERA_KEY, triple(_CAMERA, "rad", 0.35, 1e-2, fixed=not platform), rotation_vector_coordinates),
         Parameter(_OFFSET_KEY, (quantity(_OFFSET, "s", 0.05, 5e-3),)),
     )
+    names = [q.name for p in parameters for q in p.quantities]
+    check_names(config.priors, names, "priors")
+    check_names(config.require, names, "require")
+    return parameters
 
 
 def _state(keyframe: int) -> int:
@@ -262,13 +265,14 @@ def _step(model: _Model, keyframes: range) -> Step:
         factors.append(model.bias.mean_factor(end))
         stand_ins[model.bias.key(0)] = model.bias.mean_key(end)
     increments = model.helmet.increments(model.time[before], model.time[after])
+    turned = model.scale_error * np.linalg.norm(so3.log(increments.wxyz), axis=1)
     gyro = ahrs_factors(
         [_state(k) for k in before],
         [_state(k) for k in after],
         [model.bias.key(int(n)) for n in nodes],
         increments,
         model.bias_hat,
-        model.variance_rate * increments.duration,
+        model.variance_rate * increments.duration + turned**2,
     )
     return Step(
         time=float(model.time[keyframes[-1]]),

@@ -47,10 +47,14 @@ class _Section(BaseModel):
 
 
 class Noise(_Section):
-    """Noise of the sensors: densities per sqrt(Hz), walks per sqrt(s), the others per sample; None where not given."""
+    """Noise of the sensors: densities per sqrt(Hz), walks per sqrt(s), the others per sample; None where not given.
+
+    gyro_scale (no unit) is what scale and alignment errors of the gyro add: a fraction of the angle turned.
+    """
 
     gyro_density: Sigma | None = None
     gyro_bias_walk: SigmaOrZero | None = None
+    gyro_scale: SigmaOrZero | None = None
     platform_gyro_density: SigmaOrZero | None = None
     accel_density: Sigma | None = None
     mag_density: Sigma | None = None
@@ -59,6 +63,22 @@ class Noise(_Section):
     encoder: SigmaOrZero | None = None
     vision_attitude: Sigma | None = None
     corner_px: Sigma | None = None
+
+
+# Where neither the config nor a message says anything.
+DEFAULT_NOISE = Noise(
+    gyro_density=5.0e-5,
+    gyro_bias_walk=1.0e-6,
+    gyro_scale=0.0,
+    platform_gyro_density=1.0e-5,
+    accel_density=2.0e-3,
+    mag_density=5.0e-8,
+    los_error=2.0e-5,
+    los_roll=2.0e-4,
+    encoder=1.0e-5,
+    vision_attitude=8.7e-3,
+    corner_px=0.3,
+)
 
 
 class Tag(_Section):

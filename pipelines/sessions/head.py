@@ -58,7 +58,7 @@ class HeadData:
 
 
 def read_head(recording: Recording, config: Config) -> HeadData:
-    """Read and check a head session whose vision attitudes are messages.
+    """Read and check a head session; without vision attitudes they are taken from the pictures of the tag board.
 
     Raises InputError when a topic is missing or unusable, see pipelines.sessions.checks, and when the topics have no
     time in common.
@@ -76,7 +76,12 @@ def read_head(recording: Recording, config: Config) -> HeadData:
         spans[name] = platform_t
 
     name = config.topic("vision_attitude")
-    vision_t, vision_wxyz, vision_cov = _vision(recording, name, epoch, dropped)
+    vision_cov: Array | None
+    if name in recording.topics or not _has_pictures(recording, config):
+        vision_t, vision_wxyz, vision_cov = _vision(recording, name, epoch, dropped)
+    else:
+        name = config.topic("image")
+        vision_t, vision_wxyz, vision_cov = _from_pictures(recording, config, epoch, dropped)
     check_overlap({**spans, name: vision_t})
 
     truth_t = truth_wxyz = None
@@ -136,6 +141,33 @@ def write_head(
 def _wanted(recording: Recording, config: Config, key: str) -> bool:
     """Whether an optional topic is there, or the config asks for it by name."""
     return config.topic(key) in recording.topics or key in config.topics
+
+
+def _has_pictures(recording: Recording, config: Config) -> bool:
+    return config.topic("image") in recording.topics and "vision_attitude" not in config.topics
+
+
+def _from_pictures(
+    recording: Recording, config: Config, epoch_ns: int, dropped: dict[str, int]
+) -> tuple[Array, Array, Array]:
+    """Attitudes of the helmet's tag board, seen in the pictures."""
+    from pipelines.vision.camera import Camera
+    from pipelines.vision.head import board_attitudes
+    from pipelines.vision.pose import TagBody
+
+    topic = config.topic("image")
+    if config.head.board is None or not config.head.board.tags:
+        raise InputError(
+            f"topic {topic}: the pictures need the tags on the helmet: give them in the config as head.board"
+        )
+    info = recording.camera_info(config.topic("camera_info"))
+    camera = Camera(info.width, info.height, info.k, info.distortion_model, info.d)
+    board = TagBody.from_board(config.head.board)
+    seen = board_attitudes(recording.images(topic), camera, board, config.noise.corner_px)
+    for reason, number in seen.dropped.items():
+        count(dropped, f"{topic}: {reason}", number)
+    t, keep = clean(topic, seen.t_ns, epoch_ns, seen.cRh, dropped)
+    return t, seen.cRh[keep], seen.covariance[keep]
 
 
 def _gyro(

@@ -17,8 +17,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from factors import so3
 from factors.earth import earth_rate
-from pipelines.sessions.head import HeadData
+from pipelines.errors import InputError
+from pipelines.sessions.head import HeadData, write_head
 from pipelines.simulation.motion import EulerMotion, Swing, sample_times
+from pipelines.simulation.scenario import load_scenario
 
 Array = NDArray[np.float64]
 
@@ -188,3 +190,16 @@ def _truth(scenario: HeadScenario, bias: Array) -> dict[str, float]:
         for axis, value in zip("xyz", vector, strict=True)
     }
     return truth | {"time_offset": scenario.time_offset_s}
+
+
+def write_simulation(scenario: str | None, seed: int, out: Path, images: bool) -> None:
+    """Simulate a scenario (by name or file, None is head_nominal) and write it as a session with its truth.
+
+    Raises:
+        InputError: no such scenario, or it cannot be written.
+    """
+    settings = load_scenario(HeadScenario, scenario or "head_nominal")
+    if images:
+        raise InputError("head: pictures cannot be simulated yet; leave out --images")
+    data, truth = simulate_head(settings, seed)
+    write_head(out, data, truth, head_config(settings))

@@ -1,0 +1,148 @@
+"""The command `alidade`: parses, calls, prints."""
+
+from __future__ import annotations
+
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Calibrates how sensors are mounted and how wrong they are, from MCAP recordings, and says how sure it is.",
+)
+
+_EXIT_CODES = {"calibrated": 0, "unobservable": 3, "weak": 3, "inconsistent": 4}
+
+
+class Solver(StrEnum):
+    """The solvers of `calibrate`."""
+
+    batch = "batch"
+    incremental = "incremental"
+    published = "published"
+
+
+_Session = Annotated[Path, typer.Argument(metavar="SESSION.mcap", help="The recording.")]
+_MethodName = Annotated[str | None, typer.Option("--method", help="los, indexer, head or cube; by default what fits.")]
+_ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML that overrides the recording's own config.")]
+_Window = Annotated[str, typer.Option(help="Of the incremental solver: seconds kept, or 'all'.")]
+
+
+@app.command()
+def calibrate(
+    session: _Session,
+    method: _MethodName = None,
+    config: _ConfigFile = None,
+    solver: Annotated[Solver, typer.Option(help="How to solve.")] = Solver.batch,
+    window: _Window = "1",
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; default: SESSION-SOLVER.")] = None,
+) -> None:
+    """Calibrate a recording. Exit code 0 calibrated, 2 unusable input, 3 weak or unobservable, 4 inconsistent."""
+    from pipelines import terminal
+    from pipelines.calibrate import calibrate as run
+    from pipelines.reports.write import write_results
+
+    (calibration,) = run(session, [solver.value], method, config, _seconds(window))
+    folder = out or session.with_name(f"{session.stem}-{solver.value}")
+    written = write_results(folder, calibration)
+    terminal.show([calibration])
+    terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
+    raise typer.Exit(_EXIT_CODES[calibration.assessment.status])
+
+
+@app.command()
+def compare(session: _Session, method: _MethodName = None, config: _ConfigFile = None, window: _Window = "1") -> None:
+    """The published, batch and incremental solvers side by side, with errors where the truth is known."""
+    from pipelines import terminal
+    from pipelines.calibrate import calibrate as run
+
+    terminal.show(run(session, ["published", "batch", "incremental"], method, config, _seconds(window)))
+
+
+@app.command()
+def simulate(
+    method: Annotated[str, typer.Argument(help="los, indexer, head or cube.")],
+    out: Annotated[Path, typer.Option(help="The recording to write.")],
+    scenario: Annotated[str | None, typer.Option(help="YAML file or the name of one in datasets/scenarios.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
+    images: Annotated[bool, typer.Option("--images", help="Pictures instead of what is measured in them.")] = False,
+) -> None:
+    """Simulate a recording with its truth."""
+    from pipelines import terminal
+    from pipelines.registry import method as find
+
+    find(method).simulate(scenario, seed, out, images)
+    terminal.say(f"Wrote {out}")
+
+
+@app.command()
+def info(session: _Session, config: _ConfigFile = None) -> None:
+    """What is in a recording: topics, rates, gaps, and the methods it can serve."""
+    from pipelines import terminal
+    from pipelines.sessions.config import ATTACHMENT, load_config
+    from pipelines.sessions.info import session_facts
+    from pipelines.sessions.reading import open_recording
+
+    recording = open_recording(session)
+    facts = session_facts(recording, load_config(recording.attachment(ATTACHMENT), config))
+    terminal.show_facts(session.name, facts)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the recording and its results.")] = Path("alidade-demo"),
+) -> None:
+    """Simulate a helmet on a manoeuvring platform, calibrate it with all three solvers, say where the report is."""
+    from pipelines import terminal
+    from pipelines.calibrate import calibrate as run
+    from pipelines.registry import method
+    from pipelines.reports.write import write_results
+
+    out.mkdir(parents=True, exist_ok=True)
+    session = out / "head_mounts.mcap"
+    method("head").simulate("head_mounts", 1, session, False)
+    calibrations = run(session, ["published", "batch", "incremental"])
+    for calibration in calibrations:
+        write_results(out / calibration.estimate.solver, calibration)
+    terminal.show(calibrations)
+    terminal.say(f"Report: {(out / 'batch' / 'report.html').resolve()}")
+
+
+def _seconds(window: str) -> float | None:
+    from pipelines.errors import InputError
+
+    if window == "all":
+        return None
+    try:
+        seconds = float(window)
+    except ValueError:
+        seconds = 0.0
+    if not 0.0 < seconds < float("inf"):
+        raise InputError(f"--window {window}: seconds above zero are needed, or 'all'")
+    return seconds
+
+
+def main() -> None:
+    """Run the command; known trouble is one line on stderr."""
+    from pipelines.errors import InputError
+
+    try:
+        app()
+    except InputError as error:
+        print(f"alidade: {error}", file=sys.stderr)
+        sys.exit(2)
+    except Exception as error:
+        # Not to be imported before it is needed: gtsam takes a quarter of a second.
+        if type(error).__name__ != "IndeterminateError":
+            raise
+        print(f"alidade: {error}", file=sys.stderr)
+        sys.exit(3)
+
+
+if __name__ == "__main__":
+    main()

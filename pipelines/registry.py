@@ -1,0 +1,60 @@
+"""The methods, each with the functions that serve it. A new method is one more entry here.
+
+Entries are made when asked for: the modules behind them import gtsam, which takes a quarter of a second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipelines.errors import InputError
+
+if TYPE_CHECKING:
+    from pipelines.methods.base import Estimate, Problem
+    from pipelines.reports.result import Calibration, Plot
+    from pipelines.sessions.config import Config
+    from pipelines.sessions.reading import Recording
+
+
+@dataclass(frozen=True)
+class Method:
+    """What the command line needs of a method.
+
+    Attributes:
+        read: recording and config -> the method's data.
+        problem: data and config -> the graph.
+        published: data, config and problem -> the published solver's estimate.
+        simulate: scenario (name, file or None for the nominal one), seed, file to write, whether with pictures.
+        plots: the method's own figures for the report.
+    """
+
+    read: Callable[[Recording, Config], Any]
+    problem: Callable[[Any, Config], Problem]
+    published: Callable[[Any, Config, Problem], Estimate]
+    simulate: Callable[[str | None, int, Path, bool], None]
+    plots: Callable[[Any], Callable[[Calibration], Sequence[Plot]]] | None = None
+
+
+def method(name: str) -> Method:
+    """The method of that name. Raises InputError when there is none."""
+    if name not in _METHODS:
+        raise InputError(f"method {name} is not built yet; there are {', '.join(_METHODS)}")
+    return _METHODS[name]()
+
+
+def _head() -> Method:
+    from functools import partial
+
+    from pipelines.methods.head import problem
+    from pipelines.published.head import published_estimate
+    from pipelines.reports.head import head_plots
+    from pipelines.sessions.head import read_head
+    from pipelines.simulation.head import write_simulation
+
+    return Method(read_head, problem, published_estimate, write_simulation, lambda data: partial(head_plots, data))
+
+
+_METHODS: dict[str, Callable[[], Method]] = {"head": _head}
