@@ -8,7 +8,8 @@ from statistics import NormalDist
 def quantile(probability: float, dof: float) -> float:
     """x with P(chi-square of dof degrees of freedom <= x) = probability.
 
-    To 1 % for dof >= 100; upper quantiles to 5 % for dof >= 2. Wilson, Hilferty, "The distribution of chi-square", PNAS 1931: the cube root of x / dof is nearly normal.
+    To 1 % for dof >= 100; upper quantiles to 5 % for dof >= 2. Wilson,
+    Hilferty, "The distribution of chi-square", PNAS 1931: the cube root of x / dof is nearly normal.
     """
     if dof <= 0.0:
         return 0.0

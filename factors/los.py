@@ -17,12 +17,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factors import so3
-from factors.preintegration import GyroPath
 
 Array = NDArray[np.float64]
 Residuals = tuple[Array, Callable[[], tuple[Array, ...]]]
@@ -37,6 +37,9 @@ _TURNS = {
     "collimation": 2,
     "camera_roll": 1,
 }
+# Motion around a picture is smoothed over this time to either side, s: long against noise, short against sway.
+SMOOTHING = 0.2
+
 # Which turn an angle adds to, and its sign.
 _PLACES = {
     "delta_px": ("elevation", 1.0),
@@ -65,27 +68,65 @@ class GimbalPath:
         if len(self.t) < 4 or self.angles.shape != (len(self.t), 2):
             raise ValueError(f"needs stamps (G,) and angles (G, 2), G >= 4; got {self.t.shape} and {self.angles.shape}")
 
-    def weights(self, at: ArrayLike) -> tuple[NDArray[np.intp], Array, Array]:
-        """The four samples (n, 4) around each time, their weights in the angles and their weights in the rates."""
+    def weights(self, at: ArrayLike) -> tuple[NDArray[np.intp], Array]:
+        """The four samples (n, 4) around each time and their weights (n, 4), Lagrange's polynomials."""
         at = np.asarray(at, dtype=float)
         first = np.clip(np.searchsorted(self.t, at, side="right") - 2, 0, len(self.t) - 4)
         samples = first[:, None] + np.arange(4)
-        # Lagrange's polynomials and, by the product rule, their derivatives.
         nodes = self.t[samples]
-        away = at[:, None] - nodes
-        apart = nodes[:, :, None] - nodes[:, None, :] + np.eye(4)
-        value, rate = np.ones_like(away), np.zeros_like(away)
-        for j in range(4):
-            others = np.arange(4) != j
-            rate[:, others] = (rate[:, others] * away[:, [j]] + value[:, others]) / apart[:, others, j]
-            value[:, others] *= away[:, [j]] / apart[:, others, j]
-        return samples, value, rate
+        away, apart = at[:, None] - nodes, nodes[:, :, None] - nodes[:, None, :] + np.eye(4)
+        factors = np.where(np.eye(4, dtype=bool), 1.0, away[:, None, :] / apart)
+        return samples, factors.prod(axis=2)
 
-    def at(self, at: ArrayLike) -> tuple[Array, Array]:
-        """Angles (n, 2), rad, and their rates (n, 2), rad/s, at the times."""
-        samples, value, rate = self.weights(at)
-        angles = self.angles[samples]
-        return np.einsum("nk,nki->ni", value, angles), np.einsum("nk,nki->ni", rate, angles)
+    def at(self, at: ArrayLike) -> Array:
+        """Angles (n, 2), rad, at the times."""
+        samples, weights = self.weights(at)
+        return np.einsum("nk,nki->ni", weights, self.angles[samples])
+
+
+@dataclass(frozen=True)
+class LocalMotion:
+    """How gyro and gimbal move around the stamps of n pictures, smoothed.
+
+    A time offset must not be read off the noise of the sensors: what the stabilisation leaves of the picture's motion is
+    no larger than what noise puts into rates from sample to sample.
+
+    Attributes:
+        rate, acceleration: (n, 3) of the gyro, rad/s and rad/s^2.
+        gimbal_rate, gimbal_acceleration: (n, 2) of azimuth and elevation, rad/s and rad/s^2.
+    """
+
+    rate: Array
+    acceleration: Array
+    gimbal_rate: Array
+    gimbal_acceleration: Array
+
+    @classmethod
+    def around(cls, at: Array, gyro_t: Array, gyro: Array, gimbal: GimbalPath) -> LocalMotion:
+        """From polynomials fitted to the samples within about SMOOTHING s: of degree 2 to rates, 3 to angles."""
+        rates = _local_polynomials(at, gyro_t, gyro, 2)
+        angles = _local_polynomials(at, gimbal.t, gimbal.angles, 3)
+        return cls(rates[:, 0], rates[:, 1], angles[:, 1], 2.0 * angles[:, 2])
+
+    def __getitem__(self, rows: Any) -> LocalMotion:
+        """The motion around some of the pictures."""
+        return LocalMotion(
+            self.rate[rows], self.acceleration[rows], self.gimbal_rate[rows], self.gimbal_acceleration[rows]
+        )
+
+
+def _local_polynomials(at: Array, t: Array, values: Array, degree: int) -> Array:
+    """Coefficients (n, degree + 1, d), lowest first, of polynomials about the times fitted to the samples."""
+    count = int(np.clip(2.0 * SMOOTHING / np.median(np.diff(t)), 2 * degree + 1, len(t)))
+    scale = SMOOTHING ** np.arange(degree + 1)
+    out = np.empty((len(at), degree + 1, values.shape[1]))
+    for some in np.array_split(np.arange(len(at)), len(at) // 2000 + 1):
+        first = np.clip(np.searchsorted(t, at[some]) - count // 2, 0, len(t) - count)
+        samples = first[:, None] + np.arange(count)
+        powers = ((t[samples] - at[some, None]) / SMOOTHING)[..., None] ** np.arange(degree + 1)
+        transposed = np.swapaxes(powers, 1, 2)
+        out[some] = np.linalg.solve(transposed @ powers, transposed @ values[samples]) / scale[:, None]
+    return out
 
 
 @dataclass(frozen=True)
@@ -95,16 +136,16 @@ class LosDirectionFactor:
     Predicted: phz = atan2(dx, dy), phx = -atan2(dz, dy) with d = cRm tRm^T ey and, as a third row, the camera's roll
     about its line of sight, the twist about y that takes the target's texture to its picture: the rotation part of the
     picture's local similarity. Blocks: tRm at the stamps (rotations), the mounting angles `names` (rad), and with
-    `paths` the gyro bias (3, rad/s) and the time offset (1, s; positive when the picture was taken later than its stamp
-    says).
+    `motion` the gyro bias (3, rad/s) and the time offset (1, s; positive when the picture was taken later than its
+    stamp says).
 
     Attributes:
         time: (n,) stamps of the pictures, s.
         measured: (n, 2) phx, phz, or (n, 3) with the roll, rad.
         sqrt_information: (n, 2, 2) or (n, 3, 3), 1/rad.
-        gimbal: (n, 2) azimuth and elevation at the stamps, rad; not looked at with `paths`.
+        gimbal: (n, 2) azimuth and elevation at the stamps, rad.
         names: the mounting angles that are variables; all others are zero.
-        paths: gimbal and gyro over the session when the time offset is a variable.
+        motion: around the stamps, when the time offset is a variable.
     """
 
     time: Array
@@ -112,7 +153,7 @@ class LosDirectionFactor:
     sqrt_information: Array
     gimbal: Array
     names: tuple[str, ...] = ("delta_px", "delta_gx", "delta_gy", "delta_z")
-    paths: tuple[GimbalPath, GyroPath] | None = None
+    motion: LocalMotion | None = None
 
     @property
     def rows(self) -> int:
@@ -121,28 +162,24 @@ class LosDirectionFactor:
 
     def __call__(self, tRm: Array, angles: Array, bias: Array | None = None, dt: Array | None = None) -> Residuals:
         """Residual sqrt_information * (measured - predicted), (n, 2) or (n, 3)."""
-        if self.paths is None or bias is None or dt is None:
+        if self.motion is None or bias is None or dt is None:
             return self._residuals(tRm, angles, self.gimbal)
-        gimbal_path, gyro = self.paths
-        at = self.time + dt[:, 0]
-        gimbal, gimbal_rate = gimbal_path.at(at)
-        step = gyro.increments(self.time, at)
-        bias_error = bias - gyro.bias_hat
-        correction = np.einsum("nij,nj->ni", step.bias_jacobian, bias_error)
-        dV = so3.multiply(step.wxyz, so3.exp(correction))
-        residual, late_jacobians = self._residuals(so3.multiply(tRm, dV), angles, gimbal, gimbal_rate)
+        move = self.motion
+        gimbal_rate = move.gimbal_rate + move.gimbal_acceleration * dt
+        gimbal = self.gimbal + (move.gimbal_rate + 0.5 * move.gimbal_acceleration * dt) * dt
+        rate = move.rate + move.acceleration * dt - bias
+        arc = (move.rate + 0.5 * move.acceleration * dt - bias) * dt
+        turn = so3.exp(arc)
+        residual, late_jacobians = self._residuals(so3.multiply(tRm, turn), angles, gimbal, gimbal_rate)
 
         def jacobians() -> tuple[Array, ...]:
             by_attitude, by_angles, by_gimbal = late_jacobians()
-            by_correction = so3.right_jacobian(correction)
-            # Rate of dV: the gyro's rate seen through the bias correction, and the correction's own growth.
-            growth = np.einsum("nij,nj->ni", so3.hat(step.rate) @ step.bias_jacobian + np.eye(3), -bias_error)
-            rate = so3.rotate(so3.exp(-correction), step.rate) + np.einsum("nij,nj->ni", by_correction, growth)
+            by_arc = by_attitude @ so3.right_jacobian(arc)
             return (
-                by_attitude @ so3.matrix(so3.inverse(dV)),
+                by_attitude @ so3.matrix(so3.inverse(turn)),
                 by_angles,
-                by_attitude @ by_correction @ step.bias_jacobian,
-                by_attitude @ rate[..., None] + by_gimbal,
+                by_arc * -dt[:, :, None],
+                by_arc @ rate[..., None] + by_gimbal,
             )
 
         return residual, jacobians
@@ -270,7 +307,7 @@ class LosRateFactor:
             exact: H with the term -sin(eps) eta' of H2,1 that the publication leaves out.
             roll: take the rates in a frame that does not roll with the camera.
         """
-        angles = gimbal.at(gyro_t)[0]
+        angles = gimbal.at(gyro_t)
         H = rate_matrix(angles, gyro, exact)
         if roll:
             rho = _running_integral(gyro_t, roll_rate(angles, gyro))

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from pipelines.reports.result import Calibration
+    from pipelines.reports.result import Calibration, ParameterResult
     from pipelines.sessions.info import SessionFacts
 
 _console = Console(highlight=False)
@@ -32,42 +33,39 @@ def say(text: str) -> None:
 
 
 def show(calibrations: Sequence[Calibration]) -> None:
-    """One table: a row a parameter, the truth where known, value and sigma (and error in sigmas) of each solver."""
+    """One table, a row a parameter: the truth where known, then value, sigma and error (in sigmas) of each solver."""
     from pipelines.reports.result import truth_errors
     from pipelines.reports.units import human_unit, to_digits_of
 
-    truths = [truth_errors(c) for c in calibrations]
     alone = len(calibrations) == 1
-    table = Table(header_style="bold", row_styles=["", "dim"] if not alone else [])
-    table.add_column("parameter")
-    table.add_column("unit")
-    if any(truths):
-        table.add_column("truth", justify="right")
+    errors = [truth_errors(c) for c in calibrations]
+    found = [{p.name: p for p in c.parameters} for c in calibrations]
+    table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
+    table.add_column("parameter", no_wrap=True)
+    table.add_column("unit", no_wrap=True)
+    if any(errors):
+        table.add_column("truth", justify="right", no_wrap=True)
     for c in calibrations:
-        table.add_column("value" if alone else c.estimate.solver, justify="right")
-        table.add_column("sigma", justify="right")
-        if any(truths):
-            table.add_column("error / sigma" if alone else "err/s", justify="right")
+        table.add_column("value ± sigma" if alone else c.estimate.solver, justify="right")
     if alone:
-        table.add_column("verdict")
+        table.add_column("verdict", no_wrap=True)
     for q in calibrations[0].problem.quantities:
         unit, factor = human_unit(q)
         row = [q.name, unit]
-        known = next((t[q.name] for t in truths if q.name in t), None)
-        found = [{p.name: p for p in c.parameters}.get(q.name) for c in calibrations]
-        finest = min((p.sigma for p in found if p is not None and p.sigma > 0.0), default=0.0) * factor
-        if any(truths):
-            row.append(to_digits_of(known.value * factor, finest) if known else "")
-        for p, t in zip(found, truths, strict=True):
-            row += ["-", "-"] if p is None else _number(p.value * factor, p.sigma * factor)
-            if any(truths):
-                error = t[q.name].error_sigmas if q.name in t else None
-                row.append("" if error is None else f"{error:+.1f}")
-        if alone and found[0] is not None:
-            verdict = found[0].observability
+        truth = next((e[q.name].value for e in errors if q.name in e), None)
+        if any(errors):
+            finest = min((f[q.name].sigma for f in found if q.name in f and f[q.name].sigma > 0.0), default=0.0)
+            row.append("" if truth is None else to_digits_of(truth * factor, finest * factor))
+        for parameters, known in zip(found, errors, strict=True):
+            error = known[q.name].error_sigmas if q.name in known else None
+            row.append(_cell(parameters[q.name], factor, error, alone) if q.name in parameters else "-")
+        if alone and q.name in found[0]:
+            verdict = found[0][q.name].observability
             row.append(f"[{_COLOURS[verdict]}]{verdict}[/]")
         table.add_row(*row)
     _console.print(table)
+    if any(errors):
+        say("In brackets: error in sigmas.")
     for c in calibrations:
         _verdict(c, name=not alone)
 
@@ -93,10 +91,15 @@ def show_facts(name: str, facts: SessionFacts) -> None:
             _console.print(f"[green]{method}: yes[/]")
 
 
-def _number(value: float, sigma: float) -> list[str]:
+def _cell(parameter: ParameterResult, factor: float, error_sigmas: float | None, alone: bool) -> str:
     from pipelines.reports.units import to_digits_of
 
-    return [to_digits_of(value, sigma), "fixed" if sigma == 0.0 else f"{sigma:.2g}"]
+    value = to_digits_of(parameter.value * factor, parameter.sigma * factor)
+    if parameter.sigma == 0.0:
+        return f"{value} fixed"
+    # Several solvers fit a terminal's 80 columns only with the error below the value.
+    error = "" if error_sigmas is None else f"{' ' if alone else chr(10)}({error_sigmas:+.1f})"
+    return f"{value} ±{parameter.sigma * factor:.2g}{error}"
 
 
 def _verdict(calibration: Calibration, name: bool) -> None:

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from factors import so3
-from factors.los import GimbalPath, LosDirectionFactor, LosRateFactor, rate_matrix, roll_rate
-from factors.preintegration import GyroPath
+from factors.los import GimbalPath, LocalMotion, LosDirectionFactor, LosRateFactor, rate_matrix, roll_rate
 from factors.vectorized import Array, Kind, VectorizedFactor
 from tests.numerics import assert_jacobians_match, assert_rows_are_independent
 
@@ -21,15 +20,15 @@ ALL = (
 )
 
 
-def _paths() -> tuple[GimbalPath, GyroPath]:
-    rng = np.random.default_rng(1)
+def _paths() -> tuple[GimbalPath, LocalMotion]:
     t = np.arange(0.0, 6.0, 0.005)
-    rate = 0.8 * np.sin(np.array([1.1, 0.7, 1.9]) * t[:, None] + rng.uniform(0, 6, size=3))
+    rate = 0.8 * np.sin(np.array([1.1, 0.7, 1.9]) * t[:, None] + np.array([0.0, 1.0, 2.0]))
     angles = np.stack([0.4 * np.sin(1.3 * t), 0.5 + 0.2 * np.cos(0.9 * t)], axis=1)
-    return GimbalPath(t, angles), GyroPath(t, rate, rng.normal(scale=0.01, size=3))
+    gimbal = GimbalPath(t, angles)
+    return gimbal, LocalMotion.around(TIMES, t, rate, gimbal)
 
 
-GIMBAL, GYRO = _paths()
+GIMBAL, MOTION = _paths()
 
 
 def _passive(axis: int, angle: float) -> Array:
@@ -40,19 +39,19 @@ def _blocks(names: tuple[str, ...], size: float, off: float, dt: float | None) -
     """Attitudes that see the target within `off` rad of the line of sight at mounting angles of `size` rad."""
     rng = np.random.default_rng(2)
     angles = np.broadcast_to(size * rng.normal(size=len(names)), (N, len(names)))
-    level = LosDirectionFactor(TIMES, np.zeros((N, 3)), np.tile(np.eye(3), (N, 1, 1)), GIMBAL.at(TIMES)[0], names)
+    level = LosDirectionFactor(TIMES, np.zeros((N, 3)), np.tile(np.eye(3), (N, 1, 1)), GIMBAL.at(TIMES), names)
     tRm = so3.multiply(so3.exp(off * rng.normal(size=(N, 3))), level.camera(angles))
     if dt is None:
         return [tRm, angles]
-    return [tRm, angles, GYRO.bias_hat + rng.normal(scale=0.02, size=(N, 3)), np.full((N, 1), dt)]
+    return [tRm, angles, rng.normal(scale=0.02, size=(N, 3)), np.full((N, 1), dt)]
 
 
 def _factor(rows: np.ndarray, names: tuple[str, ...], width: int, offset: bool) -> LosDirectionFactor:
     rng = np.random.default_rng(3)
     root = rng.normal(size=(N, width, width)) + 3 * np.eye(width)
     measured = 0.05 * rng.normal(size=(N, width))
-    paths = (GIMBAL, GYRO) if offset else None
-    return LosDirectionFactor(TIMES[rows], measured[rows], root[rows], GIMBAL.at(TIMES)[0][rows], names, paths)
+    motion = MOTION[rows] if offset else None
+    return LosDirectionFactor(TIMES[rows], measured[rows], root[rows], GIMBAL.at(TIMES)[rows], names, motion)
 
 
 @pytest.mark.parametrize("names", [CORE, ALL], ids=["core", "all"])
@@ -115,16 +114,29 @@ def test_roll_is_right_handed_and_the_turn_of_the_picture(off: float) -> None:
     assert predicted[2] == pytest.approx(roll, abs=1e-12 if off == 0.0 else 2e-3)
 
 
+def _cubics(seed: int) -> tuple[Array, list[np.poly1d]]:
+    rng = np.random.default_rng(seed)
+    return np.sort(rng.uniform(0, 2, 80)), [np.poly1d(rng.normal(size=4)) for _ in range(2)]
+
+
 def test_gimbal_path_is_exact_for_cubics() -> None:
-    rng = np.random.default_rng(4)
-    t = np.sort(rng.uniform(0, 2, 30))
-    azimuth, elevation = np.poly1d(rng.normal(size=4)), np.poly1d(rng.normal(size=4))
-    path = GimbalPath(t, np.stack([azimuth(t), elevation(t)], axis=1))
-    at = np.concatenate([t, rng.uniform(t[0], t[-1], 50)])
-    angles, rates = path.at(at)
-    np.testing.assert_allclose(angles, np.stack([azimuth(at), elevation(at)], axis=1), atol=1e-10)
-    slopes = np.stack([azimuth.deriv()(at), elevation.deriv()(at)], axis=1)
-    np.testing.assert_allclose(rates, slopes, atol=1e-8)
+    t, angles = _cubics(4)
+    path = GimbalPath(t, np.stack([p(t) for p in angles], axis=1))
+    at = np.concatenate([t, np.random.default_rng(8).uniform(t[0], t[-1], 50)])
+    np.testing.assert_allclose(path.at(at), np.stack([p(at) for p in angles], axis=1), atol=1e-9)
+
+
+def test_local_motion_is_exact_for_cubics() -> None:
+    t, angles = _cubics(4)
+    path = GimbalPath(t, np.stack([p(t) for p in angles], axis=1))
+    rate = np.poly1d([0.3, -0.2, 0.1])
+    at = np.random.default_rng(9).uniform(t[0], t[-1], 50)
+    motion = LocalMotion.around(at, t, np.stack([rate(t)] * 3, axis=1), path)
+    np.testing.assert_allclose(motion.rate, np.stack([rate(at)] * 3, axis=1), atol=1e-7)
+    np.testing.assert_allclose(motion.acceleration, np.stack([rate.deriv()(at)] * 3, axis=1), atol=1e-6)
+    np.testing.assert_allclose(motion.gimbal_rate, np.stack([p.deriv()(at) for p in angles], axis=1), atol=1e-6)
+    second = np.stack([p.deriv(2)(at) for p in angles], axis=1)
+    np.testing.assert_allclose(motion.gimbal_acceleration, second, atol=1e-4)
 
 
 def _los_rate(X: Array, gimbal: Array, w_b: Array) -> tuple[Array, float]:

@@ -462,11 +462,10 @@ def _measurement(
 
 
 def _timestamps(model: _Model, i: int) -> dict[int, float]:
-    """The biases of the last groups stay alive, and so does the mean so far; what the groups share never ages."""
+    """The biases and means of the last groups stay alive; what all groups share never ages."""
     now = float(model.groups[i].rates.edges[-1])
-    keys = [model.bias.key(k) for k in range(max(0, i + 1 - _KEPT), i + 1)]
-    keys += [model.bias.mean_key(k) for k in range(max(0, i - 1), i + 1)]
-    return dict.fromkeys(keys, now)
+    alive = range(max(0, i + 1 - _KEPT), i + 1)
+    return {key: now for k in alive for key in (model.bias.key(k), model.bias.mean_key(k))}
 
 
 def _frames(data: IndexerData, motion: AxisMotion) -> NDArray[np.intp]:

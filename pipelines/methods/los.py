@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from factors import so3
 from factors.attitude import ahrs_factors
 from factors.chi_square import gate
-from factors.los import GimbalPath, LosDirectionFactor
+from factors.los import SMOOTHING, GimbalPath, LocalMotion, LosDirectionFactor
 from factors.preintegration import GyroPath
 from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
 from pipelines.errors import InputError
@@ -60,7 +60,8 @@ class _Model:
     measured: Array  # (K, 3) phx, phz, roll
     sqrt_information: Array  # (K, 3, 3), zero rows for a roll not measured
     angles: Array  # (K, 2) azimuth, elevation
-    paths: tuple[GimbalPath, GyroPath]
+    gyro: GyroPath
+    motion: LocalMotion | None  # around the keyframes, when the time offset is a variable
     variance_rate: float  # rad^2 / s of an increment
     bias: WalkingBias
     nodes: Array  # (K,) whole numbers: of the bias in force up to each keyframe
@@ -71,11 +72,6 @@ class _Model:
     def names(self) -> tuple[str, ...]:
         """The mounting angles that are variables."""
         return tuple(q.name for q in self.parameters[0].quantities)
-
-    @property
-    def has_offset(self) -> bool:
-        """Whether the time offset is a variable."""
-        return len(self.parameters) == 3
 
 
 def problem(data: LosData, config: Config) -> Problem:
@@ -101,9 +97,11 @@ def _prepare(data: LosData, config: Config) -> tuple[_Model, dict[str, int]]:
     density = config.noise.pick("gyro_density", data.gyro_density)
     gimbal, gyro = GimbalPath(data.gimbal_t, data.gimbal), GyroPath(data.gyro_t, data.gyro)
     covariance = _covariance(data, gimbal, config)
-    rows, starts, dropped = _select(data, np.sqrt(covariance[:, 0, 0]))
+    has_offset = len(parameters) == 3
+    rows, starts, dropped = _select(data, np.sqrt(covariance[:, 0, 0]), SMOOTHING if has_offset else 0.0)
     time, measured = data.image_t[rows], data.error[rows]
-    angles = gimbal.at(time)[0]
+    angles = gimbal.at(time)
+    motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal) if has_offset else None
     bias = WalkingBias.over(time[0], time[-1], config.noise.pick("gyro_bias_walk", None), density)
     middle = np.where(starts, time, 0.5 * (time + np.roll(time, 1)))
     model = _Model(
@@ -113,7 +111,8 @@ def _prepare(data: LosData, config: Config) -> tuple[_Model, dict[str, int]]:
         measured=measured,
         sqrt_information=_sqrt_information(covariance[rows]),
         angles=angles,
-        paths=(gimbal, gyro),
+        gyro=gyro,
+        motion=motion,
         variance_rate=density**2,
         bias=bias,
         nodes=bias.node_at(middle),
@@ -131,8 +130,8 @@ def _covariance(data: LosData, gimbal: GimbalPath, config: Config) -> Array:
     else:
         covariance = data.error_cov.copy()
     covariance[~np.isfinite(data.error[:, 2]), 2, :] = np.nan
-    _, weights, _ = gimbal.weights(data.image_t)
-    elevation = gimbal.at(data.image_t)[0][:, 1]
+    _, weights = gimbal.weights(data.image_t)
+    elevation = gimbal.at(data.image_t)[:, 1]
     # Azimuth turns the picture about an axis that is elevated against its own up.
     by_azimuth = np.stack([np.zeros_like(elevation), np.cos(elevation), np.sin(elevation)], axis=1)
     encoder = config.noise.pick("encoder", None) ** 2 * (weights**2).sum(axis=1)
@@ -152,36 +151,44 @@ def _sqrt_information(covariance: Array) -> Array:
     return out
 
 
-def _select(data: LosData, sigma: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_], dict[str, int]]:
-    """The pictures used, which of them are the first of their target, and what was left out."""
+def _select(data: LosData, sigma: Array, margin: float) -> tuple[NDArray[np.intp], NDArray[np.bool_], dict[str, int]]:
+    """The pictures used, which of them are the first of their target, and what was left out.
+
+    `margin`, s, is left out on either side of a gap in which the gimbal may have turned to another target.
+    """
     t = data.image_t
     outside = (t < max(data.gyro_t[0], data.gimbal_t[0])) | (t > min(data.gyro_t[-1], data.gimbal_t[-1]))
     blind = ~outside & (_in_gap(data.gimbal_t, t) | _in_gap(data.gyro_t, t))
     rows = np.flatnonzero(~outside & ~blind)
-    starts = _first_of_target(data, rows)
-    lone = np.zeros(len(rows), dtype=bool)
-    early = np.zeros(len(rows), dtype=bool)
-    for chain in np.split(np.arange(len(rows)), np.flatnonzero(starts)[1:]):
-        wrong = _wrong_before_followers(data.error[rows[chain], :2], sigma[rows[chain]])
-        early[chain[:wrong]] = True
-        if len(chain) - wrong < 2:
-            lone[chain[wrong:]] = True
-        elif wrong:
-            starts[chain[wrong]] = True
-    keep = ~(lone | early)
-    if keep.sum() < _FEWEST_PICTURES:
+    chains = np.split(rows, np.flatnonzero(_first_of_target(data, rows))[1:])
+    close, early, lone = (np.zeros(len(t), dtype=bool) for _ in range(3))
+    starts = np.zeros(len(t), dtype=bool)
+    for i, chain in enumerate(chains):
+        after = t[chain] - t[chain[0]] if i > 0 else np.inf
+        before = t[chain[-1]] - t[chain] if i < len(chains) - 1 else np.inf
+        close[chain] = np.minimum(after, before) < margin
+        left = chain[~close[chain]]
+        wrong = _wrong_before_followers(data.error[left, :2], sigma[left])
+        early[left[:wrong]] = True
+        if len(left) - wrong < 2:
+            lone[left[wrong:]] = True
+        else:
+            starts[left[wrong]] = True
+    keep = rows[~(close | early | lone)[rows]]
+    if len(keep) < _FEWEST_PICTURES:
         raise InputError(
-            f"only {int(keep.sum())} of {len(t)} LOS errors can be used, at least {_FEWEST_PICTURES} are needed: "
+            f"only {len(keep)} of {len(t)} LOS errors can be used, at least {_FEWEST_PICTURES} are needed: "
             f"{int(outside.sum())} lie outside the records of gyro and gimbal, {int(blind.sum())} in their gaps, "
             f"{int(lone.sum())} stand alone; check the topics and their clocks"
         )
     reasons = {
         "LOS error outside the records of gyro and gimbal": outside,
         "LOS error in a gap of gyro or gimbal": blind,
-        "LOS error alone between gaps": lone,
+        "LOS error beside a gap, where the time offset cannot be followed": close,
         "LOS error disagrees with those after it where a target is found": early,
+        "LOS error alone between gaps": lone,
     }
-    return rows[keep], starts[keep], {reason: int(mask.sum()) for reason, mask in reasons.items() if mask.any()}
+    return keep, starts[keep], {reason: int(mask.sum()) for reason, mask in reasons.items() if mask.any()}
 
 
 def _in_gap(t: Array, at: Array) -> NDArray[np.bool_]:
@@ -338,7 +345,7 @@ def _gyro_factors(model: _Model, keyframes: range) -> list[Factor]:
     """The gyro between pictures of one target; a wide prior where a target is found."""
     found = [k for k in keyframes if model.starts[k]]
     after = np.array([k for k in keyframes if not model.starts[k]], dtype=int)
-    increments = model.paths[1].increments(model.time[after - 1], model.time[after])
+    increments = model.gyro.increments(model.time[after - 1], model.time[after])
     native = ahrs_factors(
         [_state(k) for k in after - 1],
         [_state(k) for k in after],
@@ -376,11 +383,11 @@ def _picture_factor(model: _Model, k: NDArray[np.intp], rows: int, family: str) 
         model.sqrt_information[k, :rows, :rows],
         model.angles[k],
         model.names,
-        model.paths if model.has_offset else None,
+        None if model.motion is None else model.motion[k],
     )
     columns: list[int | list[int]] = [[_state(i) for i in k], _ANGLES_KEY]
     kinds: list[Kind] = ["rotation", len(model.names)]
-    if model.has_offset:
+    if model.motion is not None:
         columns += [[model.bias.key(int(n)) for n in model.nodes[k]], _OFFSET_KEY]
         kinds += [3, 1]
     return Factor.of(family, VectorizedFactor(rows_model, columns, kinds, model.loss))
@@ -409,14 +416,13 @@ def _predict(model: _Model, keyframes: range, initial: gtsam.Values, current: gt
     for key in initial.keys():
         if gtsam.Symbol(key).chr() in (ord("b"), ord("m")):
             out.insert(key, bias)
-    gyro = model.paths[1]
     for k in keyframes:
         if model.starts[k]:
             cRm = _camera(model.angles[k : k + 1], current.atVector(_ANGLES_KEY), model.names)
             attitude = _seen(cRm, model.measured[k : k + 1])[0]
         else:
             before = out if out.exists(_state(k - 1)) else current
-            step = gyro.increments(model.time[k - 1 : k], model.time[k : k + 1])
+            step = model.gyro.increments(model.time[k - 1 : k], model.time[k : k + 1])
             previous = so3.from_gtsam([before.atRot3(_state(k - 1))])[0]
             attitude = so3.compose(previous, step.wxyz[0], so3.exp(step.bias_jacobian[0] @ bias))
         out.insert(_state(k), so3.to_gtsam(attitude))

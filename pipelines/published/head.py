@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from factors import so3
 from pipelines.errors import InputError
-from pipelines.methods.base import Attitudes, Estimate, History, Problem
+from pipelines.methods.base import Attitudes, ChiSquare, Estimate, History, Problem, Residuals
 from pipelines.sessions.config import DEFAULT_NOISE, Config, first_given
 from pipelines.sessions.head import HeadData
 
@@ -36,6 +36,7 @@ class HeadFilterResult:
         bias: (K, 3) gyro bias, rad/s.
         bias_sigma: (K, 3) its standard deviation, rad/s.
         innovation: (K, 3) vision minus prediction in yaw, pitch, roll, rad; zero at the first frame.
+        innovation_covariance: (K, 3, 3) what the filter expected of it, rad^2.
     """
 
     t: Array
@@ -43,6 +44,7 @@ class HeadFilterResult:
     bias: Array
     bias_sigma: Array
     innovation: Array
+    innovation_covariance: Array
 
 
 def euler_kalman_filter(
@@ -81,18 +83,20 @@ def euler_kalman_filter(
     x = np.concatenate([measured[0], np.zeros(3)])
     P = np.diag(np.repeat([vision_sigma**2, bias_sigma**2], 3))
     R = vision_sigma**2 * np.eye(3)
-    states, sigmas, innovations = [x], [np.sqrt(np.diag(P))], [np.zeros(3)]
+    states, sigmas, innovations, expected = [x], [np.sqrt(np.diag(P))], [np.zeros(3)], [R]
     for k, steps in enumerate(_steps(data, t), start=1):
         for dt, w_iv, w_ib in steps:
             x, P = _predict(x, P, dt, w_iv, w_ib, gyro_density, bias_walk)
         innovation = _nearest_angles(measured[k], x[:3])
-        gain = P[:, :3] @ np.linalg.inv(P[:3, :3] + R)
+        S = P[:3, :3] + R
+        gain = P[:, :3] @ np.linalg.inv(S)
         x = x + gain @ innovation
         P = P - gain @ P[:3]
         P = 0.5 * (P + P.T)
         states.append(x)
         sigmas.append(np.sqrt(np.diag(P)))
         innovations.append(innovation)
+        expected.append(S)
     history = np.array(states)
     return HeadFilterResult(
         t=t,
@@ -100,6 +104,7 @@ def euler_kalman_filter(
         bias=_smooth(history[:, 3:], smoothing_window, smoothing_threshold),
         bias_sigma=np.array(sigmas)[:, 3:],
         innovation=np.array(innovations),
+        innovation_covariance=np.array(expected),
     )
 
 
@@ -117,6 +122,9 @@ def published_estimate(data: HeadData, config: Config, problem: Problem) -> Esti
         first_given(sigma, DEFAULT_NOISE.vision_attitude),
     )
     names = tuple(q.name for q in problem.quantities if q.name.startswith("gyro_bias"))
+    # The first frame starts the filter; from the second on the innovations say whether it is consistent.
+    whitened = np.linalg.solve(np.linalg.cholesky(result.innovation_covariance), result.innovation[..., None])[1:, :, 0]
+    square, dof = float((whitened**2).sum()), float(whitened.size)
     return Estimate(
         solver="published",
         names=names,
@@ -124,6 +132,8 @@ def published_estimate(data: HeadData, config: Config, problem: Problem) -> Esti
         covariance=np.diag(result.bias_sigma[-1] ** 2),
         converged=True,
         message="all vision frames used",
+        residuals={"vision": Residuals(result.t[1:], whitened, np.ones(len(whitened), dtype=bool))},
+        chi_square=ChiSquare(square, dof, {"vision": (square, dof)}),
         history=History(result.t, result.bias, result.bias_sigma),
         attitudes=Attitudes(result.t, result.wxyz),
         seconds={"solve": time.perf_counter() - start},

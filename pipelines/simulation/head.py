@@ -9,6 +9,7 @@ true attitude at the end of every interval, with no integration error.
 from __future__ import annotations
 
 from io import StringIO
+from pathlib import Path
 from typing import Annotated, Self
 
 import numpy as np

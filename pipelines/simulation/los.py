@@ -62,6 +62,17 @@ class LosAngles(BaseModel):
     axis_nonperpendicularity: float = 0.0
 
 
+class Loss(BaseModel):
+    """A target lost over [start, end), after which the camera holds on to another one."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    start_s: float
+    end_s: float
+    azimuth_step_deg: float = 0.0  # how far the gimbal is turned towards the other target
+    elevation_step_deg: float = 0.0
+
+
 class LosScenario(BaseModel):
     """What the `los` simulator is asked for; every key has a default."""
 
@@ -89,16 +100,21 @@ class LosScenario(BaseModel):
     image_phase: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.3
     acquisition_error: NotNegative = 1e-3  # rad, sigma per axis: how far off its axis the camera finds a target
     dropouts_s: list[Span] = []  # [start, end): pictures without the target
-    lost_s: list[Span] = []  # likewise, after which the camera holds on to another target
+    losses: list[Loss] = []
     outlier_share: Share = 0.0
     outlier_size: NotNegative = 5e-3  # rad, sigma per axis
     priors: dict[str, float | None] = {}  # passed on to the recording's config
 
     @model_validator(mode="after")
     def _spans_are_ordered(self) -> Self:
-        if any(end <= start for start, end in [*self.dropouts_s, *self.lost_s]):
-            raise ValueError("dropouts_s, lost_s: each gap is [start, end] with start before end")
+        if any(end <= start for start, end in self.gaps):
+            raise ValueError("dropouts_s, losses: each gap starts before it ends")
         return self
+
+    @property
+    def gaps(self) -> list[Span]:
+        """[start, end) of all stretches without pictures of the target, s."""
+        return [*self.dropouts_s, *((loss.start_s, loss.end_s) for loss in self.losses)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +179,7 @@ def simulate_motion(scenario: LosScenario, rng: np.random.Generator) -> LosMotio
     bias = np.asarray(start + np.cumsum(steps, axis=0))
     gyro = exact + bias + scenario.noise.gyro_density * np.sqrt(rate_hz) * rng.standard_normal(exact.shape)
     first = np.deg2rad(scenario.azimuth_deg), np.deg2rad(scenario.elevation_deg)
-    return LosMotion(edges, _stabilise(gyro, 1.0 / rate_hz, *first), gyro_t, gyro, bias)
+    return LosMotion(edges, _stabilise(gyro, _slew(scenario, gyro_t), 1.0 / rate_hz, *first), gyro_t, gyro, bias)
 
 
 def carrier_attitude(scenario: LosScenario, t: Array) -> Array:
@@ -201,16 +217,26 @@ def los_config(scenario: LosScenario) -> str:
     return text.getvalue()
 
 
-def _stabilise(gyro: Array, dt: float, azimuth: float, elevation: float) -> Array:
+def _slew(scenario: LosScenario, t: Array) -> Array:
+    """Rates (N, 2), rad/s, at which the gimbal is turned towards other targets while none is in sight."""
+    out = np.zeros((len(t), 2))
+    for loss in scenario.losses:
+        during = (t >= loss.start_s) & (t < loss.end_s)
+        step = np.deg2rad([loss.azimuth_step_deg, loss.elevation_step_deg])
+        out[during] += step / (loss.end_s - loss.start_s)
+    return out
+
+
+def _stabilise(gyro: Array, slew: Array, dt: float, azimuth: float, elevation: float) -> Array:
     """Gimbal angles (N + 1, 2) under the commanded rates, the command taken for the angles at mid-interval."""
     out = [(azimuth, elevation)]
-    for wx, wy, wz in gyro.tolist():
+    for (wx, wy, wz), (slew_z, slew_x) in zip(gyro.tolist(), slew.tolist(), strict=True):
         middle, lift = azimuth, elevation
         for _ in range(2):
             rate_z, rate_x = _command(wx, wy, wz, middle, lift)
             middle, lift = azimuth + 0.5 * dt * rate_z, elevation + 0.5 * dt * rate_x
         rate_z, rate_x = _command(wx, wy, wz, middle, lift)
-        azimuth, elevation = azimuth + dt * rate_z, elevation + dt * rate_x
+        azimuth, elevation = azimuth + dt * (rate_z + slew_z), elevation + dt * (rate_x + slew_x)
         out.append((azimuth, elevation))
     return np.array(out)
 
@@ -226,13 +252,13 @@ def _pictures(scenario: LosScenario, motion: LosMotion, rng: np.random.Generator
     """Stamps and exact phx, phz and roll (K, 3) of the pictures that show the target."""
     stamps = sample_times(scenario.duration_s, scenario.image_rate_hz, scenario.image_phase)
     seen = np.ones(len(stamps), dtype=bool)
-    for start, end in [*scenario.dropouts_s, *scenario.lost_s]:
+    for start, end in scenario.gaps:
         seen &= (stamps < start) | (stamps >= end)
     stamps = stamps[seen]
     t = stamps + scenario.time_offset_s
     nRb = scenario.carrier.attitude(t)
     nRc = so3.multiply(nRb, camera_attitude(scenario, motion.gimbal_at(t)))
-    target = np.searchsorted(np.sort([end for _, end in scenario.lost_s]), stamps, side="right")
+    target = np.searchsorted(np.sort([loss.end_s for loss in scenario.losses]), stamps, side="right")
     exact = np.empty((len(stamps), 3))
     for k in np.unique(target):
         mine = np.flatnonzero(target == k)
