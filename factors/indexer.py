@@ -163,7 +163,7 @@ class IndexerAverageFactor:
 
         gyro = (1 + scale) * mRt w + bias,    w = fixed + cos(epsilon) cosine + sin(epsilon) sine
 
-    compared in frame t, where encoder noise has fixed directions. Blocks: theta (3, rad), gyro bias (3, rad/s), then
+    compared in frame t, where encoder noise has fixed directions. Blocks: theta (3), gyro bias (3, rad/s), then
     the options: "scale" (3), the gyro's scale error; "epsilon" (1, rad); "tilt" (3, rad), a small rotation of the true
     platform rate against the encoders' account of it, w -> Exp(tilt) w, for errors that come again with every turn.
 
@@ -172,12 +172,14 @@ class IndexerAverageFactor:
         rates: the platform's mean rates over the same windows.
         sqrt_information: (3 n, 3 n) of the difference, in t: neighbours share the encoder noise at their common edge.
         options: those that are variables, in the order of their blocks; the others are zero.
+        theta_unit: rad, what theta's block counts.
     """
 
     gyro: Array
     rates: PlatformRates
     sqrt_information: Array
     options: tuple[Option, ...] = ()
+    theta_unit: float = 1.0
     rows: int = 3
 
     @classmethod
@@ -189,11 +191,12 @@ class IndexerAverageFactor:
         encoder: float,
         options: tuple[Option, ...] = (),
         wander: float = 0.0,
+        theta_unit: float = 1.0,
     ) -> IndexerAverageFactor:
         """From the noise of the sensors.
 
         Args:
-            gyro, rates, options: as the attributes.
+            gyro, rates, options, theta_unit: as the attributes.
             density: gyro noise, rad/s/sqrt(Hz): angle random walk in each window.
             encoder: white encoder noise at the edges, rad.
             wander: error of the encoders' account of the platform's attitude, about any axis, rad, that changes from
@@ -206,7 +209,7 @@ class IndexerAverageFactor:
         across = so3.hat(rates.fixed + rates.cosine)
         for i, block in enumerate(across @ np.swapaxes(across, 1, 2)):
             covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += wander**2 * block
-        return cls(gyro, rates, np.linalg.inv(np.linalg.cholesky(covariance)), options)
+        return cls(gyro, rates, np.linalg.inv(np.linalg.cholesky(covariance)), options, theta_unit)
 
     @property
     def time(self) -> Array:
@@ -218,6 +221,7 @@ class IndexerAverageFactor:
         given = dict(zip(self.options, more, strict=True))
         gain = 1.0 + given.get("scale", np.zeros(3))
         epsilon, tilt = given.get("epsilon", np.zeros(1)), given.get("tilt", np.zeros(3))
+        theta = self.theta_unit * theta
         tRm = mounting(theta)
         corrected = (self.gyro - bias) / gain
         encoders = self.rates.fixed + np.cos(epsilon) * self.rates.cosine + np.sin(epsilon) * self.rates.sine
@@ -232,7 +236,7 @@ class IndexerAverageFactor:
                 "epsilon": -so3.rotate(turn, by_epsilon)[..., None],
                 "tilt": so3.matrix(turn) @ so3.hat(encoders) @ so3.right_jacobian(tilt),
             }
-            by_theta = -so3.matrix(tRm) @ so3.hat(corrected) @ _angle_axes(theta)
+            by_theta = -so3.matrix(tRm) @ so3.hat(corrected) @ _angle_axes(theta) * self.theta_unit
             return tuple(self._whiten(block) for block in (by_theta, -by_gyro, *(blocks[o] for o in self.options)))
 
         return self._whiten(error[..., None])[..., 0], jacobians

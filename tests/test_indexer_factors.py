@@ -133,6 +133,14 @@ def test_jacobians_with_some_options(options: tuple[Option, ...]) -> None:
     assert_jacobians_match(model, list(kinds), list(values))
 
 
+def test_theta_may_count_another_unit() -> None:
+    model = replace(_model(RNG.normal(size=(N, 3)), _rates()), theta_unit=1e-3)
+    blocks = _blocks(0.3)
+    in_units = [blocks[0] / 1e-3, *blocks[1:]]
+    np.testing.assert_allclose(model(*in_units)[0], replace(model, theta_unit=1.0)(*blocks)[0], atol=1e-12)
+    assert_jacobians_match(model, KINDS, in_units, [1e-2, 1e-5, 1e-5, 1e-5, 1e-5])
+
+
 def test_jacobians_near_the_singular_angle() -> None:
     model = _model(RNG.normal(size=(N, 3)), _rates())
     blocks = _blocks(0.1)

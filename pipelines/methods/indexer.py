@@ -35,7 +35,7 @@ from factors.indexer import (
 from factors.vectorized import VectorizedFactor
 from pipelines.errors import InputError
 from pipelines.methods.base import Array, Attitudes, Factor, Parameter, Problem, Quantity, Step
-from pipelines.methods.priors import vector_prior
+from pipelines.methods.priors import prior_sigmas, vector_prior
 from pipelines.methods.walking_bias import WalkingBias
 from pipelines.sessions.config import Config, check_names
 from pipelines.sessions.indexer import IndexerData
@@ -51,10 +51,15 @@ _KEYS: dict[str, int] = {
     name: int(gtsam.symbol(c, 0)) for name, c in zip(("theta", "scale", "epsilon"), "TSE", strict=True)
 }
 
+# The variable theta counts these, rad: a smoother linearises anew when a variable has moved by some hundredth, and
+# angles that earlier turns left open by as much as their prior have to be followed to the arc second.
+_THETA_UNIT = 1e-3
 # Windows end where the driven axes have turned by this much, rad: short enough to see the earth's rate come and go.
 _WINDOW_ANGLE = np.pi / 4
 # Less than this over, rad, does not make a window of its own.
 _CRUMB = 2e-3
+# Encoder samples that a dwell leaves to the motion after it.
+_DWELL_MARGIN = 3.0
 # Groups and windows of fewer gyro samples than this are the crumbs of rounding.
 _FEWEST_SAMPLES = 4
 # A gyro that departs from the encoders by more than this share of the rate is not the gyro of this axis.
@@ -230,7 +235,8 @@ def groups_of(data: IndexerData, config: Config, motion: AxisMotion, split: bool
 def _borders(motion: AxisMotion, run: Run) -> Iterator[tuple[str, Array]]:
     """For each group of a run its kind and the times at which its windows begin and end."""
     if run.axis == "none":
-        yield "dwell", np.array([run.start, run.stop])
+        # Ends early enough for the motion that follows to start where it does.
+        yield "dwell", np.array([run.start, run.stop - _DWELL_MARGIN * float(np.median(np.diff(motion.t)))])
         return
     first, last = np.searchsorted(motion.t, [run.start, run.stop])
     rows = slice(first, last + 1)
@@ -303,7 +309,7 @@ def _parameters(config: Config) -> tuple[Parameter, ...]:
 
     bias_key = WalkingBias(np.zeros(2), 0.0).key(0)
     parameters = [
-        Parameter(_KEYS["theta"], several(THETA, "rad", 0.1, 5e-5, 0.1)),
+        Parameter(_KEYS["theta"], several(THETA, "rad", 0.1, 5e-5, 0.1), _theta_coordinates),
         Parameter(bias_key, several(BIAS, "rad/s", 1e-3, 1e-5, 1e-3)),
     ]
     if any(config.priors.get(name, 0.0) != 0.0 for name in SCALE):
@@ -311,6 +317,11 @@ def _parameters(config: Config) -> tuple[Parameter, ...]:
     if config.priors.get(NONPERPENDICULARITY[0], 0.0) != 0.0:
         parameters.append(Parameter(_KEYS["epsilon"], several(NONPERPENDICULARITY, "rad", 1e-2, 5e-5, 0.0)))
     return tuple(parameters)
+
+
+def _theta_coordinates(values: gtsam.Values, key: int) -> tuple[Array, Array]:
+    """The angles in rad."""
+    return _THETA_UNIT * np.asarray(values.atVector(key)), _THETA_UNIT * np.eye(3)
 
 
 def _agreeing(groups: tuple[Group, ...], config: Config) -> tuple[tuple[Group, ...], int]:
@@ -422,11 +433,15 @@ def _steps(model: _Model, chunk: int) -> Iterator[Step]:
 
 def _begin(model: _Model, initial: gtsam.Values, factors: list[Factor]) -> None:
     """The calibration variables and their priors."""
-    guesses = {_KEYS["theta"]: model.theta_guess, model.bias.key(0): model.bias_guess}
+    guesses = {_KEYS["theta"]: model.theta_guess / _THETA_UNIT, model.bias.key(0): model.bias_guess}
     for parameter in model.parameters:
         size = len(parameter.quantities)
         initial.insert(parameter.key, guesses.get(parameter.key, np.zeros(size)))
-        factors.append(vector_prior(parameter, np.zeros(size)))
+        if parameter.key == _KEYS["theta"]:
+            noise = gtsam.noiseModel.Diagonal.Precisions((prior_sigmas(parameter) / _THETA_UNIT) ** -2)
+            factors.append(Factor("prior", gtsam.PriorFactorVector(parameter.key, np.zeros(size), noise)))
+        else:
+            factors.append(vector_prior(parameter, np.zeros(size)))
 
 
 def _bias_step(model: _Model, i: int, initial: gtsam.Values, factors: list[Factor]) -> dict[int, int]:
@@ -456,7 +471,9 @@ def _measurement(
             factors.append(Factor("prior", gtsam.PriorFactorVector(key, np.zeros(3), noise)))
         options, columns = (*options, "tilt"), [*columns, key]
     wander = model.slow if group.kind == "move" else 0.0
-    average = IndexerAverageFactor.of(group.gyro, group.rates, model.density, model.encoder, options, wander)
+    average = IndexerAverageFactor.of(
+        group.gyro, group.rates, model.density, model.encoder, options, wander, _THETA_UNIT
+    )
     kinds = [3, 3, *(1 if name == "epsilon" else 3 for name in options)]
     return Factor.of(group.kind, VectorizedFactor(average, columns, kinds, compress=compress))
 
@@ -480,7 +497,7 @@ def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) ->
     """The carrier's attitude nRb."""
     rows = model.frames[list(keyframes)]
     epsilon = float(values.atVector(_KEYS["epsilon"])[0]) if "epsilon" in model.options else 0.0
-    theta = np.asarray(values.atVector(_KEYS["theta"]))
+    theta = _theta_coordinates(values, _KEYS["theta"])[0]
     return Attitudes(model.data.gyro_t[rows], _carrier(model.data, model.motion, rows, theta, epsilon))
 
 

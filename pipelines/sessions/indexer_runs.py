@@ -139,6 +139,10 @@ def _runs(t: Array, angles: Array, moving: NDArray[np.bool_]) -> list[Run]:
             continue
         begins.append(int(begin))
         kept.append(int(state[begin]))
+    # A motion begins and ends a sample inside the rest about it, where an angle between samples is known exactly.
+    for i in range(1, len(begins)):
+        if (kept[i - 1] == 0) != (kept[i] == 0):
+            begins[i] += 1 if kept[i] == 0 else -1
     ends = [*begins[1:], len(t) - 1]
     return [_run(t, angles, s, a, b) for s, a, b in zip(kept, begins, ends, strict=True) if b > a]
 
