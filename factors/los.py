@@ -88,8 +88,8 @@ class GimbalPath:
 class LocalMotion:
     """How gyro and gimbal move around the stamps of n pictures, smoothed.
 
-    A time offset must not be read off the noise of the sensors: what the stabilisation leaves of the picture's motion is
-    no larger than what noise puts into rates from sample to sample.
+    A time offset must not be read off the noise of the sensors: what the stabilisation leaves of the picture's motion
+    is no larger than what noise puts into rates from sample to sample.
 
     Attributes:
         rate, acceleration: (n, 3) of the gyro, rad/s and rad/s^2.

@@ -25,7 +25,7 @@ from pipelines.errors import InputError
 from pipelines.methods.base import Array, Factor, Parameter, Problem, Quantity, Step
 from pipelines.methods.priors import vector_prior
 from pipelines.methods.walking_bias import WalkingBias
-from pipelines.sessions.config import Config, check_names
+from pipelines.sessions.config import DEFAULT_NOISE, Config, check_names, first_given
 from pipelines.sessions.los import LosData
 
 _ANGLES = ("delta_px", "delta_gx", "delta_gy")
@@ -63,6 +63,7 @@ class _Model:
     gyro: GyroPath
     motion: LocalMotion | None  # around the keyframes, when the time offset is a variable
     variance_rate: float  # rad^2 / s of an increment
+    scale_error: float  # sigma of an increment per angle turned
     bias: WalkingBias
     nodes: Array  # (K,) whole numbers: of the bias in force up to each keyframe
     loss: TruncatedLoss
@@ -94,7 +95,9 @@ def problem(data: LosData, config: Config) -> Problem:
 
 def _prepare(data: LosData, config: Config) -> tuple[_Model, dict[str, int]]:
     parameters = _parameters(config)
-    density = config.noise.pick("gyro_density", data.gyro_density)
+    noise = config.noise
+    density = first_given(noise.gyro_density, data.gyro_density, DEFAULT_NOISE.gyro_density)
+    walk = first_given(noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk)
     gimbal, gyro = GimbalPath(data.gimbal_t, data.gimbal), GyroPath(data.gyro_t, data.gyro)
     covariance = _covariance(data, gimbal, config)
     has_offset = len(parameters) == 3
@@ -102,7 +105,7 @@ def _prepare(data: LosData, config: Config) -> tuple[_Model, dict[str, int]]:
     time, measured = data.image_t[rows], data.error[rows]
     angles = gimbal.at(time)
     motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal) if has_offset else None
-    bias = WalkingBias.over(time[0], time[-1], config.noise.pick("gyro_bias_walk", None), density)
+    bias = WalkingBias.over(time[0], time[-1], walk, density)
     middle = np.where(starts, time, 0.5 * (time + np.roll(time, 1)))
     model = _Model(
         time=time,
@@ -114,6 +117,7 @@ def _prepare(data: LosData, config: Config) -> tuple[_Model, dict[str, int]]:
         gyro=gyro,
         motion=motion,
         variance_rate=density**2,
+        scale_error=first_given(noise.gyro_scale, DEFAULT_NOISE.gyro_scale),
         bias=bias,
         nodes=bias.node_at(middle),
         loss=TruncatedLoss(gate(3 if np.isfinite(measured[:, 2]).any() else 2)),
@@ -125,7 +129,8 @@ def _prepare(data: LosData, config: Config) -> tuple[_Model, dict[str, int]]:
 def _covariance(data: LosData, gimbal: GimbalPath, config: Config) -> Array:
     """(K, 3, 3) of phx, phz, roll: the tracker's or the config's, and the encoders'; NaN where not measured."""
     if data.error_cov is None:
-        los, roll = config.noise.pick("los_error", None), config.noise.pick("los_roll", None)
+        los = first_given(config.noise.los_error, DEFAULT_NOISE.los_error)
+        roll = first_given(config.noise.los_roll, DEFAULT_NOISE.los_roll)
         covariance = np.tile(np.diag([los**2, los**2, roll**2]), (len(data.image_t), 1, 1))
     else:
         covariance = data.error_cov.copy()
@@ -134,7 +139,7 @@ def _covariance(data: LosData, gimbal: GimbalPath, config: Config) -> Array:
     elevation = gimbal.at(data.image_t)[:, 1]
     # Azimuth turns the picture about an axis that is elevated against its own up.
     by_azimuth = np.stack([np.zeros_like(elevation), np.cos(elevation), np.sin(elevation)], axis=1)
-    encoder = config.noise.pick("encoder", None) ** 2 * (weights**2).sum(axis=1)
+    encoder = first_given(config.noise.encoder, DEFAULT_NOISE.encoder) ** 2 * (weights**2).sum(axis=1)
     shape = np.diag([1.0, 0.0, 0.0]) + by_azimuth[:, :, None] * by_azimuth[:, None, :]
     return covariance + encoder[:, None, None] * shape
 
@@ -346,13 +351,14 @@ def _gyro_factors(model: _Model, keyframes: range) -> list[Factor]:
     found = [k for k in keyframes if model.starts[k]]
     after = np.array([k for k in keyframes if not model.starts[k]], dtype=int)
     increments = model.gyro.increments(model.time[after - 1], model.time[after])
+    turned = model.scale_error * np.linalg.norm(so3.log(increments.wxyz), axis=1)
     native = ahrs_factors(
         [_state(k) for k in after - 1],
         [_state(k) for k in after],
         [model.bias.key(int(model.nodes[k])) for k in after],
         increments,
         np.zeros(3),
-        model.variance_rate * increments.duration,
+        model.variance_rate * increments.duration + turned**2,
     )
     return [*(_start_factor(model, k) for k in found), *(Factor("gyro", f) for f in native)]
 

@@ -8,12 +8,15 @@ it. Methods page, section 1.
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import InputError
+from pipelines.methods.base import ChiSquare, Estimate, History, Problem, Residuals
+from pipelines.sessions.config import DEFAULT_NOISE, Config, first_given
 from pipelines.sessions.los import LosData
 
 Array = NDArray[np.float64]
@@ -30,12 +33,14 @@ class LosLeastSquares:
         values: (n, 4) px, gx, gy, dz, rad.
         covariance: (n, 4, 4) if the rates' noise were white with the sigma given, rad^2.
         residuals: (n, 2) rates minus H X with the X before this interval, rad/s.
+        sigmas: (n,) of those by noise and by the X before, rad/s per component (root mean square).
     """
 
     t: Array
     values: Array
     covariance: Array
     residuals: Array
+    sigmas: Array
 
 
 def recursive_least_squares(
@@ -56,17 +61,45 @@ def recursive_least_squares(
     t, measured, H = rates(data, exact)
     variance = 2.0 * (los_sigma / np.diff(t)) ** 2
     x, P = np.zeros(4), initial_sigma**2 * np.eye(4)
-    values, covariances, residuals = [], [], []
+    values, covariances, residuals, sigmas = [], [], [], []
     for y, h, r in zip(measured, H, variance, strict=True):
         innovation = y - h @ x
-        gain = P @ h.T @ np.linalg.inv(h @ P @ h.T + forgetting * r * np.eye(2))
+        S = h @ P @ h.T + forgetting * r * np.eye(2)
+        gain = P @ h.T @ np.linalg.inv(S)
+        sigmas.append(np.sqrt(0.5 * np.trace(S)))
         x = x + gain @ innovation
         P = (P - gain @ h @ P) / forgetting
         P = 0.5 * (P + P.T)
         values.append(x)
         covariances.append(P)
         residuals.append(innovation)
-    return LosLeastSquares(t[1:], np.array(values), np.array(covariances), np.array(residuals))
+    return LosLeastSquares(t[1:], np.array(values), np.array(covariances), np.array(residuals), np.array(sigmas))
+
+
+def published_estimate(data: LosData, config: Config, problem: Problem) -> Estimate:
+    """The filter as a solver of the problem: it knows the four mounting angles, and no gyro bias."""
+    start = time.perf_counter()
+    sigma = config.noise.los_error
+    if sigma is None and data.error_cov is not None:
+        sigma = float(np.sqrt(np.median(data.error_cov[:, [0, 1], [0, 1]])))
+    sigma = first_given(sigma, DEFAULT_NOISE.los_error)
+    result = recursive_least_squares(data, sigma)
+    keep = [i for i, name in enumerate(NAMES) if name in {q.name for q in problem.quantities}]
+    covariance = result.covariance[:, keep][:, :, keep]
+    whitened = result.residuals / result.sigmas[:, None]
+    square, dof = float((whitened**2).sum()), float(whitened.size)
+    return Estimate(
+        solver="published",
+        names=tuple(NAMES[i] for i in keep),
+        values=result.values[-1, keep],
+        covariance=covariance[-1],
+        converged=True,
+        message="all LOS error rates used",
+        residuals={"los rate": Residuals(result.t, whitened, np.ones(len(whitened), dtype=bool))},
+        chi_square=ChiSquare(square, dof, {"los rate": (square, dof)}),
+        history=History(result.t, result.values[:, keep], np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))),
+        seconds={"solve": time.perf_counter() - start},
+    )
 
 
 def rates(data: LosData, exact: bool = False) -> tuple[Array, Array, Array]:

@@ -54,7 +54,7 @@ class LosData:
 
 
 def read_los(recording: Recording, config: Config) -> LosData:
-    """Read and check a los session whose LOS errors are messages.
+    """Read and check a los session; without LOS errors they are taken from the pictures.
 
     Raises InputError when a topic is missing or unusable (see pipelines.sessions.checks), when the topics have no time
     in common, when the target was never found, and when sizes say that an encoder is in degrees, an encoder stands
@@ -63,11 +63,17 @@ def read_los(recording: Recording, config: Config) -> LosData:
     dropped: dict[str, int] = {}
     epoch = recording.epoch_ns
     gyro_name, gimbal_name, error_name = (config.topic(key) for key in ("imu", "gimbal", "los_error"))
+    from_pictures = error_name not in recording.topics and config.topic("image") in recording.topics
     gyro_t, gyro, density = _gyro(recording, gyro_name, epoch, dropped)
     gimbal_t, gimbal = _gimbal(recording, gimbal_name, epoch, dropped)
-    image_t, error = _error(recording, error_name, epoch, dropped)
+    covariance = None
+    if from_pictures and "los_error" not in config.topics:
+        error_name = config.topic("image")
+        image_t, error, covariance = _from_pictures(recording, config, epoch, dropped)
+    else:
+        image_t, error = _error(recording, error_name, epoch, dropped)
     check_overlap({gyro_name: gyro_t, gimbal_name: gimbal_t, error_name: image_t})
-    data = LosData(epoch, gyro_t, gyro, gimbal_t, gimbal, image_t, error, None, density, dropped)
+    data = LosData(epoch, gyro_t, gyro, gimbal_t, gimbal, image_t, error, covariance, density, dropped)
     check_gimbal(gimbal_name, data)
     return data
 
@@ -191,3 +197,20 @@ def _error(recording: Recording, topic: str, epoch_ns: int, dropped: dict[str, i
             f"{_WIDEST_ERROR:g} rad; are they in pixels? divide by the focal length: x and z have to be in rad"
         )
     return t, error
+
+
+def _from_pictures(
+    recording: Recording, config: Config, epoch_ns: int, dropped: dict[str, int]
+) -> tuple[Array, Array, Array]:
+    """LOS errors of the target that the first picture shows, with the tracker's covariance."""
+    from pipelines.vision.camera import Camera
+    from pipelines.vision.target import los_errors
+
+    topic = config.topic("image")
+    info = recording.camera_info(config.topic("camera_info"))
+    camera = Camera(info.width, info.height, info.k, info.distortion_model, info.d)
+    found = los_errors(recording.images(topic), camera)
+    for reason, number in found.dropped.items():
+        count(dropped, f"{topic}: {reason}", number)
+    t, keep = clean(topic, found.t_ns, epoch_ns, found.error, dropped)
+    return t, found.error[keep], found.covariance[keep]

@@ -10,10 +10,12 @@ next sample. Gimbal angles are therefore known exactly at any time.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from io import StringIO
 from math import cos, sin
-from typing import Annotated, Self
+from pathlib import Path
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +23,12 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from factors import so3
 from factors.earth import earth_rate
-from pipelines.sessions.los import LosData
+from pipelines.errors import InputError
+from pipelines.sessions import series
+from pipelines.sessions.checks import nanoseconds
+from pipelines.sessions.los import LosData, write_los
 from pipelines.simulation.motion import EulerMotion, Swing, sample_times
+from pipelines.simulation.scenario import load_scenario
 
 Array = NDArray[np.float64]
 
@@ -73,6 +79,21 @@ class Loss(BaseModel):
     elevation_step_deg: float = 0.0
 
 
+class LosCamera(BaseModel):
+    """Pictures of the target: a pinhole camera with plumb_bob distortion, what it looks at, and how well."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    width: Annotated[int, Field(gt=0)] = 640
+    height: Annotated[int, Field(gt=0)] = 480
+    focal_px: Positive = 2000.0
+    distortion: list[float] = [-0.2, 0.1, 5e-4, 3e-4, 0.0]
+    target: Literal["tag", "texture"] = "tag"
+    target_size: Positive = 0.1  # edge of the tag's black square per distance, or a quarter of the texture's width
+    blur_px: NotNegative = 0.7
+    grey_noise: NotNegative = 2.0
+
+
 class LosScenario(BaseModel):
     """What the `los` simulator is asked for; every key has a default."""
 
@@ -101,6 +122,7 @@ class LosScenario(BaseModel):
     acquisition_error: NotNegative = 1e-3  # rad, sigma per axis: how far off its axis the camera finds a target
     dropouts_s: list[Span] = []  # [start, end): pictures without the target
     losses: list[Loss] = []
+    camera: LosCamera = LosCamera()
     outlier_share: Share = 0.0
     outlier_size: NotNegative = 5e-3  # rad, sigma per axis
     priors: dict[str, float | None] = {}  # passed on to the recording's config
@@ -143,12 +165,13 @@ def simulate_los(scenario: LosScenario, seed: int) -> tuple[LosData, dict[str, f
     """A session and the true values of its parameters (rad, rad/s, s; the bias is its mean over the session)."""
     rng = np.random.default_rng(seed)
     motion = simulate_motion(scenario, rng)
+    image_t, cRt = targets(scenario, motion, rng)
     noise = scenario.noise
     gimbal_t = sample_times(scenario.duration_s, scenario.gimbal_rate_hz, scenario.gimbal_phase)
     gimbal = motion.gimbal_at(gimbal_t) + noise.encoder * rng.standard_normal((len(gimbal_t), 2))
     if scenario.encoder_step > 0.0:
         gimbal = np.round(gimbal / scenario.encoder_step) * scenario.encoder_step
-    image_t, exact = _pictures(scenario, motion, rng)
+    exact = picture_of(cRt)
     error = exact + rng.standard_normal(exact.shape) * [noise.los_error, noise.los_error, noise.los_roll]
     outlying = rng.random(len(error)) < scenario.outlier_share
     error[outlying, :2] += scenario.outlier_size * rng.standard_normal((int(outlying.sum()), 2))
@@ -204,11 +227,80 @@ def camera_attitude(scenario: LosScenario, gimbal: Array) -> Array:
     )
 
 
-def los_config(scenario: LosScenario) -> str:
-    """The recording's config (YAML): the noise that was simulated and the scenario's priors."""
+def write_simulation(scenario: str | None, seed: int, out: Path, images: bool) -> None:
+    """Simulate a scenario (by name or file, None is los_nominal or los_images) and write it as a session with truth.
+
+    Raises:
+        InputError: no such scenario.
+    """
+    settings = load_scenario(LosScenario, scenario or ("los_images" if images else "los_nominal"))
+    data, truth = simulate_los(settings, seed)
+    pictures = simulate_pictures(settings, seed) if images else None
+    write_los(out, data, truth, los_config(settings, images), pictures)
+
+
+def simulate_pictures(scenario: LosScenario, seed: int) -> tuple[series.CameraInfo, series.ImageSeries]:
+    """The pictures behind the LOS errors of `simulate_los` with the same seed; drawn one by one as they are taken."""
+    rng = np.random.default_rng(seed)
+    stamps, cRt = targets(scenario, simulate_motion(scenario, rng), rng)
+    if scenario.losses:
+        raise InputError("losses: pictures are simulated of a single target; leave out --images")
+    camera = scenario.camera
+    centre = 0.5 * camera.width - 0.5 + 3.4, 0.5 * camera.height - 0.5 - 2.7
+    K = np.array([[camera.focal_px, 0.0, centre[0]], [0.0, camera.focal_px, centre[1]], [0.0, 0.0, 1.0]])
+    t_ns = nanoseconds(stamps, EPOCH_NS)
+    info = series.CameraInfo(
+        int(t_ns[0]),
+        camera.width,
+        camera.height,
+        "plumb_bob",
+        np.array(camera.distortion),
+        K,
+        np.eye(3),
+        np.hstack([K, np.zeros((3, 1))]),
+        "camera",
+    )
+    return info, series.ImageSeries(t_ns, _exposures(camera, K, cRt, rng), "jpeg", "camera")
+
+
+def _exposures(settings: LosCamera, K: Array, cRt: Array, rng: np.random.Generator) -> Iterator[bytes]:
+    """Pictures of a target at unit distance, as JPEG files."""
+    from pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
+    from pipelines.vision.camera import Camera
+
+    camera = Camera(settings.width, settings.height, K, "plumb_bob", np.array(settings.distortion))
+    renderer = Renderer(camera)
+    oRc = so3.from_matrix(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]))
+    # The target's face: x right, y up, z towards the camera.
+    tRq = so3.from_matrix(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]))
+    texture = _texture(rng) if settings.target == "texture" else None
+    for attitude in so3.multiply(oRc, cRt):
+        position, oRq = so3.rotate(attitude, [0.0, 1.0, 0.0]), so3.multiply(attitude, tRq)
+        if texture is None:
+            quad = tag_quad(0, settings.target_size, oRq, position)
+        else:
+            quad = Quad(texture, (4.0 * settings.target_size, 3.0 * settings.target_size), oRq, position)
+        yield encode(expose(renderer.radiance([quad]), settings.blur_px, settings.grey_noise, rng), "jpeg", 92)
+
+
+def _texture(rng: np.random.Generator) -> Array:
+    """Grey levels (900, 1200) with detail at two scales."""
+    import cv2
+
+    fine, coarse = (cv2.GaussianBlur(rng.normal(size=(900, 1200)), (0, 0), s) for s in (3.0, 20.0))
+    return np.asarray(np.clip(120.0 + 35.0 * fine / fine.std() + 25.0 * coarse / coarse.std(), 0.0, 255.0))
+
+
+def los_config(scenario: LosScenario, images: bool = False) -> str:
+    """The recording's config (YAML): the noise that was simulated and the scenario's priors.
+
+    LOS errors from pictures bring their own covariance.
+    """
     from ruamel.yaml import YAML
 
     noise = {name: value for name, value in scenario.noise.model_dump().items() if value > 0.0}
+    if images:
+        noise = {name: value for name, value in noise.items() if name not in ("los_error", "los_roll")}
     config = {"method": "los", "noise": noise, "priors": scenario.priors}
     text = StringIO()
     yaml = YAML(typ="safe", pure=True)
@@ -248,8 +340,8 @@ def _command(wx: float, wy: float, wz: float, azimuth: float, elevation: float) 
     return (-se * s * wx + se * c * wy - ce * wz) / ce, -c * wx - s * wy
 
 
-def _pictures(scenario: LosScenario, motion: LosMotion, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Stamps and exact phx, phz and roll (K, 3) of the pictures that show the target."""
+def targets(scenario: LosScenario, motion: LosMotion, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Stamps (K,) of the pictures that show a target, and its attitudes cRt (K, 4): y towards it, z its up."""
     stamps = sample_times(scenario.duration_s, scenario.image_rate_hz, scenario.image_phase)
     seen = np.ones(len(stamps), dtype=bool)
     for start, end in scenario.gaps:
@@ -259,13 +351,13 @@ def _pictures(scenario: LosScenario, motion: LosMotion, rng: np.random.Generator
     nRb = scenario.carrier.attitude(t)
     nRc = so3.multiply(nRb, camera_attitude(scenario, motion.gimbal_at(t)))
     target = np.searchsorted(np.sort([loss.end_s for loss in scenario.losses]), stamps, side="right")
-    exact = np.empty((len(stamps), 3))
+    cRt = np.empty((len(stamps), 4))
     for k in np.unique(target):
         mine = np.flatnonzero(target == k)
         off = np.array([*(scenario.acquisition_error * rng.standard_normal(2)), 0.0])[[0, 2, 1]]
         nRt = so3.multiply(nRc[mine[0]], so3.exp(off))
-        exact[mine] = picture_of(so3.multiply(so3.inverse(nRc[mine]), nRt))
-    return stamps, exact
+        cRt[mine] = so3.multiply(so3.inverse(nRc[mine]), nRt)
+    return stamps, cRt
 
 
 def picture_of(cRt: Array) -> Array:
