@@ -1,0 +1,37 @@
+# Needs Python 3.11 or later and make; everything else goes into .venv, pinned by constraints.txt.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo test slow lint types bench docs clean
+
+demo: $(VENV)/installed
+	$(BIN)/alidade demo
+
+test: $(VENV)/installed
+	$(BIN)/python -m pytest -q -n auto
+
+slow: $(VENV)/installed
+	$(BIN)/python -m pytest -q -n auto -m slow
+
+lint: $(VENV)/installed
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/installed
+	$(BIN)/mypy factors pipelines datasets benchmarks tests
+
+bench: $(VENV)/installed
+	$(BIN)/python -m benchmarks
+
+docs: $(VENV)/installed
+	$(BIN)/python -m pytest -q tests/test_docs.py
+
+$(VENV)/installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or later is needed, this is " + sys.version.split()[0] + ": make PYTHON=python3.12")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[dev]' -c constraints.txt
+	touch $@
+
+clean:
+	rm -rf $(VENV) build dist alidade-demo
