@@ -1,0 +1,192 @@
+"""Properties of the cube's factors: Jacobians, batches, truth, and the integrated gyro against a closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from factors import so3
+from factors.earth import earth_rate
+from factors.triad import (
+    AccelFactor,
+    GyroRotationFactor,
+    GyroStaticFactor,
+    MagFactor,
+    TagAttitudeFactor,
+    TriadPriorFactor,
+    calibration,
+    parts,
+    triad,
+)
+from factors.vectorized import Array, Kind, Model
+from tests.numerics import assert_jacobians_match, assert_rows_are_independent
+
+N = 7
+TIMES = np.arange(float(N))
+EARTH = earth_rate(0.7)
+SQUARE = 0.06 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+
+
+def _rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def _rotations(rng: np.random.Generator, angle: float = 1.5) -> Array:
+    return so3.exp(rng.normal(size=(N, 3)) * angle)
+
+
+def _triads(rng: np.random.Generator, spread: float = 0.1) -> Array:
+    return np.array([triad(np.eye(3) + spread * rng.normal(size=(3, 3)), spread * rng.normal(size=3)) for _ in TIMES])
+
+
+def _sigma(rows: np.ndarray) -> Array:
+    return np.linspace(0.5, 2.0, N)[rows]
+
+
+def _static(kind: str, rows: np.ndarray) -> Model:
+    raw = _rng(5).normal(size=(N, 3))[rows]
+    if kind == "accel":
+        return AccelFactor(TIMES[rows], raw, _sigma(rows), 9.8)
+    if kind == "gyro":
+        return GyroStaticFactor(TIMES[rows], raw, _sigma(rows), EARTH * 1e4)
+    return MagFactor(TIMES[rows], raw, _sigma(rows))
+
+
+def _static_blocks(kind: str) -> tuple[list[Array], list[Kind]]:
+    rng = _rng(1)
+    blocks: list[Array] = [_rotations(rng), _triads(rng)]
+    if kind == "mag":
+        return [*blocks, rng.normal(size=(N, 3))], ["rotation", 12, 3]
+    return blocks, ["rotation", 12]
+
+
+@pytest.mark.parametrize("kind", ["accel", "gyro", "mag"])
+def test_static_jacobians(kind: str) -> None:
+    blocks, kinds = _static_blocks(kind)
+    assert_jacobians_match(_static(kind, np.arange(N)), kinds, blocks)
+    assert_rows_are_independent(lambda rows: _static(kind, rows), blocks)
+
+
+def _turns(rows: np.ndarray, angle: float) -> GyroRotationFactor:
+    """Turns of different length and number of samples, at rates that change direction."""
+    stamps, raw = [], []
+    for i in rows:
+        rng = _rng(100 + i)
+        t = np.arange(0.0, 0.8 + 0.1 * i, 0.01)
+        stamps.append(t)
+        raw.append(angle * np.sin(rng.uniform(0.5, 3, size=3) * t[:, None] + rng.uniform(0, 6, size=3)))
+    return GyroRotationFactor(TIMES[rows], stamps, raw, EARTH * 1e3, _sigma(rows))
+
+
+@pytest.mark.parametrize("angle", [2.0, 1e-6], ids=["turning", "at rest"])
+@pytest.mark.parametrize("miss", [1.0, 1e-7, 3.0], ids=["far off", "agreeing", "near half a turn"])
+def test_turn_jacobians(angle: float, miss: float) -> None:
+    rng = _rng(2)
+    model = _turns(np.arange(N), angle)
+    start, triads = _rotations(rng), _triads(rng, 0.05)
+    # Attitudes at the end that miss the prediction by `miss` rad.
+    error = model(start, so3.identity(N), triads)[0] * _sigma(np.arange(N))[:, None]
+    predicted = so3.inverse(so3.exp(error))
+    direction = rng.normal(size=(N, 3))
+    delta = miss * direction / np.linalg.norm(direction, axis=1)[:, None]
+    blocks = [start, so3.multiply(predicted, so3.exp(delta)), triads]
+    tolerance = 2e-5 if miss > 2.0 else 2e-6
+    assert_jacobians_match(model, ["rotation", "rotation", 12], blocks, rtol=tolerance)
+    assert_rows_are_independent(lambda rows: _turns(rows, angle), blocks)
+
+
+def test_turn_of_a_miscalibrated_gyro_on_the_turning_earth() -> None:
+    """A constant rate against inertial space: the closed form, through K, b and the earth's rotation."""
+    rng = _rng(3)
+    K, b = np.eye(3) + 0.05 * rng.normal(size=(3, 3)), 0.1 * rng.normal(size=3)
+    t = np.arange(0.0, 2.0001, 0.02)
+    w_ib = np.array([0.9, -0.4, 0.6])
+    raw = np.tile(np.linalg.solve(K, w_ib - b), (len(t), 1))
+    iRb0 = so3.exp(np.array([[0.3, 1.0, -0.7]]))
+    nRb1 = so3.compose(so3.exp(-EARTH * t[-1]), iRb0, so3.exp(w_ib * t[-1]))
+    model = GyroRotationFactor(t[-1:], [t], [raw], EARTH, np.ones(1))
+    np.testing.assert_allclose(model(iRb0, nRb1, triad(K, b)[None])[0], 0.0, atol=1e-12)
+
+
+def _tags(rows: np.ndarray, blocks: list[Array] | None) -> TagAttitudeFactor:
+    rng = _rng(6)
+    root = 10 * rng.normal(size=(N, 4, 2, 2))
+    bRt, position = so3.exp(rng.normal(size=(N, 3))), 0.08 * rng.normal(size=(N, 3))
+    measured = rng.normal(size=(N, 4, 2))
+    corners = np.tile(SQUARE, (N, 1, 1))
+    BRC = so3.exp(np.array([0.5, -1.0, 0.3]))
+    whole = TagAttitudeFactor(TIMES, measured, root, corners, bRt, position, BRC)
+    if blocks is not None:
+        error = whole(*blocks)[0].reshape(N, 4, 2)
+        measured = measured + np.linalg.solve(root, error[..., None])[..., 0]
+    return TagAttitudeFactor(
+        TIMES[rows], measured[rows], root[rows], corners[rows], bRt[rows], position[rows], whole.BRC
+    )
+
+
+def _tag_blocks(angle: float) -> list[Array]:
+    rng = _rng(7)
+    return [
+        _rotations(rng),
+        np.array([0.1, -0.05, 0.7]) + 0.05 * rng.normal(size=(N, 3)),
+        _rotations(rng),
+        angle * rng.normal(size=(N, 1)),
+        _rotations(rng, angle),
+        _rotations(rng, angle),
+    ]
+
+
+KINDS: list[Kind] = ["rotation", 3, "rotation", 1, "rotation", "rotation"]
+
+
+@pytest.mark.parametrize("angle", [1.0, 1e-7])
+def test_tag_jacobians(angle: float) -> None:
+    blocks = _tag_blocks(angle)
+    assert_jacobians_match(_tags(np.arange(N), None), KINDS, blocks)
+    assert_rows_are_independent(lambda rows: _tags(rows, None), blocks)
+
+
+def test_tags_are_met_at_the_truth_and_missed_beside_it() -> None:
+    blocks = _tag_blocks(0.5)
+    model = _tags(np.arange(N), blocks)
+    np.testing.assert_allclose(model(*blocks)[0], 0.0, atol=1e-9)
+    for j, kind in enumerate(KINDS):
+        moved = list(blocks)
+        delta = np.full(3 if kind == "rotation" else kind, 1e-3)
+        moved[j] = so3.multiply(blocks[j], so3.exp(delta)) if kind == "rotation" else blocks[j] + delta
+        assert np.abs(model(*moved)[0]).max() > 1e-4
+
+
+def test_a_corner_behind_the_camera_is_a_finite_large_residual() -> None:
+    blocks = _tag_blocks(0.5)
+    model = _tags(np.arange(N), blocks)
+    blocks[1] = blocks[1] * np.array([1.0, 1.0, -1.0])
+    residual, jacobians = model(*blocks)
+    assert np.isfinite(residual).all()
+    assert np.linalg.norm(residual) > 1e3
+    assert all(np.isfinite(J).all() for J in jacobians())
+
+
+def test_triad_and_calibration_are_inverse() -> None:
+    rng = _rng(8)
+    K, b = np.eye(3) + 0.2 * rng.normal(size=(3, 3)), rng.normal(size=3)
+    found, _ = calibration(triad(K, b))
+    np.testing.assert_allclose(found, [*K.ravel(), *b], atol=1e-12)
+    A, c = parts(triad(K, b))
+    nominal = rng.normal(size=3)
+    np.testing.assert_allclose(K @ (A @ nominal + c) + b, nominal, atol=1e-12)
+
+
+def test_prior_jacobians() -> None:
+    rng = _rng(9)
+    sigma = rng.uniform(0.1, 2.0, size=(N, 12))
+    model = TriadPriorFactor(TIMES, rng.normal(size=(N, 12)), sigma)
+    assert_jacobians_match(model, [12], [_triads(rng, 0.2)])
+
+
+def test_an_unknown_quantity_has_no_prior() -> None:
+    rng = _rng(10)
+    sigma = np.full((N, 12), np.inf)
+    residual, jacobians = TriadPriorFactor(TIMES, rng.normal(size=(N, 12)), sigma)(_triads(rng))
+    assert not residual.any()
+    assert not jacobians()[0].any()
