@@ -287,11 +287,17 @@ def _headline(
         estimated = sum(verdict != "fixed" for verdict in verdicts.values())
         by_prior = [name for name, verdict in verdicts.items() if verdict == "prior"]
         but = f", {', '.join(by_prior)} by prior alone" if by_prior else ""
-        return f"Calibrated: all {estimated} parameters are as accurate as required{but}."
+        return f"All {estimated} parameters are as accurate as required{but}."
     if status == "inconsistent" and consistency is not None:
-        return f"Inconsistent: {consistency.message}."
-    named = "; ".join(dict.fromkeys(f"{d.label} ({d.advice})" for d in directions if d.verdict == status))
-    if not named:
-        named = ", ".join(name for name, verdict in verdicts.items() if verdict == status)
-    word = "Not observable" if status == "unobservable" else "Less accurate than required"
-    return f"{word}: {named}."
+        return f"The residuals do not fit: {consistency.message}."
+    said = "The recording does not determine" if status == "unobservable" else "Less accurate than required:"
+    return f"{said} {'; '.join(f'{labels} ({advice})' for labels, advice in by_advice(directions, status))}."
+
+
+def by_advice(directions: Sequence[Direction], verdict: str) -> list[tuple[str, str]]:
+    """(labels, advice) of the directions with a verdict, those that want the same together."""
+    labels: dict[str, list[str]] = {}
+    for direction in directions:
+        if direction.verdict == verdict:
+            labels.setdefault(direction.advice, []).append(direction.label)
+    return [("; ".join(dict.fromkeys(group)), advice) for advice, group in labels.items()]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import datetime
 from dataclasses import dataclass
 
+from pipelines.observability import by_advice
 from pipelines.reports.formulas import FORMULAS
 from pipelines.reports.plots import common_plots
 from pipelines.reports.result import Calibration, Plot, quantities_of, truth_errors
@@ -50,6 +51,7 @@ def report_html(calibration: Calibration) -> str:
     facts = calibration.facts
     return environment.get_template("report.html").render(
         c=calibration,
+        by_advice=by_advice,
         method=_NAMES.get(calibration.problem.method, calibration.problem.method),
         start=datetime.datetime.fromtimestamp(facts.epoch_ns // 1_000_000_000, datetime.UTC),
         rows=_rows(calibration),

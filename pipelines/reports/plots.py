@@ -98,12 +98,12 @@ def _residuals(family: str, residuals: Residuals, innovations: bool) -> Plot:
     for i, color in zip(range(width), cycle(COLORS)):
         add_points(out, residuals.time[used], residuals.whitened[used, i], f"component {i + 1}", color, 3)
     if not used.all():
-        far = np.linalg.norm(residuals.whitened[~used], axis=1)
-        add_points(out, residuals.time[~used], far, "rejected (length)", REJECTED, 6)
+        low, high = _view(residuals.whitened[used])
+        far = np.minimum(np.linalg.norm(residuals.whitened[~used], axis=1), 0.97 * high)
+        add_points(out, residuals.time[~used], far, "rejected (length)", REJECTED, 5)
+        out.update_yaxes(range=[low, high])
     for bound in (-3.0, 3.0):
         out.add_hline(y=bound, line={"color": "#888888", "width": 1, "dash": "dot"})
-    if not used.all():
-        out.update_yaxes(range=_view(residuals.whitened[used]))
     share = float((np.abs(residuals.whitened[used]) > 3.0).mean()) if used.any() else 0.0
     return Plot(
         f"{what.capitalize()}s of {family}",
@@ -113,10 +113,10 @@ def _residuals(family: str, residuals: Residuals, innovations: bool) -> Plot:
     )
 
 
-def _view(used: Array) -> list[float]:
-    """Range of an axis that shows what was used, and of the rejected what is not far off."""
-    reach = max(6.0, 1.2 * float(np.abs(used).max(initial=0.0)))
-    return [-reach, 2.0 * reach]
+def _view(used: Array) -> tuple[float, float]:
+    """Range of an axis that shows what was used, and above it what was rejected; the farthest stand at its edge."""
+    reach = max(5.0, 1.2 * float(np.abs(used).max(initial=0.0)))
+    return -reach, 2.0 * reach
 
 
 def _squares(family: str, residuals: Residuals) -> Plot:
@@ -216,15 +216,15 @@ def _correlation(calibration: Calibration) -> Plot | None:
             zmax=1.0,
             colorscale="RdBu",
             reversescale=True,
-            colorbar={"thickness": 10, "x": 1.01},
+            showscale=False,
             texttemplate="%{z:.1f}" if len(names) <= _MOST_LABELLED else None,
             hovertemplate="%{y}, %{x}: %{z:.3f}<extra></extra>",
         )
     )
-    out.update_xaxes(tickangle=-60, automargin=True, showgrid=False)
-    out.update_yaxes(autorange="reversed", automargin=True, showgrid=False)
+    out.update_xaxes(tickangle=-60, dtick=1, automargin=True, showgrid=False)
+    out.update_yaxes(autorange="reversed", dtick=1, automargin=True, showgrid=False)
     return Plot(
         "Correlation of the parameters",
-        "Near +1 or -1 two parameters trade against each other: their errors are not independent.",
+        "Red +1, blue -1. Near either two parameters trade against each other: their errors are not independent.",
         out,
     )

@@ -15,13 +15,16 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from pipelines.methods.base import Estimate, Problem, Quantity
+from pipelines.methods.base import Estimate, Problem, Quantity, Residuals
 from pipelines.observability import Assessment, Fit, Status, Verdict
+from pipelines.reports.units import robust_sigma
 from pipelines.sessions.info import SessionFacts
 
 if TYPE_CHECKING:
     import plotly.graph_objects
 
+# Share of a family's measurements rejected that the reader is told of.
+_MANY_REJECTED = 0.2
 _PACKAGES = ("alidade", "gtsam", "numpy", "opencv-contrib-python-headless", "pycolmap")
 
 
@@ -111,7 +114,20 @@ class Calibration:
     def notes(self) -> tuple[str, ...]:
         """What a reader has to know beside the headline."""
         trouble = () if self.estimate.converged else (f"the solver did not converge: {self.estimate.message}",)
-        return (*trouble, *self.assessment.warnings)
+        many = (_rejection(family, r) for family, r in self.estimate.residuals.items())
+        return (*trouble, *self.assessment.warnings, *(note for note in many if note))
+
+
+def _rejection(family: str, residuals: Residuals) -> str | None:
+    """A sentence when so many measurements were rejected that they can hardly be outliers."""
+    share = 1.0 - float(residuals.used.mean()) if len(residuals.used) else 0.0
+    if share < _MANY_REJECTED:
+        return None
+    spread = robust_sigma(residuals.whitened)
+    return (
+        f"{100.0 * share:.0f} % of the {family} measurements were rejected as outliers; all of them together would "
+        f"fit a noise {spread:.2g} times the one stated"
+    )
 
 
 class _Record(BaseModel):

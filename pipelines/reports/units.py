@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 
-from pipelines.methods.base import Quantity
+import numpy as np
+
+from pipelines.methods.base import Array, Quantity
 
 # What is wanted to better than this, rad or rad/s, is read in arc seconds or degrees per hour.
 _FINE = 2e-4
@@ -33,4 +35,10 @@ def to_digits_of(value: float, sigma: float) -> str:
     decimals = 1 - math.floor(math.log10(sigma))
     if decimals > 9:
         return f"{value:.2e}"
-    return f"{value:.{max(decimals, 0)}f}"
+    text = f"{value:.{max(decimals, 0)}f}"
+    return text.removeprefix("-") if float(text) == 0.0 else text
+
+
+def robust_sigma(values: Array) -> float:
+    """Standard deviation of zero-mean normal numbers, told from their median so that outliers do not count."""
+    return float(np.median(np.abs(values))) / 0.6745 if values.size else 0.0
