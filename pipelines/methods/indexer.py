@@ -37,7 +37,7 @@ from pipelines.errors import InputError
 from pipelines.methods.base import Array, Attitudes, Factor, Parameter, Problem, Quantity, Step
 from pipelines.methods.priors import prior_sigmas, vector_prior
 from pipelines.methods.walking_bias import WalkingBias
-from pipelines.sessions.config import Config, check_names
+from pipelines.sessions.config import DEFAULT_NOISE, Config, check_names, first_given
 from pipelines.sessions.indexer import IndexerData
 from pipelines.sessions.indexer_runs import AxisMotion, Run, axis_motion
 
@@ -255,8 +255,8 @@ def _borders(motion: AxisMotion, run: Run) -> Iterator[tuple[str, Array]]:
 def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]:
     parameters = _parameters(config)
     motion = axis_motion(data)
-    density = config.noise.pick("gyro_density", data.gyro_density)
-    encoder = config.noise.pick("encoder", None)
+    density = first_given(config.noise.gyro_density, data.gyro_density, DEFAULT_NOISE.gyro_density)
+    encoder = first_given(config.noise.encoder, DEFAULT_NOISE.encoder)
     scatter = _scatter(motion)
     slow = float(np.sqrt(encoder**2 - scatter**2)) if encoder > max(_SLOW * scatter, _NO_ERROR) else 0.0
     groups = groups_of(data, config, motion, split=slow == 0.0)
@@ -269,10 +269,10 @@ def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]
                 f"indexer: the earth's rate shows in windows of {shortest:.3g} s and the latitude is not known; "
                 f"record {config.topic('fix')} or give latitude_deg in the config"
             )
-    groups, disagreeing = _agreeing(groups, config)
+    groups, disagreeing = _agreeing(groups, config, density, encoder)
     theta_guess, bias_guess = _guess(groups)
     starts = np.array([g.rates.edges[0] for g in groups])
-    walk = max(config.noise.pick("gyro_bias_walk", None), _LEAST_WALK)
+    walk = max(first_given(config.noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk), _LEAST_WALK)
     frames = _frames(data, motion)
     reasons = {
         "turn cut by a gap in the stamps (what lies before and after is used)": _cut_turns(motion),
@@ -324,7 +324,9 @@ def _theta_coordinates(values: gtsam.Values, key: int) -> tuple[Array, Array]:
     return _THETA_UNIT * np.asarray(values.atVector(key)), _THETA_UNIT * np.eye(3)
 
 
-def _agreeing(groups: tuple[Group, ...], config: Config) -> tuple[tuple[Group, ...], int]:
+def _agreeing(
+    groups: tuple[Group, ...], config: Config, density: float, encoder: float
+) -> tuple[tuple[Group, ...], int]:
     """The groups whose gyro follows the encoders, and how many do not.
 
     Fits gyro = A w + b over all groups, so that neither mounting nor bias counts as disagreement.
@@ -362,7 +364,9 @@ def _agreeing(groups: tuple[Group, ...], config: Config) -> tuple[tuple[Group, .
                 f"indexer: about the axis {name} the gyro turns at {100.0 * gain:.4g} % of the encoder's rate, more "
                 "than 1 % off; check units and gear, or free the gyro's scale (priors: gyro_scale_x ...)"
             )
-    good = ~moving | (misfit <= _DISAGREEMENT * np.maximum(speed, 0.1 * speed.max()))
+    duration = np.array([g.duration for g in groups])
+    noise = np.sqrt(density**2 / duration + 2.0 * (encoder / duration) ** 2)
+    good = ~moving | (misfit <= _DISAGREEMENT * np.maximum(speed, 0.1 * speed.max()) + 5.0 * noise)
     return tuple(g for g, ok in zip(groups, good, strict=True) if ok), int((~good).sum())
 
 

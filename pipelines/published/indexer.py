@@ -10,6 +10,7 @@ have been.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -19,6 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from factors import so3
 from pipelines.errors import InputError
+from pipelines.methods.base import Estimate, Problem
+from pipelines.sessions.config import DEFAULT_NOISE, Config, first_given
 from pipelines.sessions.indexer import IndexerData
 from pipelines.sessions.indexer_runs import AxisMotion, Run, axis_motion
 
@@ -39,11 +42,13 @@ class HalfDifference:
         position: 1 and 2 outer axis, 3 and 4 inner axis, with the other at 0 and at half a turn.
         axis: the one that turns.
         rate: (3,) half the forward mean less the backward mean, in m, rad/s.
+        duration: s, of all the whole turns together.
     """
 
     position: int
     axis: Literal["outer", "inner"]
     rate: Array
+    duration: float
 
 
 @dataclass(frozen=True)
@@ -87,6 +92,42 @@ def thin_shell(
     return search(half_differences(data), half_width, iterations, sweeps)
 
 
+def published_estimate(data: IndexerData, config: Config, problem: Problem) -> Estimate:
+    """One sweep of the search as a solver of the problem: it knows the angles theta.
+
+    The publication gives no accuracy; the covariance is what gyro noise alone does to the eight components.
+    """
+    start = time.perf_counter()
+    found = thin_shell(data)
+    density = first_given(config.noise.gyro_density, data.gyro_density, DEFAULT_NOISE.gyro_density)
+    known = {q.name for q in problem.quantities}
+    notes = [f"{name} has no influence on the cost" for name, flat in zip(NAMES, found.flat, strict=True) if flat]
+    notes += [f"{name} at the edge of +-2 deg" for name, edge in zip(NAMES, found.at_edge, strict=True) if edge]
+    if any(found.fourth_cases):
+        notes.append(f"fourth case met {sum(found.fourth_cases)} times")
+    return Estimate(
+        solver="published",
+        names=tuple(name for name in NAMES if name in known),
+        values=found.theta,
+        covariance=_covariance(found, density),
+        converged=not any(found.flat) and not any(found.at_edge),
+        message="; ".join(notes) or "one sweep",
+        seconds={"solve": time.perf_counter() - start},
+    )
+
+
+def _covariance(found: ThinShell, density: float) -> Array:
+    """(3, 3) rad^2: white gyro noise through the eight components; an angle without influence gets 1 rad."""
+    step = 1e-6
+    information = np.eye(3)
+    for i, half in enumerate(found.half_differences):
+        sides = [[_across(found.theta + s * d, found.half_differences)[i] for d in step * np.eye(3)] for s in (1, -1)]
+        jacobian = (np.array(sides[0]) - np.array(sides[1])).T / (2.0 * step)
+        # Half the difference of two means over half of the time each.
+        information += jacobian.T @ jacobian * half.duration / density**2
+    return np.asarray(np.linalg.inv(information))
+
+
 def half_differences(data: IndexerData) -> tuple[HalfDifference, ...]:
     """Of the positions that the recording has, in their order; several visits of a position are averaged.
 
@@ -95,15 +136,19 @@ def half_differences(data: IndexerData) -> tuple[HalfDifference, ...]:
     """
     motion = axis_motion(data)
     means: dict[int, dict[int, list[Array]]] = {p: {1: [], -1: []} for p in (1, 2, 3, 4)}
+    duration = dict.fromkeys(means, 0.0)
     for run in motion.runs:
         position = _position(run)
         if position is not None and run.whole_turns:
-            means[position][run.direction].append(_mean_over_whole_turns(data, motion, run))
+            mean, length = _mean_over_whole_turns(data, motion, run)
+            means[position][run.direction].append(mean)
+            duration[position] += length
     found = tuple(
         HalfDifference(
             position,
             "outer" if position <= 2 else "inner",
             np.asarray(0.5 * (np.mean(both[1], axis=0) - np.mean(both[-1], axis=0))),
+            duration[position],
         )
         for position, both in means.items()
         if both[1] and both[-1]
@@ -118,15 +163,16 @@ def half_differences(data: IndexerData) -> tuple[HalfDifference, ...]:
 
 def cost(theta: ArrayLike, measured: Sequence[HalfDifference]) -> float:
     """Sum of squares of the components across the axis in t, (rad/s)^2, at theta (3,), rad."""
+    return sum(float(row @ row) for row in _across(theta, measured))
+
+
+def _across(theta: ArrayLike, measured: Sequence[HalfDifference]) -> list[Array]:
+    """Components (2,) across the axis in t of each half difference, rad/s."""
     x, y, z = np.asarray(theta, dtype=float)
     ex, ey, ez = np.eye(3)
     C_m_t = so3.compose(so3.exp(z * ez), so3.exp(y * ey), so3.exp(x * ex))
-    total = 0.0
-    for half in measured:
-        in_t = so3.rotate(C_m_t, half.rate)
-        across = in_t[1:] if half.axis == "outer" else in_t[:2]
-        total += float(across @ across)
-    return total
+    in_t = [so3.rotate(C_m_t, half.rate) for half in measured]
+    return [rate[1:] if half.axis == "outer" else rate[:2] for rate, half in zip(in_t, measured, strict=True)]
 
 
 def search(measured: tuple[HalfDifference, ...], half_width: float, iterations: int = 28, sweeps: int = 1) -> ThinShell:
@@ -199,8 +245,8 @@ def _position(run: Run) -> int | None:
     return first + 1 if np.pi - off_zero < _ANGLE_TOLERANCE else None
 
 
-def _mean_over_whole_turns(data: IndexerData, motion: AxisMotion, run: Run) -> Array:
-    """Mean gyro rate (3,) from the time a run has turned a little to whole turns later, by the encoder.
+def _mean_over_whole_turns(data: IndexerData, motion: AxisMotion, run: Run) -> tuple[Array, float]:
+    """Mean gyro rate (3,) from the time a run has turned a little to whole turns later, by the encoder, and how long.
 
     The turns start behind the ramp, since the publication averages uniform turning; a run without turns to spare is
     taken from its start.
@@ -214,4 +260,4 @@ def _mean_over_whole_turns(data: IndexerData, motion: AxisMotion, run: Run) -> A
     # A sample is the mean over the interval about its stamp; those at the ends count with the part inside.
     edges = np.concatenate([[-np.inf], 0.5 * (data.gyro_t[1:] + data.gyro_t[:-1]), [np.inf]])
     inside = np.clip(np.minimum(edges[1:], end) - np.maximum(edges[:-1], begin), 0.0, None)
-    return np.asarray(inside @ data.gyro / inside.sum())
+    return np.asarray(inside @ data.gyro / inside.sum()), float(inside.sum())

@@ -134,7 +134,7 @@ def _runs(t: Array, angles: Array, moving: NDArray[np.bool_]) -> list[Run]:
     changes = np.flatnonzero(np.diff(state)) + 1
     begins = [0]
     kept = [int(state[0])]
-    for begin, end in zip(changes, [*changes[1:], len(t)], strict=True):
+    for begin, end in zip(changes, np.append(changes, len(t))[1:], strict=True):
         if t[end - 1] - t[begin] < _SHORTEST or state[begin] == kept[-1]:
             continue
         begins.append(int(begin))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from io import StringIO
+from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
@@ -17,8 +18,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from factors import so3
 from factors.earth import earth_rate
-from pipelines.sessions.indexer import IndexerData
+from pipelines.errors import InputError
+from pipelines.sessions.indexer import IndexerData, write_indexer
 from pipelines.simulation.motion import sample_times
+from pipelines.simulation.scenario import load_scenario
 
 Array = NDArray[np.float64]
 
@@ -147,6 +150,19 @@ def simulate_indexer(scenario: IndexerScenario, seed: int) -> tuple[IndexerData,
         noise.gyro_density or None,
     )
     return data, _truth(scenario, bias)
+
+
+def write_simulation(scenario: str | None, seed: int, out: Path, images: bool) -> None:
+    """Simulate a scenario (by name or file, None is indexer_nominal) and write it as a session with its truth.
+
+    Raises:
+        InputError: no such scenario, or it cannot be written, or pictures are asked for.
+    """
+    settings = load_scenario(IndexerScenario, scenario or "indexer_nominal")
+    if images:
+        raise InputError("indexer: there is no camera in this method; leave out --images")
+    data, truth = simulate_indexer(settings, seed)
+    write_indexer(out, data, truth, indexer_config(settings))
 
 
 def indexer_config(scenario: IndexerScenario) -> str:
