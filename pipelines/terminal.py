@@ -72,16 +72,22 @@ def show(calibrations: Sequence[Calibration]) -> None:
 
 def show_facts(name: str, facts: SessionFacts) -> None:
     """The topics of a recording and the methods it can serve."""
-    table = Table(title=f"{escape(name)}, {facts.duration_s:.1f} s", header_style="bold", title_justify="left")
-    for column in ("topic", "type"):
-        table.add_column(column)
-    for column in ("messages", "rate, Hz", "largest gap", "duplicates", "out of order"):
-        table.add_column(column, justify="right")
+    say(f"{name}, {facts.duration_s:.1f} s")
+    table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
+    table.add_column("topic", no_wrap=True)
+    table.add_column("type", overflow="fold")
+    for column in ("messages", "Hz", "gap, s", "twice", "back"):
+        table.add_column(column, justify="right", no_wrap=True)
     for t in facts.topics:
-        gap = "" if t.largest_gap_s is None else f"{t.largest_gap_s:.3g} s at {t.largest_gap_at_s:.1f} s"
+        gap = ""
+        if t.largest_gap_s is not None and t.rate_hz is not None:
+            gap = f"{t.largest_gap_s:.2g}" + (f" at {t.largest_gap_at_s:.0f}" if t.largest_gap_s * t.rate_hz > 2 else "")
         rate = "" if t.rate_hz is None else f"{t.rate_hz:.4g}"
-        table.add_row(escape(t.name), t.type, str(t.count), rate, gap, str(t.duplicates), str(t.out_of_order))
+        kind = t.type.rsplit("/", 1)[-1]
+        table.add_row(escape(t.name), kind, str(t.count), rate, gap, str(t.duplicates), str(t.out_of_order))
     _console.print(table)
+    if any(t.duplicates or t.out_of_order for t in facts.topics):
+        say("twice: stamps that occur again; back: stamps before the one ahead of them")
     if facts.attachments:
         say(f"attachments: {', '.join(facts.attachments)}")
     for method, missing in facts.missing.items():

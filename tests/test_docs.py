@@ -1,0 +1,56 @@
+"""The commands in README and docs are run as they stand, block after block, in one folder."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipelines.sessions.config import load_config
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+_BLOCK = re.compile(r"^```(sh|yaml file=(\S+))\n(.*?)^```", re.MULTILINE | re.DOTALL)
+_LINK = re.compile(r"\]\((?!https?://)([^)#]+)")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_commands_work(page: Path, tmp_path: Path) -> None:
+    for kind, file, text in _BLOCK.findall(page.read_text(encoding="utf-8")):
+        if kind != "sh":
+            (tmp_path / file).write_text(text, encoding="utf-8")
+            load_config(None, tmp_path / file)
+            continue
+        for line in text.splitlines():
+            words = shlex.split(line, comments=True)
+            command = [sys.executable, "-m", "pipelines.cli", *words[1:]] if words[:1] == ["alidade"] else words
+            run = subprocess.run(
+                command,
+                cwd=tmp_path,
+                env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"},
+                capture_output=True,
+                text=True,
+            )
+            assert run.returncode == 0, f"{line}\n{run.stdout}{run.stderr}"
+
+
+@pytest.mark.parametrize(
+    "page", [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "datasets" / "README.md"], ids=lambda p: p.name
+)
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in _LINK.findall(page.read_text(encoding="utf-8")):
+        assert (page.parent / target).exists(), target
+
+
+def test_readme_names_no_dependency_that_is_not_there() -> None:
+    """The Dependencies section and pyproject.toml say the same."""
+    import tomllib
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    section = (ROOT / "README.md").read_text(encoding="utf-8").split("## Dependencies")[1]
+    for requirement in project["dependencies"]:
+        assert re.split(r"[\[<>=]", requirement)[0] in section
