@@ -1,0 +1,96 @@
+"""When a device stood still: a variance test on its gyro and accelerometer."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.errors import InputError
+
+Array = NDArray[np.float64]
+
+# The test looks at this much time about each sample, s; half of it keeps a pose's ends clear of the motion.
+_SPAN = 0.5
+# Shorter rests, s, are turning points of a motion.
+_SHORTEST = 0.5
+# Quiet: the scatter over the span is below this many times the noise.
+_QUIET = 1.5
+# A motion starts slower than the test can see: this much, s, is cut off at both ends.
+_MARGIN = 0.2
+# The noise is what the quietest twentieth of the recording shows, between the stated one and this many times it.
+_FLOOR_SHARE, _FLOOR_LIMIT = 0.05, 10.0
+# A steady turn is as quiet as a rest; its mean rate departs from that of the rests by more than this, rad/s.
+_STEADY = 0.01
+# A pause between samples is a gap when longer than this many intervals.
+_GAP_SAMPLES = 5.0
+
+
+def find_rests(t: Array, gyro: Array, accel: Array, gyro_sigma: float, accel_sigma: float) -> Array:
+    """Beginnings and ends, (P, 2) s, of the times at rest, each at a sample's stamp.
+
+    After Tedaldi, Pretto, Menegatti, "A robust and easy to implement method for IMU calibration without external
+    equipments", ICRA 2014, which tests the accelerometer; a turn about the vertical shows in the gyro alone.
+
+    Args:
+        t: (N,) s.
+        gyro: (N, 3) rad/s.
+        accel: (N, 3) m/s^2.
+        gyro_sigma, accel_sigma: stated noise of one sample, per axis.
+
+    Raises:
+        InputError: there is no rest.
+    """
+    interval = float(np.median(np.diff(t)))
+    half = max(2, round(0.5 * _SPAN / interval))
+    if len(t) < 2 * half + 1:
+        raise InputError(f"the device's record is {t[-1] - t[0]:.3g} s long, shorter than one static pose")
+    scatter = np.stack([_scatter(gyro, half), _scatter(accel, half)])
+    stated = np.array([gyro_sigma, accel_sigma])
+    floor = np.clip(np.quantile(scatter, _FLOOR_SHARE, axis=1), stated, _FLOOR_LIMIT * stated)
+    quiet = np.all(scatter < _QUIET * floor[:, None], axis=0)
+    dense = np.diff(t) < _GAP_SAMPLES * interval
+    quiet &= np.append(dense, True) & np.append(True, dense)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], quiet, [False]]).astype(int)))
+    margin = round(_MARGIN / interval)
+    runs = edges.reshape(-1, 2) + np.array([margin, -1 - margin])
+    runs = runs[runs[:, 1] > runs[:, 0]]
+    runs = runs[t[runs[:, 1]] - t[runs[:, 0]] >= _SHORTEST]
+    runs = runs[_turns_not(gyro, runs, floor[0])]
+    if not len(runs):
+        least = scatter.min(axis=1)
+        raise InputError(
+            f"no static pose: in the quietest {_SPAN:g} s the gyro scatters by {least[0]:.2g} rad/s and the "
+            f"accelerometer by {least[1]:.2g} m/s^2, noise stated is {gyro_sigma:.2g} and {accel_sigma:.2g}; let the "
+            "cube stand still for a few seconds in each pose, or state the device's noise in the config"
+        )
+    return t[runs]
+
+
+def _scatter(values: Array, half: int) -> Array:
+    """Standard deviation (N,) over 2 half + 1 samples about each, root mean square over the axes; inf at the ends."""
+    n = 2 * half + 1
+    centred = values - values.mean(axis=0)
+    sums = [np.cumsum(np.pad(power, ((1, 0), (0, 0))), axis=0) for power in (centred, centred**2)]
+    mean, square = ((s[n:] - s[:-n]) / n for s in sums)
+    out = np.full(len(values), np.inf)
+    out[half:-half] = np.sqrt(np.maximum(square - mean**2, 0.0).mean(axis=1))
+    # The recording's ends are as quiet as the first and last whole span.
+    out[:half], out[-half:] = out[half], out[-half - 1]
+    return out
+
+
+def _turns_not(gyro: Array, runs: NDArray[np.intp], sigma: float) -> NDArray[np.bool_]:
+    """Which runs have the mean rate that most of the quiet time has."""
+    means = np.array([gyro[a : b + 1].mean(axis=0) for a, b in runs]).reshape(-1, 3)
+    lengths = runs[:, 1] - runs[:, 0] + 1
+    middle = np.array([_weighted_median(column, lengths) for column in means.T])
+    allowed = _STEADY + 5.0 * sigma / np.sqrt(lengths)
+    return np.asarray(np.abs(means - middle).max(axis=1, initial=0.0) < allowed)
+
+
+def _weighted_median(values: Array, weights: NDArray[np.intp]) -> float:
+    if not len(values):
+        return 0.0
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
