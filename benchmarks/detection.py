@@ -114,6 +114,10 @@ def _seconds(run: object, picture: Picture) -> float:
     return time.process_time() - start
 
 
-if __name__ == "__main__":
+def main() -> None:
     corner_errors()
     speed()
+
+
+if __name__ == "__main__":
+    main()

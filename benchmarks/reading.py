@@ -93,8 +93,7 @@ def import_only(path: Path) -> None:
     """The yardstick of memory."""
 
 
-def main() -> None:
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 200_000
+def main(count: int = 200_000) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "imu.mcap"
         rates = measure_rates(path, count)
@@ -110,4 +109,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(*map(int, sys.argv[1:]))
