@@ -1,0 +1,146 @@
+"""What an indexer recording may lack: one clear line each, and what is left is used."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipelines.errors import InputError
+from pipelines.methods.indexer import problem, validate
+from pipelines.sessions.config import Config, load_config
+from pipelines.sessions.indexer import IndexerData
+from pipelines.sessions.indexer_runs import axis_motion
+from pipelines.simulation.indexer import IndexerNoise, IndexerScenario, Position, indexer_config, simulate_indexer
+from pipelines.solvers.batch import solve_batch
+
+SCENARIO = IndexerScenario(
+    positions=[
+        Position(axis="outer", other_deg=0, turns=2),
+        Position(axis="inner", other_deg=0, turns=2),
+    ],
+    gyro_rate_hz=100,
+    noise=IndexerNoise(gyro_density=1e-6, encoder=1e-6),
+    encoder_bits=26,
+)
+
+
+@pytest.fixture(scope="module")
+def session() -> tuple[IndexerData, dict[str, float]]:
+    return simulate_indexer(SCENARIO, 1)
+
+
+def _config(extra: str = "") -> Config:
+    return load_config((indexer_config(SCENARIO) + extra).encode())
+
+
+def _errors(data: IndexerData, truth: dict[str, float], config: Config | None = None) -> np.ndarray:
+    estimate = solve_batch(problem(data, config or _config()))
+    expected = np.array([truth[name] for name in estimate.names])
+    return np.asarray((estimate.values - expected) / estimate.sigmas)
+
+
+def test_no_rotation(session: tuple[IndexerData, dict[str, float]]) -> None:
+    data, _ = session
+    still = replace(data, outer=0.0 * data.outer, inner=1e-3 * np.sin(data.encoder_t))
+    with pytest.raises(
+        InputError, match=r"no rotation found, the outer axis moves by 0 deg and the inner by 0.115 deg"
+    ):
+        problem(still, _config())
+
+
+@pytest.mark.parametrize(("name", "axis"), [("outer", "outer_x"), ("inner", "inner_z")])
+def test_encoder_that_counts_the_other_way_is_named(
+    session: tuple[IndexerData, dict[str, float]], name: str, axis: str
+) -> None:
+    data, _ = session
+    with pytest.raises(InputError, match=f"the axis {axis} disagree in sign"):
+        problem(replace(data, **{name: -getattr(data, name)}), _config())
+
+
+def test_gear_that_is_off_by_two_percent_is_named(session: tuple[IndexerData, dict[str, float]]) -> None:
+    data, _ = session
+    with pytest.raises(InputError, match=r"about the axis outer_x the gyro turns at 98.0\d* % of the encoder's rate"):
+        problem(replace(data, outer=1.02 * data.outer), _config())
+    problem(replace(data, outer=1.009 * data.outer), _config())
+
+
+def test_missing_latitude_is_refused_when_the_earth_shows(session: tuple[IndexerData, dict[str, float]]) -> None:
+    data, truth = session
+    blind = replace(data, latitude_deg=None)
+    with pytest.raises(InputError, match=r"latitude is not known; record /fix or give latitude_deg"):
+        problem(blind, _config())
+    coarse = _config().model_copy(update={"noise": _config().noise.model_copy(update={"gyro_density": 1e-3})})
+    assert np.abs(_errors(blind, truth, coarse)).max() < 1.0
+
+
+def test_unknown_parameter_names_the_nearest(session: tuple[IndexerData, dict[str, float]]) -> None:
+    config = _config().model_copy(update={"priors": {"tetha_x": 0.1}})
+    with pytest.raises(InputError, match=r"priors.tetha_x; the nearest known key is theta_x"):
+        problem(session[0], config)
+
+
+@pytest.mark.parametrize("stream", ["gyro", "encoder"])
+def test_gap_in_a_turn_is_told_and_the_rest_is_used(session: tuple[IndexerData, dict[str, float]], stream: str) -> None:
+    data, truth = session
+    if stream == "gyro":
+        keep = (data.gyro_t < 20.0) | (data.gyro_t > 27.0)
+        damaged = replace(data, gyro_t=data.gyro_t[keep], gyro=data.gyro[keep])
+    else:
+        keep = (data.encoder_t < 20.0) | (data.encoder_t > 27.0)
+        damaged = replace(data, encoder_t=data.encoder_t[keep], outer=data.outer[keep], inner=data.inner[keep])
+    found = problem(damaged, _config())
+    assert any("cut by a gap" in reason for reason in found.dropped)
+    assert np.abs(_errors(damaged, truth)).max() < 4.0
+
+
+def test_turn_in_which_the_gyro_stuck_is_dropped(session: tuple[IndexerData, dict[str, float]]) -> None:
+    data, truth = session
+    gyro = data.gyro.copy()
+    gyro[(data.gyro_t > 20.0) & (data.gyro_t < 25.0)] = 0.0
+    found = problem(replace(data, gyro=gyro), _config())
+    assert found.dropped["turn in which gyro and encoder disagree by more than 1 %"] == 1
+    assert np.abs(_errors(replace(data, gyro=gyro), truth)).max() < 4.0
+
+
+@pytest.mark.parametrize("wrap", [np.pi, 2.0 * np.pi])
+def test_wrapped_and_continuous_encoders_give_the_same(
+    session: tuple[IndexerData, dict[str, float]], wrap: float
+) -> None:
+    data, _ = session
+    low = wrap - 2.0 * np.pi
+    wrapped = replace(data, outer=(data.outer - low) % (2 * np.pi) + low, inner=(data.inner - low) % (2 * np.pi) + low)
+    assert np.ptp(wrapped.outer) < 6.3
+    expected, got = solve_batch(problem(data, _config())), solve_batch(problem(wrapped, _config()))
+    np.testing.assert_allclose(got.values, expected.values, atol=1e-3 * expected.sigmas.min())
+
+
+@pytest.mark.parametrize(("gyro_hz", "encoder_hz"), [(50, 10), (37, 1000), (400, 23.7)])
+def test_any_rates(gyro_hz: float, encoder_hz: float) -> None:
+    scenario = SCENARIO.model_copy(
+        update={"gyro_rate_hz": gyro_hz, "encoder_rate_hz": encoder_hz, "encoder_phase": 0.37}
+    )
+    assert np.abs(_errors(*simulate_indexer(scenario, 4))).max() < 4.0
+
+
+def test_runs_cut_in_the_middle_of_a_turn(session: tuple[IndexerData, dict[str, float]]) -> None:
+    """A recording that starts and stops while an axis turns."""
+    data, truth = session
+    g = (data.gyro_t > 13.0) & (data.gyro_t < data.gyro_t[-1] - 30.0)
+    e = (data.encoder_t > 12.0) & (data.encoder_t < data.encoder_t[-1] - 31.0)
+    part = replace(
+        data,
+        gyro_t=data.gyro_t[g],
+        gyro=data.gyro[g],
+        encoder_t=data.encoder_t[e],
+        outer=data.outer[e],
+        inner=data.inner[e],
+    )
+    assert axis_motion(part).runs[0].axis == "outer"
+    assert np.abs(_errors(part, truth)).max() < 4.0
+
+
+def test_validation_needs_an_attitude(session: tuple[IndexerData, dict[str, float]]) -> None:
+    with pytest.raises(InputError, match="no orientation"):
+        validate(session[0], _config(), {"theta_x": 0.0})
