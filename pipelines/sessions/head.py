@@ -105,11 +105,16 @@ def read_head(recording: Recording, config: Config) -> HeadData:
 
 
 def write_head(
-    path: Path | str, data: HeadData, truth: Mapping[str, float] | None = None, config_yaml: str | None = None
+    path: Path | str,
+    data: HeadData,
+    truth: Mapping[str, float] | None = None,
+    config_yaml: str | None = None,
+    pictures: tuple[series.CameraInfo, series.ImageSeries] | None = None,
 ) -> None:
     """Write a head session under the default topic names, with its truth and config as attachments.
 
-    Stamps are rounded to ns. read_head gives the same data back if the first sample is the one at t = 0.
+    Given pictures, they take the place of vision's attitudes. Stamps are rounded to ns. read_head gives the same data
+    back if the first sample is the one at t = 0.
     """
 
     def imu(t: Array, gyro: Array, density: float | None) -> series.ImuSeries:
@@ -122,11 +127,14 @@ def write_head(
     }
     if data.platform_t is not None and data.platform_gyro is not None:
         topics[TOPICS["platform_imu"].name] = imu(data.platform_t, data.platform_gyro, data.platform_gyro_density)
-    cov = np.zeros((len(data.vision_t), 6, 6))
-    if data.vision_cov is not None:
-        cov[:, _ROTATION, _ROTATION] = data.vision_cov
-    t_ns = nanoseconds(data.vision_t, data.epoch_ns)
-    topics[TOPICS["vision_attitude"].name] = series.PoseSeries(t_ns, data.vision_wxyz, cov=cov, frame_id="camera")
+    if pictures is None:
+        cov = np.zeros((len(data.vision_t), 6, 6))
+        if data.vision_cov is not None:
+            cov[:, _ROTATION, _ROTATION] = data.vision_cov
+        t_ns = nanoseconds(data.vision_t, data.epoch_ns)
+        topics[TOPICS["vision_attitude"].name] = series.PoseSeries(t_ns, data.vision_wxyz, cov=cov, frame_id="camera")
+    else:
+        topics[TOPICS["camera_info"].name], topics[TOPICS["image"].name] = pictures
     if data.truth_t is not None and data.truth_wxyz is not None:
         t_ns = nanoseconds(data.truth_t, data.epoch_ns)
         topics[TOPICS["truth_attitude"].name] = series.QuaternionSeries(t_ns, data.truth_wxyz, frame_id="platform")

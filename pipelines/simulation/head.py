@@ -19,7 +19,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from factors import so3
 from factors.earth import earth_rate
 from pipelines.errors import InputError
+from pipelines.sessions import series
+from pipelines.sessions.checks import nanoseconds
 from pipelines.sessions.head import HeadData, write_head
+from pipelines.simulation.head_pictures import HeadPictures, draw
 from pipelines.simulation.motion import EulerMotion, Swing, sample_times
 from pipelines.simulation.scenario import load_scenario
 
@@ -72,6 +75,7 @@ class HeadScenario(BaseModel):
     vision_outages_s: list[tuple[float, float]] = []  # [start, end) of each gap
     outlier_fraction: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     outlier_deg: NotNegative = 20.0  # an outlier is turned this far about a random axis
+    pictures: HeadPictures = HeadPictures()  # when pictures are asked for: they take the place of vision's attitudes
     priors: dict[str, float | None] = {}  # passed on to the recording's config
 
     @model_validator(mode="after")
@@ -114,14 +118,33 @@ def simulate_head(scenario: HeadScenario, seed: int) -> tuple[HeadData, dict[str
     return data, _truth(scenario, bias)
 
 
-def head_config(scenario: HeadScenario) -> str:
-    """The recording's config (YAML): the noise that was simulated and the scenario's priors."""
+def simulate_pictures(scenario: HeadScenario, seed: int) -> tuple[series.CameraInfo, series.ImageSeries]:
+    """The pictures from which the attitudes of such a session can be measured; drawn one by one as they are taken.
+
+    Raises:
+        InputError: the scenario has outliers, which are made of attitudes, or impossible distortion.
+    """
+    if scenario.outlier_fraction > 0.0:
+        raise InputError("outlier_fraction: pictures are simulated without outliers; leave out --images")
+    t, cRh = _sights(scenario)
+    rng = np.random.default_rng(seed)
+    return draw(scenario.pictures, t + scenario.time_offset_s, nanoseconds(t, EPOCH_NS), cRh, rng)
+
+
+def head_config(scenario: HeadScenario, images: bool = False) -> str:
+    """The recording's config (YAML): the noise that was simulated, the scenario's priors and, of pictures, the board.
+
+    Attitudes from pictures bring their own covariance.
+    """
     from ruamel.yaml import YAML
 
     noise = scenario.noise.model_dump()
     if scenario.platform is None:
         del noise["platform_gyro_density"]
     config = {"method": "head", "noise": noise, "priors": scenario.priors}
+    if images:
+        del noise["vision_attitude"]
+        config["head"] = {"board": scenario.pictures.board.model_dump()}
     text = StringIO()
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style = False
@@ -158,21 +181,27 @@ def _walking_bias(scenario: HeadScenario, n: int, rng: np.random.Generator) -> A
     return np.asarray(start + np.cumsum(steps, axis=0))
 
 
+def _sights(scenario: HeadScenario) -> tuple[Array, Array]:
+    """Stamps of what vision sees and exact cRh, shape (K, 4)."""
+    t = sample_times(scenario.duration_s, scenario.vision_rate_hz, scenario.vision_phase)
+    seen = np.ones(len(t), dtype=bool)
+    for start, end in scenario.vision_outages_s:
+        seen &= (t < start) | (t >= end)
+    t = t[seen]
+    cRb, vRh = _mount(scenario.camera_mount_deg), _mount(scenario.helmet_mount_deg)
+    return t, so3.compose(cRb, scenario.head.attitude(t + scenario.time_offset_s), vRh)
+
+
 def _vision(scenario: HeadScenario, rng: np.random.Generator) -> tuple[Array, Array]:
     """Stamps and measured cRh, shape (K, 4)."""
-    t = sample_times(scenario.duration_s, scenario.vision_rate_hz, scenario.vision_phase)
+    t, cRh = _sights(scenario)
     n = len(t)
     error = so3.exp(scenario.noise.vision_attitude * rng.standard_normal((n, 3)))
     axis = rng.standard_normal((n, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     is_outlier = rng.random(n) < scenario.outlier_fraction
     jump = so3.exp(axis * (np.deg2rad(scenario.outlier_deg) * is_outlier)[:, None])
-    cRb, vRh = _mount(scenario.camera_mount_deg), _mount(scenario.helmet_mount_deg)
-    cRh = so3.compose(cRb, scenario.head.attitude(t + scenario.time_offset_s), vRh, error, jump)
-    seen = np.ones(n, dtype=bool)
-    for start, end in scenario.vision_outages_s:
-        seen &= (t < start) | (t >= end)
-    return t[seen], cRh[seen]
+    return t, so3.compose(cRh, error, jump)
 
 
 def _mount(rotation_vector_deg: Vector) -> Array:
@@ -194,13 +223,14 @@ def _truth(scenario: HeadScenario, bias: Array) -> dict[str, float]:
 
 
 def write_simulation(scenario: str | None, seed: int, out: Path, images: bool) -> None:
-    """Simulate a scenario (by name or file, None is head_nominal) and write it as a session with its truth.
+    """Simulate a scenario and write it as a session with its truth.
+
+    By name or file; None is head_nominal, or head_pictures with images.
 
     Raises:
-        InputError: no such scenario, or it cannot be written.
+        InputError: no such scenario, or it cannot be drawn or written.
     """
-    settings = load_scenario(HeadScenario, scenario or "head_nominal")
-    if images:
-        raise InputError("head: pictures cannot be simulated yet; leave out --images")
+    settings = load_scenario(HeadScenario, scenario or ("head_pictures" if images else "head_nominal"))
     data, truth = simulate_head(settings, seed)
-    write_head(out, data, truth, head_config(settings))
+    pictures = simulate_pictures(settings, seed) if images else None
+    write_head(out, data, truth, head_config(settings, images), pictures)
