@@ -81,13 +81,19 @@ def calibration_yaml(calibration: Calibration) -> str:
     """The text of calibration.yaml."""
     from ruamel.yaml import YAML
     from ruamel.yaml.comments import CommentedMap
+    from ruamel.yaml.representer import RoundTripRepresenter
 
+    class Representer(RoundTripRepresenter):
+        """With floats of our own."""
+
+    Representer.add_representer(float, _float)
     content = saved(calibration).model_dump(by_alias=True, mode="json")
     for section in ("parameters", "rotations"):
         for name, entry in content[section].items():
             content[section][name] = CommentedMap(entry)
             content[section][name].fa.set_flow_style()  # one line each
     yaml = YAML()
+    yaml.Representer = Representer
     yaml.width = 200
     text = StringIO()
     yaml.dump(content, text)
@@ -144,6 +150,12 @@ def _rotations(calibration: Calibration) -> dict[str, SavedRotation]:
             w, x, y, z = (_rounded(v) for v in so3.exp(np.array([values[n] for n in names])).tolist())
             found[name] = SavedRotation(name=ROTATIONS.get(name, name), wxyz=(w, x, y, z))
     return found
+
+
+def _float(representer: Any, value: float) -> Any:
+    """A float that YAML 1.1 takes for one too: 5e-05 is a string there, 5.0e-05 is not."""
+    text = repr(value)
+    return representer.represent_scalar("tag:yaml.org,2002:float", text if "." in text else text.replace("e", ".0e"))
 
 
 def _rounded(value: float) -> float:

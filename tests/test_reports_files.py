@@ -1,0 +1,301 @@
+"""result.json, calibration.yaml, attitude.tum, estimates.mcap, and how they come to their places."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from factors import so3
+from pipelines.errors import InputError
+from pipelines.methods.base import (
+    Attitudes,
+    ChiSquare,
+    Estimate,
+    History,
+    Parameter,
+    Problem,
+    Quantity,
+    Residuals,
+    Step,
+    rotation_vector_coordinates,
+)
+from pipelines.observability import assess
+from pipelines.reports import write
+from pipelines.reports.calibration import SavedCalibration, calibration_yaml, load_calibration
+from pipelines.reports.result import Calibration, quantities_of, result_json
+from pipelines.reports.trajectory import tum
+from pipelines.reports.write import write_results
+from pipelines.sessions.info import SessionFacts, TopicFacts
+from pipelines.sessions.messages import definition
+
+EPOCH_NS = 1_795_176_000_123_456_789
+MOUNT = np.array([0.03, -0.02, 0.5])
+NAMES = ("helmet_mount_x", "helmet_mount_y", "helmet_mount_z", "time_offset", "free", "pinned")
+
+
+def no_steps(_: int) -> Iterator[Step]:
+    return iter(())
+
+
+def make_problem() -> Problem:
+    mount = tuple(Quantity(name, "rad", 0.35, 0.35, 1e-2) for name in NAMES[:3])
+    others = (
+        Quantity("time_offset", "s", 0.05, 0.05, 5e-3),
+        Quantity("free", "rad/s", None, 0.05, 2e-3),
+        Quantity("pinned", "rad", 0.0, 0.35, 1e-2),
+    )
+    parameters = (
+        Parameter(1, mount, rotation_vector_coordinates),
+        *(Parameter(2 + i, (q,)) for i, q in enumerate(others)),
+    )
+    return Problem("head", parameters, no_steps, dropped={"/vision/attitude: not finite": 3})
+
+
+def make_calibration(**changes: object) -> Calibration:
+    rng = np.random.default_rng(0)
+    sigmas = np.array([1e-3, 1e-3, 2e-3, 2e-4, 1e-4, 0.0])
+    values = np.array([*MOUNT, 0.012, 5e-5, 0.0])
+    time = np.linspace(0.0, 9.5, 200)
+    used = np.arange(200) % 50 != 7
+    estimate = Estimate(
+        solver="incremental",
+        names=NAMES,
+        values=values,
+        covariance=np.diag(sigmas**2),
+        converged=True,
+        message="all steps taken",
+        residuals={"vision": Residuals(time, rng.standard_normal((200, 3)) + 9.0 * ~used[:, None], used)},
+        chi_square=ChiSquare(570.0, 588.0, {"vision": (570.0, 588.0)}),
+        history=History(time[::10], np.tile(values, (20, 1)), np.tile(sigmas, (20, 1))),
+        attitudes=Attitudes(time, so3.exp(rng.standard_normal((200, 3)))),
+        rejected={"vision": 4},
+        seconds={"solve": 1.5},
+    )
+    estimate = replace(estimate, **{k: v for k, v in changes.items() if hasattr(estimate, k)})  # type: ignore[arg-type]
+    problem = make_problem()
+    calibration = Calibration(
+        problem=problem,
+        estimate=estimate,
+        assessment=assess(quantities_of(problem, estimate), estimate.covariance, estimate.chi_square, None),
+        recording="ride.mcap",
+        sha256="ab" * 32,
+        facts=SessionFacts(
+            EPOCH_NS,
+            9.5,
+            (),
+            (TopicFacts("/head/imu", "sensor_msgs/msg/Imu", 3800, 0.0, 9.5, 400.0, 0.0025, 0.1, 0, 0),),
+            {},
+        ),
+        config_text="method: head\n",
+        seconds={"read": 0.2},
+    )
+    return replace(calibration, **{k: v for k, v in changes.items() if not hasattr(estimate, k)})  # type: ignore[arg-type]
+
+
+def numbers(content: object) -> Iterator[float]:
+    """All numbers in a JSON document."""
+    if isinstance(content, dict):
+        content = list(content.values())
+    if isinstance(content, list):
+        for entry in content:
+            yield from numbers(entry)
+    elif isinstance(content, int | float):
+        yield content
+
+
+def strict(text: str) -> dict:
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is no JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def test_result_json_has_the_contracts_keys() -> None:
+    content = strict(result_json(make_calibration()))
+    assert content["schema"] == "alidade.result/1"
+    assert (content["method"], content["solver"], content["status"]) == ("head", "incremental", "calibrated")
+    for parameter in content["parameters"]:
+        assert list(parameter) == ["name", "value", "sigma", "unit", "prior_sigma", "require", "observability"]
+    by_name = {p["name"]: p for p in content["parameters"]}
+    assert by_name["free"]["prior_sigma"] is None
+    assert by_name["pinned"]["observability"] == "fixed"
+    assert by_name["time_offset"]["value"] == 0.012
+    assert content["covariance"]["order"] == list(NAMES)
+    assert np.array(content["covariance"]["matrix"]).shape == (6, 6)
+    assert content["covariance"]["matrix"][3][3] == pytest.approx(4e-8)
+    assert content["null_directions"] == []
+    assert {"value", "dof", "low", "high", "families"} == set(content["chi_square"])
+    assert content["chi_square"]["low"] < 588.0 < content["chi_square"]["high"]
+    assert content["session"] == {
+        "sha256": "ab" * 32,
+        "duration_s": 9.5,
+        "counts": {"/head/imu": 3800, "vision": 196},
+        "dropped": {"/vision/attitude: not finite": 3, "vision: outliers": 4},
+    }
+    assert "gtsam" in content["software"]
+    assert content["timing_s"] == {"read": 0.2, "solve": 1.5}
+    assert "truth" not in content
+
+
+def test_null_directions_are_in_result_json() -> None:
+    covariance = np.diag([1e-6, 1e-6, 0.35**2, 1e-8, 1e-8, 0.0])
+    content = strict(result_json(make_calibration(covariance=covariance)))
+    assert content["status"] == "unobservable"
+    (direction,) = content["null_directions"]
+    assert direction["weights"] == {"helmet_mount_z": 1.0}
+    assert direction["sigma_ratio"] == pytest.approx(1.0)
+    assert direction["advice"]
+
+
+def test_result_json_has_finite_numbers_for_any_covariance_and_chi_square() -> None:
+    broken = make_calibration(
+        covariance=np.full((6, 6), np.nan), chi_square=ChiSquare(math.nan, math.inf, {"vision": (math.nan, 3.0)})
+    )
+    content = strict(result_json(broken))
+    assert all(math.isfinite(number) for number in numbers(content))
+    assert content["chi_square"]["value"] is None
+
+
+def test_a_published_solver_may_know_fewer_parameters_and_no_chi_square(tmp_path: Path) -> None:
+    known = make_calibration(
+        solver="published",
+        names=("free", "time_offset"),
+        values=np.array([1e-3, 0.0]),
+        covariance=np.diag([1e-8, 1e-8]),
+        chi_square=None,
+        history=None,
+    )
+    content = strict(result_json(known))
+    assert [p["name"] for p in content["parameters"]] == ["free", "time_offset"]
+    assert content["parameters"][0]["unit"] == "rad/s"
+    assert content["chi_square"] == {"value": None, "dof": None, "low": None, "high": None, "families": {}}
+    assert load_from(tmp_path, known).rotations == {}
+
+
+def test_truth_stands_under_its_own_key() -> None:
+    truth = {"time_offset": 0.0125, "pinned": 0.1, "_t0": 5, "_attitude": {"t": []}}
+    content = strict(result_json(make_calibration(truth=truth)))
+    assert set(content["truth"]) == {"time_offset", "pinned"}
+    assert content["truth"]["time_offset"]["error"] == pytest.approx(-5e-4)
+    assert content["truth"]["time_offset"]["error_sigmas"] == pytest.approx(-2.5)
+    assert content["truth"]["pinned"]["error_sigmas"] is None
+
+
+def test_what_the_solver_complains_of_is_noted() -> None:
+    rejected = {"vision": Residuals(np.arange(10.0), np.full((10, 3), 5.0), np.arange(10) < 4)}
+    content = strict(result_json(make_calibration(converged=False, message="stuck", residuals=rejected)))
+    assert any("stuck" in note for note in content["notes"])
+    assert any("60 % of the vision" in note for note in content["notes"])
+
+
+def load_from(folder: Path, calibration: Calibration) -> SavedCalibration:
+    path = folder / "calibration.yaml"
+    path.write_text(calibration_yaml(calibration))
+    return load_calibration(path)
+
+
+def test_calibration_yaml_reads_back(tmp_path: Path) -> None:
+    saved = load_from(tmp_path, make_calibration())
+    assert (saved.method, saved.status) == ("head", "calibrated")
+    assert saved.value("time_offset") == 0.012
+    assert saved.parameters["free"].value == 5e-5
+    assert saved.parameters["free"].unit == "rad/s"
+    rotation = saved.rotations["helmet_mount"]
+    assert rotation.name == "vRh"
+    np.testing.assert_allclose(so3.log(np.array(rotation.wxyz)), MOUNT, atol=1e-11)
+    assert any("gyro - gyro_bias" in formula for formula in saved.formulas)
+    with pytest.raises(InputError, match="no parameter gyro_bias_x"):
+        saved.value("gyro_bias_x")
+
+
+def test_calibration_yaml_has_floats_that_older_yaml_readers_take_for_floats() -> None:
+    """YAML 1.1 takes 5e-05 for a string."""
+    assert "value: 5.0e-05" in calibration_yaml(make_calibration())
+
+
+@pytest.mark.parametrize("text", ["", "[1, 2", "method: head\n", "a: \x00", "- 1\n"])
+def test_a_file_that_is_no_calibration_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "calibration.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"calibration\.yaml: ") as caught:
+        load_calibration(path)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match="cannot be opened"):
+        load_calibration(tmp_path / "none.yaml")
+
+
+def test_tum_has_absolute_times_to_the_nanosecond_in_order() -> None:
+    wxyz = so3.exp(np.array([[0.0, 0.0, 0.2], [0.1, -0.3, 0.0], [0.0, 0.0, 0.1]]))
+    lines = tum(Attitudes(np.array([1.0, 2.5, 0.000000011]), wxyz), EPOCH_NS).splitlines()
+    assert [line.split()[0] for line in lines] == [
+        "1795176000.123456800",
+        "1795176001.123456789",
+        "1795176002.623456789",
+    ]
+    rows = np.array([line.split() for line in lines], dtype=float)
+    np.testing.assert_array_equal(rows[:, 1:4], 0.0)
+    np.testing.assert_allclose(rows[:, [7, 4, 5, 6]], wxyz[[2, 0, 1]], atol=1e-12)
+
+
+def test_estimates_read_back_with_a_ros_decoder(tmp_path: Path) -> None:
+    calibration = make_calibration()
+    history = calibration.estimate.history
+    assert history is not None
+    write_results(tmp_path, calibration)
+    with (tmp_path / "estimates.mcap").open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        found: dict[str, list] = {}
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None
+            decoded = definition(schema.name, schema.data.decode()).decode(message.data)
+            found.setdefault(channel.topic, []).append((message.log_time, decoded))
+    assert set(found) == {f"/estimate/{name}" for name in NAMES}
+    rows = found["/estimate/time_offset"]
+    assert [t for t, _ in rows] == [EPOCH_NS + round(t * 1e9) for t in history.time.tolist()]
+    for t_ns, message in rows:
+        assert message.stamp.sec * 1_000_000_000 + message.stamp.nanosec == t_ns
+        assert (message.value, message.sigma) == (0.012, 2e-4)
+        assert (message.lower, message.upper) == pytest.approx((0.0118, 0.0122))
+
+
+def test_all_files_are_written_and_others_left_alone(tmp_path: Path) -> None:
+    out = tmp_path / "a" / "b"
+    written = write_results(out, make_calibration())
+    assert {path.name for path in written} == set(write.FILES)
+    assert {path.name for path in out.iterdir()} == set(write.FILES)
+    (out / "notes.txt").write_text("mine")
+    batch = make_calibration(solver="batch", history=None)
+    assert {path.name for path in write_results(out, batch)} == set(write.FILES) - {"estimates.mcap"}
+    assert {path.name for path in out.iterdir()} == {*write.FILES, "notes.txt"} - {"estimates.mcap"}
+    assert json.loads((out / "result.json").read_text())["solver"] == "batch"
+
+
+def test_a_failure_leaves_everything_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_results(tmp_path, make_calibration())
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(write, "write_estimates", fail)
+    with pytest.raises(InputError, match="No space left"):
+        write_results(tmp_path, make_calibration(values=np.zeros(6)))
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    with pytest.raises(InputError):
+        write_results(tmp_path / "new", make_calibration())
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "out"
+    path.write_text("x")
+    with pytest.raises(InputError, match="no folder"):
+        write_results(path, make_calibration())
+    assert path.read_text() == "x"
