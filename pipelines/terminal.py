@@ -81,7 +81,9 @@ def show_facts(name: str, facts: SessionFacts) -> None:
     for t in facts.topics:
         gap = ""
         if t.largest_gap_s is not None and t.rate_hz is not None:
-            gap = f"{t.largest_gap_s:.2g}" + (f" at {t.largest_gap_at_s:.0f}" if t.largest_gap_s * t.rate_hz > 2 else "")
+            gap = f"{t.largest_gap_s:.2g}" + (
+                f" at {t.largest_gap_at_s:.0f}" if t.largest_gap_s * t.rate_hz > 2 else ""
+            )
         rate = "" if t.rate_hz is None else f"{t.rate_hz:.4g}"
         kind = t.type.rsplit("/", 1)[-1]
         table.add_row(escape(t.name), kind, str(t.count), rate, gap, str(t.duplicates), str(t.out_of_order))
