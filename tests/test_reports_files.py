@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -110,7 +111,7 @@ def numbers(content: object) -> Iterator[float]:
         yield content
 
 
-def strict(text: str) -> dict:
+def strict(text: str) -> dict[str, Any]:
     def refuse(constant: str) -> None:
         raise AssertionError(f"{constant} is no JSON")
 
@@ -251,7 +252,7 @@ def test_estimates_read_back_with_a_ros_decoder(tmp_path: Path) -> None:
     write_results(tmp_path, calibration)
     with (tmp_path / "estimates.mcap").open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
-        found: dict[str, list] = {}
+        found: dict[str, list[tuple[int, Any]]] = {}
         for schema, channel, message in reader.iter_messages():
             assert schema is not None
             decoded = definition(schema.name, schema.data.decode()).decode(message.data)

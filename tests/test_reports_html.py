@@ -139,7 +139,9 @@ def test_units_people_read(unit: str, require: float, shown: str) -> None:
         "ms": 1e3,
         "nT": 1e9,
     }
-    assert human_unit(Quantity("a", unit, 1.0, 1.0, require)) == (shown, pytest.approx(factors.get(shown, 1.0)))
+    label, factor = human_unit(Quantity("a", unit, 1.0, 1.0, require))
+    assert label == shown
+    assert factor == pytest.approx(factors.get(shown, 1.0))
 
 
 @pytest.mark.parametrize(
