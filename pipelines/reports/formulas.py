@@ -16,7 +16,7 @@ FORMULAS: dict[str, tuple[str, ...]] = {
     "indexer": (
         "mRt = Rx(theta_x) Ry(theta_y) Rz(theta_z), Rx(a) = transpose(Exp(a ex)): t payload platform, m IMU on it",
         "rate of the payload platform, rad/s: w_it = inverse(mRt) (gyro - gyro_bias)",
-        "attitude of the carrier: nRb = nRm mRt inverse(bRt), bRt = Exp(outer ex) Exp(inner ez) of the encoders' angles",
+        "carrier attitude: nRb = nRm mRt inverse(bRt), bRt = Exp(outer ex) Exp(inner ez) of the encoders' angles",
     ),
     "head": (
         "vRh = Exp(helmet_mount), cRb = Exp(camera_mount): v helmet IMU, h markers, c camera, b platform",
