@@ -65,6 +65,28 @@ def compare(session: _Session, method: _MethodName = None, config: _ConfigFile =
 
 
 @app.command()
+def validate(
+    session: _Session,
+    calibration: Annotated[Path, typer.Option(help="The calibration.yaml to try on the recording.")],
+    method: _MethodName = None,
+    config: _ConfigFile = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the page; default: SESSION-validation.")] = None,
+) -> None:
+    """Errors of a recording before and after compensation with a calibration made on another one."""
+    from pipelines import terminal
+    from pipelines.validate import table, write_validation
+    from pipelines.validate import validate as run
+
+    validated = run(session, calibration, method, config)
+    written = write_validation(out or session.with_name(f"{session.stem}-validation"), validated)
+    for line in table(validated):
+        terminal.say(line)
+    for note in validated.notes:
+        terminal.say(f"  note: {note}")
+    terminal.say(f"Plots in {written}")
+
+
+@app.command()
 def simulate(
     method: Annotated[str, typer.Argument(help="los, indexer, head or cube.")],
     out: Annotated[Path, typer.Option(help="The recording to write.")],

@@ -5,7 +5,7 @@ Entries are made when asked for: the modules behind them import gtsam, which tak
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ from pipelines.errors import InputError
 
 if TYPE_CHECKING:
     from pipelines.methods.base import Estimate, Problem
+    from pipelines.methods.validation import Validation
     from pipelines.reports.result import Calibration, Plot
     from pipelines.sessions.config import Config
     from pipelines.sessions.reading import Recording
@@ -29,6 +30,7 @@ class Method:
         published: data, config and problem -> the published solver's estimate.
         simulate: scenario (name, file or None for the nominal one), seed, file to write, whether with pictures.
         plots: the method's own figures for the report.
+        validate: data, config and parameter values by name -> errors before and after compensation.
     """
 
     read: Callable[[Recording, Config], Any]
@@ -36,6 +38,7 @@ class Method:
     published: Callable[[Any, Config, Problem], Estimate]
     simulate: Callable[[str | None, int, Path, bool], None]
     plots: Callable[[Any], Callable[[Calibration], Sequence[Plot]]] | None = None
+    validate: Callable[[Any, Config, Mapping[str, float]], Sequence[Validation]] | None = None
 
 
 def method(name: str) -> Method:
@@ -49,12 +52,15 @@ def _head() -> Method:
     from functools import partial
 
     from pipelines.methods.head import problem
+    from pipelines.methods.head_validation import validate
     from pipelines.published.head import published_estimate
     from pipelines.reports.head import head_plots
     from pipelines.sessions.head import read_head
     from pipelines.simulation.head import write_simulation
 
-    return Method(read_head, problem, published_estimate, write_simulation, lambda data: partial(head_plots, data))
+    return Method(
+        read_head, problem, published_estimate, write_simulation, lambda data: partial(head_plots, data), validate
+    )
 
 
 _METHODS: dict[str, Callable[[], Method]] = {"head": _head}

@@ -1,0 +1,94 @@
+"""From a recording and a calibration to the errors without and with it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipelines.errors import InputError
+from pipelines.methods.validation import Validation
+from pipelines.registry import method
+from pipelines.reports.calibration import SavedCalibration, load_calibration
+from pipelines.reports.validation import validation_html, validation_rows
+from pipelines.sessions.config import ATTACHMENT, load_config
+from pipelines.sessions.info import resolve_method
+from pipelines.sessions.reading import open_recording
+
+FILE = "validation.html"
+
+
+@dataclass(frozen=True, eq=False)
+class Validated:
+    """A calibration held against a recording.
+
+    Attributes:
+        calibration: the one validated.
+        recording: name of the file.
+        validations: what the method says.
+        same_recording: it was calibrated on the very recording.
+    """
+
+    calibration: SavedCalibration
+    recording: str
+    validations: Sequence[Validation]
+    same_recording: bool
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader has to know beside the numbers."""
+        out = [f"{v.name}: {v.note}" for v in self.validations if v.note]
+        if self.same_recording:
+            out.append("this is the recording it was calibrated on; another one tells more")
+        if self.calibration.status != "calibrated":
+            out.append(f"the calibration's own verdict is {self.calibration.status}")
+        return out
+
+
+def validate(
+    path: Path, calibration_file: Path, method_name: str | None = None, config_file: Path | None = None
+) -> Validated:
+    """The errors of a recording before and after compensation.
+
+    Args:
+        path: the recording.
+        calibration_file: calibration.yaml.
+        method_name: overrides the config's.
+        config_file: overrides the recording's own config key by key.
+
+    Raises:
+        InputError: recording, config or calibration cannot be used, or the calibration is another method's.
+    """
+    calibration = load_calibration(calibration_file)
+    recording = open_recording(path)
+    config = load_config(recording.attachment(ATTACHMENT), config_file)
+    name = resolve_method(method_name or calibration.method, recording, config)
+    if name != calibration.method:
+        raise InputError(f"{calibration_file}: is a calibration of {calibration.method}, not of {name}")
+    chosen = method(name)
+    if chosen.validate is None:
+        raise InputError(f"method {name} has no validation")
+    values = {parameter: saved.value for parameter, saved in calibration.parameters.items()}
+    validations = chosen.validate(chosen.read(recording, config), config, values)
+    return Validated(calibration, path.name, validations, calibration.recording.sha256 == recording.sha256())
+
+
+def table(validated: Validated) -> list[str]:
+    """Lines of text: for each error RMS and peak, before and after."""
+    rows = validation_rows(validated.validations)
+    width = max(len(row[0]) for row in rows)
+    head = f"{'':{width}}  {'RMS':>9} {'':>9}  {'peak':>9}"
+    under = f"{'error':{width}}  {'before':>9} {'after':>9}  {'before':>9} {'after':>9}"
+    lines = [f"{name:{width}}  {a:>9} {b:>9}  {c:>9} {d:>9}  {unit}" for name, a, b, c, d, unit in rows]
+    return [head, under, *lines]
+
+
+def write_validation(out_dir: Path, validated: Validated) -> Path:
+    """Write validation.html; returns its path. Raises InputError when it cannot be written."""
+    text = validation_html(validated.validations, validated.calibration, validated.recording)
+    try:
+        out_dir.mkdir(parents=True, exist_ok=True)
+        (out_dir / FILE).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{out_dir}: the validation cannot be written ({error.strerror})") from error
+    return out_dir / FILE
