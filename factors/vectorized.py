@@ -150,6 +150,13 @@ class VectorizedFactor:
         """Whitened residuals (n, m) at the values, outliers included."""
         return self._at(values).residuals
 
+    def rows(self, values: gtsam.Values) -> tuple[Array, Array]:
+        """Residuals (n * m,) and their Jacobian (n * m, d) on the factor's keys, neither weighed nor compressed."""
+        evaluation = self._at(values)
+        jacobians: list[Array] = [np.empty(0)] * len(self.keys)
+        self._lay_out(evaluation.jacobians(), jacobians)
+        return evaluation.residuals.ravel(), np.concatenate(jacobians, axis=1)
+
     def used(self, values: gtsam.Values) -> NDArray[np.bool_]:
         """Which of the n measurements lie inside the gate."""
         square = (self.residuals(values) ** 2).sum(axis=1)

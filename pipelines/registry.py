@@ -63,4 +63,22 @@ def _head() -> Method:
     )
 
 
-_METHODS: dict[str, Callable[[], Method]] = {"head": _head}
+def _los() -> Method:
+    from pipelines.methods.los import problem
+    from pipelines.published.los import published_estimate
+    from pipelines.sessions.los import read_los
+    from pipelines.simulation.los import write_simulation
+
+    return Method(read_los, problem, published_estimate, write_simulation)
+
+
+def _indexer() -> Method:
+    from pipelines.methods.indexer import problem
+    from pipelines.published.indexer import published_estimate
+    from pipelines.sessions.indexer import read_indexer
+    from pipelines.simulation.indexer import write_simulation
+
+    return Method(read_indexer, problem, published_estimate, write_simulation)
+
+
+_METHODS: dict[str, Callable[[], Method]] = {"los": _los, "indexer": _indexer, "head": _head}

@@ -90,6 +90,16 @@ def test_compression_of_singular_systems_keeps_the_null_space() -> None:
     assert np.linalg.norm(R @ np.array([1e3, -1.0, 0.0, -1.0])) < 1e-4 * np.linalg.norm(R)
 
 
+@pytest.mark.parametrize("compress", [False, True])
+def test_rows_are_the_plain_linearisation(compress: bool) -> None:
+    model = _line(6)
+    values = _values(np.array([0.2, 0.1, -0.3]), np.ones(2))
+    loss = TruncatedLoss(gate=0.1)
+    error, A = VectorizedFactor(model, [0, 1], [3, 2], loss=loss, compress=compress).rows(values)
+    np.testing.assert_allclose(A, np.concatenate([model.A.reshape(-1, 3), np.tile(np.eye(2), (6, 1))], axis=1))
+    np.testing.assert_allclose(error, A @ np.array([0.2, 0.1, -0.3, 1, 1]) - model.y.ravel())
+
+
 def test_compressed_factors_need_shared_columns() -> None:
     with pytest.raises(ValueError, match="shared by all"):
         VectorizedFactor(_line(2), [[0, 1], 2], [3, 2], compress=True)

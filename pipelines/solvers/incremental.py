@@ -15,6 +15,7 @@ import gtsam
 import numpy as np
 
 from factors.chi_square import gate
+from factors.vectorized import VectorizedFactor
 from pipelines.methods.base import (
     Array,
     Attitudes,
@@ -178,21 +179,29 @@ class _Run:
         new = step.initial if step.predict is None else step.predict(values)
         values.insert(new)
         processes = [f for f in step.factors if f.measurement is None]
-        factors = processes + [f for f in step.factors if f.measurement and self._agrees(f, processes, values, new)]
+        factors = processes + [
+            f for f in step.factors if f.measurement and self._agrees(f, f.measurement, processes, values, new)
+        ]
         self.smoother.update(factors, new, dict(step.timestamps))
         self._record(step.time, step.keyframes, self.smoother.estimate())
 
-    def _agrees(self, factor: Factor, processes: Sequence[Factor], values: gtsam.Values, new: gtsam.Values) -> bool:
+    def _agrees(
+        self,
+        factor: Factor,
+        measurement: VectorizedFactor,
+        processes: Sequence[Factor],
+        values: gtsam.Values,
+        new: gtsam.Values,
+    ) -> bool:
         """Whether the innovation lies within the gate; notes it."""
-        linear = factor.factor.linearize(values)
-        A, b = linear.jacobian()
-        S = A @ self._predicted(linear.keys(), processes, values, new) @ A.T + np.eye(len(b))
-        whitened = np.linalg.solve(np.linalg.cholesky(S), -b)
-        agrees = bool(whitened @ whitened < gate(len(b)) ** 2)
+        error, A = measurement.rows(values)
+        S = A @ self._predicted(measurement.keys, processes, values, new) @ A.T + np.eye(len(error))
+        whitened = np.linalg.solve(np.linalg.cholesky(S), error)
+        agrees = bool(whitened @ whitened < gate(len(error)) ** 2)
         self.rejected_in_a_row = 0 if agrees else self.rejected_in_a_row + 1
         if self.rejected_in_a_row > _MOST_REJECTED:
             agrees, self.rejected_in_a_row = True, 0
-        self._note(factor, whitened[None], agrees)
+        self._note(factor, whitened.reshape(-1, measurement.model.rows), agrees)
         return agrees
 
     def _predicted(
