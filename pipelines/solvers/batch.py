@@ -15,7 +15,7 @@ import numpy as np
 
 from factors.vectorized import TruncatedLoss
 from pipelines.methods.base import Estimate, Factor, Problem, Residuals
-from pipelines.solvers.marginals import chi_square, joint_covariance, reported
+from pipelines.solvers.marginals import chi_square, history_of, joint_covariance, reported
 
 # Frames in one vectorised factor: past this the Jacobians' zeros cost more than the Python calls they save.
 CHUNK = 20
@@ -51,10 +51,13 @@ def solve_batch(problem: Problem) -> Estimate:
     factors: list[Factor] = []
     values = gtsam.Values()
     stand_ins: dict[int, int] = {}
+    held: list[tuple[float, dict[int, int]]] = []
     keyframes: list[int] = []
     for step in problem.steps(CHUNK):
         factors.extend(step.factors)
         values.insert(step.initial)
+        if not held or step.stand_ins:
+            held.append((step.time, {**stand_ins, **step.stand_ins}))
         stand_ins.update(step.stand_ins)
         keyframes.extend(step.keyframes)
     built = time.perf_counter()
@@ -68,6 +71,8 @@ def solve_batch(problem: Problem) -> Estimate:
     marginal = joint_covariance(problem, linear, ordering, values, stand_ins)
     residuals = _residuals(factors, values)
     summary = chi_square(problem, factors, linear, ordering, values, marginal)
+    # The last stand-ins are what the session reports; those before them held the parameters over time.
+    history = history_of(problem, linear, ordering, values, held[:-1], marginal) if len(held) > 2 else None
     done = time.perf_counter()
     return Estimate(
         solver="batch",
@@ -78,6 +83,7 @@ def solve_batch(problem: Problem) -> Estimate:
         message=solution.message,
         residuals=residuals,
         chi_square=summary,
+        history=history,
         attitudes=problem.attitudes(keyframes, values) if problem.attitudes else None,
         rejected={family: int((~r.used).sum()) for family, r in residuals.items()},
         seconds={"build": built - start, "solve": solved - built, "marginals": done - solved},

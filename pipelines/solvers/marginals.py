@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import gtsam
 import numpy as np
 
-from pipelines.methods.base import Array, ChiSquare, Factor, Parameter, Problem
+from pipelines.methods.base import Array, ChiSquare, Factor, History, Parameter, Problem
 
 # A direction the data and priors say nothing about gets this many times its prior scale as sigma, so that it can be
 # named with the others instead of making the system unsolvable.
@@ -52,6 +52,42 @@ def joint_covariance(
         last.push_back(key)
     information = remaining.hessian(last)[0]
     return reported_covariance(problem.parameters, information, values, keys)
+
+
+def history_of(
+    problem: Problem,
+    linear: gtsam.GaussianFactorGraph,
+    ordering: gtsam.Ordering,
+    values: gtsam.Values,
+    held: Sequence[tuple[float, Mapping[int, int]]],
+    covariance: Array,
+) -> History | None:
+    """Smoothed values and sigmas over time of parameters that move along; the others as they are at the end.
+
+    Args:
+        held: time and, from then on, parameter key -> variable that held it.
+        covariance: (n, n) of the reported numbers, for those that do not move.
+
+    Returns None when the system is singular.
+    """
+    try:
+        tree = linear.eliminateMultifrontal(ordering)
+    except RuntimeError:
+        return None
+    sigmas = []
+    for _, stand_ins in held:
+        row = []
+        fixed = np.sqrt(np.diag(covariance))
+        for p in problem.parameters:
+            n, key = len(p.quantities), stand_ins.get(p.key)
+            if key is None:
+                row.append(fixed[:n])
+            else:
+                row.append(np.sqrt(np.diag(reported_covariance([p], tree.marginalInformation(key), values, [key]))))
+            fixed = fixed[n:]
+        sigmas.append(np.concatenate(row))
+    times = np.array([time for time, _ in held])
+    return History(times, np.array([reported(problem, values, s) for _, s in held]), np.array(sigmas))
 
 
 def reported_covariance(
