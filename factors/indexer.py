@@ -58,8 +58,8 @@ class PlatformRates:
     Attributes:
         edges: (n + 1,) s, where the windows begin and end.
         fixed, cosine, sine: (n, 3) rad/s.
-        noise: (3 n, 2 (n + 1)) 1/s, change of the means with encoder noise of 1 rad a sample: columns
-            are the outer and the inner encoder at each edge, one after the other.
+        noise: (3 n, 2 (n + 1) + n) 1/s, change of the means with encoder noise of 1 rad a sample. Columns: the outer
+            and the inner encoder at each edge, one after the other, then the inner one's mean over each window.
     """
 
     edges: Array
@@ -72,7 +72,8 @@ class PlatformRates:
 class AxisPath:
     """The encoder stream integrated once; the platform's mean rate over any window then costs a look-up.
 
-    Between samples both axes are taken to turn uniformly.
+    Between samples both axes are taken to turn uniformly; the angles at a window's ends are interpolated to third
+    order.
 
     Args:
         t: (M,) stamps, s, increasing, M >= 2.
@@ -89,11 +90,6 @@ class AxisPath:
         pieces = self._arc(np.diff(self.t), self._angles[:-1], self._angles[1:])
         self._integral = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(pieces, axis=0)])
 
-    def angles(self, at: ArrayLike) -> Array:
-        """Outer and inner angle at the times, shape (n, 2), rad."""
-        at = np.asarray(at, dtype=float)
-        return np.stack([np.interp(at, self.t, a) for a in self._angles.T], axis=1)
-
     def rates(self, edges: ArrayLike) -> PlatformRates:
         """Mean rates over the adjoining windows between the edges, (n + 1,), s, increasing, within the stamps.
 
@@ -104,13 +100,13 @@ class AxisPath:
         if edges[0] < self.t[0] or edges[-1] > self.t[-1] or (np.diff(edges) <= 0.0).any():
             raise ValueError(f"windows must lie within [{self.t[0]}, {self.t[-1]}] s and not be empty")
         i = np.clip(np.searchsorted(self.t, edges, side="right") - 1, 0, len(self.t) - 2)
-        share = (edges - self.t[i]) / (self.t[i + 1] - self.t[i])
-        angles = self._angles[i] + share[:, None] * (self._angles[i + 1] - self._angles[i])
+        weights, samples = self._interpolation(edges, i)
+        angles = np.einsum("nk,nkd->nd", weights, self._angles[samples])
         integral = self._integral[i] + self._arc(edges - self.t[i], self._angles[i], angles)
         duration = np.diff(edges)[:, None, None]
         mean = np.diff(integral, axis=0) / duration
-        # The axes in t at the edges; interpolation averages the noise of two samples.
-        spread = np.sqrt((1.0 - share) ** 2 + share**2)
+        # The axes in t at the edges; interpolation averages the noise of the samples.
+        spread = np.sqrt((weights**2).sum(axis=1))
         axes = np.zeros((len(edges), 3, 2))
         axes[:, 0, 0], axes[:, 1, 0], axes[:, 2, 1] = np.cos(angles[:, 1]), -np.sin(angles[:, 1]), 1.0
         axes *= spread[:, None, None]
@@ -118,7 +114,26 @@ class AxisPath:
         noise = np.zeros((n, 3, n + 1, 2))
         noise[np.arange(n), :, np.arange(n)] = -axes[:-1] / duration
         noise[np.arange(n), :, np.arange(1, n + 1)] = axes[1:] / duration
-        return PlatformRates(edges, mean[:, 0], mean[:, 1], mean[:, 2], noise.reshape(3 * n, 2 * (n + 1)))
+        # The mean error of the inner angle turns the outer axis, and with it the rate, about z.
+        samples = np.maximum(np.diff(np.searchsorted(self.t, edges)), 1)
+        turned = np.zeros((n, 3, n))
+        turned[np.arange(n), :, np.arange(n)] = so3.cross(mean[:, 0] + mean[:, 1], _EZ) / np.sqrt(samples)[:, None]
+        columns = [noise.reshape(3 * n, 2 * (n + 1)), turned.reshape(3 * n, n)]
+        return PlatformRates(edges, mean[:, 0], mean[:, 1], mean[:, 2], np.hstack(columns))
+
+    def _interpolation(self, at: Array, i: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
+        """Weights and indexes (n, 4) of the samples that make the angles at the times, in the intervals i.
+
+        The straight line between the two neighbours, bent by the curvature that the next two show: an axis that
+        gathers speed is followed to third order.
+        """
+        samples = np.clip(i[:, None] + np.array([-1, 0, 1, 2]), 0, len(self.t) - 1)
+        share = (at - self.t[i]) / (self.t[i + 1] - self.t[i])
+        # Where a neighbour lies beyond a pause or the ends, the line stays straight.
+        steps = np.diff(self.t[samples], axis=1)
+        even = (np.ptp(steps, axis=1) < 0.1 * steps[:, 1]) & (steps > 0.0).all(axis=1)
+        bend = np.where(even, 0.25 * share * (1.0 - share), 0.0)
+        return np.stack([-bend, 1.0 - share + bend, share + bend, -bend], axis=1), samples
 
     def _arc(self, duration: Array, begin: Array, end: Array) -> Array:
         """Integrals (n, part, 3) of the platform's rate while both axes turn uniformly from begin to end (n, 2)."""
@@ -188,7 +203,7 @@ class IndexerAverageFactor:
         gyro: Array,
         rates: PlatformRates,
         density: float,
-        encoder: float,
+        encoder: ArrayLike,
         options: tuple[Option, ...] = (),
         wander: float = 0.0,
         theta_unit: float = 1.0,
@@ -198,11 +213,13 @@ class IndexerAverageFactor:
         Args:
             gyro, rates, options, theta_unit: as the attributes.
             density: gyro noise, rad/s/sqrt(Hz): angle random walk in each window.
-            encoder: white encoder noise at the edges, rad.
+            encoder: white encoder noise at the edges, rad, one for both axes or (2,) for outer and inner.
             wander: error of the encoders' account of the platform's attitude, about any axis, rad, that changes from
                 edge to edge: it turns the platform between the edges, and its mean turns the rate.
         """
-        covariance = encoder**2 * rates.noise @ rates.noise.T
+        both = np.broadcast_to(np.asarray(encoder, dtype=float), 2)
+        sigmas = np.concatenate([np.tile(both, len(rates.edges)), np.repeat(both[1], len(gyro))])
+        covariance = (rates.noise * sigmas**2) @ rates.noise.T
         covariance += np.diag(np.repeat(density**2 / np.diff(rates.edges), 3))
         ends = np.diff(np.eye(len(rates.edges)), axis=0) / np.diff(rates.edges)[:, None]
         covariance += wander**2 * np.kron(ends @ ends.T, np.eye(3))

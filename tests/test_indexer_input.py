@@ -124,6 +124,25 @@ def test_any_rates(gyro_hz: float, encoder_hz: float) -> None:
     assert np.abs(_errors(*simulate_indexer(scenario, 4))).max() < 4.0
 
 
+def test_reversal_without_a_rest() -> None:
+    """Forward and back are two runs even when the axis stops for no longer than it takes to turn round."""
+    scenario = SCENARIO.model_copy(update={"dwell_s": 0.02})
+    data, truth = simulate_indexer(scenario, 2)
+    turning = [run for run in axis_motion(data).runs if run.axis != "none"]
+    assert [run.whole_turns * run.direction for run in turning] == [2, -2, 2, -2]
+    assert np.abs(_errors(data, truth)).max() < 4.0
+
+
+def test_coarse_encoders_are_slow_errors() -> None:
+    """Sixteen bits, 20 arc seconds a step: the resting encoder shows no scatter."""
+    scenario = SCENARIO.model_copy(
+        update={"encoder_bits": 16, "noise": IndexerNoise(gyro_density=1e-6), "gyro_rate_hz": 200.0}
+    )
+    data, truth = simulate_indexer(scenario, 3)
+    config = load_config(indexer_config(scenario).encode())
+    assert np.abs(_errors(data, truth, config)).max() < 3.0
+
+
 def test_runs_cut_in_the_middle_of_a_turn(session: tuple[IndexerData, dict[str, float]]) -> None:
     """A recording that starts and stops while an axis turns."""
     data, truth = session

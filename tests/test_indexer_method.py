@@ -154,7 +154,9 @@ def test_independent_simulator_within_three_sigma(shared_data: Path) -> None:
 
 
 def test_real_turns_by_hand_against_imucal(shared_data: Path) -> None:
-    """One whole turn about each axis. imucal counts its turns as -360 degrees, hence the sign of its R_g; its K_g R_g is
+    """One whole turn about each axis.
+
+    imucal counts its turns as -360 degrees, hence the sign of its R_g. Its K_g R_g is
     (1 + scale) mRt here, but for gyro axes 0.3 degrees from perpendicular, which are left out here.
     """
     data = to_session(read_parts(shared_data / "imucal" / "annotated_session.csv"))

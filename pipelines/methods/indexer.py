@@ -59,7 +59,7 @@ _WINDOW_ANGLE = np.pi / 4
 # Less than this over, rad, does not make a window of its own.
 _CRUMB = 2e-3
 # Encoder samples that a dwell leaves to the motion after it.
-_DWELL_MARGIN = 3.0
+_DWELL_MARGIN = 5.0
 # Groups and windows of fewer gyro samples than this are the crumbs of rounding.
 _FEWEST_SAMPLES = 4
 # A gyro that departs from the encoders by more than this share of the rate is not the gyro of this axis.
@@ -128,7 +128,7 @@ class _Model:
     groups: tuple[Group, ...]
     bias: WalkingBias
     density: float
-    encoder: float
+    encoder: float  # white noise of a sample, rad
     slow: float  # sigma of the errors that come again with every turn, rad; 0: none
     parameters: tuple[Parameter, ...]
     theta_guess: Array
@@ -226,8 +226,9 @@ def groups_of(data: IndexerData, config: Config, motion: AxisMotion, split: bool
             if len(cuts) < 2:
                 continue
             groups.append(Group(kind, run, gyro_means(data.gyro_t, data.gyro, cuts), path.rates(edges[cuts])))
-            # The last edge lies between two encoder samples; the next group starts behind them.
-            after = np.searchsorted(motion.t, edges[cuts[-1]], side="right") + 1
+            # The angle at the last edge is made of the two encoder samples on either side of it, and so is that at the
+            # first edge of the next group.
+            after = np.searchsorted(motion.t, edges[cuts[-1]], side="right") + 3
             free_from = motion.t[min(after, len(motion.t) - 1)]
     return tuple(groups)
 
@@ -475,9 +476,10 @@ def _measurement(
             factors.append(Factor("prior", gtsam.PriorFactorVector(key, np.zeros(3), noise)))
         options, columns = (*options, "tilt"), [*columns, key]
     wander = model.slow if group.kind == "move" else 0.0
-    average = IndexerAverageFactor.of(
-        group.gyro, group.rates, model.density, model.encoder, options, wander, _THETA_UNIT
-    )
+    # A resting encoder repeats its slow errors from edge to edge, a turning one need not (quantisation).
+    turning = np.array([group.run.axis in ("outer", "both"), group.run.axis in ("inner", "both")])
+    encoder = np.hypot(model.encoder, np.where(turning, model.slow, 0.0))
+    average = IndexerAverageFactor.of(group.gyro, group.rates, model.density, encoder, options, wander, _THETA_UNIT)
     kinds = [3, 3, *(1 if name == "epsilon" else 3 for name in options)]
     return Factor.of(group.kind, VectorizedFactor(average, columns, kinds, compress=compress))
 

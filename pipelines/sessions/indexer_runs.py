@@ -21,6 +21,8 @@ _SPEED_SPAN = 0.2
 _SHORTEST = 0.4
 # Less turning than this in all, rad, calibrates nothing.
 _LEAST_TURNED = 0.5
+# How far a motion reaches into the rest about it, in samples.
+_REST_SAMPLES = 2
 # A pause between samples is a gap when longer than both of these: s, sample intervals.
 _GAP = 0.1
 _GAP_SAMPLES = 2.5
@@ -28,7 +30,7 @@ _GAP_SAMPLES = 2.5
 
 @dataclass(frozen=True)
 class Run:
-    """A stretch in which the same axes moved, without gaps in either stream.
+    """A stretch in which the same axes moved the same way, without gaps in either stream.
 
     Attributes:
         axis: which one moved.
@@ -92,11 +94,11 @@ def axis_motion(data: IndexerData) -> AxisMotion:
             f"{np.rad2deg(turned[1]):.3g} deg; turn each axis through whole turns, forward and back, in two positions"
         )
     speeds = [_speeds(t[piece], angles[piece]) for piece in pieces]
-    moving = _MOVING * float(np.percentile(np.concatenate(speeds).max(axis=1), 99.0))
+    moving = _MOVING * float(np.percentile(np.abs(np.concatenate(speeds)).max(axis=1), 99.0))
     runs = [
         run
         for piece, speed in zip(pieces, speeds, strict=True)
-        for run in _runs(t[piece], angles[piece], speed > moving)
+        for run in _runs(t[piece], angles[piece], np.sign(speed) * (np.abs(speed) > moving))
     ]
     return AxisMotion(t, angles, tuple(runs), gaps)
 
@@ -121,16 +123,19 @@ def _gaps(data: IndexerData) -> tuple[tuple[float, float], ...]:
 
 
 def _speeds(t: Array, angles: Array) -> Array:
-    """Speed of both axes (M, 2), rad/s, over a short span around each sample."""
+    """Rates of both axes (M, 2), rad/s, over a short span around each sample."""
     span = max(1, round(0.5 * _SPEED_SPAN / float(np.median(np.diff(t)))))
     before = np.maximum(np.arange(len(t)) - span, 0)
     after = np.minimum(np.arange(len(t)) + span, len(t) - 1)
-    return np.asarray(np.abs(angles[after] - angles[before]) / (t[after] - t[before])[:, None])
+    return np.asarray((angles[after] - angles[before]) / (t[after] - t[before])[:, None])
 
 
-def _runs(t: Array, angles: Array, moving: NDArray[np.bool_]) -> list[Run]:
-    """Cut one piece where the state of the axes changes; states too short to be meant join the one before."""
-    state = moving[:, 0] + 2 * moving[:, 1]
+def _runs(t: Array, angles: Array, moving: Array) -> list[Run]:
+    """Cut one piece where the state of the axes changes; states too short to be meant join the one before.
+
+    `moving` (M, 2) is 1 for an axis that moves forward, -1 back, 0 at rest.
+    """
+    state = (moving @ [1, 3]).astype(int)
     changes = np.flatnonzero(np.diff(state)) + 1
     begins = [0]
     kept = [int(state[0])]
@@ -139,18 +144,21 @@ def _runs(t: Array, angles: Array, moving: NDArray[np.bool_]) -> list[Run]:
             continue
         begins.append(int(begin))
         kept.append(int(state[begin]))
-    # A motion begins and ends a sample inside the rest about it, where an angle between samples is known exactly.
+    first_of = list(begins)
+    # A motion begins and ends inside the rest about it, where the angle between samples is known exactly.
     for i in range(1, len(begins)):
         if (kept[i - 1] == 0) != (kept[i] == 0):
-            begins[i] += 1 if kept[i] == 0 else -1
+            begins[i] += _REST_SAMPLES if kept[i] == 0 else -_REST_SAMPLES
     ends = [*begins[1:], len(t) - 1]
-    return [_run(t, angles, s, a, b) for s, a, b in zip(kept, begins, ends, strict=True) if b > a]
+    states = moving[first_of]
+    return [_run(t, angles, s, a, b) for s, a, b in zip(states, begins, ends, strict=True) if b > a]
 
 
-def _run(t: Array, angles: Array, state: int, begin: int, end: int) -> Run:
+def _run(t: Array, angles: Array, moving: Array, begin: int, end: int) -> Run:
     turned = angles[end] - angles[begin]
     mean = angles[begin : end + 1].mean(axis=0) % (2.0 * np.pi)
-    axis: Axis = ("none", "outer", "inner", "both")[state]
+    names: tuple[Axis, ...] = ("none", "outer", "inner", "both")
+    axis = names[int(np.abs(moving) @ [1, 2])]
     net = {"none": 0.0, "outer": turned[0], "inner": turned[1], "both": turned.sum()}[axis]
     other = {"outer": mean[1], "inner": mean[0]}.get(axis, 0.0)
     return Run(axis, float(t[begin]), float(t[end]), float(net), float(other))
