@@ -213,4 +213,7 @@ def _from_pictures(
     for reason, number in found.dropped.items():
         count(dropped, f"{topic}: {reason}", number)
     t, keep = clean(topic, found.t_ns, epoch_ns, found.error, dropped)
-    return t, found.error[keep], found.covariance[keep]
+    covariance = found.covariance[keep]
+    # The first picture agrees with itself without error, yet where it puts the target is as uncertain as elsewhere.
+    covariance[0] = np.median(covariance, axis=0)
+    return t, found.error[keep], covariance
