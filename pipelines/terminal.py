@@ -113,7 +113,8 @@ def _cell(parameter: ParameterResult, factor: float, error_sigmas: float | None,
 def _verdict(calibration: Calibration, name: bool) -> None:
     assessment = calibration.assessment
     solver = f"{calibration.estimate.solver}: " if name else ""
-    _console.print(f"{solver}[{_COLOURS[assessment.status]}]{escape(assessment.headline)}[/]", soft_wrap=True)
+    colour = _COLOURS[assessment.status]
+    _console.print(f"{solver}[bold {colour}]{assessment.status}[/] {escape(assessment.headline)}", soft_wrap=True)
     for direction in assessment.directions:
         say(f"  {direction.verdict}: {direction.label}: {direction.advice}")
     for note in calibration.notes:
