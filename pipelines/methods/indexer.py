@@ -213,7 +213,11 @@ def groups_of(data: IndexerData, config: Config, motion: AxisMotion, split: bool
     edges = gyro_edges(data.gyro_t)
     groups: list[Group] = []
     free_from = -np.inf
+    before = -np.inf
     for run in motion.runs:
+        if run.start > before:  # behind a gap, all samples are new
+            free_from = -np.inf
+        before = run.stop
         for kind, borders in _borders(motion, run):
             if not split:
                 borders = borders[[0, -1]]
