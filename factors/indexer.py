@@ -164,9 +164,9 @@ def gyro_edges(t: Array) -> Array:
     return np.concatenate([[2.0 * t[0] - middle[0]], middle, [2.0 * t[-1] - middle[-1]]])
 
 
-def gyro_means(t: Array, rate: Array, cuts: NDArray[np.intp]) -> Array:
-    """Mean gyro rates (n, 3) over the samples from cut to cut (n + 1,), each weighed with its interval."""
-    edges = gyro_edges(t)[cuts[0] : cuts[-1] + 1]
+def gyro_means(edges: Array, rate: Array, cuts: NDArray[np.intp]) -> Array:
+    """Mean gyro rates (n, 3) over the samples from cut to cut (n + 1,), weighed with the intervals between edges."""
+    edges = edges[cuts[0] : cuts[-1] + 1]
     moved = rate[cuts[0] : cuts[-1]] * np.diff(edges)[:, None]
     at = cuts - cuts[0]
     return np.asarray(np.add.reduceat(moved, at[:-1], axis=0) / np.diff(edges[at])[:, None])

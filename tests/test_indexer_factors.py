@@ -112,7 +112,7 @@ def test_gyro_mean_is_the_integral_between_sample_edges() -> None:
     t = np.array([0.0, 1.0, 2.0, 4.0, 5.0])
     np.testing.assert_allclose(gyro_edges(t), [-0.5, 0.5, 1.5, 3.0, 4.5, 5.5])
     rate = np.arange(15.0).reshape(5, 3)
-    mean = gyro_means(t, rate, np.array([1, 4, 5]))
+    mean = gyro_means(gyro_edges(t), rate, np.array([1, 4, 5]))
     np.testing.assert_allclose(mean, [(rate[1] + 1.5 * rate[2] + 1.5 * rate[3]) / 4.0, rate[4]])
 
 

@@ -211,27 +211,27 @@ def groups_of(data: IndexerData, config: Config, motion: AxisMotion, split: bool
     earth = np.zeros(3) if latitude is None else earth_rate(np.deg2rad(latitude))
     path = AxisPath(motion.t, motion.angles[:, 0], motion.angles[:, 1], so3.rotate(so3.inverse(nRbase), earth))
     edges = gyro_edges(data.gyro_t)
+    middles = 0.5 * (edges[1:] + edges[:-1])
     groups: list[Group] = []
-    free_from = -np.inf
-    before = -np.inf
+    free_from = before = -np.inf
     for run in motion.runs:
         if run.start > before:  # behind a gap, all samples are new
             free_from = -np.inf
         before = run.stop
         for kind, borders in _borders(motion, run):
-            if not split:
-                borders = borders[[0, -1]]
-            inside = np.flatnonzero((edges >= max(run.start, free_from)) & (edges <= run.stop))
-            if len(inside) <= _FEWEST_SAMPLES:
+            # The sample edges nearest to the borders, within what the run and the group before leave.
+            first = np.searchsorted(edges, max(run.start, free_from))
+            last = np.searchsorted(edges, run.stop, side="right") - 1
+            if last - first < _FEWEST_SAMPLES:
                 continue
-            nearest = np.searchsorted(0.5 * (edges[1:] + edges[:-1]), borders)
-            cuts = np.unique(np.clip(nearest, inside[0], inside[-1]))
+            nearest = np.searchsorted(middles, borders if split else borders[[0, -1]])
+            cuts = np.unique(np.clip(nearest, first, last))
             cuts = cuts[np.concatenate([[True], np.diff(cuts) >= _FEWEST_SAMPLES])]
             if len(cuts) < 2:
                 continue
-            groups.append(Group(kind, run, gyro_means(data.gyro_t, data.gyro, cuts), path.rates(edges[cuts])))
-            # The angle at the last edge is made of the two encoder samples on either side of it, and so is that at the
-            # first edge of the next group.
+            groups.append(Group(kind, run, gyro_means(edges, data.gyro, cuts), path.rates(edges[cuts])))
+            # The angle at the last edge is made of the two encoder samples on either side of it, and so is that at
+            # the first edge of the next group.
             after = np.searchsorted(motion.t, edges[cuts[-1]], side="right") + 3
             free_from = motion.t[min(after, len(motion.t) - 1)]
     return tuple(groups)
