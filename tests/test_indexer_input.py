@@ -160,6 +160,7 @@ def test_runs_cut_in_the_middle_of_a_turn(session: tuple[IndexerData, dict[str, 
     assert np.abs(_errors(part, truth)).max() < 4.0
 
 
-def test_validation_needs_an_attitude(session: tuple[IndexerData, dict[str, float]]) -> None:
-    with pytest.raises(InputError, match="no orientation"):
-        validate(session[0], _config(), {"theta_x": 0.0})
+def test_validation_without_an_attitude_looks_at_the_turns(session: tuple[IndexerData, dict[str, float]]) -> None:
+    data, truth = session
+    (turns,) = validate(data, _config(), truth)
+    assert np.abs(turns.after).max() < 1e-4 < np.abs(turns.before).max()

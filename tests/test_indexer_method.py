@@ -14,6 +14,7 @@ from factors.chi_square import quantile
 from factors.indexer import mounting
 from pipelines.methods.base import Estimate
 from pipelines.methods.indexer import problem, validate
+from pipelines.methods.validation import rms
 from pipelines.published.indexer import published_estimate, thin_shell
 from pipelines.sessions.config import load_config
 from pipelines.sessions.indexer import read_indexer
@@ -131,12 +132,12 @@ def test_an_hour_of_attitude_is_within_a_millidegree_after_compensation() -> Non
     config = load_config(indexer_config(scenario).encode())
     estimate = solve_batch(problem(data, config))
     values = dict(zip(estimate.names, estimate.values.tolist(), strict=True))
-    _, before, after = validate(data, config, values)
-    rms = [float(np.sqrt((error**2).sum(axis=1).mean())) for error in (before, after)]
-    assert rms[0] > 0.05 * np.deg2rad(1.0)
-    assert rms[1] < MILLIDEGREE
+    attitude, turns = validate(data, config, values)
+    assert rms(attitude.before) > 0.05 * np.deg2rad(1.0)
+    assert rms(attitude.after) < MILLIDEGREE
     # Little but the noise of the INS itself, one arc second about each of three axes, and of the encoders is left.
-    assert rms[1] < 2.0 * ARCSEC
+    assert rms(attitude.after) < 2.0 * ARCSEC
+    assert rms(turns.after) < 0.01 * rms(turns.before)
     assert estimate.attitudes is not None
     np.testing.assert_allclose(np.abs(estimate.attitudes.wxyz[:, 0]), 1.0, atol=1e-9)
     assert truth["theta_x"] == pytest.approx(values["theta_x"], abs=0.2 * ARCSEC)

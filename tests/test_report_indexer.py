@@ -1,0 +1,39 @@
+"""The indexer's own figures say what the recording holds."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+
+from pipelines.methods.indexer import problem
+from pipelines.reports.indexer import indexer_plots
+from pipelines.reports.result import Calibration, Plot
+from pipelines.sessions.config import load_config
+from pipelines.simulation.indexer import IndexerScenario, Position, indexer_config, simulate_indexer
+from pipelines.solvers.batch import solve_batch
+
+
+def _plots(scenario: IndexerScenario) -> dict[str, Plot]:
+    data, _ = simulate_indexer(scenario, 1)
+    config = load_config(indexer_config(scenario).encode())
+    estimate = solve_batch(problem(data, config))
+    text = config.model_dump_json(exclude_defaults=True)
+    found = indexer_plots(data, cast(Calibration, SimpleNamespace(config_text=text, estimate=estimate)))
+    return {plot.title: plot for plot in found}
+
+
+def test_figures_of_a_whole_schedule() -> None:
+    plots = _plots(IndexerScenario(attitude_noise_arcsec=1, gyro_rate_hz=100))
+    assert list(plots) == ["Attitude output", "Half differences", "Misfit by turn", "What each position says"]
+    measured, compensated = plots["Half differences"].figure.data
+    assert list(measured.x) == ["1 yt", "1 zt", "2 yt", "2 zt", "3 xt", "3 yt", "4 xt", "4 yt"]
+    assert np.abs(compensated.y).max() < 1.0 < 500.0 < np.abs(measured.y).max()
+    shares = np.sum([bar.y for bar in plots["What each position says"].figure.data], axis=0)
+    np.testing.assert_allclose(shares, 100.0)
+
+
+def test_figures_without_attitude_and_without_a_published_position() -> None:
+    plots = _plots(IndexerScenario(positions=[Position(axis="outer", other_deg=90, turns=1)], gyro_rate_hz=100))
+    assert list(plots) == ["Misfit by turn", "What each position says"]
