@@ -56,13 +56,19 @@ class _Smoother:
         params.setFactorization("QR")
         self._lagged = None if window is None else gtsam.IncrementalFixedLagSmoother(window, params)
         self._plain = gtsam.ISAM2(params)
+        self._kept: set[int] = set()  # variables that stay for good
 
     def update(self, factors: Sequence[Factor], values: gtsam.Values, stamps: dict[int, float]) -> None:
         """Add factors and new variables."""
         if self._lagged is None:
             self._plain.update(graph_of(factors), values)
-        else:
-            self._lagged.update(graph_of(factors), values, cast(Any, stamps))
+            return
+        self._kept = (self._kept | set(values.keys())) - stamps.keys()
+        if stamps:
+            # Without a time of their own gtsam would order them among the variables about to be forgotten, and now and
+            # then before one of these, which then cannot be taken out of the Bayes tree.
+            stamps = {**stamps, **dict.fromkeys(self._kept, max(stamps.values()))}
+        self._lagged.update(graph_of(factors), values, cast(Any, stamps))
 
     def estimate(self) -> gtsam.Values:
         """Current values of all variables held."""
