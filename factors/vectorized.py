@@ -158,9 +158,9 @@ class VectorizedFactor:
         return evaluation.residuals.ravel(), np.concatenate(jacobians, axis=1)
 
     def used(self, values: gtsam.Values) -> NDArray[np.bool_]:
-        """Which of the n measurements lie inside the gate."""
+        """Which of the n measurements the loss lets count; all of them while it stands for plain least squares."""
         square = (self.residuals(values) ** 2).sum(axis=1)
-        return np.ones(len(square), dtype=bool) if self.loss is None else square < self.loss.gate**2
+        return np.ones(len(square), dtype=bool) if self.loss is None else self.loss.weight(square) > 0.5
 
     def _at(self, values: gtsam.Values) -> _Evaluation:
         """The model at the values.

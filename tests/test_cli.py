@@ -185,7 +185,7 @@ def test_bad_data_is_one_line(alidade: Command, data: HeadData, tmp_path: Path, 
         ("priors: {helmet_mont_x: 0.1}", ("helmet_mont_x", "helmet_mount_x")),
         ("topics: {vision_attitude: /nowhere}", ("/nowhere",)),
         ("noise: {gyro_density: -1}", ("noise.gyro_density",)),
-        ("method: los", ("/gimbal/joint_states",)),
+        ("method: los", ("/imu", "topics:")),
     ],
 )
 def test_bad_config_is_one_line(

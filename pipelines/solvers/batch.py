@@ -26,6 +26,9 @@ _ERROR_TOLERANCE = 1e-5
 # Below this mean pull of outliers on plain least squares, in sigmas a measurement, good measurements stay inside the
 # gate and the outliers can be cut off at once.
 _MILD_PULL = 0.5
+# Outliers are a minority. If the gate would leave less than this share, it is the noise or the model that is wrong:
+# nothing is rejected then, and chi-square says so.
+_FEWEST_USED = 0.5
 
 
 @dataclass(frozen=True)
@@ -134,6 +137,10 @@ def optimize(
     if len(outlying) == 0:
         return plain
     final = _minimize(graph, values, ordering)
+    used = np.concatenate([r.used for r in _residuals(factors, final.values).values()])
+    if used.mean() < _FEWEST_USED:
+        loss.mu = 0.0
+        return plain
     return Solution(final.values, final.converged, final.message, iterations + final.iterations)
 
 

@@ -156,15 +156,16 @@ class _Run:
             values.insert(step.initial)
             stamps.update(step.timestamps)
         values = optimize([f for step in gathered for f in step.factors], values, self.keys, self.problem.loss).values
+        factors = [f for step in steps for f in step.factors]
+        used = [f.measurement is None or bool(f.measurement.used(values).all()) for f in factors]
         if self.problem.loss is not None:
             self.problem.loss.mu = 0.0  # from here on whole measurements are in or out
-        factors = [f for step in steps for f in step.factors]
         self.smoother = _Smoother(self.window)
-        self.smoother.update([f for f in factors if _all_used(f, values)], values, stamps)
+        self.smoother.update([f for f, good in zip(factors, used, strict=True) if good], values, stamps)
         if not self.started:
-            for f in factors:
+            for f, good in zip(factors, used, strict=True):
                 if f.measurement is not None:
-                    self._note(f, f.measurement.residuals(values), _all_used(f, values))
+                    self._note(f, f.measurement.residuals(values), good)
         self.started = True
         self.attitudes.clear()
         self._record(steps[-1].time, [k for step in steps for k in step.keyframes], values)
@@ -293,10 +294,6 @@ def _ordering(keys: Sequence[int]) -> gtsam.Ordering:
     for key in keys:
         ordering.push_back(key)
     return ordering
-
-
-def _all_used(factor: Factor, values: gtsam.Values) -> bool:
-    return factor.measurement is None or bool(factor.measurement.used(values).all())
 
 
 def _joined(pieces: Iterable[Attitudes]) -> Attitudes:
