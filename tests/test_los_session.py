@@ -46,11 +46,11 @@ def test_written_and_read_back(tmp_path: Path) -> None:
 
 
 def test_turning_azimuth_is_made_continuous(tmp_path: Path) -> None:
-    wrapped = DATA.gimbal + np.array([np.pi - DATA.gimbal[0, 0], 0.0])
-    folded = np.stack([(wrapped[:, 0] + np.pi) % (2 * np.pi) - np.pi, wrapped[:, 1]], axis=1)
+    data, _ = simulate_los(LosScenario(duration_s=12.0, azimuth_deg=179.0), 1)
+    folded = np.stack([(data.gimbal[:, 0] + np.pi) % (2 * np.pi) - np.pi, data.gimbal[:, 1]], axis=1)
     assert np.abs(np.diff(folded[:, 0])).max() > 6.0
-    back = _back(tmp_path / "s.mcap", replace(DATA, gimbal=folded))
-    np.testing.assert_allclose(np.diff(back.gimbal, axis=0), np.diff(DATA.gimbal, axis=0), atol=1e-12)
+    back = _back(tmp_path / "s.mcap", replace(data, gimbal=folded))
+    np.testing.assert_allclose(np.diff(back.gimbal, axis=0), np.diff(data.gimbal, axis=0), atol=1e-12)
 
 
 def test_lost_target_is_left_out_and_counted_nowhere_as_zero(tmp_path: Path) -> None:
@@ -75,6 +75,10 @@ def _frozen(data: LosData) -> LosData:
     return replace(data, gimbal=gimbal)
 
 
+def _other_sign(data: LosData) -> LosData:
+    return replace(data, gyro=data.gyro * np.array([1.0, -1.0, 1.0]))
+
+
 def _pixels(data: LosData) -> LosData:
     return replace(data, error=data.error * 2000.0 + [5.0, 0.0, 0.0])
 
@@ -89,6 +93,7 @@ def _never_found(data: LosData) -> LosData:
         (_degrees, r"/gimbal/joint_states: elevation of .* is the encoder in degrees\?"),
         (_steep, r"elevation of 82.00 deg .* beyond 80 deg .* cannot stabilise"),
         (_frozen, r"elevation stands still from .* the encoder is frozen"),
+        (_other_sign, r"/imu: gimbal and pictures show that the gyro's y has the opposite sign"),
         (_pixels, r"/los/error: LOS errors of .* are they in pixels\?"),
         (_never_found, r"/los/error: the target was never found, none of the 600 messages"),
     ],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +29,8 @@ _STEEPEST = np.deg2rad(80.0)
 _WIDEST_ERROR = 0.5
 # A gimbal is looked at in stretches this long, s, and counts as moved by the carrier beyond this, rad.
 _STRETCH, _MOVED = 2.0, 0.01
+# Pictures this far apart, s, and at least so many, tell the signs of the gyro's axes.
+_STRIDE, _FEWEST = 0.2, 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +60,7 @@ def read_los(recording: Recording, config: Config) -> LosData:
 
     Raises InputError when a topic is missing or unusable (see pipelines.sessions.checks), when the topics have no time
     in common, when the target was never found, and when sizes say that an encoder is in degrees, an encoder stands
-    still, the elevation is beyond 80 deg, or the LOS error is not in radians.
+    still, a gyro axis has the opposite sign, the elevation is beyond 80 deg, or the LOS error is not in radians.
     """
     dropped: dict[str, int] = {}
     epoch = recording.epoch_ns
@@ -75,6 +77,7 @@ def read_los(recording: Recording, config: Config) -> LosData:
     check_overlap({gyro_name: gyro_t, gimbal_name: gimbal_t, error_name: image_t})
     data = LosData(epoch, gyro_t, gyro, gimbal_t, gimbal, image_t, error, covariance, density, dropped)
     check_gimbal(gimbal_name, data)
+    check_signs(gyro_name, data)
     return data
 
 
@@ -117,18 +120,13 @@ def check_gimbal(topic: str, data: LosData) -> None:
 
     A gimbal locked on purpose is told from a frozen encoder by the LOS error, which then moves with the carrier.
     """
-    azimuth, elevation = (np.interp(data.gyro_t, data.gimbal_t, data.gimbal[:, k]) for k in range(2))
-    wx, wy, wz = data.gyro.T
-    ahead = np.cos(azimuth) * wy - np.sin(azimuth) * wx
-    # What turns the picture unless the gimbal turns against it: about the camera's z and x.
-    rate = np.stack([np.cos(elevation) * wz - np.sin(elevation) * ahead, np.cos(azimuth) * wx + np.sin(azimuth) * wy])
-    turned = np.cumsum(rate[:, 1:] * np.diff(data.gyro_t), axis=1).T
+    turned = _turned_by_carrier(data).sum(axis=2)
     for start, stop in pairwise(np.arange(data.gimbal_t[0], data.gimbal_t[-1], _STRETCH)):
         gimbal, turn, error = (
             _span(values[slice(*np.searchsorted(t, [start, stop]))])
             for t, values in (
                 (data.gimbal_t, data.gimbal),
-                (data.gyro_t[1:], turned),
+                (data.gyro_t, turned),
                 (data.image_t, data.error[:, [1, 0]]),
             )
         )
@@ -139,6 +137,43 @@ def check_gimbal(topic: str, data: LosData) -> None:
                 f"{np.rad2deg(angle):.2f} deg and the target stays in the picture; the encoder is frozen: check its "
                 "cable and its driver"
             )
+
+
+def check_signs(topic: str, data: LosData) -> None:
+    """Raise InputError if with opposite signs of gyro axes the gimbal holds the picture far better than as they are."""
+    t = data.image_t
+    inside = (t >= max(data.gyro_t[0], data.gimbal_t[0])) & (t <= min(data.gyro_t[-1], data.gimbal_t[-1]))
+    stride = max(1, round(_STRIDE / float(np.median(np.diff(t)))))
+    at, error = t[inside][::stride], data.error[inside][::stride, [1, 0]]
+    if len(at) < _FEWEST:
+        return
+    gimbal = np.stack([np.interp(at, data.gimbal_t, data.gimbal[:, k]) for k in range(2)], axis=1)
+    columns = _turned_by_carrier(data).reshape(len(data.gyro_t), 6).T
+    turned = np.stack([np.interp(at, data.gyro_t, column) for column in columns], axis=1).reshape(-1, 2, 3)
+    # The gimbal's own turn about the camera's z and x, less what the picture shows of it.
+    middle = 0.5 * (gimbal[1:, 1] + gimbal[:-1, 1])
+    held = np.diff(gimbal, axis=0) * np.stack([np.cos(middle), np.ones_like(middle)], axis=1) - np.diff(error, axis=0)
+    miss = {
+        signs: float(np.median(np.linalg.norm(held + np.diff(turned, axis=0) @ np.array(signs), axis=1)))
+        for signs in product((1, -1), repeat=3)
+    }
+    best = min(miss, key=miss.__getitem__)
+    if miss[best] < 0.3 * miss[1, 1, 1]:
+        axes = " and ".join(axis for axis, sign in zip("xyz", best, strict=True) if sign < 0)
+        raise InputError(
+            f"topic {topic}: gimbal and pictures show that the gyro's {axes} has the opposite sign; the "
+            "carrier's axes are x right, y ahead, z up: turn the gyro's axes, or the encoders', the right way"
+        )
+
+
+def _turned_by_carrier(data: LosData) -> Array:
+    """(N, 2, 3) rad: how far each gyro axis has turned the picture about the camera's z and x since the start."""
+    azimuth, elevation = (np.interp(data.gyro_t, data.gimbal_t, data.gimbal[:, k]) for k in range(2))
+    s, c, se, ce = np.sin(azimuth), np.cos(azimuth), np.sin(elevation), np.cos(elevation)
+    wx, wy, wz = data.gyro.T
+    about_z = np.stack([se * s * wx, -se * c * wy, ce * wz], axis=1)
+    about_x = np.stack([c * wx, s * wy, np.zeros_like(wz)], axis=1)
+    return np.cumsum(np.stack([about_z, about_x], axis=1) * np.gradient(data.gyro_t)[:, None, None], axis=0)
 
 
 def _span(values: Array) -> Array:

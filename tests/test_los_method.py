@@ -1,0 +1,227 @@
+"""The los method end to end, on simulated recordings and on an independent simulator's."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factors.chi_square import quantile
+from pipelines.errors import InputError
+from pipelines.methods.base import Array, Estimate
+from pipelines.methods.los import problem
+from pipelines.observability import Assessment, assess
+from pipelines.published.los import recursive_least_squares
+from pipelines.sessions.config import Config, Noise, load_config
+from pipelines.sessions.los import LosData, read_los
+from pipelines.sessions.reading import open_recording
+from pipelines.simulation.los import LosScenario, los_config, simulate_los
+from pipelines.simulation.motion import EulerMotion, Swing
+from pipelines.simulation.scenario import load_scenario
+from pipelines.solvers.batch import solve_batch
+from pipelines.solvers.incremental import solve_incremental
+
+# Sway swift enough for a short recording.
+BRISK = EulerMotion(
+    roll=[Swing(amplitude_deg=6, frequency_hz=0.31)],
+    pitch=[Swing(amplitude_deg=5, frequency_hz=0.27)],
+    yaw=[Swing(amplitude_deg=6, frequency_hz=0.23)],
+)
+SHORT = LosScenario(duration_s=15.0, carrier=BRISK, image_rate_hz=25.0, gyro_rate_hz=200.0, gimbal_rate_hz=100.0)
+
+
+def _config(scenario: LosScenario) -> Config:
+    return load_config(los_config(scenario).encode())
+
+
+def _errors(estimate: Estimate, truth: dict[str, float]) -> Array:
+    return np.asarray(estimate.values - [truth[name] for name in estimate.names])
+
+
+def _nees(estimate: Estimate, truth: dict[str, float]) -> float:
+    error = _errors(estimate, truth)
+    return float(error @ np.linalg.solve(estimate.covariance, error))
+
+
+def _assess(data: LosData, config: Config) -> tuple[Estimate, Assessment]:
+    made = problem(data, config)
+    estimate = solve_batch(made)
+    return estimate, assess(made.quantities, estimate.covariance, estimate.chi_square, made.advice)
+
+
+@pytest.mark.parametrize(
+    "elevation", [pytest.param(0.0, marks=pytest.mark.slow), 20.0, pytest.param(45.0, marks=pytest.mark.slow)]
+)
+def test_without_noise_the_angles_come_out_exactly(elevation: float) -> None:
+    scenario = load_scenario(LosScenario, "los_noise_free").model_copy(update={"elevation_deg": elevation})
+    data, truth = simulate_los(scenario, 0)
+    noise = Noise(gyro_density=1e-6, gyro_bias_walk=0.0, encoder=0.0, los_error=5e-6)
+    estimate = solve_batch(problem(data, Config(noise=noise)))
+    assert np.rad2deg(np.abs(_errors(estimate, truth)[:4])).max() < 1e-6
+
+
+def _mean_nees(scenario: LosScenario, runs: int) -> tuple[float, int]:
+    total, size = 0.0, 0
+    for seed in range(runs):
+        data, truth = simulate_los(scenario, 100 + seed)
+        estimate = solve_batch(problem(data, _config(scenario)))
+        total += _nees(estimate, truth)
+        size = len(estimate.values)
+    return total / runs, size
+
+
+def test_errors_fit_their_covariance_in_a_few_short_runs() -> None:
+    mean, size = _mean_nees(SHORT, 8)
+    assert quantile(5e-4, 8 * size) < 8 * mean < quantile(1 - 5e-4, 8 * size)
+
+
+@pytest.mark.slow
+def test_errors_fit_their_covariance_over_fifty_runs() -> None:
+    mean, size = _mean_nees(LosScenario(), 50)
+    assert quantile(5e-3, 50 * size) < 50 * mean < quantile(1 - 5e-3, 50 * size)
+
+
+def test_nominal_noise_leaves_a_hundredth_of_a_degree_where_the_published_solver_leaves_a_tenth() -> None:
+    data, truth = simulate_los(load_scenario(LosScenario, "los_nominal"), 2)
+    estimate, assessment = _assess(data, _config(LosScenario()))
+    assert np.abs(_errors(estimate, truth) / estimate.sigmas).max() < 3.0
+    assert np.rad2deg(estimate.sigmas[:4]).max() < 0.01
+    assert assessment.status == "calibrated"
+    published = recursive_least_squares(data).values[-1] - [truth[n] for n in estimate.names[:4]]
+    assert np.abs(published).max() > 5.0 * np.abs(_errors(estimate, truth)[:4]).max()
+
+
+def test_outliers_dropouts_and_another_target() -> None:
+    scenario = load_scenario(LosScenario, "los_outliers").model_copy(update={"image_rate_hz": 25.0})
+    data, truth = simulate_los(scenario, 1)
+    estimate, assessment = _assess(data, _config(scenario))
+    assert np.abs(_errors(estimate, truth) / estimate.sigmas).max() < 3.5
+    assert assessment.status == "calibrated"
+    rejected = estimate.rejected["los with roll"]
+    assert 0.03 * len(data.image_t) < rejected < 0.06 * len(data.image_t)
+
+
+def test_an_outlier_as_the_first_sight_of_a_target_does_not_mislead() -> None:
+    scenario = SHORT.model_copy(update={"dropouts_s": [(5.0, 6.0)]})
+    data, truth = simulate_los(scenario, 3)
+    error = data.error.copy()
+    error[np.searchsorted(data.image_t, 6.0), :2] += 0.02
+    spoiled = problem(replace(data, error=error), _config(scenario))
+    assert spoiled.dropped == {"LOS error disagrees with those after it where a target is found": 1}
+    for solve in (solve_batch, solve_incremental):
+        estimate = solve(spoiled)
+        assert np.abs(_errors(estimate, truth) / estimate.sigmas).max() < 4.0
+
+
+def test_incremental_agrees_with_batch() -> None:
+    data, _ = simulate_los(SHORT, 5)
+    made = problem(data, _config(SHORT))
+    batch, incremental = solve_batch(made), solve_incremental(made)
+    assert np.abs((incremental.values - batch.values) / batch.sigmas).max() < 0.2
+    np.testing.assert_allclose(incremental.sigmas, batch.sigmas, rtol=0.1)
+
+
+def test_options_gimbal_axes_and_time_offset() -> None:
+    scenario = load_scenario(LosScenario, "los_options").model_copy(update={"image_rate_hz": 25.0})
+    data, truth = simulate_los(scenario, 1)
+    estimate, assessment = _assess(data, _config(scenario))
+    assert set(estimate.names) >= {"collimation", "axis_nonperpendicularity", "time_offset"}
+    assert np.abs(_errors(estimate, truth) / estimate.sigmas).max() < 3.5
+    assert assessment.status == "calibrated"
+
+
+def test_earth_rate_stays_in_the_bias() -> None:
+    scenario = SHORT.model_copy(update={"latitude_deg": 40.0})
+    data, truth = simulate_los(scenario, 7)
+    estimate = solve_batch(problem(data, _config(scenario)))
+    assert np.abs(_errors(estimate, truth) / estimate.sigmas).max() < 3.5
+
+
+def test_pz_and_gz_cannot_be_told_apart() -> None:
+    data, _ = simulate_los(SHORT, 1)
+    config = _config(SHORT.model_copy(update={"priors": {"delta_pz": 0.1, "delta_gz": 0.1}}))
+    estimate, assessment = _assess(data, config)
+    assert "delta_z" not in estimate.names
+    assert assessment.status == "unobservable"
+    weights = assessment.directions[0].weights
+    assert weights["delta_pz"] == pytest.approx(weights["delta_gz"], rel=1e-3)
+    assert "ask for delta_z = delta_pz - delta_gz instead" in assessment.directions[0].advice
+
+
+def test_without_azimuth_motion_px_is_weak_against_gx_and_gy() -> None:
+    scenario = load_scenario(LosScenario, "los_no_azimuth")
+    data, _ = simulate_los(scenario, 1)
+    _, assessment = _assess(data, _config(scenario))
+    assert assessment.status in ("weak", "unobservable")
+    worst = assessment.directions[0]
+    assert abs(worst.weights["delta_px"]) > 0.5
+    assert abs(worst.weights["delta_gx"]) > 0.3
+    assert "sway the carrier in azimuth too" in worst.advice
+
+
+def test_gaps_of_gyro_and_gimbal_are_stepped_over() -> None:
+    data, truth = simulate_los(SHORT, 9)
+    gyro = (data.gyro_t < 4.0) | (data.gyro_t > 4.3)
+    gimbal = (data.gimbal_t < 9.0) | (data.gimbal_t > 9.2)
+    broken = replace(
+        data,
+        gyro_t=data.gyro_t[gyro],
+        gyro=data.gyro[gyro],
+        gimbal_t=data.gimbal_t[gimbal],
+        gimbal=data.gimbal[gimbal],
+    )
+    made = problem(broken, _config(SHORT))
+    assert made.dropped["LOS error in a gap of gyro or gimbal"] > 10
+    estimate = solve_batch(made)
+    assert np.abs(_errors(estimate, truth) / estimate.sigmas).max() < 3.5
+
+
+def test_a_prior_of_zero_fixes_an_angle() -> None:
+    data, _ = simulate_los(SHORT, 1)
+    estimate = solve_batch(problem(data, Config(priors={"delta_px": 0.0})))
+    assert abs(estimate.values[0]) < 1e-8
+    assert estimate.sigmas[0] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("config", "said"),
+    [
+        (Config(priors={"delta_pz": 0.1}), "delta_pz alone"),
+        (Config(priors={"delta_zz": 0.1}), "unknown key priors.delta_zz; the nearest known key is delta_z"),
+        (Config(require={"delta_qx": 0.1}), "unknown key require.delta_qx"),
+    ],
+)
+def test_config_that_cannot_be_served(config: Config, said: str) -> None:
+    data, _ = simulate_los(SHORT, 1)
+    with pytest.raises(InputError, match=said):
+        problem(data, config)
+
+
+def test_too_few_pictures_is_one_clear_line() -> None:
+    data, _ = simulate_los(SHORT, 1)
+    with pytest.raises(InputError, match="only 0 of 375 LOS errors can be used"):
+        problem(replace(data, gyro_t=data.gyro_t + 100.0, gimbal_t=data.gimbal_t + 100.0), Config())
+
+
+def _contract(path: Path) -> tuple[Estimate, Assessment, Array]:
+    recording = open_recording(path)
+    config = load_config(recording.attachment("alidade.yaml"))
+    estimate, assessment = _assess(read_los(recording, config), config)
+    truth = json.loads(path.with_suffix(".truth.json").read_text())
+    return estimate, assessment, _errors(estimate, truth) / estimate.sigmas
+
+
+def test_independent_recording(shared_data: Path) -> None:
+    _, assessment, z = _contract(shared_data / "contract" / "los_nominal.mcap")
+    assert np.abs(z).max() < 3.0
+    assert assessment.status == "calibrated"
+
+
+@pytest.mark.slow
+def test_independent_pictures(shared_data: Path) -> None:
+    _, assessment, z = _contract(shared_data / "contract" / "los_images_tag.mcap")
+    assert np.abs(z).max() < 3.0
+    assert assessment.status == "calibrated"
