@@ -196,7 +196,7 @@ def validate(data: IndexerData, config: Config, values: Mapping[str, float]) -> 
 
 
 def misfit(groups: Sequence[Group], values: Mapping[str, float]) -> tuple[Array, Array]:
-    """Ends (n,) of the groups, s, and their mean rates less what encoders and earth say, over the rate, (n, 3) rad in t.
+    """Ends (n,) of the groups, s, and their mean rates less what encoders and earth say, over the rate, (n, 3) in t.
 
     Args:
         groups: in which an axis turns.
