@@ -45,10 +45,10 @@ from pipelines.methods.cube_parameters import (
     joining,
     tag_key,
 )
-from pipelines.methods.cube_reference import Reference, cube_reference, field_model, from_vectors
+from pipelines.methods.cube_reference import Reference, cube_reference, from_vectors
 from pipelines.sessions.checks import count
 from pipelines.sessions.config import DEFAULT_NOISE, Config, first_given
-from pipelines.sessions.cube import CubeData, noise_densities, nominal
+from pipelines.sessions.cube import CubeData, local_field, noise_densities, nominal
 from pipelines.sessions.cube_poses import SeenTags, StaticPoses, static_poses, turn
 
 # Nothing is known of the cube's place in the camera beforehand, m, nor of an attitude that no gyro leads to, rad: these
@@ -107,7 +107,7 @@ def _prepare(data: CubeData, config: Config) -> _Model:
     if poses.mag is not None and data.longitude is None:
         count(poses.dropped, "magnetometer: no position for the field model, not calibrated", 1)
     elif poses.mag is not None:
-        field = field_model(data, config)
+        field = local_field(data, config)
     bias = np.median(poses.gyro, axis=0)
     reference = cube_reference(data, config, poses, field)
     length = float(poses.span[-1, 1] - poses.span[0, 0])
@@ -196,7 +196,7 @@ def _step(model: _Model, k: int) -> Step:
         initial.insert(_place_key(k), seen.pose.position)
         anywhere = gtsam.noiseModel.Isotropic.Sigma(3, _ANYWHERE)
         factors.append(Factor("prior", gtsam.PriorFactorVector(_place_key(k), seen.pose.position, anywhere)))
-    if model.data.camera is not None and (k == 0 or model.reference.moves):
+    if model.data.camera is not None and (seen is not None if model.reference.moves else k == 0):
         initial.insert(_reference_key(k), so3.to_gtsam(model.reference.nRB[k]))
         if model.reference.covariance is not None:
             measured = so3.to_gtsam(model.reference.nRB[k])

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import datetime
 from dataclasses import dataclass
 
 import numpy as np
 
 from factors import so3
-from factors.earth import magnetic_field
 from pipelines.errors import InputError
 from pipelines.methods.base import Array
 from pipelines.sessions.config import Config
@@ -40,24 +38,6 @@ class Reference:
     def nRC(self) -> Array:
         """(P, 4) attitude of the camera with the mount as given."""
         return so3.multiply(self.nRB, self.BRC)
-
-
-def field_model(data: CubeData, config: Config) -> Array:
-    """The World Magnetic Model at the reference, (3,) T in n, on the config's date or that of the stamps.
-
-    Raises:
-        InputError: the model does not hold there and then.
-    """
-    assert data.latitude is not None
-    assert data.longitude is not None
-    start = datetime.datetime.fromtimestamp(data.epoch_ns * 1e-9, datetime.UTC).date()
-    date = config.field_date or start
-    first, last = datetime.date(date.year, 1, 1), datetime.date(date.year + 1, 1, 1)
-    year = date.year + (date - first) / (last - first)
-    try:
-        return magnetic_field(data.latitude, data.longitude, data.height, year)
-    except ValueError as error:
-        raise InputError(f"{error}; give the date of the recording in the config as `date`") from error
 
 
 def cube_reference(data: CubeData, config: Config, poses: StaticPoses, field: Array | None) -> Reference:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from factors.earth import magnetic_field
 from pipelines.errors import InputError
 from pipelines.sessions import series
 from pipelines.sessions.checks import (
@@ -101,6 +103,22 @@ def nominal(values: Array, conversion: RawConversion | None) -> Array:
 def rests(data: CubeData, config: Config) -> Array:
     """Beginnings and ends, (P, 2) s, of the device's static poses. Raises InputError when there is none."""
     return _rests(data.imu_t, data.gyro, data.accel, data.gyro_density, data.accel_density, config)
+
+
+def local_field(data: CubeData, config: Config) -> Array:
+    """The World Magnetic Model where the reference is, (3,) T in n, on the config's date or that of the stamps.
+
+    Raises InputError when the model does not hold there and then. `data` has latitude and longitude.
+    """
+    assert data.latitude is not None
+    assert data.longitude is not None
+    date = config.field_date or datetime.datetime.fromtimestamp(data.epoch_ns * 1e-9, datetime.UTC).date()
+    first, last = datetime.date(date.year, 1, 1), datetime.date(date.year + 1, 1, 1)
+    year = date.year + (date - first) / (last - first)
+    try:
+        return magnetic_field(data.latitude, data.longitude, data.height, year)
+    except ValueError as error:
+        raise InputError(f"{error}; give the date of the recording in the config as `date`") from error
 
 
 def noise_densities(data: CubeData, config: Config) -> tuple[float, float, float]:
