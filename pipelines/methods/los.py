@@ -101,7 +101,7 @@ def _prepare(data: LosData, config: Config) -> tuple[_Model, dict[str, int]]:
     gimbal, gyro = GimbalPath(data.gimbal_t, data.gimbal), GyroPath(data.gyro_t, data.gyro)
     covariance = _covariance(data, gimbal, config)
     has_offset = len(parameters) == 3
-    rows, starts, dropped = _select(data, np.sqrt(covariance[:, 0, 0]), SMOOTHING if has_offset else 0.0)
+    rows, starts, dropped = select_pictures(data, np.sqrt(covariance[:, 0, 0]), SMOOTHING if has_offset else 0.0)
     time, measured = data.image_t[rows], data.error[rows]
     angles = gimbal.at(time)
     motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal) if has_offset else None
@@ -156,7 +156,9 @@ def _sqrt_information(covariance: Array) -> Array:
     return out
 
 
-def _select(data: LosData, sigma: Array, margin: float) -> tuple[NDArray[np.intp], NDArray[np.bool_], dict[str, int]]:
+def select_pictures(
+    data: LosData, sigma: Array, margin: float
+) -> tuple[NDArray[np.intp], NDArray[np.bool_], dict[str, int]]:
     """The pictures used, which of them are the first of their target, and what was left out.
 
     `margin`, s, is left out on either side of a gap in which the gimbal may have turned to another target.
@@ -233,7 +235,7 @@ def _initial(time: Array, starts: NDArray[np.bool_], measured: Array, angles: Ar
     """
     out = np.empty((len(time), 4))
     cRm = _camera(angles)
-    toward = so3.rotate(so3.inverse(cRm), _direction(measured))
+    toward = so3.rotate(so3.inverse(cRm), los_direction(measured))
     for chain in np.split(np.arange(len(time)), np.flatnonzero(starts)[1:]):
         first = chain[:1]
         start = _seen(cRm[first], measured[first])
@@ -250,17 +252,25 @@ def _camera(angles: Array, mount: Array | None = None, names: tuple[str, ...] = 
     return model.camera(np.zeros((n, len(names))) if mount is None else np.tile(mount, (n, 1)))
 
 
-def _direction(measured: Array) -> Array:
-    """Unit vectors (n, 3) in c towards the target at LOS errors phx, phz."""
+def los_direction(measured: Array) -> Array:
+    """Unit vectors (n, 3) in c towards the target at LOS errors phx, phz, (n, 2 or more)."""
     ahead = np.stack([np.tan(measured[:, 1]), np.ones(len(measured)), -np.tan(measured[:, 0])], axis=1)
     return np.asarray(ahead / np.linalg.norm(ahead, axis=1, keepdims=True))
+
+
+def los_error(direction: Array) -> Array:
+    """phx, phz (n, 2), rad, of directions (n, 3) in c."""
+    x, y, z = direction.T
+    return np.stack([-np.arctan2(z, y), np.arctan2(x, y)], axis=1)
 
 
 def _seen(cRm: Array, measured: Array) -> Array:
     """tRm (n, 4) of cameras that see the target at LOS errors, with the roll they measure or none."""
     roll = np.nan_to_num(measured[:, 2])
     y = np.array([0.0, 1.0, 0.0])
-    cRt = so3.multiply(_shortest(np.broadcast_to(y, (len(cRm), 3)), _direction(measured)), so3.exp(-roll[:, None] * y))
+    cRt = so3.multiply(
+        _shortest(np.broadcast_to(y, (len(cRm), 3)), los_direction(measured)), so3.exp(-roll[:, None] * y)
+    )
     return so3.multiply(so3.inverse(cRt), cRm)
 
 
