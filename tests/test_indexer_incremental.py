@@ -54,7 +54,10 @@ def test_independent_simulator_within_three_sigma(shared_data: Path) -> None:
 
 @pytest.mark.slow
 def test_hours_of_indexing_cost_the_same_per_turn() -> None:
-    """The last quarter's steps cost what those of the second quarter do, when the window has filled."""
+    """The last quarter's steps cost what those of the second quarter do, when the window has filled.
+
+    The quickest tenth of them: whatever else the machine does only adds to a step's time.
+    """
     graph, _ = _problem(load_scenario(IndexerScenario, "indexer_long"), 1)
     batch = solve_batch(graph)
     moments: list[float] = []
@@ -68,5 +71,6 @@ def test_hours_of_indexing_cost_the_same_per_turn() -> None:
     estimate = solve_incremental(timed)
     cost = np.diff(moments)
     quarter = len(cost) // 4
-    assert np.median(cost[-quarter:]) < 1.3 * np.median(cost[quarter : 2 * quarter])
+    early, late = (np.percentile(part, 10.0) for part in (cost[quarter : 2 * quarter], cost[-quarter:]))
+    assert late < 1.2 * early
     assert _distance(estimate, batch) < 0.02
