@@ -319,7 +319,7 @@ def _predict(model: _Model, k: int, initial: gtsam.Values, current: gtsam.Values
 def _advice(weights: Mapping[str, float]) -> str:
     """The motion that would make a weak direction observable."""
     strongest = [name for name, w in weights.items() if abs(w) > 0.3] or list(weights)
-    if any(name.startswith("field") for name in strongest) and any(name.startswith("mag_k") for name in weights):
+    if all(name.startswith("field") for name in strongest):
         return (
             "the magnetometer's scale follows the field model's strength: tighter priors on field_e, field_n, field_u"
         )
