@@ -114,7 +114,7 @@ def _verdict(calibration: Calibration, name: bool) -> None:
     assessment = calibration.assessment
     solver = f"{calibration.estimate.solver}: " if name else ""
     colour = _COLOURS[assessment.status]
-    _console.print(f"{solver}[bold {colour}]{assessment.status}[/] {escape(assessment.headline)}", soft_wrap=True)
+    _console.print(f"{solver}[bold {colour}]{assessment.status}.[/] {escape(assessment.headline)}", soft_wrap=True)
     for direction in assessment.directions:
         say(f"  {direction.verdict}: {direction.label}: {direction.advice}")
     for note in calibration.notes:
