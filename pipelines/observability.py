@@ -62,7 +62,10 @@ class Direction:
 
 @dataclass(frozen=True)
 class Fit:
-    """A sum of squared whitened residuals, its degrees of freedom and its 99.9 % interval."""
+    """A sum of squared whitened residuals, its degrees of freedom and its 99.9 % interval.
+
+    With less than one degree of freedom the sum has no interval worth the name: low and high are NaN.
+    """
 
     value: float
     dof: float
@@ -72,6 +75,8 @@ class Fit:
     @classmethod
     def of(cls, value: float, dof: float) -> Fit:
         """With its interval."""
+        if dof < 1.0:
+            return cls(value, dof, np.nan, np.nan)
         return cls(value, dof, quantile(_TAIL, dof), quantile(1.0 - _TAIL, dof))
 
     @property
@@ -96,7 +101,7 @@ class Consistency:
     def too_large(self) -> bool:
         """Residuals larger than the noise explains, or no number at all."""
         fit = self.total
-        return not np.isfinite(fit.value) or (fit.dof > 0.0 and fit.value > fit.high)
+        return not np.isfinite(fit.value) or fit.value > fit.high
 
     @property
     def too_small(self) -> bool:

@@ -191,6 +191,15 @@ def test_no_chi_square_and_no_redundancy_are_no_inconsistency() -> None:
     assert judged([quantity("a")], 1e-4 * np.eye(1), ChiSquare(1e-9, 0.0, {})).status == "calibrated"
 
 
+def test_a_family_with_less_than_one_degree_of_freedom_has_no_interval() -> None:
+    chi = ChiSquare(1000.5, 1000.5, {"vision": (1000.0, 1000.0), "bias walk": (0.5, 0.03)})
+    consistency = judged([quantity("a")], 1e-4 * np.eye(1), chi).consistency
+    assert consistency is not None
+    walk = consistency.families["bias walk"]
+    assert np.isnan([walk.low, walk.high]).all()
+    assert consistency.message is None
+
+
 def test_chi_square_that_is_no_number_is_inconsistent() -> None:
     found = judged([quantity("a")], 1e-4 * np.eye(1), replace(GOOD_FIT, value=float("nan")))
     assert found.status == "inconsistent"
