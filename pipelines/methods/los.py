@@ -23,6 +23,7 @@ from factors.preintegration import GyroPath
 from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
 from pipelines.errors import InputError
 from pipelines.methods.base import Array, Factor, Parameter, Problem, Quantity, Step
+from pipelines.methods.los_guess import camera, guess, initial_attitudes, seen
 from pipelines.methods.priors import vector_prior
 from pipelines.methods.walking_bias import WalkingBias
 from pipelines.sessions.config import DEFAULT_NOISE, Config, check_names, first_given
@@ -56,11 +57,12 @@ class _Model:
 
     time: Array  # (K,) keyframes: the pictures used
     starts: NDArray[np.bool_]  # (K,) whether a keyframe is the first of its target
+    mount: Array  # first guess of the mounting angles
     initial: Array  # (K, 4) tRm
     measured: Array  # (K, 3) phx, phz, roll
     sqrt_information: Array  # (K, 3, 3), zero rows for a roll not measured
     angles: Array  # (K, 2) azimuth, elevation
-    gyro: GyroPath
+    gyro: GyroPath  # with the first guess of its bias taken off
     motion: LocalMotion | None  # around the keyframes, when the time offset is a variable
     variance_rate: float  # rad^2 / s of an increment
     scale_error: float  # sigma of an increment per angle turned
@@ -104,13 +106,19 @@ def _prepare(data: LosData, config: Config) -> tuple[_Model, dict[str, int]]:
     rows, starts, dropped = select_pictures(data, np.sqrt(covariance[:, 0, 0]), SMOOTHING if has_offset else 0.0)
     time, measured = data.image_t[rows], data.error[rows]
     angles = gimbal.at(time)
+    chains = np.split(np.arange(len(time)), np.flatnonzero(starts)[1:])
+    sigma = float(np.sqrt(np.median(covariance[rows, 0, 0])))
+    mount, bias_hat = guess(chains, time, angles, measured, gyro, parameters, sigma)
+    names = tuple(q.name for q in parameters[0].quantities)
+    gyro = GyroPath(data.gyro_t, data.gyro, bias_hat)
     motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal) if has_offset else None
     bias = WalkingBias.over(time[0], time[-1], walk, density)
     middle = np.where(starts, time, 0.5 * (time + np.roll(time, 1)))
     model = _Model(
         time=time,
         starts=starts,
-        initial=_initial(time, starts, measured, angles, gyro),
+        mount=mount,
+        initial=initial_attitudes(chains, time, camera(angles, mount, names), measured, gyro),
         measured=measured,
         sqrt_information=_sqrt_information(covariance[rows]),
         angles=angles,
@@ -228,57 +236,6 @@ def _wrong_before_followers(error: Array, sigma: Array) -> int:
     return 0
 
 
-def _initial(time: Array, starts: NDArray[np.bool_], measured: Array, angles: Array, gyro: GyroPath) -> Array:
-    """First guess of tRm: carried by the gyro from a target's first picture, turned to where each picture shows it.
-
-    The camera and the gyro are taken as mounted straight.
-    """
-    out = np.empty((len(time), 4))
-    cRm = _camera(angles)
-    toward = so3.rotate(so3.inverse(cRm), los_direction(measured))
-    for chain in np.split(np.arange(len(time)), np.flatnonzero(starts)[1:]):
-        first = chain[:1]
-        start = _seen(cRm[first], measured[first])
-        carried = so3.multiply(start, gyro.increments(np.repeat(time[first], len(chain)), time[chain]).wxyz)
-        expected = so3.rotate(so3.inverse(carried), [0.0, 1.0, 0.0])
-        out[chain] = so3.multiply(carried, _shortest(toward[chain], expected))
-    return out
-
-
-def _camera(angles: Array, mount: Array | None = None, names: tuple[str, ...] = ()) -> Array:
-    """cRm (n, 4) at gimbal angles (n, 2) and mounting angles (d,)."""
-    n = len(angles)
-    model = LosDirectionFactor(np.zeros(n), np.zeros((n, 2)), np.zeros((n, 2, 2)), angles, names)
-    return model.camera(np.zeros((n, len(names))) if mount is None else np.tile(mount, (n, 1)))
-
-
-def los_direction(measured: Array) -> Array:
-    """Unit vectors (n, 3) in c towards the target at LOS errors phx, phz, (n, 2 or more)."""
-    ahead = np.stack([np.tan(measured[:, 1]), np.ones(len(measured)), -np.tan(measured[:, 0])], axis=1)
-    return np.asarray(ahead / np.linalg.norm(ahead, axis=1, keepdims=True))
-
-
-def los_error(direction: Array) -> Array:
-    """phx, phz (n, 2), rad, of directions (n, 3) in c."""
-    x, y, z = direction.T
-    return np.stack([-np.arctan2(z, y), np.arctan2(x, y)], axis=1)
-
-
-def _seen(cRm: Array, measured: Array) -> Array:
-    """tRm (n, 4) of cameras that see the target at LOS errors, with the roll they measure or none."""
-    roll = np.nan_to_num(measured[:, 2])
-    y = np.array([0.0, 1.0, 0.0])
-    cRt = so3.multiply(
-        _shortest(np.broadcast_to(y, (len(cRm), 3)), los_direction(measured)), so3.exp(-roll[:, None] * y)
-    )
-    return so3.multiply(so3.inverse(cRt), cRm)
-
-
-def _shortest(a: Array, b: Array) -> Array:
-    """The shortest rotations (n, 4) that turn unit vectors a into b."""
-    return so3.normalize(np.concatenate([1.0 + (a * b).sum(axis=1, keepdims=True), so3.cross(a, b)], axis=1))
-
-
 def _parameters(config: Config) -> tuple[Parameter, ...]:
     """The method's parameters with their priors; options only where the config gives them a prior other than 0."""
     check_names(config.priors, NAMES, "priors")
@@ -315,8 +272,11 @@ def _step(model: _Model, keyframes: range) -> Step:
     factors: list[Factor] = []
     if keyframes.start == 0:
         for parameter in model.parameters:
-            initial.insert(parameter.key, np.zeros(len(parameter.quantities)))
             factors.append(vector_prior(parameter, np.zeros(len(parameter.quantities))))
+        initial.insert(_ANGLES_KEY, model.mount)
+        initial.insert(model.bias.key(0), model.gyro.bias_hat)
+        if model.motion is not None:
+            initial.insert(_OFFSET_KEY, np.zeros(1))
     stand_ins = _bias_step(model, keyframes, initial, factors)
     for k in keyframes:
         initial.insert(_state(k), so3.to_gtsam(model.initial[k]))
@@ -339,18 +299,18 @@ def _before(model: _Model, keyframes: range) -> int:
 
 def _bias_step(model: _Model, keyframes: range, initial: gtsam.Values, factors: list[Factor]) -> dict[int, int]:
     """Adds the bias nodes that begin with these keyframes; returns what holds the reported bias from now on."""
-    bias, zero = model.bias, np.zeros(3)
+    bias, bias_hat = model.bias, model.gyro.bias_hat
     stand_ins: dict[int, int] = {}
     for node in range(_before(model, keyframes) + 1, int(model.nodes[keyframes[-1]]) + 1):
-        initial.insert(bias.key(node), zero)
+        initial.insert(bias.key(node), bias_hat)
         factors.append(bias.walk_factor(node))
         if node >= 2:
-            initial.insert(bias.mean_key(node - 1), zero)
+            initial.insert(bias.mean_key(node - 1), bias_hat)
             factors.append(bias.mean_factor(node - 1))
         stand_ins[bias.key(0)] = bias.key(node)
     if keyframes.stop == len(model.time) and bias.nodes > 1:
         end = bias.nodes - 1
-        initial.insert(bias.mean_key(end), zero)
+        initial.insert(bias.mean_key(end), bias_hat)
         factors.append(bias.mean_factor(end))
         stand_ins[bias.key(0)] = bias.mean_key(end)
     return stand_ins
@@ -367,7 +327,7 @@ def _gyro_factors(model: _Model, keyframes: range) -> list[Factor]:
         [_state(k) for k in after],
         [model.bias.key(int(model.nodes[k])) for k in after],
         increments,
-        np.zeros(3),
+        model.gyro.bias_hat,
         model.variance_rate * increments.duration + turned**2,
     )
     return [*(_start_factor(model, k) for k in found), *(Factor("gyro", f) for f in native)]
@@ -434,13 +394,15 @@ def _predict(model: _Model, keyframes: range, initial: gtsam.Values, current: gt
             out.insert(key, bias)
     for k in keyframes:
         if model.starts[k]:
-            cRm = _camera(model.angles[k : k + 1], current.atVector(_ANGLES_KEY), model.names)
-            attitude = _seen(cRm, model.measured[k : k + 1])[0]
+            cRm = camera(model.angles[k : k + 1], current.atVector(_ANGLES_KEY), model.names)
+            attitude = seen(cRm, model.measured[k : k + 1])[0]
         else:
             before = out if out.exists(_state(k - 1)) else current
             step = model.gyro.increments(model.time[k - 1 : k], model.time[k : k + 1])
             previous = so3.from_gtsam([before.atRot3(_state(k - 1))])[0]
-            attitude = so3.compose(previous, step.wxyz[0], so3.exp(step.bias_jacobian[0] @ bias))
+            attitude = so3.compose(
+                previous, step.wxyz[0], so3.exp(step.bias_jacobian[0] @ (bias - model.gyro.bias_hat))
+            )
         out.insert(_state(k), so3.to_gtsam(attitude))
     return out
 

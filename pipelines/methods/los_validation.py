@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from factors import so3
 from factors.los import GimbalPath
 from pipelines.methods.base import Array
-from pipelines.methods.los import los_direction, los_error, select_pictures
+from pipelines.methods.los import select_pictures
+from pipelines.methods.los_guess import los_direction, los_error
 from pipelines.methods.validation import Validation
 from pipelines.sessions.config import DEFAULT_NOISE, Config, first_given
 from pipelines.sessions.los import LosData
