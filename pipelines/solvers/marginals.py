@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 
 import gtsam
@@ -185,6 +186,7 @@ def _family_dof(
 
 
 def _explain(message: str) -> str:
-    """A sentence from gtsam's text about an indeterminate system, which names the variable as <letter><index>."""
-    near = message.split("near variable", 1)[-1].split()[0].strip(".,") if "near variable" in message else "unknown"
-    return f"the recording does not determine the state {near}: no measurement constrains it"
+    """A sentence from gtsam's text about an indeterminate system, which names the variable by its key."""
+    key = re.search(r"near variable\s+(\d+)", message)
+    name = gtsam.Symbol(int(key.group(1))).string() if key else "unknown"
+    return f"the recording does not determine the state {name}: no measurement constrains it"
