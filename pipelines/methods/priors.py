@@ -10,12 +10,18 @@ from pipelines.methods.base import Array, Factor, Parameter
 
 # A fixed quantity is held by a prior this much tighter than the accuracy wanted of it.
 _PINNED = 1e-6
+# A free quantity is held by a prior this much wider than the default one. It tells nothing, but without it a smoother
+# could not even begin where the data do not determine the quantity, or not yet.
+_FREE = 10.0
 
 
 def prior_sigmas(parameter: Parameter) -> Array:
-    """(n,) sigmas of the prior factor; inf for a free quantity."""
+    """(n,) sigmas of the prior factor."""
     return np.array(
-        [np.inf if q.prior_sigma is None else q.prior_sigma or _PINNED * q.require for q in parameter.quantities]
+        [
+            _FREE * q.prior_scale if q.prior_sigma is None else q.prior_sigma or _PINNED * q.require
+            for q in parameter.quantities
+        ]
     )
 
 
