@@ -1,0 +1,264 @@
+"""Batch and incremental on linear Gaussian problems, whose answers have closed forms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from factors.vectorized import TruncatedLoss, VectorizedFactor
+from pipelines.methods.base import Array, Estimate, Factor, Parameter, Problem, Quantity, Step
+from pipelines.methods.priors import vector_prior
+from pipelines.observability import assess
+from pipelines.solvers.batch import solve_batch
+from pipelines.solvers.incremental import solve_incremental
+from pipelines.solvers.marginals import IndeterminateError
+
+PARAMETER = int(gtsam.symbol("p", 0))
+WALK, START, NOISE, PRIOR = 0.3, 0.5, 0.2, 2.0
+INTERVAL = 0.1
+
+
+def state(k: int) -> int:
+    return int(gtsam.symbol("s", k))
+
+
+@dataclass(frozen=True)
+class Line:
+    """Measurements z = s + h p of a walking number s, with a slope p (d,) of known rows h (n, d)."""
+
+    time: Array
+    h: Array
+    z: Array
+    rows: int = 1
+
+    def __call__(self, s: Array, p: Array) -> tuple[Array, Callable[[], tuple[Array, ...]]]:
+        predicted = s[:, 0] + (self.h * p).sum(axis=1)
+        jacobians = (np.full((len(s), 1, 1), 1.0 / NOISE), self.h[:, None, :] / NOISE)
+        return ((predicted - self.z) / NOISE)[:, None], lambda: jacobians
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A linear problem: parameter (d,), states that walk, one measurement a state."""
+
+    h: Array
+    z: Array
+    prior: float | None = PRIOR
+
+    @classmethod
+    def random(cls, seed: int, h: Array | None = None, n: int = 60) -> tuple[Walk, Array]:
+        """With data drawn from the model, priors included, and the true parameter."""
+        rng = np.random.default_rng(seed)
+        h = rng.standard_normal((n, 2)) if h is None else h
+        p = PRIOR * rng.standard_normal(h.shape[1:])
+        s = START * rng.standard_normal() + np.append(0.0, np.cumsum(WALK * rng.standard_normal(len(h) - 1)))
+        return cls(h, s + h @ p + NOISE * rng.standard_normal(len(h))), p
+
+    @property
+    def parameter(self) -> Parameter:
+        names = [f"slope_{i}" for i in range(self.h.shape[1])]
+        return Parameter(PARAMETER, tuple(Quantity(name, "", self.prior, PRIOR, 0.5) for name in names))
+
+    def problem(self, loss: TruncatedLoss | None = None) -> Problem:
+        return Problem("linear", (self.parameter,), lambda chunk: self.steps(chunk, loss), loss)
+
+    def steps(self, chunk: int, loss: TruncatedLoss | None) -> Iterator[Step]:
+        first = self.step(range(1), loss)
+        first.initial.insert(PARAMETER, np.zeros(self.h.shape[1]))
+        start = gtsam.PriorFactorVector(state(0), np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, START))
+        prior = vector_prior(self.parameter, np.zeros(self.h.shape[1]))
+        yield replace(first, factors=[prior, Factor("start", start), *first.factors])
+        for begin in range(1, len(self.z), chunk):
+            yield self.step(range(begin, min(begin + chunk, len(self.z))), loss)
+
+    def step(self, frames: range, loss: TruncatedLoss | None) -> Step:
+        initial = gtsam.Values()
+        for k in frames:
+            initial.insert(state(k), np.zeros(1))
+        time = INTERVAL * np.array(frames)
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, WALK)
+        walk = [
+            Factor("walk", gtsam.BetweenFactorVector(state(k - 1), state(k), np.zeros(1), noise)) for k in frames if k
+        ]
+        model = Line(time, self.h[list(frames)], self.z[list(frames)])
+        seen = VectorizedFactor(model, [[state(k) for k in frames], PARAMETER], [1, self.h.shape[1]], loss)
+        stamps = {state(k): float(t) for k, t in zip(frames, time, strict=True)}
+
+        def predict(values: gtsam.Values) -> gtsam.Values:
+            out = gtsam.Values()
+            for k in frames:
+                out.insert(state(k), values.atVector(state(frames.start - 1)))
+            return out
+
+        return Step(float(time[-1]), initial, [*walk, Factor.of("seen", seen)], predict, stamps)
+
+    def whitened(self) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Rows A x - b of all unknowns x = (p, s), and which of them are priors on p."""
+        n, d = self.h.shape
+        walk = np.eye(n, k=0)[1:] - np.eye(n)[:-1]
+        A = np.vstack(
+            [
+                np.eye(d, n + d) / (self.prior or np.inf),
+                np.eye(1, n + d, d) / START,
+                np.hstack([np.zeros((n - 1, d)), walk / WALK]),
+                np.hstack([self.h, np.eye(n)]) / NOISE,
+            ]
+        )
+        b = np.concatenate([np.zeros(d + 1 + n - 1), self.z / NOISE])
+        return A, b, np.arange(len(b)) < d
+
+    def closed_form(self) -> tuple[Array, Array, float]:
+        """Value and covariance of the parameter, and the sum of squares without its priors."""
+        A, b, prior = self.whitened()
+        d = self.h.shape[1]
+        covariance = np.asarray(np.linalg.inv(A.T @ A), dtype=float)
+        x = covariance @ A.T @ b
+        return x[:d], covariance[:d, :d], float((((A @ x - b)[~prior]) ** 2).sum())
+
+
+def assert_same(estimate: Estimate, value: Array, covariance: Array, tolerance: float = 1e-8) -> None:
+    np.testing.assert_allclose(estimate.values, value, atol=tolerance)
+    np.testing.assert_allclose(estimate.covariance, covariance, rtol=1e3 * tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_batch_is_the_closed_form(seed: int) -> None:
+    walk, _ = Walk.random(seed)
+    estimate = solve_batch(walk.problem())
+    value, covariance, square = walk.closed_form()
+    assert_same(estimate, value, covariance)
+    assert estimate.converged
+    assert estimate.chi_square is not None
+    assert estimate.chi_square.value == pytest.approx(square, rel=1e-9)
+
+
+@pytest.mark.parametrize("h_of", [lambda rng: rng.standard_normal((30, 2)), lambda rng: 0.02 * rng.random((30, 2))])
+def test_degrees_of_freedom_are_the_expected_sum_of_squares(h_of: Callable[[np.random.Generator], Array]) -> None:
+    """Also where priors decide as much as the data do (the second, weak one)."""
+    h = h_of(np.random.default_rng(9))
+    found = [solve_batch(Walk.random(seed, h)[0].problem()).chi_square for seed in range(200)]
+    value, dof = (np.array([getattr(c, what) for c in found]) for what in ("value", "dof"))
+    assert np.ptp(dof) < 1e-6
+    # Standard deviation of the mean of 200: sqrt(2 dof / 200).
+    assert abs(value.mean() - dof[0]) < 3.5 * np.sqrt(2.0 * dof[0] / len(dof))
+    for family in ("seen", "walk"):
+        squares, expected = (np.array([c.families[family][i] for c in found if c]) for i in (0, 1))
+        assert squares.mean() == pytest.approx(expected.mean(), rel=0.15)
+
+
+def test_errors_are_as_large_as_the_covariance_says() -> None:
+    nees = []
+    for seed in range(200):
+        walk, truth = Walk.random(seed, n=20)
+        estimate = solve_batch(walk.problem())
+        error = estimate.values - truth
+        nees.append(error @ np.linalg.solve(estimate.covariance, error))
+    # 400 degrees of freedom, 99 %.
+    assert 330.9 < sum(nees) < 476.6
+
+
+@pytest.mark.parametrize("solve", [solve_batch, solve_incremental])
+def test_unknown_direction_is_named_not_raised(solve: Callable[[Problem], Estimate]) -> None:
+    """Both slopes act alike, their difference is free: a null prior makes the system singular."""
+    walk, truth = Walk.random(1, np.repeat(np.random.default_rng(2).standard_normal((40, 1)), 2, axis=1))
+    walk = replace(walk, prior=None)
+    problem = walk.problem()
+    estimate = solve(problem)
+    assert np.isfinite(estimate.values).all()
+    assert estimate.values.sum() == pytest.approx(truth.sum(), abs=0.5)
+    assessment = assess(problem.quantities, estimate.covariance, estimate.chi_square, None)
+    assert assessment.status == "unobservable"
+    (direction,) = assessment.directions
+    first, second = direction.weights.values()
+    assert set(direction.weights) == {"slope_0", "slope_1"}
+    assert (first, second) == pytest.approx((2**-0.5, -(2**-0.5)), abs=1e-6)
+    # The sum is known as well as a single slope with that row would be.
+    A, _, _ = Walk(walk.h[:, :1], walk.z, prior=None).whitened()
+    of_sum = float(np.ones(2) @ estimate.covariance @ np.ones(2))
+    assert of_sum == pytest.approx(np.linalg.inv(A.T @ A)[0, 0], rel=1e-3)
+
+
+@dataclass(frozen=True)
+class HalfSeen:
+    """Sees the first of two components of a state."""
+
+    time: Array
+    rows: int = 1
+
+    def __call__(self, s: Array, p: Array) -> tuple[Array, Callable[[], tuple[Array, ...]]]:
+        first = np.tile([[[1.0, 0.0]]], (len(s), 1, 1))
+        return s[:, :1] + p[:, :1], lambda: (first, np.tile([[[1.0, 0.0]]], (len(s), 1, 1)))
+
+
+def test_undetermined_state_is_named() -> None:
+    walk, _ = Walk.random(1)
+
+    def steps(chunk: int) -> Iterator[Step]:
+        yield from walk.steps(chunk, None)
+        initial = gtsam.Values()
+        initial.insert(gtsam.symbol("q", 7), np.zeros(2))
+        half = VectorizedFactor(HalfSeen(np.array([9.0])), [gtsam.symbol("q", 7), PARAMETER], [2, 2])
+        yield Step(9.0, initial, [Factor.of("half", half)])
+
+    with pytest.raises(IndeterminateError, match="state q7"):
+        solve_batch(replace(walk.problem(), steps=steps))
+
+
+@pytest.mark.parametrize("window", [0.35, 1.0, None])
+def test_incremental_is_batch(window: float | None) -> None:
+    """A linear problem loses nothing when states are marginalised out of the window."""
+    walk, _ = Walk.random(4)
+    batch, incremental = solve_batch(walk.problem()), solve_incremental(walk.problem(), window)
+    assert_same(incremental, batch.values, batch.covariance, 1e-7)
+
+
+@pytest.mark.parametrize("window", [1.0, None])
+def test_history_is_what_batch_finds_on_the_data_so_far(window: float | None) -> None:
+    walk, _ = Walk.random(5)
+    history = solve_incremental(walk.problem(), window).history
+    assert history is not None
+    for time, value, sigma in list(zip(history.time, history.values, history.sigmas, strict=True))[3::7]:
+        n = round(time / INTERVAL) + 1
+        so_far, covariance, _ = Walk(walk.h[:n], walk.z[:n]).closed_form()
+        np.testing.assert_allclose(value, so_far, atol=1e-7)
+        np.testing.assert_allclose(sigma, np.sqrt(np.diag(covariance)), rtol=1e-5)
+
+
+def test_innovations_are_white() -> None:
+    """Their squares have the mean of their dimension."""
+    squares = []
+    for seed in range(20):
+        residuals = solve_incremental(Walk.random(seed)[0].problem(), None).residuals["seen"]
+        late = residuals.time > 2.05  # innovations proper; what came before was solved in batch
+        squares.append(residuals.whitened[late] ** 2)
+    n = sum(map(len, squares))
+    assert abs(np.concatenate(squares).mean() - 1.0) < 3.5 * np.sqrt(2.0 / n)
+
+
+@pytest.mark.parametrize("solve", [solve_batch, solve_incremental])
+def test_outliers_are_left_out_and_cost_nothing(solve: Callable[[Problem], Estimate]) -> None:
+    """As good as if the bad measurements had not been made."""
+    walk, _ = Walk.random(6)
+    bad = np.array([13, 30, 44])
+    spoilt = replace(walk, z=walk.z + 40.0 * np.isin(np.arange(60), bad))
+    estimate = solve(spoilt.problem(TruncatedLoss(4.0)))
+    assert estimate.rejected == {"seen": 3}
+    A, b, _ = walk.whitened()
+    good = np.ones(len(b), dtype=bool)
+    good[len(b) - 60 + bad] = False
+    covariance = np.asarray(np.linalg.inv(A[good].T @ A[good]), dtype=float)
+    value = covariance @ A[good].T @ b[good]
+    assert_same(estimate, value[:2], covariance[:2, :2], 1e-7)
+
+
+def test_nothing_is_known_but_the_prior() -> None:
+    walk, _ = Walk.random(7, np.zeros((20, 2)))
+    estimate = solve_batch(walk.problem())
+    assert_same(estimate, np.zeros(2), PRIOR**2 * np.eye(2))
+    assert estimate.chi_square is not None
+    assert estimate.chi_square.dof == pytest.approx(20.0, abs=1e-6)
