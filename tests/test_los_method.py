@@ -18,7 +18,7 @@ from pipelines.published.los import recursive_least_squares
 from pipelines.sessions.config import Config, Noise, load_config
 from pipelines.sessions.los import LosData, read_los
 from pipelines.sessions.reading import open_recording
-from pipelines.simulation.los import LosScenario, los_config, simulate_los
+from pipelines.simulation.los import LosAngles, LosScenario, los_config, simulate_los
 from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.simulation.scenario import load_scenario
 from pipelines.solvers.batch import solve_batch
@@ -225,3 +225,20 @@ def test_independent_pictures(shared_data: Path) -> None:
     _, assessment, z = _contract(shared_data / "contract" / "los_images_tag.mcap")
     assert np.abs(z).max() < 3.0
     assert assessment.status == "calibrated"
+
+
+def test_large_angles_and_bias_need_no_special_start() -> None:
+    angles = LosAngles(delta_px=5, delta_pz=4, delta_gx=-5, delta_gy=4, delta_gz=-1)
+    changes = {"gyro_turn_on_bias": 0.01, "angles_deg": angles, "outlier_share": 0.1, "outlier_size": 0.02}
+    scenario = SHORT.model_copy(update=changes)
+    data, truth = simulate_los(scenario, 1)
+    made = problem(data, _config(scenario))
+    for solve in (solve_batch, solve_incremental):
+        estimate = solve(made)
+        assert np.abs(_errors(estimate, truth) / estimate.sigmas).max() < 3.5
+
+
+def test_gyro_axis_of_opposite_sign_is_inconsistent() -> None:
+    data, _ = simulate_los(SHORT, 1)
+    _, assessment = _assess(replace(data, gyro=data.gyro * np.array([1.0, -1.0, 1.0])), _config(SHORT))
+    assert assessment.status == "inconsistent"

@@ -25,6 +25,7 @@ from pipelines.errors import InputError
 from pipelines.methods.base import Array, Factor, Parameter, Problem, Quantity, Step
 from pipelines.methods.los_guess import camera, guess, initial_attitudes, seen
 from pipelines.methods.priors import vector_prior
+from pipelines.methods.walking_bias import FIRST as FIRST_BIAS
 from pipelines.methods.walking_bias import WalkingBias
 from pipelines.sessions.config import DEFAULT_NOISE, Config, check_names, first_given
 from pipelines.sessions.los import LosData
@@ -250,7 +251,7 @@ def _parameters(config: Config) -> tuple[Parameter, ...]:
     names = (*_ANGLES, *(_SPLIT if given else ("delta_z",)), *(n for n in _OPTIONS if config.priors.get(n, 0.0) != 0.0))
     parameters = [
         Parameter(_ANGLES_KEY, tuple(quantity(name, "rad", _PRIOR_ANGLE) for name in names)),
-        Parameter(WalkingBias(np.zeros(2), 0.0).key(0), tuple(quantity(name, "rad/s", _PRIOR_BIAS) for name in _BIAS)),
+        Parameter(FIRST_BIAS, tuple(quantity(name, "rad/s", _PRIOR_BIAS) for name in _BIAS)),
     ]
     if config.priors.get(_OFFSET, 0.0) != 0.0:
         parameters.append(Parameter(_OFFSET_KEY, (quantity(_OFFSET, "s", _PRIOR_OFFSET),)))
@@ -271,8 +272,7 @@ def _step(model: _Model, keyframes: range) -> Step:
     initial = gtsam.Values()
     factors: list[Factor] = []
     if keyframes.start == 0:
-        for parameter in model.parameters:
-            factors.append(vector_prior(parameter, np.zeros(len(parameter.quantities))))
+        factors += [vector_prior(p, np.zeros(len(p.quantities))) for p in model.parameters]
         initial.insert(_ANGLES_KEY, model.mount)
         initial.insert(model.bias.key(0), model.gyro.bias_hat)
         if model.motion is not None:

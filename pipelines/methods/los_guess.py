@@ -1,7 +1,7 @@
-"""First guesses for the los method's graph: mounting angles, gyro bias and attitudes, from pictures about a second apart.
+"""First guesses for the los method's graph: mounting angles, gyro bias and attitudes.
 
-Linearising at zero angles and zero bias is good enough for a minute; over ten the camera's roll about its line of sight,
-which no picture tells, would start too far off.
+They come from pictures a second apart. Linearising at zero angles and zero bias is good enough for a minute; over ten
+the camera's roll about its line of sight, which no picture tells, would start too far off.
 """
 
 from __future__ import annotations
