@@ -65,20 +65,26 @@ def _head() -> Method:
 
 def _los() -> Method:
     from pipelines.methods.los import problem
+    from pipelines.methods.los_validation import validate
     from pipelines.published.los import published_estimate
     from pipelines.sessions.los import read_los
     from pipelines.simulation.los import write_simulation
 
-    return Method(read_los, problem, published_estimate, write_simulation)
+    return Method(read_los, problem, published_estimate, write_simulation, validate=validate)
 
 
 def _indexer() -> Method:
-    from pipelines.methods.indexer import problem
+    from functools import partial
+
+    from pipelines.methods.indexer import problem, validate
     from pipelines.published.indexer import published_estimate
+    from pipelines.reports.indexer import indexer_plots
     from pipelines.sessions.indexer import read_indexer
     from pipelines.simulation.indexer import write_simulation
 
-    return Method(read_indexer, problem, published_estimate, write_simulation)
+    return Method(
+        read_indexer, problem, published_estimate, write_simulation, lambda data: partial(indexer_plots, data), validate
+    )
 
 
 _METHODS: dict[str, Callable[[], Method]] = {"los": _los, "indexer": _indexer, "head": _head}

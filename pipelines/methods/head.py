@@ -33,6 +33,7 @@ from pipelines.methods.base import (
     rotation_vector_coordinates,
 )
 from pipelines.methods.priors import rotation_prior, vector_prior
+from pipelines.methods.walking_bias import FIRST as FIRST_BIAS
 from pipelines.methods.walking_bias import WalkingBias
 from pipelines.sessions.config import DEFAULT_NOISE, Config, check_names, first_given
 from pipelines.sessions.head import HeadData
@@ -194,9 +195,8 @@ def _parameters(config: Config, platform: bool) -> tuple[Parameter, ...]:
     ) -> tuple[Quantity, ...]:
         return tuple(quantity(f"{name}_{axis}", unit, scale, require, fixed, extra) for axis in "xyz")
 
-    bias_key = WalkingBias(np.zeros(2), 0.0).key(0)
     parameters = (
-        Parameter(bias_key, triple(_BIAS, "rad/s", 0.05, 2e-3, extra=0.0 if platform else EARTH_RATE)),
+        Parameter(FIRST_BIAS, triple(_BIAS, "rad/s", 0.05, 2e-3, extra=0.0 if platform else EARTH_RATE)),
         Parameter(_HELMET_KEY, triple(_HELMET, "rad", 0.35, 1e-2), rotation_vector_coordinates),
         Parameter(_CAMERA_KEY, triple(_CAMERA, "rad", 0.35, 1e-2, fixed=not platform), rotation_vector_coordinates),
         Parameter(_OFFSET_KEY, (quantity(_OFFSET, "s", 0.05, 5e-3),)),

@@ -37,6 +37,7 @@ from pipelines.errors import InputError
 from pipelines.methods.base import Array, Attitudes, Factor, Parameter, Problem, Quantity, Step
 from pipelines.methods.priors import prior_sigmas, vector_prior
 from pipelines.methods.validation import Validation
+from pipelines.methods.walking_bias import FIRST as FIRST_BIAS
 from pipelines.methods.walking_bias import WalkingBias
 from pipelines.sessions.config import DEFAULT_NOISE, Config, check_names, first_given
 from pipelines.sessions.indexer import IndexerData
@@ -302,7 +303,7 @@ def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]
         data=data,
         motion=motion,
         groups=groups,
-        bias=WalkingBias(np.append(starts, groups[-1].rates.edges[-1]), walk),
+        bias=WalkingBias(np.append(starts, groups[-1].rates.edges[-1]), walk, density),
         density=density,
         encoder=scatter if slow > 0.0 else encoder,
         slow=slow,
@@ -326,10 +327,9 @@ def _parameters(config: Config) -> tuple[Parameter, ...]:
             for name in names
         )
 
-    bias_key = WalkingBias(np.zeros(2), 0.0).key(0)
     parameters = [
         Parameter(_KEYS["theta"], several(THETA, "rad", 0.1, 5e-5, 0.1), _theta_coordinates),
-        Parameter(bias_key, several(BIAS, "rad/s", 1e-3, 1e-5, 1e-3)),
+        Parameter(FIRST_BIAS, several(BIAS, "rad/s", 1e-3, 1e-5, 1e-3)),
     ]
     if any(config.priors.get(name, 0.0) != 0.0 for name in SCALE):
         parameters.append(Parameter(_KEYS["scale"], several(SCALE, "1", 0.01, 1e-3, 0.0)))

@@ -18,8 +18,12 @@ from pipelines.methods.base import Array, Factor
 _FRACTION = 0.2
 # ... and is never longer than this, s, so that the bias over time can be seen.
 _LONGEST = 10.0
-# The mean follows from the nodes without error; what is left to it keeps the arithmetic well conditioned, rad/s.
-_MEAN_SIGMA = 1e-9
+# The mean follows from the nodes without error; this share of what gyro noise leaves unknown of a stretch's bias is
+# left to it, which keeps the arithmetic well conditioned.
+_MEAN_SHARE = 1e-2
+
+# The first stretch's node, which is the whole bias where it does not walk.
+FIRST = int(gtsam.symbol("b", 0))
 
 
 @dataclass(frozen=True)
@@ -29,19 +33,21 @@ class WalkingBias:
     Attributes:
         edges: (J + 1,) s, ends of the stretches.
         walk: rad/s/sqrt(s).
+        density: of the gyro's white noise, rad/s/sqrt(Hz).
     """
 
     edges: Array
     walk: float
+    density: float
 
     @classmethod
     def over(cls, start: float, stop: float, walk: float, density: float) -> WalkingBias:
         """Stretches short enough for the walk (rad/s/sqrt(s)) to stay below gyro noise (rad/s/sqrt(Hz))."""
         if walk <= 0.0:
-            return cls(np.array([start, stop]), 0.0)
+            return cls(np.array([start, stop]), 0.0, density)
         longest = min(_LONGEST, _FRACTION * np.sqrt(3.0) * density / walk)
         count = max(1, int(np.ceil((stop - start) / max(longest, 1e-3))))
-        return cls(np.linspace(start, stop, count + 1), walk)
+        return cls(np.linspace(start, stop, count + 1), walk, density)
 
     @property
     def nodes(self) -> int:
@@ -69,9 +75,11 @@ class WalkingBias:
     def mean_factor(self, node: int) -> Factor:
         """Defines the mean at the end of a node's stretch from the one before and the node (native, linear)."""
         whole = self.edges[node + 1] - self.edges[0]
-        share = float((self.edges[node + 1] - self.edges[node]) / whole)
+        stretch = self.edges[node + 1] - self.edges[node]
+        share = float(stretch / whole)
         # Within the stretch the walk's own mean departs from the node's constant by this much.
-        departure = self.walk * np.sqrt((self.edges[node + 1] - self.edges[node]) / 12.0) * share
+        departure = self.walk * np.sqrt(stretch / 12.0) * share
+        slack = _MEAN_SHARE * self.density / np.sqrt(stretch) * share
         keys = (self.mean_key(node), self.mean_key(node - 1), self.key(node))
         zeros = gtsam.Values()
         for key in keys:
@@ -84,6 +92,6 @@ class WalkingBias:
             keys[2],
             -share * np.eye(3),
             np.zeros(3),
-            gtsam.noiseModel.Isotropic.Sigma(3, float(np.hypot(departure, _MEAN_SIGMA))),
+            gtsam.noiseModel.Isotropic.Sigma(3, float(np.hypot(departure, slack))),
         )
         return Factor("definition", gtsam.LinearContainerFactor(linear, zeros))

@@ -200,11 +200,11 @@ class _Run:
         values: gtsam.Values,
         new: gtsam.Values,
     ) -> bool:
-        """Whether the innovation lies within the gate; notes it."""
+        """Whether the innovation lies within the gate, if the problem expects outliers; notes it."""
         error, A = measurement.rows(values)
         S = A @ self._predicted(measurement.keys, processes, values, new) @ A.T + np.eye(len(error))
         whitened = np.linalg.solve(np.linalg.cholesky(S), error)
-        agrees = bool(whitened @ whitened < gate(len(error)) ** 2)
+        agrees = self.problem.loss is None or bool(whitened @ whitened < gate(len(error)) ** 2)
         self.rejected_in_a_row = 0 if agrees else self.rejected_in_a_row + 1
         if self.rejected_in_a_row > _MOST_REJECTED:
             agrees, self.rejected_in_a_row = True, 0
