@@ -100,7 +100,9 @@ class AccelFactor:
 
 @dataclass(frozen=True)
 class GyroStaticFactor:
-    """Mean of a gyro at rest on the turning earth: raw = A bRn w_ie + c. Blocks: nRb (rotations), triad (12).
+    """Mean of a gyro at rest on the turning earth: raw = A bRn w_ie + c + d.
+
+    Blocks: nRb (rotations), triad (12), d (3; how far the gyro's offset has wandered, in the unit of raw).
 
     Attributes:
         time: (n,) s.
@@ -115,10 +117,10 @@ class GyroStaticFactor:
     earth_rate: Array
     rows: int = 3
 
-    def __call__(self, nRb: Array, triads: Array) -> Residuals:
+    def __call__(self, nRb: Array, triads: Array, wandered: Array) -> Residuals:
         """Residual (predicted - raw) / sigma, (n, 3)."""
-        error, jacobians = _at_rest(self.raw, self.sigma, nRb, triads, self.earth_rate)
-        return error, lambda: jacobians()[:2]
+        error, jacobians = _at_rest(self.raw - wandered, self.sigma, nRb, triads, self.earth_rate)
+        return error, lambda: (*jacobians()[:2], np.eye(3) / self.sigma[:, None, None])
 
 
 @dataclass(frozen=True)
@@ -168,7 +170,8 @@ def _by_triad(nominal: Array, weight: Array) -> Array:
 class GyroRotationFactor:
     """A gyro's rotation between two attitudes, integrated with its whole triad: nRb_j = Exp(w_ie T)^T nRb_i dR(A, c).
 
-    Blocks: nRb_i, nRb_j (rotations), triad (12). Samples are mean rates centred on their stamps (trapezoid); the arc
+    Blocks: nRb_i, nRb_j (rotations), triad (12), d_i, d_j (3 each; how far the gyro's offset has wandered at both ends,
+    in the unit of raw: their mean adds to c). Samples are mean rates centred on their stamps (trapezoid); the arc
     between the rates w0 and w1 is T (w0 + w1) / 2 + T^2 (w0 x w1) / 12 (Magnus, see factors.preintegration).
 
     Attributes:
@@ -186,11 +189,12 @@ class GyroRotationFactor:
     sigma: Array
     rows: int = 3
 
-    def __call__(self, nRb_i: Array, nRb_j: Array, triads: Array) -> Residuals:
+    def __call__(self, nRb_i: Array, nRb_j: Array, triads: Array, wandered_i: Array, wandered_j: Array) -> Residuals:
         """Residual Log(predicted^T nRb_j) / sigma, (n, 3)."""
         A, c = parts(triads)
+        offsets = c + 0.5 * (wandered_i + wandered_j)
         K = np.linalg.inv(A)
-        rates = [(raw - offset) @ k.T for raw, offset, k in zip(self.raw, c, K, strict=True)]
+        rates = [(raw - offset) @ k.T for raw, offset, k in zip(self.raw, offsets, K, strict=True)]
         paths = [GyroPath(t, w) for t, w in zip(self.stamps, rates, strict=True)]
         dR = np.array([path.attitude(path.t[-1:])[0] for path in paths])
         turned = np.array([t[-1] - t[0] for t in self.stamps])[:, None] * self.earth_rate
@@ -201,10 +205,33 @@ class GyroRotationFactor:
         def jacobians() -> tuple[Array, ...]:
             left = -so3.right_jacobian_inverse(-error) * weight[:, None, None]
             right = so3.right_jacobian_inverse(error) * weight[:, None, None]
-            by_triad = np.array([_turn_by_triad(p, w, k) for p, w, k in zip(paths, rates, K, strict=True)])
-            return left @ so3.matrix(so3.inverse(dR)), right, left @ by_triad
+            by_triad = left @ np.array([_turn_by_triad(p, w, k) for p, w, k in zip(paths, rates, K, strict=True)])
+            by_wandered = 0.5 * by_triad[..., 9:]
+            return left @ so3.matrix(so3.inverse(dR)), right, by_triad, by_wandered, by_wandered
 
         return error * weight[:, None], jacobians
+
+
+@dataclass(frozen=True)
+class WeightedSumFactor:
+    """The weighted sum of several vectors is zero. Blocks: as many vectors (3) as weights.
+
+    Attributes:
+        time: (1,) s.
+        weights: (k,).
+        sigma: of the sum.
+    """
+
+    time: Array
+    weights: Array
+    sigma: float
+    rows: int = 3
+
+    def __call__(self, *vectors: Array) -> Residuals:
+        """Residual sum / sigma, (1, 3)."""
+        scaled = self.weights / self.sigma
+        total = sum((w * v for w, v in zip(scaled, vectors, strict=True)), start=np.zeros((1, 3)))
+        return total, lambda: tuple(w * np.eye(3)[None] for w in scaled)
 
 
 def _turn_by_triad(path: GyroPath, rate: Array, K: Array) -> Array:

@@ -14,6 +14,7 @@ from factors.triad import (
     MagFactor,
     TagAttitudeFactor,
     TriadPriorFactor,
+    WeightedSumFactor,
     calibration,
     parts,
     triad,
@@ -57,6 +58,8 @@ def _static_blocks(kind: str) -> tuple[list[Array], list[Kind]]:
     blocks: list[Array] = [_rotations(rng), _triads(rng)]
     if kind == "mag":
         return [*blocks, rng.normal(size=(N, 3))], ["rotation", 12, 3]
+    if kind == "gyro":
+        return [*blocks, 0.1 * rng.normal(size=(N, 3))], ["rotation", 12, 3]
     return blocks, ["rotation", 12]
 
 
@@ -84,14 +87,15 @@ def test_turn_jacobians(angle: float, miss: float) -> None:
     rng = _rng(2)
     model = _turns(np.arange(N), angle)
     start, triads = _rotations(rng), _triads(rng, 0.05)
+    wandered = list(0.01 * rng.normal(size=(2, N, 3)))
     # Attitudes at the end that miss the prediction by `miss` rad.
-    error = model(start, so3.identity(N), triads)[0] * _sigma(np.arange(N))[:, None]
+    error = model(start, so3.identity(N), triads, *wandered)[0] * _sigma(np.arange(N))[:, None]
     predicted = so3.inverse(so3.exp(error))
     direction = rng.normal(size=(N, 3))
     delta = miss * direction / np.linalg.norm(direction, axis=1)[:, None]
-    blocks = [start, so3.multiply(predicted, so3.exp(delta)), triads]
+    blocks = [start, so3.multiply(predicted, so3.exp(delta)), triads, *wandered]
     tolerance = 2e-5 if miss > 2.0 else 2e-6
-    assert_jacobians_match(model, ["rotation", "rotation", 12], blocks, rtol=tolerance)
+    assert_jacobians_match(model, ["rotation", "rotation", 12, 3, 3], blocks, rtol=tolerance)
     assert_rows_are_independent(lambda rows: _turns(rows, angle), blocks)
 
 
@@ -101,11 +105,12 @@ def test_turn_of_a_miscalibrated_gyro_on_the_turning_earth() -> None:
     K, b = np.eye(3) + 0.05 * rng.normal(size=(3, 3)), 0.1 * rng.normal(size=3)
     t = np.arange(0.0, 2.0001, 0.02)
     w_ib = np.array([0.9, -0.4, 0.6])
-    raw = np.tile(np.linalg.solve(K, w_ib - b), (len(t), 1))
+    wandered = 0.01 * rng.normal(size=(2, 1, 3))
+    raw = np.tile(np.linalg.solve(K, w_ib - b) + wandered.mean(axis=0), (len(t), 1))
     iRb0 = so3.exp(np.array([[0.3, 1.0, -0.7]]))
     nRb1 = so3.compose(so3.exp(-EARTH * t[-1]), iRb0, so3.exp(w_ib * t[-1]))
     model = GyroRotationFactor(t[-1:], [t], [raw], EARTH, np.ones(1))
-    np.testing.assert_allclose(model(iRb0, nRb1, triad(K, b)[None])[0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(model(iRb0, nRb1, triad(K, b)[None], *wandered)[0], 0.0, atol=1e-12)
 
 
 def _tags(rows: np.ndarray, blocks: list[Array] | None) -> TagAttitudeFactor:
@@ -190,3 +195,12 @@ def test_an_unknown_quantity_has_no_prior() -> None:
     residual, jacobians = TriadPriorFactor(TIMES, rng.normal(size=(N, 12)), sigma)(_triads(rng))
     assert not residual.any()
     assert not jacobians()[0].any()
+
+
+def test_weighted_sum_jacobians() -> None:
+    rng = _rng(11)
+    model = WeightedSumFactor(TIMES[:1], np.array([0.2, 0.5, 0.3]), 0.1)
+    blocks = list(rng.normal(size=(3, 1, 3)))
+    assert_jacobians_match(model, [3, 3, 3], blocks)
+    blocks[2] = -(0.2 * blocks[0] + 0.5 * blocks[1]) / 0.3
+    np.testing.assert_allclose(model(*blocks)[0], 0.0, atol=1e-14)

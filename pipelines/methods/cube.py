@@ -29,6 +29,7 @@ from factors.triad import (
     GyroStaticFactor,
     MagFactor,
     TagAttitudeFactor,
+    WeightedSumFactor,
     parts,
 )
 from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
@@ -54,8 +55,39 @@ from pipelines.sessions.cube_poses import SeenTags, StaticPoses, static_poses, t
 # Nothing is known of the cube's place in the camera beforehand, m, nor of an attitude that no gyro leads to, rad: these
 # only make the new variables of a step determined without its measurements.
 _ANYWHERE, _ANYHOW = 10.0, np.pi
+# A gyro bias that does not walk still does so by this much, rad/s, for the sake of the arithmetic.
+_STEADY = 1e-8
 # A pause of the gyro's record in a turn longer than this, s, breaks the chain of turns.
 _LONGEST_GAP = 0.1
+
+
+@dataclass(frozen=True)
+class _Wander:
+    """How the gyro's offset departs from its mean over the session: a random walk that stays bounded.
+
+    An Ornstein-Uhlenbeck process: over short times the walk, over the session the departure that a walk has from its
+    own mean, whose variance is walk^2 times a sixth of the session.
+
+    Attributes:
+        sigma: (P,) of each pose's departure, given the one before it; of the first alone.
+        kept: (P,) what a departure keeps of the one before it; 0 for the first.
+        weights: (P,) share of the session that a pose stands for.
+    """
+
+    sigma: Array
+    kept: Array
+    weights: Array
+
+    @classmethod
+    def over(cls, poses: StaticPoses, walk: float) -> _Wander:
+        """For a walk in rad/s/sqrt(s)."""
+        start, stop = poses.span.T
+        middle = 0.5 * (start + stop)
+        length = float(stop[-1] - start[0])
+        departure = max(walk * float(np.sqrt(length / 6.0)), _STEADY)
+        kept = np.append(0.0, np.exp(-np.diff(middle) / (length / 3.0)))
+        edges = np.concatenate([start[:1], 0.5 * (middle[1:] + middle[:-1]), stop[-1:]])
+        return cls(departure * np.sqrt(1.0 - kept**2), kept, np.diff(edges) / length)
 
 
 @dataclass(frozen=True)
@@ -68,10 +100,11 @@ class _Model:
     reference: Reference
     parameters: Parameters
     gravity: float  # m/s^2
-    earth_rate: Array  # (3,) rad/s in n
+    earth_rate: Array  # (3,) rad/s in n, as far as the heading is known
+    unknown_rate: float  # rad/s per axis, what of the earth rate that leaves out
     field: Array | None  # (3,) T in n, by the model
     density: tuple[float, float, float]  # of gyro, accelerometer and magnetometer
-    wander: float  # rad/s, departure of a walking gyro bias from its mean over the session
+    wander: _Wander
     scale_error: float  # sigma of a turn per angle turned
     gyro_bias: Array  # (3,) first guess, in nominal units
     initial: Array  # (P, 4) nRb
@@ -108,10 +141,11 @@ def _prepare(data: CubeData, config: Config) -> _Model:
         count(poses.dropped, "magnetometer: no position for the field model, not calibrated", 1)
     elif poses.mag is not None:
         field = local_field(data, config)
+    # Else only the horizontal earth rate would show the heading, which no MEMS gyro feels: it is left out as noise.
+    heading_known = field is not None or data.reference_t is not None
+    earth = earth_rate(data.latitude)
     bias = np.median(poses.gyro, axis=0)
     reference = cube_reference(data, config, poses, field)
-    length = float(poses.span[-1, 1] - poses.span[0, 0])
-    walk = first_given(config.noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk)
     return _Model(
         data=data,
         config=config,
@@ -124,11 +158,11 @@ def _prepare(data: CubeData, config: Config) -> _Model:
             field=field,
         ),
         gravity=float(gravity(data.latitude, data.height)),
-        earth_rate=earth_rate(data.latitude),
+        earth_rate=earth * np.array([1.0, 1.0, 1.0] if heading_known else [0.0, 0.0, 1.0]),
+        unknown_rate=0.0 if heading_known else float(np.hypot(*earth[:2]) * np.sqrt(0.5)),
         field=field,
         density=noise_densities(data, config),
-        # Mean over the session of the variance of a random walk about its own mean.
-        wander=walk * float(np.sqrt(length / 6.0)),
+        wander=_Wander.over(poses, first_given(config.noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk)),
         scale_error=first_given(config.noise.gyro_scale, DEFAULT_NOISE.gyro_scale),
         gyro_bias=bias,
         initial=_attitudes(data, config, poses, reference, field, bias),
@@ -171,6 +205,10 @@ def _place_key(k: int) -> int:
     return int(gtsam.symbol("p", k))
 
 
+def _wandered_key(k: int) -> int:
+    return int(gtsam.symbol("d", k))
+
+
 def _reference_key(k: int) -> int:
     return int(gtsam.symbol("R", k))
 
@@ -190,7 +228,8 @@ def _step(model: _Model, k: int) -> Step:
         initial.insert(model.parameters.initial(model.gyro_bias))
         factors += first_priors(model.parameters)
     initial.insert(_pose_key(k), so3.to_gtsam(model.initial[k]))
-    factors += _process(model, k)
+    initial.insert(_wandered_key(k), np.zeros(3))
+    factors += [*_wander_factors(model, k), *_process(model, k)]
     seen = model.poses.tags[k]
     if seen is not None:
         initial.insert(_place_key(k), seen.pose.position)
@@ -229,8 +268,8 @@ def _process(model: _Model, k: int) -> list[Factor]:
     if k > 0 and _turn_known(model, k):
         measurement = VectorizedFactor(
             _rotation_model(model, k),
-            [_pose_key(k - 1), _pose_key(k), TRIAD_KEYS["gyro"]],
-            ["rotation", "rotation", 12],
+            [_pose_key(k - 1), _pose_key(k), TRIAD_KEYS["gyro"], _wandered_key(k - 1), _wandered_key(k)],
+            ["rotation", "rotation", 12, 3, 3],
         )
         return [Factor("gyro turns", measurement.factor)]
     attitude = so3.to_gtsam(model.initial[k])
@@ -238,12 +277,31 @@ def _process(model: _Model, k: int) -> list[Factor]:
     return [Factor("prior", gtsam.PriorFactorRot3(_pose_key(k), attitude, anyhow))]
 
 
+def _wander_factors(model: _Model, k: int) -> list[Factor]:
+    """How the offset of the gyro came to where it is in pose k; after the last, that c is its mean over the session."""
+    wander, key = model.wander, _wandered_key(k)
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, float(wander.sigma[k]))
+    if k == 0:
+        return [Factor("bias walk", gtsam.PriorFactorVector(key, np.zeros(3), noise))]
+    zeros = gtsam.Values()
+    zeros.insert(key, np.zeros(3))
+    zeros.insert(_wandered_key(k - 1), np.zeros(3))
+    step = gtsam.JacobianFactor(key, np.eye(3), _wandered_key(k - 1), -wander.kept[k] * np.eye(3), np.zeros(3), noise)
+    factors = [Factor("bias walk", gtsam.LinearContainerFactor(step, zeros))]
+    if k == len(model.poses) - 1:
+        mean = WeightedSumFactor(model.poses.span[-1:, 1], wander.weights, _STEADY)
+        keys = [_wandered_key(i) for i in range(k + 1)]
+        factors.append(Factor("definition", VectorizedFactor(mean, keys, [3] * len(keys)).factor))
+    return factors
+
+
 def _rotation_model(model: _Model, k: int) -> GyroRotationFactor:
     samples = _turn(model, k)
     t, raw = model.data.imu_t[samples], nominal(model.data.gyro[samples], model.config.cube.raw.gyro)
     duration = float(t[-1] - t[0])
     angle = np.linalg.norm(so3.log(GyroPath(t, raw, model.gyro_bias).attitude(t[-1:])[0]))
-    variance = model.density[0] ** 2 * duration + (model.wander * duration) ** 2 + (model.scale_error * angle) ** 2
+    known = model.density[0] ** 2 * duration + (model.scale_error * angle) ** 2
+    variance = known + (model.unknown_rate * duration) ** 2
     return GyroRotationFactor(t[-1:], [t], [raw], model.earth_rate, np.sqrt([variance]))
 
 
@@ -253,12 +311,13 @@ def _sensor_factors(model: _Model, k: int) -> list[Factor]:
     time = 0.5 * poses.span[row].sum(axis=1)
     gyro_density, accel_density, mag_density = model.density
     duration = poses.duration[row]
-    gyro_sigma = np.sqrt(gyro_density**2 / duration + model.wander**2)
     accel = AccelFactor(time, poses.accel[row], accel_density / np.sqrt(duration), model.gravity)
+    gyro_sigma = np.sqrt(gyro_density**2 / duration + model.unknown_rate**2)
     gyro = GyroStaticFactor(time, poses.gyro[row], gyro_sigma, model.earth_rate)
+    gyro_columns = [_pose_key(k), TRIAD_KEYS["gyro"], _wandered_key(k)]
     factors = [
         Factor.of("accelerometer", VectorizedFactor(accel, [_pose_key(k), TRIAD_KEYS["accel"]], ["rotation", 12])),
-        Factor.of("gyro at rest", VectorizedFactor(gyro, [_pose_key(k), TRIAD_KEYS["gyro"]], ["rotation", 12])),
+        Factor.of("gyro at rest", VectorizedFactor(gyro, gyro_columns, ["rotation", 12, 3])),
     ]
     if model.field is not None and poses.mag is not None and poses.mag_duration[k] > 0.0:
         mag = MagFactor(time, poses.mag[row], mag_density / np.sqrt(poses.mag_duration[row]))
@@ -309,7 +368,9 @@ def _predict(model: _Model, k: int, initial: gtsam.Values, current: gtsam.Values
     samples = _turn(model, k)
     A, c = parts(current.atVector(TRIAD_KEYS["gyro"]))
     raw = nominal(model.data.gyro[samples], model.config.cube.raw.gyro)
-    path = GyroPath(model.data.imu_t[samples], (raw - c) @ np.linalg.inv(A).T)
+    wandered = current.atVector(_wandered_key(k - 1))
+    out.update(_wandered_key(k), model.wander.kept[k] * wandered)
+    path = GyroPath(model.data.imu_t[samples], (raw - c - wandered) @ np.linalg.inv(A).T)
     before = so3.from_gtsam([current.atRot3(_pose_key(k - 1))])[0]
     earth = so3.exp(-model.earth_rate * (path.t[-1] - path.t[0]))
     out.update(_pose_key(k), so3.to_gtsam(so3.compose(earth, before, path.attitude(path.t[-1:])[0])))

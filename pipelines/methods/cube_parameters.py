@@ -174,7 +174,7 @@ def _triad_parameter(key: int, plain: Sequence[Quantity], conversion: RawConvers
     """A triad as reported: nominal = K raw + b for the raw numbers as recorded.
 
     With nominal = K' (raw - offset) scale + b' it is K = K' scale, b = b' - K (offset, offset, offset); the sigmas of
-    priors follow.
+    priors and the accuracies wanted follow.
     """
     if conversion is None:
         return Parameter(key, tuple(plain), partial(_coordinates, np.eye(12)))
@@ -186,14 +186,14 @@ def _triad_parameter(key: int, plain: Sequence[Quantity], conversion: RawConvers
     def through(sigmas: Sequence[float]) -> list[float]:
         return [float(s) for s in np.sqrt(linear**2 @ np.square(sigmas))]
 
-    scales = through([q.prior_scale for q in plain])
+    scales, requires = through([q.prior_scale for q in plain]), through([q.require for q in plain])
     sigmas = through([q.prior_scale if q.prior_sigma is None else q.prior_sigma for q in plain])
     reported = []
     for i, q in enumerate(plain):
         on = plain[3 * (i - 9) : 3 * (i - 9) + 3] if i >= 9 else []
         free = any(p.prior_sigma is None for p in (q, *on))
-        unit, require = (f"{_BIAS[q.name.split('_')[0]][0]}/count", q.require * scale) if i < 9 else (q.unit, q.require)
-        reported.append(Quantity(q.name, unit, None if free else sigmas[i], scales[i], require))
+        unit = f"{plain[9].unit}/count" if i < 9 else q.unit
+        reported.append(Quantity(q.name, unit, None if free else sigmas[i], scales[i], requires[i]))
     return Parameter(key, tuple(reported), partial(_coordinates, linear))
 
 

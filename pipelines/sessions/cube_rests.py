@@ -14,11 +14,11 @@ _SPAN = 0.5
 # Shorter rests, s, are turning points of a motion.
 _SHORTEST = 0.5
 # Quiet: the scatter over the span is below this many times the noise.
-_QUIET = 1.5
+_QUIET = 2.0
 # A motion starts slower than the test can see: this much, s, is cut off at both ends.
-_MARGIN = 0.2
-# The noise is what the quietest twentieth of the recording shows, between the stated one and this many times it.
-_FLOOR_SHARE, _FLOOR_LIMIT = 0.05, 10.0
+_MARGIN = 0.25
+# The noise is what the quietest twentieth of the recording shows, between these multiples of the stated one.
+_FLOOR_SHARE, _FLOOR_LIMITS = 0.05, (0.2, 10.0)
 # A steady turn is as quiet as a rest; its mean rate departs from that of the rests by more than this, rad/s.
 _STEADY = 0.01
 # A pause between samples is a gap when longer than this many intervals.
@@ -46,7 +46,8 @@ def find_rests(t: Array, gyro: Array, accel: Array, gyro_sigma: float, accel_sig
         raise InputError(f"the device's record is {t[-1] - t[0]:.3g} s long, shorter than one static pose")
     scatter = np.stack([_scatter(gyro, half), _scatter(accel, half)])
     stated = np.array([gyro_sigma, accel_sigma])
-    floor = np.clip(np.quantile(scatter, _FLOOR_SHARE, axis=1), stated, _FLOOR_LIMIT * stated)
+    low, high = _FLOOR_LIMITS
+    floor = np.clip(np.quantile(scatter, _FLOOR_SHARE, axis=1), low * stated, high * stated)
     quiet = np.all(scatter < _QUIET * floor[:, None], axis=0)
     dense = np.diff(t) < _GAP_SAMPLES * interval
     quiet &= np.append(dense, True) & np.append(True, dense)
