@@ -167,10 +167,11 @@ def _seen_in(
         count(dropped, "static pose with its tags' planar flip not told" if pose else "static pose not solved", 1)
         return None
     side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean()
-    misfit = pose.tag_rms_px > _MISFIT_SHARE * side
-    for tag in [*pose.rejected, *pose.ids[misfit].tolist()]:
+    misfit = bool((pose.tag_rms_px > _MISFIT_SHARE * side).any())
+    # Of two tags that disagree either may be the wrong one.
+    for tag in [*pose.rejected, *(pose.ids.tolist() if misfit else [])]:
         wrong[tag] = wrong.get(tag, 0) + 1
-    if misfit.any():
+    if misfit:
         count(dropped, "static pose whose tags do not fit the layout", 1)
         return None
     keep = np.isin(ids, pose.ids)
@@ -195,11 +196,15 @@ def _mean_corners(data: CubeData, config: Config, rows: NDArray[np.intp]) -> tup
 
 
 def _check_rigid(wrong: dict[int, int], found: list[SeenTags | None]) -> None:
-    """Raise InputError if a tag misses the layout more often than it fits."""
-    for tag, times in sorted(wrong.items(), key=lambda item: -item[1]):
-        fits = sum(tag in seen.ids for seen in found if seen is not None)
-        if times > fits:
-            raise InputError(
-                f"cube not rigid: tag {tag} disagrees with the others in {times} of {times + fits} static poses; check "
-                f"its size, rotation and position in the config (cube.tags.{tag}) and that it is glued down"
-            )
+    """Raise InputError if a tag disagrees with others more often than it agrees with others."""
+    agrees = {tag: sum(len(seen.ids) > 1 and tag in seen.ids for seen in found if seen is not None) for tag in wrong}
+    often = {tag: times for tag, times in wrong.items() if times > agrees[tag]}
+    if not often:
+        return
+    worst = sorted(tag for tag, times in often.items() if times == max(often.values()))
+    names = " or ".join(str(tag) for tag in worst)
+    raise InputError(
+        f"cube not rigid: tag {names} disagrees with others in {often[worst[0]]} of "
+        f"{often[worst[0]] + agrees[worst[0]]} static poses; check size, rotation and position in the config "
+        f"(cube.tags.{worst[0]}) and that it is glued down"
+    )
