@@ -1,0 +1,288 @@
+"""The cube method end to end: every mode, both graph solvers, what cannot be observed, independent and real data."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from datasets import imu_tk_xsens
+from factors import so3
+from pipelines.errors import InputError
+from pipelines.methods.base import Estimate, Problem
+from pipelines.methods.cube import problem
+from pipelines.observability import Assessment, assess
+from pipelines.published.cube import published_estimate
+from pipelines.sessions.config import Config, Raw, RawConversion, load_config
+from pipelines.sessions.cube import CubeData, read_cube, rests
+from pipelines.sessions.reading import open_recording
+from pipelines.simulation.cube import CubeScenario, cube_config, simulate_cube
+from pipelines.solvers.batch import solve_batch
+from pipelines.solvers.incremental import solve_incremental
+
+# The default field prior leaves the magnetometer's scale at one per cent; here the field is known better.
+FIELD = {"field_e": 1e-8, "field_n": 1e-8, "field_u": 1e-8}
+
+
+@cache
+def _simulated(seed: int, **options: Any) -> tuple[CubeData, dict[str, float], Config]:
+    scenario = CubeScenario(**options)
+    data, truth = simulate_cube(scenario, seed)
+    return data, truth, load_config(cube_config(scenario).encode())
+
+
+def _solved(data: CubeData, config: Config) -> tuple[Problem, Estimate, Assessment]:
+    built = problem(data, config)
+    estimate = solve_batch(built)
+    return built, estimate, assess(built.quantities, estimate.covariance, estimate.chi_square, built.advice)
+
+
+def _sigmas_off(estimate: Estimate, truth: dict[str, float], names: str = "") -> dict[str, float]:
+    """Errors in sigmas of what is estimated and known."""
+    rows = zip(estimate.names, estimate.values, estimate.sigmas, strict=True)
+    return {n: abs(v - truth[n]) / s for n, v, s in rows if n in truth and s > 0.0 and n.startswith(names)}
+
+
+@pytest.mark.parametrize("missing", [[], ["magnetometer"], ["reference"], ["reference", "magnetometer"]], ids=str)
+def test_every_mode_with_a_camera(missing: list[str]) -> None:
+    absent = dict.fromkeys(missing, False)
+    priors = {} if "magnetometer" in missing else FIELD
+    data, truth, config = _simulated(4, **absent)
+    config = config.model_copy(update={"priors": priors})
+    built, estimate, judged = _solved(data, config)
+    assert estimate.converged
+    assert judged.status == "calibrated", judged.headline
+    assert max(_sigmas_off(estimate, truth).values()) < 4.0
+    names = [q.name for q in built.quantities]
+    assert ("mag_k11" in names) == ("magnetometer" not in missing)
+    fixed = {q.name for q in built.quantities if q.prior_sigma == 0.0}
+    assert ("camera_mount_x" in fixed) == ("reference" in missing)
+    assert {"tag_16_x", "tag_16_y", "tag_16_z"} <= fixed
+
+
+def test_without_a_camera_the_accelerometer_defines_the_body() -> None:
+    data, truth, config = _simulated(5, camera=False, reference=False, magnetometer=False, poses=30)
+    _, estimate, judged = _solved(data, config)
+    assert judged.status == "calibrated", judged.headline
+    values = dict(zip(estimate.names, estimate.values, strict=True))
+
+    def gain(numbers: dict[str, float], name: str) -> np.ndarray:
+        return np.array([[numbers[f"{name}_k{i}{j}"] for j in "123"] for i in "123"])
+
+    u = _upper(gain(truth, "accel"))
+    np.testing.assert_allclose(gain(values, "accel"), u @ gain(truth, "accel"), atol=2e-3)
+    np.testing.assert_allclose(gain(values, "gyro"), u @ gain(truth, "gyro"), atol=2e-3)
+
+
+def _upper(K: np.ndarray) -> np.ndarray:
+    """The rotation U with U K upper triangular, its diagonal positive."""
+    q, r = np.linalg.qr(K)
+    return np.diag(np.sign(np.diag(r))) @ q.T
+
+
+def test_incremental_ends_where_batch_does() -> None:
+    data, _, config = _simulated(6, poses=12)
+    batch = solve_batch(problem(data, config))
+    incremental = solve_incremental(problem(data, config))
+    free = batch.sigmas > 0.0
+    assert np.abs((incremental.values - batch.values)[free] / batch.sigmas[free]).max() < 0.3
+    np.testing.assert_allclose(incremental.sigmas[free], batch.sigmas[free], rtol=0.1)
+
+
+def test_three_poses_are_too_few_and_the_directions_are_named() -> None:
+    data, _, config = _simulated(7, poses=3)
+    _, _, judged = _solved(data, config)
+    assert judged.status == "unobservable"
+    named = {name for d in judged.directions for name in d.weights}
+    assert any(name.startswith("accel_") for name in named)
+    assert any("add static poses" in d.advice for d in judged.directions)
+
+
+def test_axes_never_turned_are_named() -> None:
+    data, _, config = _simulated(8, turn_axes=((0, 0, 1),), poses=12)
+    _, _, judged = _solved(data, config)
+    assert judged.status == "unobservable"
+    weak = {name for name, verdict in judged.verdicts.items() if verdict in ("weak", "unobservable")}
+    assert {"gyro_k11", "gyro_k12", "gyro_k21", "gyro_k22"} <= weak
+    sigma = dict(zip(judged.verdicts, judged.sigmas, strict=True))
+    assert sigma["gyro_k33"] < 0.05 * sigma["gyro_k11"]
+    assert any("turn the cube between poses about its x" in d.advice for d in judged.directions)
+
+
+def test_a_face_never_seen_is_known_by_its_prior_alone() -> None:
+    data, _, config = _simulated(9, faces_hidden=(19,))
+    _, _, judged = _solved(data, config.model_copy(update={"priors": FIELD}))
+    assert judged.verdicts["tag_19_x"] == "prior"
+    assert "tag_19_x" in judged.headline
+
+
+def test_wrong_heading_is_found_or_reported() -> None:
+    data, truth, config = _simulated(10, reference_heading_deg=1.0)
+    _, estimate, _ = _solved(data, config)
+    assert max(_sigmas_off(estimate, truth).values()) < 4.0
+    # Without doubt about mount and field the heading is all that is left.
+    priors = FIELD | dict.fromkeys(("camera_mount_x", "camera_mount_y", "camera_mount_z"), 1e-3)
+    data, truth, config = _simulated(10, reference_heading_deg=1.0, camera_mount=1e-3)
+    _, estimate, _ = _solved(data, config.model_copy(update={"priors": priors | {"reference_heading": 0.1}}))
+    values = dict(zip(estimate.names, estimate.values, strict=True))
+    assert abs(values["reference_heading"] - np.deg2rad(1.0)) < 3e-3
+    assert max(_sigmas_off(estimate, truth).values()) < 4.0
+
+
+def test_poses_near_iron_are_left_out() -> None:
+    data, truth, config = _simulated(11, disturbed=0.1)
+    _, estimate, _ = _solved(data, config)
+    assert estimate.rejected["magnetometer"] > 0
+    assert max(_sigmas_off(estimate, truth, "mag").values()) < 4.0
+
+
+def test_a_reference_that_moves_has_an_attitude_at_each_pose() -> None:
+    """A reference that turns about the camera's axis leaves the picture as it is but for a turn of its corners."""
+    data, truth, config = _simulated(12, poses=12)
+    moved = _turned_with_camera(data)
+    standing, moving = ({k for step in problem(d, config).steps(1) for k in step.initial.keys()} for d in (data, moved))
+    assert len(moving) == len(standing) + 11
+    _, estimate, _ = _solved(moved, config)
+    assert max(_sigmas_off(estimate, truth).values()) < 4.0
+
+
+def _turned_with_camera(data: CubeData) -> CubeData:
+    """The session with reference and camera turned from pose to pose about the true camera's own centre."""
+    assert data.camera is not None
+    assert data.sightings is not None
+    assert data.reference_t is not None
+    assert data.reference_wxyz is not None
+    config = _simulated(12, poses=12)[2]
+    edges = rests(data, config)[1:, 0] - 0.3
+    turns = so3.exp(0.03 * np.random.default_rng(1).normal(size=(len(edges) + 1, 3)))
+    assert config.cube.camera_rotation is not None
+    BRC = so3.multiply(
+        config.cube.camera_rotation, so3.exp([_simulated(12, poses=12)[1][f"camera_mount_{a}"] for a in "xyz"])
+    )
+    turned_B = turns[np.searchsorted(edges, data.reference_t)]
+    seen = data.sightings
+    turned_C = so3.compose(so3.inverse(BRC), turns, BRC)[np.searchsorted(edges, seen.t[seen.frame])]
+    rays = so3.rotate(so3.inverse(turned_C)[:, None], data.camera.rays(seen.corners))
+    corners = data.camera.project(rays)
+    return replace(
+        data,
+        reference_wxyz=so3.multiply(data.reference_wxyz, turned_B),
+        sightings=replace(seen, corners=corners),
+    )
+
+
+def test_graph_is_better_than_the_published_regression() -> None:
+    data, truth, config = _simulated(13)
+    built = problem(data, config)
+    graph, published = solve_batch(built), published_estimate(data, config, built)
+
+    def error(estimate: Estimate, prefix: str) -> float:
+        pairs = zip(estimate.names, estimate.values, strict=True)
+        return float(np.sqrt(np.mean([(v - truth[n]) ** 2 for n, v in pairs if n.startswith(prefix)])))
+
+    assert error(graph, "accel_k") < 0.6 * error(published, "accel_k")
+    assert error(graph, "mag_k") < 0.6 * error(published, "mag_k")
+    assert error(graph, "gyro_k") < 3e-3
+    values = dict(zip(published.names, published.values, strict=True))
+    assert abs(values["gyro_k11"]) < 0.5
+
+
+def test_counts_are_calibrated_as_recorded() -> None:
+    """The same session in counts: K and b are for the counts, sigmas and verdicts follow."""
+    data, truth, config = _simulated(14, poses=12, magnetometer=False)
+    scale, offset = 2e-3, 30000.0
+    counts = replace(data, accel=data.accel / scale + offset)
+    raw = Raw(accel=RawConversion(scale=scale, offset=offset))
+    in_counts = config.model_copy(update={"cube": config.cube.model_copy(update={"raw": raw})})
+    plain, found = _solved(data, config)[1], _solved(counts, in_counts)[1]
+    a, b = (dict(zip(e.names, e.values, strict=True)) for e in (plain, found))
+    for i in "123":
+        row = [a[f"accel_k{i}{j}"] for j in "123"]
+        np.testing.assert_allclose([b[f"accel_k{i}{j}"] for j in "123"], np.array(row) * scale, atol=1e-4 * scale)
+        assert b[f"accel_b{i}"] == pytest.approx(a[f"accel_b{i}"] - sum(row) * scale * offset, abs=0.02)
+    assert truth["accel_k11"] == pytest.approx(a["accel_k11"], abs=1e-3)
+    assert found.sigmas[0] == pytest.approx(plain.sigmas[0] * scale, rel=0.05)
+
+
+def test_unknown_place_and_unknown_prior() -> None:
+    data, _, config = _simulated(15, poses=4)
+    with pytest.raises(InputError, match="place on the earth is unknown"):
+        problem(replace(data, latitude=None, longitude=None), config)
+    with pytest.raises(InputError, match=r"unknown key priors.accel_k14; the nearest known key is accel_k"):
+        problem(data, config.model_copy(update={"priors": {"accel_k14": 0.1}}))
+
+
+@pytest.mark.parametrize("solve", [solve_batch, pytest.param(solve_incremental, marks=pytest.mark.slow)])
+def test_an_independent_simulators_recording(shared_data: Path, solve: Any) -> None:
+    estimate, truth = _contract(shared_data, "cube_nominal", solve)
+    assert max(_sigmas_off(estimate, truth).values()) < 3.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solve", [solve_batch, solve_incremental], ids=["batch", "incremental"])
+def test_an_independent_simulators_pictures(shared_data: Path, solve: Any) -> None:
+    estimate, truth = _contract(shared_data, "cube_images", solve)
+    assert max(_sigmas_off(estimate, truth).values()) < 5.0
+
+
+def _contract(shared_data: Path, name: str, solve: Any) -> tuple[Estimate, dict[str, float]]:
+    recording = open_recording(shared_data / "contract" / f"{name}.mcap")
+    config = load_config(recording.attachment("alidade.yaml"))
+    said = json.loads((shared_data / "contract" / f"{name}.truth.json").read_text())
+    truth = {key: value for key, value in said.items() if not key.startswith("_")}
+
+    def correction(given: Any, true_xyzw: list[float]) -> np.ndarray:
+        return so3.log(so3.multiply(so3.inverse(given), np.roll(true_xyzw, 1)))
+
+    frames = said["_truth_frames"]
+    vectors = {f"tag_{i}": correction(config.cube.tags[int(i)].rotation, q) for i, q in frames["tags_xyzw"].items()}
+    vectors["camera_mount"] = correction(config.cube.camera_rotation, frames["BRC_xyzw"])
+    truth |= {f"{n}_{axis}": float(x) for n, v in vectors.items() for axis, x in zip("xyz", v, strict=True)}
+    truth |= {f"field_{axis}": x for axis, x in zip("enu", frames["field_enu_T"], strict=True)}
+    return solve(problem(read_cube(recording, config), config)), truth
+
+
+def test_real_counts_of_an_xsens_without_camera(shared_data: Path) -> None:
+    """Against the factory sheet of the very sensor."""
+    config = load_config(imu_tk_xsens.CONFIG.encode())
+    assert config.latitude_deg is not None
+    data = imu_tk_xsens.to_session(shared_data / "imu_tk_xsens")
+    _, estimate, judged = _solved(replace(data, latitude=float(np.deg2rad(config.latitude_deg))), config)
+    assert judged.status == "calibrated", judged.headline
+    accel, gyro = imu_tk_xsens.as_on_sheet(dict(zip(estimate.names, estimate.values, strict=True)))
+    for found, sheet in ((accel, imu_tk_xsens.ACCEL_SHEET), (gyro, imu_tk_xsens.GYRO_SHEET)):
+        np.testing.assert_allclose(found.scale, sheet.scale, rtol=3e-3)
+        np.testing.assert_allclose(found.misalignment, sheet.misalignment, atol=1e-2)
+    assert accel.offset is not None
+    assert imu_tk_xsens.ACCEL_SHEET.offset is not None
+    np.testing.assert_allclose(accel.offset, imu_tk_xsens.ACCEL_SHEET.offset, atol=10.0)
+
+
+def _normalized_error(estimate: Estimate, truth: dict[str, float]) -> float:
+    """NEES of the 36 sensor parameters over their number."""
+    rows = [i for i, n in enumerate(estimate.names) if n in truth and n.split("_")[1][0] in "kb" and "tag" not in n]
+    error = np.array([estimate.values[i] - truth[estimate.names[i]] for i in rows])
+    return float(error @ np.linalg.solve(estimate.covariance[np.ix_(rows, rows)], error)) / len(rows)
+
+
+def _assert_consistent(runs: int) -> None:
+    """Mean NEES inside its 99 % interval (normal approximation of chi-square's)."""
+    found = []
+    for seed in range(runs):
+        data, truth = simulate_cube(CubeScenario(), 1000 + seed)
+        found.append(_normalized_error(solve_batch(problem(data, _simulated(1)[2])), truth))
+    assert abs(np.mean(found) - 1.0) < 2.58 * np.sqrt(2.0 / (36 * runs))
+
+
+def test_sigmas_are_consistent() -> None:
+    _assert_consistent(3)
+
+
+@pytest.mark.slow
+def test_sigmas_are_consistent_over_thirty_runs() -> None:
+    _assert_consistent(30)

@@ -1,0 +1,131 @@
+"""The cube's simulator against closed forms and its own truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from factors import so3
+from factors.earth import earth_rate, gravity
+from pipelines.sessions.config import load_config
+from pipelines.sessions.cube import read_cube, rests
+from pipelines.sessions.cube_poses import static_poses
+from pipelines.sessions.reading import open_recording
+from pipelines.simulation.cube import CubeNoise, CubeScenario, cube_config, simulate_cube, write_simulation
+from pipelines.simulation.scenario import load_scenario
+
+QUIET = CubeNoise(gyro_density=1e-12, gyro_bias_walk=0.0, accel_density=1e-12, mag_density=1e-18, corner_px=1e-6)
+EXACT = CubeScenario(
+    poses=5,
+    static_s=2.0,
+    noise=QUIET,
+    reference_level_deg=1e-9,
+    reference_heading_noise_deg=1e-9,
+    camera_mount=0.0,
+    tag_mount=0.0,
+    occluded=0.0,
+    camera_rate_hz=5.0,
+)
+
+
+def _gain(truth: dict[str, float], name: str) -> tuple[np.ndarray, np.ndarray]:
+    K = np.array([[truth[f"{name}_k{i}{j}"] for j in "123"] for i in "123"])
+    return K, np.array([truth[f"{name}_b{i}"] for i in "123"])
+
+
+def test_at_rest_every_sensor_says_what_the_attitude_seen_by_the_camera_predicts() -> None:
+    data, truth = simulate_cube(EXACT, 1)
+    config = load_config(cube_config(EXACT.model_copy(update={"noise": CubeNoise()})).encode())
+    poses = static_poses(data, config)
+    assert len(poses) == EXACT.poses
+    assert data.reference_wxyz is not None
+    assert config.cube.camera_rotation is not None
+    nRC = so3.multiply(data.reference_wxyz[0], config.cube.camera_rotation)
+    field = np.array([truth[f"field_{axis}"] for axis in "enu"])
+    latitude = float(np.deg2rad(EXACT.latitude_deg))
+    vectors = {"accel": np.array([0, 0, gravity(latitude, EXACT.height)]), "gyro": earth_rate(latitude), "mag": field}
+    means = {"accel": poses.accel, "gyro": poses.gyro, "mag": poses.mag}
+    for k, seen in enumerate(poses.tags):
+        assert seen is not None
+        bRn = so3.inverse(so3.multiply(nRC, seen.pose.cRb))
+        for name, vector in vectors.items():
+            K, b = _gain(truth, name)
+            mean = means[name]
+            assert mean is not None
+            scale = np.linalg.norm(vector)
+            np.testing.assert_allclose((K @ mean[k] + b) / scale, so3.rotate(bRn, vector) / scale, atol=2e-5)
+
+
+def test_the_gyro_leads_from_pose_to_pose() -> None:
+    data, truth = simulate_cube(EXACT, 2)
+    config = load_config(cube_config(EXACT.model_copy(update={"noise": CubeNoise()})).encode())
+    poses = static_poses(data, config)
+    K, b = _gain(truth, "gyro")
+    first, last = poses.tags[0], poses.tags[-1]
+    assert first is not None
+    assert last is not None
+    start, stop = np.searchsorted(data.imu_t, [poses.span[0, 0], poses.span[-1, 0]])
+    dt = float(np.median(np.diff(data.imu_t)))
+    attitude = so3.multiply(_nRC(data.reference_wxyz[0], config), first.pose.cRb)  # type: ignore[index]
+    # Mean rates over intervals centred on the stamps: half an interval at both ends.
+    weights = np.full(stop - start + 1, dt)
+    weights[[0, -1]] *= 0.5
+    for rate, weight in zip(data.gyro[start : stop + 1], weights, strict=True):
+        attitude = so3.multiply(attitude, so3.exp((K @ rate + b) * weight))
+    turned = earth_rate(float(np.deg2rad(EXACT.latitude_deg))) * (poses.span[-1, 0] - poses.span[0, 0])
+    attitude = so3.multiply(so3.exp(-turned), attitude)
+    expected = so3.multiply(_nRC(data.reference_wxyz[0], config), last.pose.cRb)  # type: ignore[index]
+    assert np.linalg.norm(so3.log(so3.multiply(so3.inverse(attitude), expected))) < 2e-4
+
+
+def _nRC(nRB: np.ndarray, config: object) -> np.ndarray:
+    return so3.multiply(nRB, config.cube.camera_rotation)  # type: ignore[attr-defined]
+
+
+def test_noise_is_as_stated() -> None:
+    scenario = CubeScenario(poses=1, static_s=60.0, magnetometer=True)
+    data, _ = simulate_cube(scenario, 3)
+    noise = scenario.noise
+    assert data.gyro.std(axis=0) == pytest.approx(noise.gyro_density * 10.0, rel=0.05)
+    assert data.accel.std(axis=0) == pytest.approx(noise.accel_density * 10.0, rel=0.05)
+    assert data.mag is not None
+    assert data.mag.std(axis=0) == pytest.approx(noise.mag_density * np.sqrt(50.0), rel=0.05)
+
+
+def test_same_seed_same_session_and_another_one_differs() -> None:
+    scenario = CubeScenario(poses=2, camera_rate_hz=2.0)
+    (a, truth_a), (b, truth_b), (c, _) = (simulate_cube(scenario, seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(a.gyro, b.gyro)
+    assert truth_a == truth_b
+    assert not np.array_equal(a.gyro, c.gyro[: len(a.gyro)])
+
+
+@pytest.mark.parametrize(
+    "name", ["nominal", "no_camera", "three_poses", "one_axis", "wrong_heading", "disturbed", "pictures"]
+)
+def test_scenarios_are_valid(name: str) -> None:
+    load_scenario(CubeScenario, f"cube_{name}")
+
+
+def test_pictures_show_the_tags_where_the_detections_have_them(tmp_path: Path) -> None:
+    scenario = tmp_path / "short.yaml"
+    scenario.write_text("{poses: 1, static_s: 2.0, occluded: 0.0, tag_mount: 0.002, picture_rate_hz: 1.0}")
+    write_simulation(str(scenario), 5, tmp_path / "p.mcap", images=True)
+    write_simulation(str(scenario), 5, tmp_path / "d.mcap", images=False)
+    seen = []
+    for file in ("p.mcap", "d.mcap"):
+        recording = open_recording(tmp_path / file)
+        config = load_config(recording.attachment("alidade.yaml"))
+        data = read_cube(recording, config)
+        assert len(rests(data, config)) == 1
+        poses = static_poses(data, config)
+        assert poses.tags[0] is not None
+        seen.append(poses.tags[0])
+    pictured, detected = seen
+    both = sorted(set(pictured.ids.tolist()) & set(detected.ids.tolist()))
+    assert both
+    for tag in both:
+        a, b = (s.corners[list(s.ids).index(tag)] for s in seen)
+        np.testing.assert_allclose(a, b, atol=0.2)
