@@ -1,0 +1,1 @@
+"""Many recordings on dask.distributed: Monte Carlo studies and fleets. Needs the extra `alidade[fleet]`."""

@@ -1,0 +1,192 @@
+"""Many recordings calibrated, and what they say together.
+
+    outcome = calibrate_fleet(find(["recordings/*.mcap"]), Settings(), out, scheduler=None, jobs=2)
+
+Each worker reads its own recording and sends back a small mapping; nothing else of a recording reaches this process.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+from pipelines import exit_codes
+from pipelines.errors import InputError
+from pipelines.fleet.engine import Killed, cluster, completed, source_version
+from pipelines.fleet.progress import progress
+from pipelines.fleet.recordings import as_date, from_metadata, from_name, local
+from pipelines.fleet.store import Result, Store, settings_key
+
+if TYPE_CHECKING:
+    from fsspec.core import OpenFile
+
+    from pipelines.reports.result import Calibration
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How every recording of a fleet is calibrated.
+
+    Attributes:
+        method: overrides the recordings' own; None: what fits.
+        config: text of a YAML file that overrides the recordings' own config key by key.
+        solver: batch, incremental or published.
+        window: s, of the incremental solver; None keeps the whole history.
+    """
+
+    method: str | None = None
+    config: str | None = None
+    solver: str = "batch"
+    window: float | None = 1.0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run of a fleet ended with.
+
+    Attributes:
+        results: by recording, in their order; of those that are finished.
+        recordings: how many there are.
+        kept: how many had been finished by an earlier run.
+        interrupted: Ctrl-C came before the end.
+    """
+
+    results: Mapping[str, Result]
+    recordings: int
+    kept: int
+    interrupted: bool
+
+
+def calibrate_fleet(
+    recordings: Mapping[str, OpenFile],
+    settings: Settings,
+    out: Path,
+    scheduler: str | None = None,
+    jobs: int | None = None,
+    names: str | None = None,
+) -> Outcome:
+    """Calibrate every recording that has not been finished before with these settings and this version.
+
+    Args:
+        recordings: by name.
+        settings: for all of them.
+        out: folder; results are kept there as they come.
+        scheduler: address; None works on this machine.
+        jobs: how many local workers.
+        names: pattern of the file names, see recordings.from_name.
+
+    Raises:
+        InputError: out cannot be written to, no cluster can be had, or a name does not fit.
+    """
+    told = {name: from_name(name, names) for name in recordings}
+    for fields in told.values():
+        if "date" in fields:
+            as_date(fields["date"])
+    store = Store(out, settings_key(source_version(), asdict(settings)))
+    tasks = {name: (file, settings, store.results.get(name, {}).get("sha256")) for name, file in recordings.items()}
+    fresh: dict[str, Result] = {}
+    kept, interrupted = [], False
+    with cluster(scheduler, jobs) as client, progress("calibrating", len(tasks)) as advance:
+        try:
+            for name, result in completed(client, calibrate_recording, tasks):
+                if isinstance(result, Killed):
+                    fresh[name] = _failure(exit_codes.KILLED, "killed its worker again and again; set aside")
+                elif result is None:
+                    kept.append(name)
+                elif "sha256" in result:
+                    store.add(name, result)
+                else:
+                    fresh[name] = result
+                advance()
+        except KeyboardInterrupt:
+            interrupted = True
+    known = {**{name: store.results[name] for name in recordings if name in store.results}, **fresh}
+    results = {name: _placed(name, known[name], told[name]) for name in recordings if name in known}
+    return Outcome(results, len(recordings), len(kept), interrupted)
+
+
+def calibrate_recording(file: OpenFile, settings: Settings, known_sha256: str | None) -> Result | None:
+    """On the worker: the result of one recording, None when its hash is the one known.
+
+    A result without `sha256` is of a file that could not be read at all; the next run tries again.
+    """
+    try:
+        with local(file) as path:
+            sha256 = _sha256(path)
+            if sha256 == known_sha256:
+                return None
+            return {"sha256": sha256, **_told(path), **_calibrated(path, settings)}
+    except (OSError, InputError) as error:
+        return _failure(exit_codes.BAD_INPUT, str(error))
+
+
+def _told(path: Path) -> Result:
+    """Unit and date by the recording's own metadata."""
+    return {key: value for key, value in from_metadata(path).items() if key != "date" or as_date(value)}
+
+
+def _calibrated(path: Path, settings: Settings) -> Result:
+    from pipelines.calibrate import calibrate
+    from pipelines.solvers.marginals import IndeterminateError
+
+    with TemporaryDirectory(prefix="alidade.") as folder:
+        config = None
+        if settings.config is not None:
+            config = Path(folder) / "config.yaml"
+            config.write_text(settings.config, encoding="utf-8")
+        try:
+            (calibration,) = calibrate(path, [settings.solver], settings.method, config, settings.window)
+        except InputError as error:
+            return _failure(exit_codes.BAD_INPUT, str(error))
+        except IndeterminateError as error:
+            return _failure(exit_codes.UNDETERMINED, str(error))
+        except Exception as error:
+            # One recording that meets a fault of the program must not cost the others.
+            return _failure(exit_codes.CRASHED, f"{type(error).__name__}: {error}")
+    return _summary(calibration)
+
+
+def _summary(calibration: Calibration) -> Result:
+    """The numbers of a calibration that a fleet is about; SI."""
+    assessment = calibration.assessment
+    good = assessment.status == "calibrated"
+    return {
+        "start_ns": calibration.facts.epoch_ns,
+        "duration_s": calibration.facts.duration_s,
+        "method": calibration.problem.method,
+        "status": assessment.status,
+        "exit_code": exit_codes.OF_STATUS[assessment.status],
+        "reason": "" if good else assessment.headline,
+        "seconds": sum(calibration.timing.values()),
+        "parameters": {
+            p.name: {
+                "value": p.value,
+                "sigma": p.sigma,
+                "unit": p.unit,
+                "require": p.require,
+                "verdict": p.observability,
+            }
+            for p in calibration.parameters
+        },
+    }
+
+
+def _failure(exit_code: int, reason: str) -> Result:
+    return {"status": "failed", "exit_code": exit_code, "reason": " ".join(reason.split()), "parameters": {}}
+
+
+def _placed(name: str, result: Result, told: Mapping[str, str]) -> Result:
+    """With unit and date: by the file's name, else by the recording's metadata, else the file and its start."""
+    unit = told.get("unit") or result.get("unit") or Path(name).stem
+    text = told.get("date") or result.get("date")
+    date = as_date(text).timestamp() if text else result.get("start_ns", 0) * 1e-9 or None
+    return {**result, "unit": unit, "date": date}
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

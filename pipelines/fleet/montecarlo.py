@@ -1,0 +1,275 @@
+"""Are the sigmas true? Many simulated recordings of one scenario, solved, and their errors held against the sigmas.
+
+    study = run_study("head", "head_nominal", seeds=range(200), solvers=SOLVERS, out=Path("study"))
+    study.nees("batch").consistent
+
+Every seed is simulated and solved by one task on one core, so that the numbers do not depend on how many workers there
+are. A worker writes the recording to a folder of its own and sends back numbers only.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipelines import exit_codes
+from pipelines.errors import InputError
+from pipelines.fleet import statistics
+from pipelines.fleet.engine import Killed, cluster, completed, source_version
+from pipelines.fleet.progress import progress
+from pipelines.fleet.store import Result, Store, settings_key
+from pipelines.fleet.tables import Cell, Row
+
+if TYPE_CHECKING:
+    from pipelines.reports.result import Calibration
+
+SOLVERS = ("published", "batch", "incremental")
+
+
+@dataclass(frozen=True)
+class Study:
+    """Runs of one scenario.
+
+    Attributes:
+        method: simulated and solved.
+        scenario: its name.
+        solvers: in the order of the tables.
+        results: seed -> solver -> numbers, in the order of the seeds; of those that are finished.
+        seeds: how many were asked for.
+        kept: how many had been finished by an earlier run.
+        interrupted: Ctrl-C came before the end.
+    """
+
+    method: str
+    scenario: str
+    solvers: tuple[str, ...]
+    results: Mapping[int, Mapping[str, Result]]
+    seeds: int
+    kept: int
+    interrupted: bool
+
+    def estimates(self, solver: str) -> list[Result]:
+        """The results of the runs in which this solver came to an estimate whose truth is known."""
+        return [run[solver] for run in self.results.values() if run.get(solver, {}).get("dof")]
+
+    def failures(self, solver: str) -> dict[int, str]:
+        """Seed -> why there is no estimate."""
+        return {
+            seed: run[solver]["reason"]
+            for seed, run in self.results.items()
+            if solver in run and run[solver]["status"] == "failed"
+        }
+
+    def statuses(self, solver: str) -> dict[str, int]:
+        """Status -> number of runs."""
+        found = [run[solver]["status"] for run in self.results.values() if solver in run]
+        return {status: found.count(status) for status in sorted(set(found))}
+
+    def nees(self, solver: str) -> statistics.Nees:
+        """Mean NEES; needs an estimate."""
+        found = self.estimates(solver)
+        return statistics.mean_nees(np.array([r["nees"] for r in found]), np.array([float(r["dof"]) for r in found]))
+
+    def normalised(self, solver: str) -> statistics.Array:
+        """All errors in sigmas, over runs and parameters."""
+        return np.array([p["error"] / p["sigma"] for r in self.estimates(solver) for p in r["parameters"].values()])
+
+    def accuracies(self, solver: str) -> dict[str, tuple[statistics.Accuracy, Result]]:
+        """Parameter -> accuracy over the runs, and what one result says of the parameter (unit, require)."""
+        members: dict[str, list[Result]] = {}
+        for result in self.estimates(solver):
+            for name, parameter in result["parameters"].items():
+                members.setdefault(name, []).append(parameter)
+        return {
+            name: (
+                statistics.accuracy(np.array([p["error"] for p in found]), np.array([p["sigma"] for p in found])),
+                found[0],
+            )
+            for name, found in members.items()
+        }
+
+
+def run_study(
+    method: str,
+    scenario: str | None,
+    seeds: Sequence[int],
+    solvers: Sequence[str],
+    out: Path,
+    scheduler: str | None = None,
+    jobs: int | None = None,
+    window: float | None = 1.0,
+) -> Study:
+    """Simulate and solve every seed that has not been finished before.
+
+    Args:
+        method: to simulate and solve.
+        scenario: name or YAML file; None is the method's nominal one.
+        seeds: one run each.
+        solvers: of SOLVERS.
+        out: folder; results are kept there as they come.
+        scheduler: address; None works on this machine.
+        jobs: how many local workers.
+        window: s, of the incremental solver; None keeps the whole history.
+
+    Raises:
+        InputError: no such method, scenario or solver, out cannot be written to, or no cluster can be had.
+    """
+    unknown = [solver for solver in solvers if solver not in SOLVERS]
+    if unknown or not solvers:
+        raise InputError(f"no solver {', '.join(unknown)!r}; the solvers are {', '.join(SOLVERS)}, or all")
+    if not seeds:
+        raise InputError("--runs: at least one run is needed")
+    scenario = scenario or f"{method}_nominal"
+    file = Path(scenario)
+    text = file.read_text(encoding="utf-8") if file.is_file() else None
+    # The first recording tells this scenario and simulator from others; and a bad scenario is refused here.
+    fingerprint = _fingerprint(method, scenario, seeds[0])
+    store = Store(out, settings_key(source_version(), fingerprint, method, list(solvers), window))
+    tasks = {
+        str(seed): (method, scenario, text, seed, tuple(solvers), window)
+        for seed in seeds
+        if str(seed) not in store.results
+    }
+    kept, interrupted = len(seeds) - len(tasks), False
+    killed: dict[str, Result] = {}
+    if tasks:
+        with cluster(scheduler, jobs) as client, progress("simulating and solving", len(tasks)) as advance:
+            try:
+                for name, result in completed(client, simulate_and_solve, tasks):
+                    if isinstance(result, Killed):
+                        failure = _failure(exit_codes.KILLED, "killed its worker again and again; set aside")
+                        killed[name] = dict.fromkeys(solvers, failure)
+                    else:
+                        store.add(name, result)
+                    advance()
+            except KeyboardInterrupt:
+                interrupted = True
+    known = {**store.results, **killed}
+    results = {seed: known[str(seed)] for seed in seeds if str(seed) in known}
+    name = file.stem if text is not None else scenario
+    return Study(method, name, tuple(solvers), results, len(seeds), kept, interrupted)
+
+
+def simulate_and_solve(
+    method: str, scenario: str, text: str | None, seed: int, solvers: Sequence[str], window: float | None
+) -> dict[str, Result]:
+    """On the worker: solver -> numbers of one seed. `text` is the scenario file's, which the worker may not see."""
+    from pipelines.registry import method as find
+
+    with TemporaryDirectory(prefix="alidade.") as folder:
+        if text is not None:
+            scenario = str(Path(folder) / "scenario.yaml")
+            Path(scenario).write_text(text, encoding="utf-8")
+        session = Path(folder) / "session.mcap"
+        find(method).simulate(scenario, seed, session, False)
+        return {solver: _solved(session, method, solver, window) for solver in solvers}
+
+
+def run_table(study: Study) -> list[Row]:
+    """A row a seed and solver: verdict, NEES, chi-square, and of every parameter error and sigma, SI."""
+    rows: list[Row] = []
+    for seed, run in study.results.items():
+        for solver, result in run.items():
+            row: dict[str, Cell] = {"seed": seed, "solver": solver}
+            row |= {k: result.get(k) for k in ("status", "exit_code", "reason", "nees", "dof")}
+            row |= {k: result.get(k) for k in ("chi_square", "chi_square_dof")}
+            for name, parameter in result["parameters"].items():
+                row |= {f"{name}_error": parameter["error"], f"{name}_sigma": parameter["sigma"]}
+            rows.append(row)
+    return rows
+
+
+def summary_table(study: Study) -> list[Row]:
+    """A row a solver and parameter, and one for all parameters of a solver together; SI."""
+    rows: list[Row] = []
+    for solver in study.solvers:
+        if not study.estimates(solver):
+            continue
+        nees, shares = study.nees(solver), statistics.coverage(study.normalised(solver))
+        rows.append(
+            {
+                "solver": solver,
+                "parameter": "all",
+                "runs": nees.runs,
+                "mean_nees": nees.mean,
+                "nees_low": nees.low,
+                "nees_high": nees.high,
+                "dof": nees.dof,
+                **_coverage_cells(shares),
+            }
+        )
+        for name, (a, _) in study.accuracies(solver).items():
+            cells: dict[str, Cell] = {"solver": solver, "parameter": name, "bias": a.bias, "bias_sigma": a.bias_sigma}
+            rows.append(cells | {"rms_error": a.rms, "rms_sigma": a.sigma} | _coverage_cells(a.coverage))
+    return rows
+
+
+def _coverage_cells(shares: tuple[float, float, float]) -> dict[str, Cell]:
+    return {f"within_{k}_sigma": share for k, share in enumerate(shares, start=1)}
+
+
+def _fingerprint(method: str, scenario: str, seed: int) -> str:
+    from pipelines.registry import method as find
+
+    with TemporaryDirectory(prefix="alidade.") as folder:
+        session = Path(folder) / "session.mcap"
+        find(method).simulate(scenario, seed, session, False)
+        with session.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _solved(session: Path, method: str, solver: str, window: float | None) -> Result:
+    from pipelines.calibrate import calibrate
+    from pipelines.solvers.marginals import IndeterminateError
+
+    try:
+        (calibration,) = calibrate(session, [solver], method, None, window)
+    except InputError as error:
+        return _failure(exit_codes.BAD_INPUT, str(error))
+    except IndeterminateError as error:
+        return _failure(exit_codes.UNDETERMINED, str(error))
+    except Exception as error:
+        # One seed that meets a fault of the program must not cost the others.
+        return _failure(exit_codes.CRASHED, f"{type(error).__name__}: {error}")
+    return _numbers(calibration)
+
+
+def _failure(exit_code: int, reason: str) -> Result:
+    return {"status": "failed", "exit_code": exit_code, "reason": " ".join(reason.split()), "parameters": {}}
+
+
+def _numbers(calibration: Calibration) -> Result:
+    """Errors against sigmas, of what was estimated and whose truth is known."""
+    from pipelines.reports.result import truth_errors
+
+    errors = truth_errors(calibration)
+    judged = [p for p in calibration.parameters if p.name in errors and p.sigma > 0.0]
+    assessment = calibration.assessment
+    numbers: Result = {
+        "status": assessment.status,
+        "exit_code": exit_codes.OF_STATUS[assessment.status],
+        "reason": "" if assessment.status == "calibrated" else assessment.headline,
+        "parameters": {
+            p.name: {"error": errors[p.name].error, "sigma": p.sigma, "unit": p.unit, "require": p.require}
+            for p in judged
+        },
+        "seconds": sum(calibration.timing.values()),
+    }
+    if judged:
+        places = [calibration.estimate.names.index(p.name) for p in judged]
+        sigmas = np.array([p.sigma for p in judged])
+        correlation = assessment.covariance[np.ix_(places, places)] / np.outer(sigmas, sigmas)
+        normalised = np.array([errors[p.name].error for p in judged]) / sigmas
+        numbers |= {"nees": float(normalised @ np.linalg.solve(correlation, normalised)), "dof": len(judged)}
+    if calibration.estimate.chi_square is not None:
+        numbers |= {
+            "chi_square": calibration.estimate.chi_square.value,
+            "chi_square_dof": calibration.estimate.chi_square.dof,
+        }
+    return numbers

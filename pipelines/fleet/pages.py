@@ -1,0 +1,259 @@
+"""The pages of studies and fleets: HTML that opens offline."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipelines.fleet import analysis, statistics
+from pipelines.fleet.analysis import Change, Population, iso
+from pipelines.methods.base import Array, Quantity
+from pipelines.reports.plots import COLORS, REJECTED, figure, thin
+from pipelines.reports.result import Plot
+from pipelines.reports.units import human_unit, to_digits_of
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
+
+    from pipelines.fleet.fleet import Outcome
+    from pipelines.fleet.montecarlo import Study
+    from pipelines.fleet.store import Result
+
+# Rows of a list on the page; the CSV has all.
+_MOST_LISTED = 200
+_MONTH = 30.0
+
+
+@dataclass(frozen=True)
+class _Finding:
+    """Something that stands out, in words."""
+
+    unit: str
+    parameter: str
+    text: str
+    z: float
+
+
+def fleet_html(outcome: Outcome, fleet: Sequence[Population]) -> str:
+    """The page of a fleet."""
+    results = outcome.results
+    failures = [(name, r) for name, r in results.items() if r["exit_code"] != 0]
+    outlying = sorted((_outlying(p, i) for p in fleet for i in np.flatnonzero(p.outlying)), key=lambda f: -abs(f.z))
+    changed = sorted((_changed(p, c) for p, c in analysis.every_change(fleet) if c.changed), key=lambda f: -abs(f.z))
+    statuses = [r["status"] for r in results.values()]
+    dates = [r["date"] for r in results.values() if r["date"] is not None]
+    return _render(
+        "fleet.html",
+        outcome=outcome,
+        counts={status: statuses.count(status) for status in sorted(set(statuses))},
+        units=len({r["unit"] for r in results.values()}),
+        first=iso(min(dates, default=None)),
+        last=iso(max(dates, default=None)),
+        outlying=outlying[:_MOST_LISTED],
+        changed=changed[:_MOST_LISTED],
+        failures=failures[:_MOST_LISTED],
+        hidden={"outlying": len(outlying), "changed": len(changed), "failures": len(failures)},
+        parameters=[_parameter_row(p) for p in fleet],
+        plots=[_population_plot(p) for p in fleet],
+    )
+
+
+def study_html(study: Study) -> str:
+    """The page of a Monte Carlo study."""
+    solvers = [solver for solver in study.solvers if study.estimates(solver)]
+    return _render(
+        "montecarlo.html",
+        study=study,
+        finished=len(study.results),
+        rows=[_consistency_row(study, solver) for solver in solvers],
+        failures={solver: study.failures(solver) for solver in study.solvers},
+        accuracies=[_accuracy_row(solver, *row) for solver in solvers for row in study.accuracies(solver).items()],
+        plots=[plot for solver in solvers for plot in (_nees_plot(study, solver), _errors_plot(study, solver))],
+    )
+
+
+def _render(template: str, plots: Sequence[Plot], **context: Any) -> str:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+    from plotly.offline import get_plotlyjs
+
+    environment = Environment(
+        loader=PackageLoader("pipelines.fleet"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    divs = [
+        plot.figure.to_html(full_html=False, include_plotlyjs=False, config={"responsive": True, "displaylogo": False})
+        for plot in plots
+    ]
+    return environment.get_template(template).render(
+        plots=[(plot.title, plot.caption, div) for plot, div in zip(plots, divs, strict=True)],
+        plotly_js=get_plotlyjs() if plots else "",
+        **context,
+    )
+
+
+# -- fleets
+
+
+def _readable(p: Population) -> tuple[str, float]:
+    return human_unit(Quantity(p.name, p.unit, None, 1.0, p.require))
+
+
+def _outlying(p: Population, i: int) -> _Finding:
+    assert p.spread is not None  # without one nothing is outlying
+    unit, factor = _readable(p)
+    off, scale = factor * (p.values[i] - p.spread.centre), factor * float(np.hypot(p.spread.tau, p.sigmas[i]))
+    text = f"{to_digits_of(off, scale)} {unit} off the fleet's centre ({p.recordings[i]}, {iso(p.dates[i])})"
+    return _Finding(p.units[i], p.name, text, float(p.z[i]))
+
+
+def _changed(p: Population, c: Change) -> _Finding:
+    unit, factor = _readable(p)
+    change = f"{to_digits_of(factor * c.difference, factor * c.sigma)} ± {factor * c.sigma:.2g} {unit}"
+    text = f"changed by {change} from {iso(p.dates[c.before])} to {iso(p.dates[c.after])}"
+    return _Finding(c.unit, p.name, text, c.z)
+
+
+def _parameter_row(p: Population) -> dict[str, Any]:
+    """The cells of a parameter, in the unit people read."""
+    unit, factor = _readable(p)
+    sigma = factor * float(np.median(p.sigmas))
+    row: dict[str, Any] = {"name": p.name, "method": p.method, "unit": unit, "count": len(p.values), "sigma": sigma}
+    row |= {"centre": "", "tau": "", "low": "", "high": "", "beyond": "", "drift": "", "drifts": p.drifts}
+    row |= {"repeatability": "", "outlying": int(p.outlying.sum()), "changed": sum(c.changed for c in p.changes)}
+    if p.spread and p.control:
+        scatter = float(np.hypot(factor * p.spread.tau, sigma))
+        row |= {"centre": to_digits_of(factor * p.spread.centre, scatter), "tau": f"{factor * p.spread.tau:.2g}"}
+        low, high = (to_digits_of(factor * bound, scatter) for bound in p.control)
+        row |= {"low": low, "high": high, "beyond": p.beyond}
+    if p.drift:
+        slope, slope_sigma = (_MONTH * factor * number for number in (p.drift.slope, p.drift.sigma))
+        row["drift"] = f"{to_digits_of(slope, slope_sigma)} ± {slope_sigma:.2g}"
+    if p.repeatability is not None:
+        row["repeatability"] = f"{factor * p.repeatability:.2g}"
+    return row
+
+
+def _population_plot(p: Population) -> Plot:
+    unit, factor = _readable(p)
+    out = figure(unit, x_title="date")
+    out.update_layout(
+        xaxis={"domain": [0.0, 0.8]}, xaxis2={"domain": [0.83, 1.0], "title": {"text": "recordings"}}, barmode="stack"
+    )
+    flagged = p.outlying.copy()
+    flagged[[i for c in p.changes if c.changed for i in (c.before, c.after)]] = True
+    good = np.flatnonzero(~flagged)
+    _add_recordings(out, p, good[thin(len(good))], factor, "recording", COLORS[0])
+    out.add_histogram(y=factor * p.values[good], xaxis="x2", marker={"color": COLORS[0]}, showlegend=False)
+    if flagged.any():
+        _add_recordings(out, p, np.flatnonzero(flagged), factor, "outlying or changed", REJECTED)
+        out.add_histogram(y=factor * p.values[flagged], xaxis="x2", marker={"color": REJECTED}, showlegend=False)
+    if p.spread and p.control:
+        for bound, dash in ((p.spread.centre, "solid"), *((limit, "dash") for limit in p.control)):
+            out.add_hline(y=factor * bound, line={"color": "#888888", "width": 1, "dash": dash})
+    caption = f"{len(p.values)} recordings of {len(set(p.units))} units, {unit}, with one sigma each"
+    limits = "; dashed are the control limits, three standard deviations about the centre" if p.spread else ""
+    return Plot(f"{p.name} ({p.method})", f"{caption}{limits}.", out)
+
+
+def _add_recordings(out: go.Figure, p: Population, some: Any, factor: float, name: str, color: str) -> None:
+    out.add_scatter(
+        x=[iso(p.dates[i]) for i in some],
+        y=factor * p.values[some],
+        error_y={"array": factor * p.sigmas[some], "thickness": 1, "width": 0},
+        text=[f"{p.units[i]}<br>{_escaped(p.recordings[i])}" for i in some],
+        mode="markers",
+        name=name,
+        marker={"color": color, "size": 6},
+    )
+
+
+def _escaped(text: str) -> str:
+    """Plotly reads tags in what hovers; names of files are only text."""
+    return text.replace("&", "&amp;").replace("<", "&lt;")
+
+
+# -- studies
+
+
+def _consistency_row(study: Study, solver: str) -> dict[str, Any]:
+    nees = study.nees(solver)
+    return {
+        "solver": solver,
+        "nees": nees,
+        "coverage": statistics.coverage(study.normalised(solver)),
+        "statuses": ", ".join(f"{count} {status}" for status, count in study.statuses(solver).items()),
+        "seconds": float(np.median([result["seconds"] for result in study.estimates(solver)])),
+    }
+
+
+def _accuracy_row(solver: str, name: str, row: tuple[statistics.Accuracy, Result]) -> dict[str, Any]:
+    a, parameter = row
+    unit, factor = human_unit(Quantity(name, parameter["unit"], None, 1.0, parameter["require"]))
+    return {
+        "solver": solver,
+        "name": name,
+        "unit": unit,
+        "bias": f"{to_digits_of(factor * a.bias, factor * a.bias_sigma)} ± {factor * a.bias_sigma:.2g}",
+        "biased": abs(a.bias) > 3.0 * a.bias_sigma,
+        "rms": f"{factor * a.rms:.3g}",
+        "sigma": f"{factor * a.sigma:.3g}",
+        "ratio": a.rms / a.sigma,
+        "coverage": a.coverage,
+    }
+
+
+def _nees_plot(study: Study, solver: str) -> Plot:
+    found = study.estimates(solver)
+    values = np.array([result["nees"] for result in found])
+    dof = study.nees(solver).dof
+    # What lies far out is told by the table.
+    top = 1.5 * max(float(np.quantile(values, 0.95)), dof + 3.0 * math.sqrt(2.0 * dof))
+    out = figure("runs", x_title="NEES")
+    _histogram(out, np.minimum(values, top), 0.0, top, lambda x: _chi_square_density(x, dof), f"chi-square of {dof:g}")
+    return Plot(
+        f"{solver}: NEES",
+        f"Normalised estimation error squared of {len(values)} runs; the line is what true covariances give. "
+        f"{int((values > top).sum())} runs beyond {top:.3g} stand in the last bar.",
+        out,
+    )
+
+
+def _errors_plot(study: Study, solver: str) -> Plot:
+    values = study.normalised(solver)
+    out = figure("errors", x_title="error, sigmas")
+    _histogram(
+        out,
+        np.clip(values, -5.0, 5.0),
+        -5.0,
+        5.0,
+        np.vectorize(NormalDist().pdf, otypes=[float]),
+        "normal distribution",
+    )
+    return Plot(
+        f"{solver}: errors in sigmas",
+        f"{len(values)} errors of all parameters; those beyond 5 sigmas stand in the outer bars.",
+        out,
+    )
+
+
+def _histogram(out: go.Figure, values: Array, low: float, high: float, density: Any, name: str) -> None:
+    bars = 30
+    counts, edges = np.histogram(values, bins=bars, range=(low, high))
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    out.add_bar(x=middles, y=counts, width=np.diff(edges), name="runs", marker={"color": COLORS[0]}, opacity=0.7)
+    x = np.linspace(low, high, 300)[1:]
+    expected = len(values) * (high - low) / bars * density(x)
+    out.add_scatter(x=x, y=expected, mode="lines", name=name, line={"color": COLORS[1]})
+
+
+def _chi_square_density(x: Array, dof: float) -> Array:
+    half = 0.5 * dof
+    return np.asarray(np.exp((half - 1.0) * np.log(x) - 0.5 * x - half * math.log(2.0) - math.lgamma(half)))

@@ -1,0 +1,129 @@
+"""The recordings of a fleet: where they are, which unit each shows, and when.
+
+Paths are fsspec's: a folder of this machine or of a network file system, or s3://bucket/... with the package of that
+file system. A worker opens its recording by itself; what is not on a local file system is copied for that time.
+"""
+
+from __future__ import annotations
+
+import datetime
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+from pipelines.errors import InputError
+
+if TYPE_CHECKING:
+    from fsspec.core import OpenFile
+
+_FIELDS = {"{unit}": r"(?P<unit>.+?)", "{date}": r"(?P<date>\d{4}-?\d\d-?\d\d(?:T\d\d:?\d\d(?::?\d\d)?Z?)?)", "*": ".*"}
+
+
+def find(patterns: Sequence[str]) -> dict[str, OpenFile]:
+    """The files that match, by name, in order. Raises InputError when a pattern matches none or cannot be looked up."""
+    import fsspec
+
+    found: dict[str, OpenFile] = {}
+    for pattern in patterns:
+        try:
+            matches = fsspec.open_files(pattern)
+            # A name without wildcards is taken as it is, there or not.
+            matches = [file for file in matches if file.fs.isfile(file.path)]
+        except (OSError, ValueError, ImportError) as error:
+            raise InputError(f"{pattern}: cannot be looked up: {' '.join(str(error).split())}") from error
+        if not matches:
+            raise InputError(f"no file matches {pattern}")
+        for file in matches:
+            found[file.path if _is_local(file) else file.full_name] = file
+    return dict(sorted(found.items()))
+
+
+@contextmanager
+def local(file: OpenFile) -> Iterator[Path]:
+    """The file on this machine. Raises InputError when it cannot be read."""
+    if _is_local(file):
+        yield Path(file.path)
+        return
+    with TemporaryDirectory(prefix="alidade.") as folder:
+        path = Path(folder) / Path(file.path).name
+        try:
+            file.fs.get_file(file.path, str(path))
+        except (OSError, ValueError) as error:
+            raise InputError(f"{file.full_name}: cannot be read: {' '.join(str(error).split())}") from error
+        yield path
+
+
+def from_name(name: str, names: str | None) -> dict[str, str]:
+    """Unit and date in the file's name, as far as the pattern has them.
+
+    Args:
+        name: the file's, with or without folders.
+        names: like `{unit}_{date}*`, of the name without its ending; `*` stands for anything. Dates are ISO 8601.
+
+    Raises:
+        InputError: the pattern has neither field, or the name does not fit it.
+    """
+    if names is None:
+        return {}
+    if "{unit}" not in names and "{date}" not in names:
+        raise InputError(f"--names {names}: needs {{unit}}, {{date}} or both, like '{{unit}}_{{date}}*'")
+    parts = re.split(r"(\{unit\}|\{date\}|\*)", names)
+    expression = "".join(_FIELDS.get(part, re.escape(part)) for part in parts)
+    try:
+        match = re.fullmatch(expression, Path(name).stem)
+    except re.error as error:
+        raise InputError(f"--names {names}: {{unit}} and {{date}} may each occur once") from error
+    if match is None:
+        raise InputError(f"{name}: the name does not fit --names {names}")
+    return match.groupdict()
+
+
+def from_metadata(path: Path) -> dict[str, str]:
+    """Unit and date in the recording's metadata, as far as they are there.
+
+    Any MCAP metadata record with a key `unit` or `date`, or the custom data of rosbag2 (`ros2 bag record --custom-data
+    unit=U17`).
+    """
+    from mcap.exceptions import McapError
+    from mcap.reader import make_reader
+
+    found: dict[str, str] = {}
+    with path.open("rb") as stream:
+        try:
+            for record in make_reader(stream).iter_metadata():
+                found |= {k: v for k, v in {**_custom(record.metadata), **record.metadata}.items() if v}
+        except McapError:
+            return {}  # the messages can be read by other means; nobody can find metadata in such a file
+    return {key: found[key] for key in ("unit", "date") if key in found}
+
+
+def as_date(text: str) -> datetime.datetime:
+    """A date of ISO 8601, with or without time; UTC unless it says otherwise. Raises InputError when it is none."""
+    try:
+        date = datetime.datetime.fromisoformat(text)
+    except ValueError as error:
+        raise InputError(f"date {text!r}: must be like 2026-11-20 or 2026-11-20T12:00") from error
+    return date if date.tzinfo else date.replace(tzinfo=datetime.UTC)
+
+
+def _custom(metadata: dict[str, str]) -> dict[str, str]:
+    """rosbag2's custom data: YAML inside one metadata record."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        content = YAML(typ="safe", pure=True).load(metadata.get("serialized_metadata", ""))
+    except YAMLError:
+        return {}
+    information = content.get("rosbag2_bagfile_information", content) if isinstance(content, dict) else {}
+    custom = (information or {}).get("custom_data")
+    return {str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {}
+
+
+def _is_local(file: OpenFile) -> bool:
+    from fsspec.implementations.local import LocalFileSystem
+
+    return isinstance(file.fs, LocalFileSystem)

@@ -1,0 +1,43 @@
+"""Tables as CSV and Parquet: rows are mappings, columns are those of all rows in the order of their first appearance.
+
+Parquet by arro3: 12 MB to download and 35 installed, without dependencies, where pyarrow is 55 and 171.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+Cell = str | int | float | None
+Row = Mapping[str, Cell]
+
+
+def write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """Numbers with all their digits; empty where a row has nothing."""
+    with path.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.DictWriter(stream, columns(rows), restval="")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def write_parquet(path: Path, rows: Sequence[Row]) -> None:
+    """Columns of text, whole numbers or float64, null where a row has nothing."""
+    from arro3.core import Array, DataType, Table
+    from arro3.io import write_parquet as write
+
+    table: dict[str, Any] = {}
+    for name in columns(rows):
+        cells = [row.get(name) for row in rows]
+        kinds = {type(cell) for cell in cells if cell is not None}
+        kind = DataType.utf8() if str in kinds else DataType.int64() if kinds == {int} else DataType.float64()
+        if float in kinds:
+            cells = [None if cell is None else float(cell) for cell in cells]
+        table[name] = Array(cells, kind)
+    write(Table.from_pydict(table), path)
+
+
+def columns(rows: Sequence[Row]) -> list[str]:
+    """Their names."""
+    return list(dict.fromkeys(name for row in rows for name in row))
