@@ -9,14 +9,14 @@ from typing import Annotated
 
 import typer
 
+from pipelines import exit_codes
+
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
     help="Calibrates how sensors are mounted and how wrong they are, from MCAP recordings, and says how sure it is.",
 )
-
-_EXIT_CODES = {"calibrated": 0, "unobservable": 3, "weak": 3, "inconsistent": 4}
 
 
 class Solver(StrEnum):
@@ -30,6 +30,8 @@ class Solver(StrEnum):
 _Session = Annotated[Path, typer.Argument(metavar="SESSION.mcap", help="The recording.")]
 _MethodName = Annotated[str | None, typer.Option("--method", help="los, indexer, head or cube; by default what fits.")]
 _ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML that overrides the recording's own config.")]
+_Scheduler = Annotated[str | None, typer.Option(help="Of a dask cluster, tcp://host:8786; default: this machine.")]
+_Jobs = Annotated[int | None, typer.Option(help="Local worker processes; default: one a core.")]
 _Window = Annotated[str, typer.Option(help="Of the incremental solver: seconds kept, or 'all'.")]
 
 
@@ -52,7 +54,7 @@ def calibrate(
     written = write_results(folder, calibration)
     terminal.show([calibration])
     terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
-    raise typer.Exit(_EXIT_CODES[calibration.assessment.status])
+    raise typer.Exit(exit_codes.OF_STATUS[calibration.assessment.status])
 
 
 @app.command()
@@ -133,6 +135,64 @@ def demo(
         write_results(out / calibration.estimate.solver, calibration)
     terminal.show(calibrations)
     terminal.say(f"Report: {(out / 'batch' / 'report.html').resolve()}")
+
+
+@app.command()
+def montecarlo(
+    method: Annotated[str, typer.Argument(help="los, indexer, head or cube.")],
+    runs: Annotated[int, typer.Option(help="How many recordings to simulate, one a seed.")] = 200,
+    scenario: Annotated[str | None, typer.Option(help="YAML file or name; default: the method's nominal one.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the first run; the others follow.")] = 0,
+    solvers: Annotated[str, typer.Option(help="'all', or some of published,batch,incremental.")] = "all",
+    window: _Window = "1",
+    scheduler: _Scheduler = None,
+    jobs: _Jobs = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; default: METHOD-montecarlo.")] = None,
+) -> None:
+    """Simulate and solve many recordings: are the sigmas true? The same command goes on after an interruption."""
+    from pipelines import terminal
+    from pipelines.fleet.montecarlo import SOLVERS, run_study
+    from pipelines.fleet.write import write_study
+
+    folder = out or Path(f"{method}-montecarlo")
+    chosen = SOLVERS if solvers == "all" else tuple(solvers.split(","))
+    seeds = range(seed, seed + runs)
+    study = run_study(method, scenario, seeds, chosen, folder, scheduler, jobs, _seconds(window))
+    written = write_study(folder, study)
+    for line in study.summary:
+        terminal.say(line)
+    terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
+    if study.interrupted:
+        raise typer.Exit(exit_codes.INTERRUPTED)
+
+
+@app.command()
+def fleet(
+    recordings: Annotated[list[str], typer.Argument(metavar="FILES", help="Paths or patterns, 'recordings/*.mcap'.")],
+    method: _MethodName = None,
+    config: _ConfigFile = None,
+    solver: Annotated[Solver, typer.Option(help="How to solve.")] = Solver.batch,
+    window: _Window = "1",
+    names: Annotated[str | None, typer.Option(help="What file names tell: '{unit}_{date}*'.")] = None,
+    scheduler: _Scheduler = None,
+    jobs: _Jobs = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("alidade-fleet"),
+) -> None:
+    """Calibrate many recordings and compare units and dates. The same command goes on after an interruption."""
+    from pipelines import terminal
+    from pipelines.fleet.analysis import populations
+    from pipelines.fleet.fleet import Settings, calibrate_fleet
+    from pipelines.fleet.recordings import find
+    from pipelines.fleet.write import write_fleet
+
+    settings = Settings.of(method, config, solver.value, _seconds(window))
+    outcome = calibrate_fleet(find(recordings), settings, out, scheduler, jobs, names)
+    written = write_fleet(out, outcome, populations(outcome.results))
+    for line in outcome.summary:
+        terminal.say(line)
+    terminal.say(f"Results in {out}: {', '.join(p.name for p in written)}")
+    if outcome.interrupted:
+        raise typer.Exit(exit_codes.INTERRUPTED)
 
 
 def _seconds(window: str) -> float | None:

@@ -20,6 +20,8 @@ from pipelines.fleet.engine import Killed, cluster, completed, source_version
 from pipelines.fleet.progress import progress
 from pipelines.fleet.recordings import as_date, from_metadata, from_name, local
 from pipelines.fleet.store import Result, Store, settings_key
+from pipelines.sessions.config import load_config
+from pipelines.sessions.topics import METHODS
 
 if TYPE_CHECKING:
     from fsspec.core import OpenFile
@@ -43,6 +45,16 @@ class Settings:
     solver: str = "batch"
     window: float | None = 1.0
 
+    @classmethod
+    def of(cls, method: str | None, config: Path | None, solver: str, window: float | None) -> Settings:
+        """With the text of a config file. Raises InputError when there is no such method or the config is wrong."""
+        if method is not None and method not in METHODS:
+            raise InputError(f"no method {method!r}; the methods are {', '.join(METHODS)}")
+        if config is None:
+            return cls(method, None, solver, window)
+        load_config(None, config)
+        return cls(method, config.read_text(encoding="utf-8"), solver, window)
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -59,6 +71,16 @@ class Outcome:
     recordings: int
     kept: int
     interrupted: bool
+
+    @property
+    def summary(self) -> list[str]:
+        """In a few lines: how many, with what verdicts, and what was set aside."""
+        statuses = [result["status"] for result in self.results.values()]
+        verdicts = ", ".join(f"{statuses.count(status)} {status}" for status in sorted(set(statuses)))
+        lines = [f"{len(self.results)} of {self.recordings} recordings, {self.kept} from an earlier run: {verdicts}"]
+        aside = [name for name, result in self.results.items() if result["exit_code"] == exit_codes.KILLED]
+        lines += [f"set aside, it kills workers: {name}" for name in aside]
+        return [*lines, "interrupted; the same command continues"] if self.interrupted else lines
 
 
 def calibrate_fleet(

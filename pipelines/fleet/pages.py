@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
@@ -43,7 +43,9 @@ def fleet_html(outcome: Outcome, fleet: Sequence[Population]) -> str:
     """The page of a fleet."""
     results = outcome.results
     failures = [(name, r) for name, r in results.items() if r["exit_code"] != 0]
-    outlying = sorted((_outlying(p, i) for p in fleet for i in np.flatnonzero(p.outlying)), key=lambda f: -abs(f.z))
+    outlying = sorted(
+        (_outlying(p, int(i)) for p in fleet for i in np.flatnonzero(p.outlying)), key=lambda f: -abs(f.z)
+    )
     changed = sorted((_changed(p, c) for p, c in analysis.every_change(fleet) if c.changed), key=lambda f: -abs(f.z))
     statuses = [r["status"] for r in results.values()]
     dates = [r["date"] for r in results.values() if r["date"] is not None]

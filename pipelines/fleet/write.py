@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 from pipelines.errors import InputError
@@ -10,30 +11,42 @@ from pipelines.fleet.analysis import Population, change_table, table
 from pipelines.fleet.fleet import Outcome
 from pipelines.fleet.montecarlo import Study, run_table, summary_table
 from pipelines.fleet.pages import fleet_html, study_html
-from pipelines.fleet.tables import Row, write_csv, write_parquet
+from pipelines.fleet.tables import write_csv, write_parquet
 
 
 def write_fleet(out: Path, outcome: Outcome, fleet: Sequence[Population]) -> tuple[Path, ...]:
-    """fleet.csv, fleet.parquet, changes.csv and fleet.html; returns their paths."""
+    """fleet.html, fleet.csv, fleet.parquet and changes.csv; returns their paths."""
     rows = table(outcome.results, fleet)
-    changes = change_table(fleet)
-    written = _write(out, {"fleet": rows, "changes": changes}, {"fleet.html": fleet_html(outcome, fleet)})
-    write_parquet(out / "fleet.parquet", rows)
-    return (*written, out / "fleet.parquet")
+    page = fleet_html(outcome, fleet)
+    return _write(
+        {
+            out / "fleet.html": partial(_write_text, text=page),
+            out / "fleet.csv": partial(write_csv, rows=rows),
+            out / "fleet.parquet": partial(write_parquet, rows=rows),
+            out / "changes.csv": partial(write_csv, rows=change_table(fleet)),
+        }
+    )
 
 
 def write_study(out: Path, study: Study) -> tuple[Path, ...]:
-    """runs.csv, summary.csv and montecarlo.html; returns their paths."""
-    tables = {"runs": run_table(study), "summary": summary_table(study)}
-    return _write(out, tables, {"montecarlo.html": study_html(study)})
+    """montecarlo.html, runs.csv and summary.csv; returns their paths."""
+    return _write(
+        {
+            out / "montecarlo.html": partial(_write_text, text=study_html(study)),
+            out / "runs.csv": partial(write_csv, rows=run_table(study)),
+            out / "summary.csv": partial(write_csv, rows=summary_table(study)),
+        }
+    )
 
 
-def _write(out: Path, tables: dict[str, list[Row]], pages: dict[str, str]) -> tuple[Path, ...]:
-    try:
-        for name, rows in tables.items():
-            write_csv(out / f"{name}.csv", rows)
-        for name, text in pages.items():
-            (out / name).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{out}: the results cannot be written ({error.strerror})") from error
-    return (*(out / name for name in pages), *(out / f"{name}.csv" for name in tables))
+def _write(files: Mapping[Path, Callable[[Path], None]]) -> tuple[Path, ...]:
+    for path, write in files.items():
+        try:
+            write(path)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+    return tuple(files)
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
