@@ -66,8 +66,6 @@ _DWELL_MARGIN = 5.0
 _FEWEST_SAMPLES = 4
 # A gyro that departs from the encoders by more than this share of the rate is not the gyro of this axis.
 _DISAGREEMENT = 0.01
-# A bias that does not walk walks this little, rad/s/sqrt(s), so that a smoother can forget the groups behind it.
-_LEAST_WALK = 1e-12
 # So many groups stay in a smoother whatever its window, s: a schedule of four positions, to be linearised anew when its
 # later positions move the angles that its earlier ones left open.
 _KEPT = 64
@@ -292,7 +290,7 @@ def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]
     groups, disagreeing = _agreeing(groups, config, density, encoder)
     theta_guess, bias_guess = _guess(groups)
     starts = np.array([g.rates.edges[0] for g in groups])
-    walk = max(first_given(config.noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk), _LEAST_WALK)
+    walk = first_given(config.noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk)
     frames = _frames(data, motion)
     reasons = {
         "turn cut by a gap in the stamps (what lies before and after is used)": _cut_turns(motion),

@@ -18,9 +18,9 @@ from pipelines.methods.base import Array, Factor
 _FRACTION = 0.2
 # ... and is never longer than this, s, so that the bias over time can be seen.
 _LONGEST = 10.0
-# The mean follows from the nodes without error; this share of what gyro noise leaves unknown of a stretch's bias is
-# left to it, which keeps the arithmetic well conditioned.
-_MEAN_SHARE = 1e-2
+# What follows without error (a bias that does not walk, the mean of the nodes) is given this share of what gyro noise
+# leaves unknown of a stretch's bias, which keeps the arithmetic well conditioned.
+_SLACK = 1e-4
 
 # The first stretch's node, which is the whole bias where it does not walk.
 FIRST = int(gtsam.symbol("b", 0))
@@ -69,8 +69,12 @@ class WalkingBias:
     def walk_factor(self, node: int) -> Factor:
         """Joins a node to the one before it."""
         spacing = 0.5 * (self.edges[node + 1] - self.edges[node - 1])
-        noise = gtsam.noiseModel.Isotropic.Sigma(3, self.walk * float(np.sqrt(spacing)))
+        step = self.walk * np.sqrt(spacing)
+        noise = gtsam.noiseModel.Isotropic.Sigma(3, float(np.hypot(step, self._slack(spacing))))
         return Factor("bias walk", gtsam.BetweenFactorVector(self.key(node - 1), self.key(node), np.zeros(3), noise))
+
+    def _slack(self, stretch: float) -> float:
+        return _SLACK * self.density / float(np.sqrt(stretch))
 
     def mean_factor(self, node: int) -> Factor:
         """Defines the mean at the end of a node's stretch from the one before and the node (native, linear)."""
@@ -79,7 +83,6 @@ class WalkingBias:
         share = float(stretch / whole)
         # Within the stretch the walk's own mean departs from the node's constant by this much.
         departure = self.walk * np.sqrt(stretch / 12.0) * share
-        slack = _MEAN_SHARE * self.density / np.sqrt(stretch) * share
         keys = (self.mean_key(node), self.mean_key(node - 1), self.key(node))
         zeros = gtsam.Values()
         for key in keys:
@@ -92,6 +95,6 @@ class WalkingBias:
             keys[2],
             -share * np.eye(3),
             np.zeros(3),
-            gtsam.noiseModel.Isotropic.Sigma(3, float(np.hypot(departure, slack))),
+            gtsam.noiseModel.Isotropic.Sigma(3, float(np.hypot(departure, self._slack(stretch) * share))),
         )
         return Factor("definition", gtsam.LinearContainerFactor(linear, zeros))

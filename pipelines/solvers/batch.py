@@ -1,7 +1,8 @@
 """Batch: all steps in one graph, solved once.
 
 The outer loop is our own, since gtsam's optimizers copy all values into Python at every call of a Python factor, which
-makes them quadratic in the number of variables. Linearising, ordering and elimination stay gtsam's.
+makes them quadratic in the number of variables. Linearising, ordering and elimination stay gtsam's. Elimination
+is by QR: tight processes beside loose priors cost Cholesky its digits, and QR costs only half as much again.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ def solve_batch(problem: Problem) -> Estimate:
     ordering = elimination_ordering(graph, shared)
     linear = graph.linearize(values)
     marginal = joint_covariance(problem, linear, ordering, values, stand_ins)
-    residuals = _residuals(factors, values)
+    residuals = residuals_of(factors, values)
     summary = chi_square(problem, factors, linear, ordering, values, marginal)
     # The last stand-ins are what the session reports; those before them held the parameters over time.
     history = history_of(problem, linear, ordering, values, held[:-1], marginal) if len(held) > 2 else None
@@ -115,17 +116,21 @@ def elimination_ordering(graph: gtsam.NonlinearFactorGraph, shared: Sequence[int
 
 
 def optimize(
-    factors: Sequence[Factor], values: gtsam.Values, shared: Sequence[int], loss: TruncatedLoss | None
+    factors: Sequence[Factor],
+    values: gtsam.Values,
+    shared: Sequence[int],
+    loss: TruncatedLoss | None,
+    most: int = _MOST_ITERATIONS,
 ) -> Solution:
     """Minimise; with a loss: plain least squares first, and the graduated relaxation only if it leaves outliers."""
     graph = graph_of(factors)
     ordering = elimination_ordering(graph, shared)
     if loss is None:
-        return _minimize(graph, values, ordering)
+        return _minimize(graph, values, ordering, most)
     loss.mu = 0.0
     plain = _minimize(graph, values, ordering)
     values, iterations = plain.values, plain.iterations
-    norms = np.concatenate([np.linalg.norm(r.whitened, axis=1) for r in _residuals(factors, values).values()])
+    norms = np.concatenate([np.linalg.norm(r.whitened, axis=1) for r in residuals_of(factors, values).values()])
     outlying = norms[norms > loss.gate]
     if outlying.sum() > _MILD_PULL * len(norms):
         loss.mu = loss.gate**2 / (2.0 * float(outlying.max()) ** 2 - loss.gate**2)
@@ -137,7 +142,7 @@ def optimize(
     if len(outlying) == 0:
         return plain
     final = _minimize(graph, values, ordering)
-    used = np.concatenate([r.used for r in _residuals(factors, final.values).values()])
+    used = np.concatenate([r.used for r in residuals_of(factors, final.values).values()])
     if used.mean() < _FEWEST_USED:
         loss.mu = 0.0
         return plain
@@ -177,7 +182,7 @@ def _step(
     try:
         if damping > 0.0:
             linear = _damped(linear, damping)
-        return values.retract(linear.optimize(ordering))
+        return values.retract(linear.optimize(ordering, gtsam.EliminateQR))
     except RuntimeError:
         return None
 
@@ -201,7 +206,7 @@ def _damped(linear: gtsam.GaussianFactorGraph, damping: float) -> gtsam.Gaussian
     return out
 
 
-def _residuals(factors: Sequence[Factor], values: gtsam.Values) -> dict[str, Residuals]:
+def residuals_of(factors: Sequence[Factor], values: gtsam.Values) -> dict[str, Residuals]:
     """Residuals of all measurements, by family, in time order of the steps."""
     gathered: dict[str, list[Residuals]] = {}
     for f in factors:

@@ -35,8 +35,10 @@ DEFAULT_WINDOW = 1.0
 # At these times since the first step, s, everything so far is solved in batch and the smoother starts again from there:
 # factors that leave the window keep their last linearisation point for good, so it has to be a good one, and outliers
 # of the first moments are not to be told by innovations. Later the calibration moves too little to matter.
-_ANCHORS = (2.0, 5.0, 10.0, 20.0, 40.0)
-# After so many rejections in a row it is the prediction that is wrong: take the measurement.
+_ANCHORS = (2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 10.0, 20.0, 40.0)
+# After so many rejections in a row the smoother may have lost its way: until the last anchor, start it anew at once.
+_DOUBTED = 5
+# After so many it is the prediction that is wrong: take the measurement.
 _MOST_REJECTED = 10
 # Move of a variable, in its own units (rad, rad/s, s), that makes iSAM2 linearise its factors anew.
 _RELINEARIZE = 1e-2
@@ -54,6 +56,8 @@ class _Smoother:
         params.findUnusedFactorSlots = True
         # Tight processes beside loose priors: Cholesky loses the small ones.
         params.setFactorization("QR")
+        # Back-substitution goes on however small a change is: 0.001, gtsam's limit, is much for a bias in rad/s.
+        params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
         self._lagged = None if window is None else gtsam.IncrementalFixedLagSmoother(window, params)
         self._plain = gtsam.ISAM2(params)
         self._kept: set[int] = set()  # variables that stay for good
@@ -136,8 +140,13 @@ class _Run:
             self.past.append(step)
         if self.started:
             self._advance(step)
-        if self.past and step.time - self.past[0].time >= self.anchors[0]:
+        if not self.past:
+            return
+        due = step.time - self.past[0].time >= self.anchors[0]
+        if due or self.rejected_in_a_row >= _DOUBTED:
             self._anchor(self.past)
+            self.rejected_in_a_row = 0
+        if due:
             self.anchors.pop(0)
             if not self.anchors:
                 self.past = None

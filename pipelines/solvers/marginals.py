@@ -45,7 +45,7 @@ def joint_covariance(
         for key in rest:
             first.push_back(key)
         try:
-            remaining = linear.eliminatePartialMultifrontal(first)[1]
+            remaining = linear.eliminatePartialMultifrontal(first, gtsam.EliminateQR)[1]
         except RuntimeError as error:
             raise IndeterminateError(_explain(str(error))) from None
     last = gtsam.Ordering()
@@ -72,23 +72,32 @@ def history_of(
     Returns None when the system is singular.
     """
     try:
-        tree = linear.eliminateMultifrontal(ordering)
+        tree = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
+        sigmas = [_sigmas_of(problem, tree, values, stand_ins, covariance) for _, stand_ins in held]
     except RuntimeError:
         return None
-    sigmas = []
-    for _, stand_ins in held:
-        row = []
-        fixed = np.sqrt(np.diag(covariance))
-        for p in problem.parameters:
-            n, key = len(p.quantities), stand_ins.get(p.key)
-            if key is None:
-                row.append(fixed[:n])
-            else:
-                row.append(np.sqrt(np.diag(reported_covariance([p], tree.marginalInformation(key), values, [key]))))
-            fixed = fixed[n:]
-        sigmas.append(np.concatenate(row))
     times = np.array([time for time, _ in held])
     return History(times, np.array([reported(problem, values, s) for _, s in held]), np.array(sigmas))
+
+
+def _sigmas_of(
+    problem: Problem,
+    tree: gtsam.GaussianBayesTree,
+    values: gtsam.Values,
+    stand_ins: Mapping[int, int],
+    covariance: Array,
+) -> Array:
+    """(n,) sigmas, of the stand-ins where there are any, else from the covariance."""
+    sigmas = np.sqrt(np.diag(covariance))
+    start = 0
+    for p in problem.parameters:
+        stop = start + len(p.quantities)
+        if p.key in stand_ins:
+            key = stand_ins[p.key]
+            moving = reported_covariance([p], tree.marginalInformation(key), values, [key])
+            sigmas[start:stop] = np.sqrt(np.diag(moving))
+        start = stop
+    return sigmas
 
 
 def reported_covariance(
@@ -163,7 +172,7 @@ def _family_dof(
 ) -> dict[str, float]:
     """Expected sum of squares of each family: that of simulated unit noise after solving for the same unknowns."""
     try:
-        bayes_net = linear.eliminateSequential(ordering)
+        bayes_net = linear.eliminateSequential(ordering, gtsam.EliminateQR)
     except RuntimeError:  # singular: no sampling
         return dict.fromkeys(families, 0.0)
     rows = [gtsam.JacobianFactor(linear.at(i)) for i in range(len(families))]
