@@ -189,7 +189,7 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
 
     camera = sightings = None
     if _has_camera(recording, config):
-        camera = _camera(recording, config)
+        camera = read_camera(recording, config)
         if "image" not in config.topics and _wanted(recording, config, "tag_detections"):
             sightings = _detections(recording, config, epoch, dropped)
         else:
@@ -360,7 +360,8 @@ def _position(recording: Recording, config: Config) -> tuple[float | None, float
     return first_given(given, float(np.deg2rad(latitude))), float(np.deg2rad(longitude)), height
 
 
-def _camera(recording: Recording, config: Config) -> Camera:
+def read_camera(recording: Recording, config: Config) -> Camera:
+    """The camera that looks at the cube. Raises InputError when it, or the cube's tags, are not described."""
     from pipelines.vision.camera import Camera
 
     if not config.cube.tags:

@@ -1,0 +1,89 @@
+"""The layout of a cube's tags from what a camera sees, against the simulator's truth and TagSLAM's block."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datasets import tagslam_block
+from factors import so3
+from pipelines.errors import InputError
+from pipelines.sessions.config import load_config
+from pipelines.sessions.cube import write_cube
+from pipelines.sessions.cube_layout import cube_layout, layout_yaml
+from pipelines.sessions.reading import open_recording
+from pipelines.simulation.cube import CubeScenario, cube_config, simulate_cube
+
+SCENARIO = CubeScenario(poses=16, static_s=1.0, turn_rad_s=1.5, camera_rate_hz=4.0, tag_mount=0.02, magnetometer=False)
+
+
+def _session(path: Path, seed: int, scenario: CubeScenario = SCENARIO) -> dict[str, float]:
+    data, truth = simulate_cube(scenario, seed)
+    write_cube(path, data, truth, cube_config(scenario))
+    return truth
+
+
+def test_tags_are_found_where_they_are_with_honest_sigmas(tmp_path: Path) -> None:
+    squares = []
+    for seed in range(3):
+        truth = _session(tmp_path / "s.mcap", seed)
+        recording = open_recording(tmp_path / "s.mcap")
+        config = load_config(recording.attachment("alidade.yaml"))
+        layout = cube_layout(recording, config)
+        assert layout.body.ids.tolist() == sorted(config.cube.tags)
+        assert layout.sigma_px == pytest.approx(SCENARIO.noise.corner_px, rel=0.1)
+        error = []
+        for k, tag in enumerate(layout.body.ids.tolist()):
+            given = config.cube.tags[tag]
+            true = so3.multiply(given.rotation, so3.exp([truth[f"tag_{tag}_{axis}"] for axis in "xyz"]))
+            delta = so3.log(so3.multiply(so3.inverse(true), layout.body.bRt[k]))
+            error.append(np.concatenate([delta, layout.body.position[k] - given.position]))
+        np.testing.assert_allclose(error[0], 0.0, atol=1e-12)
+        off = np.concatenate(error[1:])
+        squares.append(float(off @ np.linalg.solve(layout.covariance, off)) / len(off))
+        assert np.abs(off.reshape(-1, 6)[:, :3]).max() < 5e-3
+        assert np.abs(off.reshape(-1, 6)[:, 3:]).max() < 5e-4
+    assert 0.6 < np.mean(squares) < 1.5
+
+
+def test_layout_as_a_config_reads_back(tmp_path: Path) -> None:
+    _session(tmp_path / "s.mcap", 4)
+    recording = open_recording(tmp_path / "s.mcap")
+    layout = cube_layout(recording, load_config(recording.attachment("alidade.yaml")))
+    (tmp_path / "cube.yaml").write_text(layout_yaml(layout))
+    config = load_config(None, tmp_path / "cube.yaml")
+    for k, tag in enumerate(layout.body.ids.tolist()):
+        np.testing.assert_allclose(config.cube.tags[tag].position, layout.body.position[k], rtol=1e-12)
+        np.testing.assert_allclose(config.cube.tags[tag].rotation, layout.body.bRt[k], rtol=1e-9)
+
+
+def test_a_tag_never_seen_is_not_placed(tmp_path: Path) -> None:
+    _session(tmp_path / "s.mcap", 5, SCENARIO.model_copy(update={"faces_hidden": [19]}))
+    recording = open_recording(tmp_path / "s.mcap")
+    layout = cube_layout(recording, load_config(recording.attachment("alidade.yaml")))
+    assert layout.unplaced == (19,)
+    assert "tag 19: could not be placed" in layout_yaml(layout)
+
+
+def test_one_tag_alone_places_nothing(tmp_path: Path) -> None:
+    data, _ = simulate_cube(SCENARIO, 6)
+    assert data.sightings is not None
+    one = data.sightings.ids == 16
+    seen = data.sightings
+    data = replace(data, sightings=replace(seen, frame=seen.frame[one], ids=seen.ids[one], corners=seen.corners[one]))
+    write_cube(tmp_path / "s.mcap", data, None, cube_config(SCENARIO))
+    recording = open_recording(tmp_path / "s.mcap")
+    with pytest.raises(InputError, match="no picture shows tag 16 together with another tag"):
+        cube_layout(recording, load_config(recording.attachment("alidade.yaml")))
+
+
+@pytest.mark.slow
+def test_tagslams_block(shared_data: Path) -> None:
+    layout, comparison = tagslam_block.compare(tagslam_block.read_block(shared_data / "tagslam_block"))
+    assert len(layout.body.ids) == 10
+    assert comparison.held_out_px < 0.4
+    assert comparison.position_mm < 1.0
+    assert comparison.rotation_deg < 0.3
