@@ -15,6 +15,8 @@ import hashlib
 import importlib.util
 import logging
 import queue
+import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
@@ -166,9 +168,23 @@ def _local(jobs: int | None) -> Any:
     from dask.system import CPU_COUNT
     from distributed import LocalCluster
 
-    return LocalCluster(
-        n_workers=jobs or CPU_COUNT, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL
-    )
+    # Ctrl-C reaches every process on the terminal; workers inherit deafness to it and leave it to this one.
+    with _deaf():
+        return LocalCluster(
+            n_workers=jobs or CPU_COUNT, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL
+        )
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals are the main thread's
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _require_workers(client: Client, timeout: float) -> None:

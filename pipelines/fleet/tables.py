@@ -17,7 +17,7 @@ Row = Mapping[str, Cell]
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
     """Numbers with all their digits; empty where a row has nothing."""
     with path.open("w", encoding="utf-8", newline="") as stream:
-        writer = csv.DictWriter(stream, columns(rows), restval="")
+        writer = csv.DictWriter(stream, columns(rows), restval="", lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
 
