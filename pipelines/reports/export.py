@@ -1,0 +1,130 @@
+"""A cube calibration for the programs that will apply it, in their own conventions.
+
+The numbers are for the axes as recorded. Where a format has no place for a part of K, a comment says how much is lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from io import StringIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.errors import InputError
+from pipelines.reports.calibration import SavedCalibration
+
+Array = NDArray[np.float64]
+
+_GAUSS, _MILLIGAUSS = 1e4, 1e7  # in a tesla
+_AXES = "XYZ"
+
+
+def exported(saved: SavedCalibration, form: str) -> str:
+    """The text of a parameter file. Raises InputError for an unknown format or a calibration of another method."""
+    if form not in FORMATS:
+        raise InputError(f"unknown format {form}; there are {', '.join(FORMATS)}")
+    if saved.method != "cube":
+        raise InputError(f"only calibrations of the cube method can be exported, this one is of {saved.method}")
+    names = [name for name in ("accel", "gyro", "mag") if f"{name}_k11" in saved.parameters]
+    return FORMATS[form]({name: _triad(saved, name) for name in names})
+
+
+def _triad(saved: SavedCalibration, name: str) -> tuple[Array, Array]:
+    """K (3, 3) and b (3,) with nominal = K raw + b."""
+    K = np.array([[saved.value(f"{name}_k{i}{j}") for j in "123"] for i in "123"])
+    return K, np.array([saved.value(f"{name}_b{i}") for i in "123"])
+
+
+def zero_offset(K: Array, b: Array) -> Array:
+    """What the sensor says when the nominal is zero: nominal = K (raw - offset)."""
+    return np.asarray(-np.linalg.solve(K, b))
+
+
+def symmetric_part(K: Array) -> tuple[Array, float]:
+    """S of K = R S, S symmetric and R a rotation, and the angle of R, rad (polar decomposition)."""
+    u, s, vt = np.linalg.svd(K)
+    angle = float(np.arccos(np.clip(0.5 * (np.trace(u @ vt) - 1.0), -1.0, 1.0)))
+    return (vt.T * s) @ vt, angle
+
+
+def _px4(triads: Mapping[str, tuple[Array, Array]]) -> str:
+    """QGroundControl's parameter file: vehicle, component, name, value, type (9: float).
+
+    accelerometer: scale (raw - offset); gyro: raw - offset; magnetometer, in gauss: symmetric matrix (raw - offset).
+    """
+    rows: list[tuple[str, float]] = []
+    notes = []
+    if "accel" in triads:
+        K, b = triads["accel"]
+        rows += _xyz("CAL_ACC0_{}OFF", zero_offset(K, b)) + _xyz("CAL_ACC0_{}SCALE", np.diag(K))
+        notes.append(_lost("accelerometer", K - np.diag(np.diag(K))))
+    if "gyro" in triads:
+        K, b = triads["gyro"]
+        rows += _xyz("CAL_GYRO0_{}OFF", zero_offset(K, b))
+        notes.append(_lost("gyro", K - np.eye(3)))
+    if "mag" in triads:
+        K, b = triads["mag"]
+        S, angle = symmetric_part(K)
+        rows += _xyz("CAL_MAG0_{}OFF", _GAUSS * zero_offset(K, b)) + _xyz("CAL_MAG0_{}SCALE", np.diag(S))
+        rows += _xyz("CAL_MAG0_{}ODIAG", S[[0, 0, 1], [1, 2, 2]])
+        notes.append(_turned(angle))
+    lines = [f"# {note}" for note in notes] + [f"1\t1\t{name}\t{value:.9g}\t9" for name, value in rows]
+    return "\n".join(["# Calibrated by alidade; give CAL_*0_ID the ids of the sensors.", *lines, ""])
+
+
+def _ardupilot(triads: Mapping[str, tuple[Array, Array]]) -> str:
+    """A parameter file NAME,value.
+
+    accelerometer: scale (raw - offset); gyro: raw - offset; compass, in milligauss: symmetric matrix (raw + offset).
+    """
+    rows: list[tuple[str, float]] = []
+    notes = []
+    if "accel" in triads:
+        K, b = triads["accel"]
+        rows += _xyz("INS_ACCOFFS_{}", zero_offset(K, b)) + _xyz("INS_ACCSCAL_{}", np.diag(K))
+        notes.append(_lost("accelerometer", K - np.diag(np.diag(K))))
+    if "gyro" in triads:
+        K, b = triads["gyro"]
+        rows += _xyz("INS_GYROFFS_{}", zero_offset(K, b))
+        notes.append(_lost("gyro", K - np.eye(3)))
+    if "mag" in triads:
+        K, b = triads["mag"]
+        S, angle = symmetric_part(K)
+        rows += _xyz("COMPASS_OFS_{}", -_MILLIGAUSS * zero_offset(K, b)) + _xyz("COMPASS_DIA_{}", np.diag(S))
+        rows += [*_xyz("COMPASS_ODI_{}", S[[0, 0, 1], [1, 2, 2]]), ("COMPASS_SCALE", 1.0)]
+        notes.append(_turned(angle))
+    return "\n".join([*(f"# {note}" for note in notes), *(f"{name},{value:.9g}" for name, value in rows), ""])
+
+
+def _ros2(triads: Mapping[str, tuple[Array, Array]]) -> str:
+    """Parameters of a node: rows of K and b of each sensor, in the units of sensor_msgs, whole."""
+    from ruamel.yaml import YAML
+
+    parameters = {
+        name: {"gain": [float(x) for x in K.ravel()], "bias": [float(x) for x in b]} for name, (K, b) in triads.items()
+    }
+    text = StringIO()
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = None
+    yaml.dump({"/**": {"ros__parameters": parameters}}, text)
+    return "# calibrated = gain raw + bias, gain a 3x3 matrix by rows\n" + text.getvalue()
+
+
+FORMATS: Mapping[str, Callable[[Mapping[str, tuple[Array, Array]]], str]] = {
+    "px4": _px4,
+    "ardupilot": _ardupilot,
+    "ros2": _ros2,
+}
+
+
+def _xyz(name: str, values: Array) -> list[tuple[str, float]]:
+    return [(name.format(axis), float(value)) for axis, value in zip(_AXES, values, strict=True)]
+
+
+def _lost(sensor: str, rest: Array) -> str:
+    return f"{sensor}: terms of K up to {np.abs(rest).max():.2g} have no place in this format"
+
+
+def _turned(angle: float) -> str:
+    return f"magnetometer: its mounting, {np.rad2deg(angle):.2f} deg in all, has no place in this format"

@@ -1,0 +1,145 @@
+"""Exported calibrations, applied to raw data as each program does; sheets of tags."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from pipelines.errors import InputError
+from pipelines.reports.calibration import SavedCalibration
+from pipelines.reports.export import exported
+from pipelines.reports.printing import print_cube, tag_size
+
+RNG = np.random.default_rng(1)
+BIAS = {"accel": 0.3, "gyro": 0.02, "mag": 2e-5}
+NOMINAL = {"accel": 9.8, "gyro": 1.0, "mag": 5e-5}
+
+
+def _calibration(K: dict[str, np.ndarray], b: dict[str, np.ndarray], method: str = "cube") -> SavedCalibration:
+    numbers = {f"{n}_k{i + 1}{j + 1}": K[n][i, j] for n in K for i in range(3) for j in range(3)}
+    numbers |= {f"{n}_b{i + 1}": b[n][i] for n in K for i in range(3)}
+    return SavedCalibration.model_validate(
+        {
+            "schema": "alidade.calibration/1",
+            "method": method,
+            "solver": "batch",
+            "status": "calibrated",
+            "recording": {"file": "s.mcap", "sha256": "", "start": ""},
+            "parameters": {
+                name: {"value": float(v), "sigma": 1e-4, "unit": "1", "verdict": "observable"}
+                for name, v in numbers.items()
+            },
+        }
+    )
+
+
+def _fits(K: dict[str, np.ndarray]) -> tuple[SavedCalibration, dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """A calibration with these gains, raw data and the nominal values behind them."""
+    b = {name: BIAS[name] * RNG.normal(size=3) for name in K}
+    nominal = {name: NOMINAL[name] * RNG.normal(size=(20, 3)) for name in K}
+    raw = {name: (nominal[name] - b[name]) @ np.linalg.inv(K[name]).T for name in K}
+    return _calibration(K, b), raw, nominal
+
+
+def _diagonal() -> dict[str, np.ndarray]:
+    """What PX4 and ArduPilot can hold without loss."""
+    S = RNG.normal(size=(3, 3)) * 0.03
+    return {
+        "accel": np.diag(1.0 + 0.03 * RNG.normal(size=3)),
+        "gyro": np.eye(3),
+        "mag": np.eye(3) + S + S.T,
+    }
+
+
+def _three(values: dict[str, float], name: str) -> np.ndarray:
+    return np.array([values[name.format(axis)] for axis in "XYZ"])
+
+
+def _symmetric(diagonal: np.ndarray, off: np.ndarray) -> np.ndarray:
+    return np.array([[diagonal[0], off[0], off[1]], [off[0], diagonal[1], off[2]], [off[1], off[2], diagonal[2]]])
+
+
+def test_px4() -> None:
+    saved, raw, nominal = _fits(_diagonal())
+    rows = [line.split("\t") for line in exported(saved, "px4").splitlines() if not line.startswith("#")]
+    values = {row[2]: float(row[3]) for row in rows}
+    assert all(row[4] == "9" for row in rows)
+    accel = _three(values, "CAL_ACC0_{}SCALE") * (raw["accel"] - _three(values, "CAL_ACC0_{}OFF"))
+    gyro = raw["gyro"] - _three(values, "CAL_GYRO0_{}OFF")
+    S = _symmetric(_three(values, "CAL_MAG0_{}SCALE"), _three(values, "CAL_MAG0_{}ODIAG"))
+    gauss = (1e4 * raw["mag"] - _three(values, "CAL_MAG0_{}OFF")) @ S.T
+    np.testing.assert_allclose(accel, nominal["accel"], atol=1e-6)
+    np.testing.assert_allclose(gyro, nominal["gyro"], atol=1e-8)
+    np.testing.assert_allclose(gauss, 1e4 * nominal["mag"], atol=1e-7)
+
+
+def test_ardupilot() -> None:
+    saved, raw, nominal = _fits(_diagonal())
+    lines = [line.split(",") for line in exported(saved, "ardupilot").splitlines() if not line.startswith("#")]
+    values = {name: float(value) for name, value in lines}
+    accel = _three(values, "INS_ACCSCAL_{}") * (raw["accel"] - _three(values, "INS_ACCOFFS_{}"))
+    S = _symmetric(_three(values, "COMPASS_DIA_{}"), _three(values, "COMPASS_ODI_{}"))
+    milligauss = values["COMPASS_SCALE"] * (1e7 * raw["mag"] + _three(values, "COMPASS_OFS_{}")) @ S.T
+    np.testing.assert_allclose(accel, nominal["accel"], atol=1e-6)
+    np.testing.assert_allclose(raw["gyro"] - _three(values, "INS_GYROFFS_{}"), nominal["gyro"], atol=1e-8)
+    np.testing.assert_allclose(milligauss, 1e7 * nominal["mag"], atol=1e-4)
+
+
+def test_ros2_holds_everything() -> None:
+    full = {name: np.eye(3) + 0.05 * RNG.normal(size=(3, 3)) for name in ("accel", "gyro", "mag")}
+    saved, raw, nominal = _fits(full)
+    parameters = YAML(typ="safe", pure=True).load(exported(saved, "ros2"))["/**"]["ros__parameters"]
+    for name, entry in parameters.items():
+        found = raw[name] @ np.reshape(entry["gain"], (3, 3)).T + entry["bias"]
+        np.testing.assert_allclose(found, nominal[name], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("form", ["px4", "ardupilot"])
+def test_what_is_lost_is_said(form: str) -> None:
+    K = {name: np.eye(3) for name in ("accel", "gyro", "mag")}
+    K["accel"] = K["accel"] + np.array([[0, 0.02, 0], [0, 0, 0], [0, 0, 0]])
+    K["mag"] = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    text = exported(_fits(K)[0], form)
+    assert "accelerometer: terms of K up to 0.02 have no place" in text
+    assert "its mounting, 90.00 deg in all" in text
+
+
+def test_wrong_format_and_method() -> None:
+    saved, _, _ = _fits(_diagonal())
+    with pytest.raises(InputError, match="unknown format yaml; there are px4, ardupilot, ros2"):
+        exported(saved, "yaml")
+    with pytest.raises(InputError, match="only calibrations of the cube method"):
+        exported(_calibration({"accel": np.eye(3)}, {"accel": np.zeros(3)}, "head"), "px4")
+
+
+def test_without_magnetometer_nothing_is_said_about_one() -> None:
+    saved, _, _ = _fits({"accel": np.eye(3), "gyro": np.eye(3)})
+    assert "MAG" not in exported(saved, "px4")
+    assert "COMPASS" not in exported(saved, "ardupilot")
+
+
+def test_printed_faces_are_true_to_scale(tmp_path: Path) -> None:
+    print_cube(tmp_path / "cube.pdf", 0.12)
+    data = (tmp_path / "cube.pdf").read_bytes()
+    assert data.startswith(b"%PDF-1.4")
+    assert data.count(b"/Type /Page ") == 6
+    for i, at in enumerate(
+        int(line[:10]) for line in data[data.rindex(b"xref\n0") :].splitlines()[3:] if line.endswith(b"n ")
+    ):
+        assert data[at:].startswith(f"{i + 1} 0 obj".encode())
+    # Black cells of the first page, in m.
+    page = data.split(b"stream\n")[1].split(b"\nf\n")[0].decode()
+    cells = np.array([[float(x) for x in line.split()[:4]] for line in page.splitlines()]) * 0.0254 / 72.0
+    low, high = cells[:, :2].min(axis=0), (cells[:, :2] + cells[:, 2:]).max(axis=0)
+    np.testing.assert_allclose(high - low, tag_size(0.12), atol=1e-6)
+    np.testing.assert_allclose(0.5 * (low + high), [0.105, 0.1485], atol=1e-6)
+
+
+@pytest.mark.parametrize(("edge", "first"), [(0.5, 16), (-1.0, 16), (0.1, 585)])
+def test_faces_that_cannot_be_printed(tmp_path: Path, edge: float, first: int) -> None:
+    with pytest.raises(InputError):
+        print_cube(tmp_path / "cube.pdf", edge, first)
+    assert not (tmp_path / "cube.pdf").exists()
