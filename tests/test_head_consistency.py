@@ -1,0 +1,219 @@
+"""Whether the head method's numbers mean what they say: errors against sigmas, chi-square, outliers, outages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from typer.testing import CliRunner
+
+from factors import so3
+from pipelines.cli import app
+from pipelines.methods.base import Array, Estimate, Problem
+from pipelines.methods.head import problem
+from pipelines.observability import Assessment, assess
+from pipelines.sessions.config import load_config
+from pipelines.sessions.head import write_head
+from pipelines.simulation.head import HeadScenario, head_config, simulate_head
+from pipelines.simulation.scenario import load_scenario
+from pipelines.solvers.batch import solve_batch
+from pipelines.solvers.incremental import solve_incremental
+
+Solve = Callable[[Problem], Estimate]
+SOLVERS = pytest.mark.parametrize("solve", [solve_batch, solve_incremental])
+# Quick enough a platform for short runs.
+SHORT = {
+    "platform": {
+        "yaw": [{"rate_deg_s": 3}, {"amplitude_deg": 10, "frequency_hz": 0.21}],
+        "pitch": [{"amplitude_deg": 12, "frequency_hz": 0.17}],
+        "roll": [{"amplitude_deg": 30, "frequency_hz": 0.11}, {"amplitude_deg": 3, "frequency_hz": 0.41}],
+    },
+    "duration_s": 20,
+    "vision_rate_hz": 15,
+    "gyro_rate_hz": 200,
+}
+
+
+def scenario(**changes: object) -> HeadScenario:
+    return HeadScenario.model_validate(load_scenario(HeadScenario, "head_mounts").model_dump() | SHORT | changes)
+
+
+class Run:
+    """A simulated session solved."""
+
+    def __init__(self, settings: HeadScenario, seed: int, solve: Solve, noise: str = "") -> None:
+        data, truth = simulate_head(settings, seed)
+        config = load_config(head_config(settings).encode())
+        if noise:
+            changed = config.noise.model_copy(update={noise: getattr(config.noise, noise) / 3.0})
+            config = config.model_copy(update={"noise": changed})
+        self.problem = problem(data, config)
+        self.settings = settings
+        self.estimate = solve(self.problem)
+        self.error = self.estimate.values - np.array([truth[name] for name in self.estimate.names])
+
+    @property
+    def assessment(self) -> Assessment:
+        e = self.estimate
+        return assess(self.problem.quantities, e.covariance, e.chi_square, self.problem.advice)
+
+    @property
+    def worst(self) -> float:
+        """Largest error in sigmas."""
+        return float(np.abs(self.error / self.estimate.sigmas).max())
+
+    @property
+    def nees(self) -> float:
+        return float(self.error @ np.linalg.solve(self.estimate.covariance, self.error))
+
+    def attitude_error(self) -> tuple[Array, Array]:
+        """Times, and angles between bRv and its truth, deg."""
+        found = self.estimate.attitudes
+        assert found is not None
+        true = self.settings.head.attitude(found.time)
+        return found.time, np.rad2deg(np.linalg.norm(so3.log(so3.multiply(so3.inverse(true), found.wxyz)), axis=1))
+
+
+@cache
+def clean(solve: Solve) -> Run:
+    return Run(scenario(duration_s=30), 1, solve)
+
+
+def assert_consistent(runs: Sequence[Run]) -> None:
+    """Mean NEES and summed chi-square within their 99 % intervals."""
+    parameters = len(runs[0].error)
+    low, high = chi2.ppf([0.005, 0.995], parameters * len(runs)) / len(runs)
+    assert low < np.mean([run.nees for run in runs]) < high
+    fits = [run.estimate.chi_square for run in runs]
+    low, high = chi2.ppf([0.005, 0.995], sum(f.dof for f in fits if f))
+    assert low < sum(f.value for f in fits if f) < high
+
+
+def test_batch_errors_fit_their_covariance() -> None:
+    assert_consistent([Run(scenario(), seed, solve_batch) for seed in range(15)])
+
+
+@pytest.mark.slow
+def test_batch_errors_fit_their_covariance_over_many_runs() -> None:
+    assert_consistent([Run(scenario(), seed, solve_batch) for seed in range(100, 150)])
+
+
+@pytest.mark.slow
+def test_incremental_errors_fit_their_covariance() -> None:
+    assert_consistent([Run(scenario(), seed, solve_incremental) for seed in range(15)])
+
+
+def test_incremental_agrees_with_batch() -> None:
+    batch, incremental = clean(solve_batch).estimate, clean(solve_incremental).estimate
+    assert np.abs((incremental.values - batch.values) / batch.sigmas).max() < 0.2
+    np.testing.assert_allclose(incremental.sigmas, batch.sigmas, rtol=0.05)
+
+
+@SOLVERS
+def test_right_noise_is_consistent(solve: Solve) -> None:
+    assert clean(solve).assessment.status == "calibrated"
+    assert clean(solve).worst < 3.0
+
+
+@SOLVERS
+def test_vision_noise_set_too_small_is_inconsistent(solve: Solve) -> None:
+    """Three times."""
+    assessment = Run(scenario(), 1, solve, "vision_attitude").assessment
+    assert assessment.status == "inconsistent"
+    assert "noise" in assessment.headline
+    assert "vision" in assessment.headline
+
+
+def test_gyro_noise_set_too_small_is_inconsistent() -> None:
+    """Where the gyro's noise, and not vision's, is what the residuals are made of."""
+    settings = scenario(noise={"gyro_density": 2e-3, "vision_attitude": 5e-4})
+    assert Run(settings, 1, solve_batch).assessment.status == "calibrated"
+    assert Run(settings, 1, solve_batch, "gyro_density").assessment.status == "inconsistent"
+
+
+@SOLVERS
+def test_without_platform_motion_only_the_product_of_the_mounts_is_known(solve: Solve) -> None:
+    """The head turned about one attitude only says how cRb and vRh act together at rest; the report names them."""
+    priors = {f"camera_mount_{axis}": 0.35 for axis in "xyz"}
+    run = Run(scenario(platform=None, priors=priors), 1, solve)
+    assessment = run.assessment
+    assert assessment.status == "unobservable"
+    named = {name for direction in assessment.directions for name in direction.weights}
+    assert {f"camera_mount_{axis}" for axis in "xyz"} <= named
+    assert all("turn the platform" in direction.advice for direction in assessment.directions)
+    time, _ = run.attitude_error()
+    found = run.estimate.attitudes
+    assert found is not None
+    values = dict(zip(run.estimate.names, run.estimate.values, strict=True))
+    cRb = so3.exp(np.array([values[f"camera_mount_{axis}"] for axis in "xyz"]))
+    true = so3.multiply(so3.exp(np.deg2rad(run.settings.camera_mount_deg)), run.settings.head.attitude(time))
+    miss = so3.log(so3.multiply(so3.inverse(true), so3.multiply(cRb, found.wxyz)))
+    late = time > 5.0
+    assert np.rad2deg(np.sqrt((miss[late] ** 2).sum(axis=1).mean())) < 0.5
+    _, alone = run.attitude_error()
+    assert np.sqrt((alone[late] ** 2).mean()) > 1.0
+
+
+def test_unobservable_mount_ends_with_code_3(tmp_path: Path) -> None:
+    settings = scenario(platform=None, priors={f"camera_mount_{axis}": 0.35 for axis in "xyz"})
+    data, truth = simulate_head(settings, 1)
+    write_head(tmp_path / "s.mcap", data, truth, head_config(settings))
+    result = CliRunner().invoke(app, ["calibrate", str(tmp_path / "s.mcap")])
+    assert result.exit_code == 3
+    assert "turn the platform" in result.output
+
+
+@pytest.mark.parametrize("fraction", [0.05, 0.2])
+def test_outliers_cost_no_more_than_the_frames_they_spoil(fraction: float) -> None:
+    """The solution is the one without the spoilt frames, as if these had been known beforehand."""
+    settings = scenario(duration_s=30, outlier_fraction=fraction)
+    run = Run(settings, 1, solve_batch)
+    assert run.worst < 3.0
+    assert run.assessment.status == "calibrated"
+    (spoilt, _), (good, _) = simulate_head(settings, 1), simulate_head(scenario(duration_s=30), 1)
+    left = np.linalg.norm(so3.log(so3.multiply(so3.inverse(good.vision_wxyz), spoilt.vision_wxyz)), axis=1) < 0.1
+    assert run.estimate.rejected == {"vision": int((~left).sum())}
+    assert spoilt.vision_cov is not None
+    known = replace(
+        spoilt,
+        vision_t=spoilt.vision_t[left],
+        vision_wxyz=spoilt.vision_wxyz[left],
+        vision_cov=spoilt.vision_cov[left],
+    )
+    best = solve_batch(problem(known, load_config(head_config(settings).encode())))
+    assert np.abs((run.estimate.values - best.values) / best.sigmas).max() < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fraction", [0.05, 0.2])
+def test_outliers_do_not_lead_the_smoother_astray(fraction: float) -> None:
+    run = Run(scenario(duration_s=30, outlier_fraction=fraction), 1, solve_incremental)
+    batch = Run(scenario(duration_s=30, outlier_fraction=fraction), 1, solve_batch).estimate
+    assert run.worst < 3.0
+    assert run.assessment.status == "calibrated"
+    assert np.abs((run.estimate.values - batch.values) / batch.sigmas).max() < 0.2
+
+
+@SOLVERS
+def test_back_to_normal_at_the_first_frame_after_an_outage(solve: Solve) -> None:
+    gaps = [(10.0, 20.0), (28.0, 38.0)]
+    run = Run(scenario(duration_s=45, vision_rate_hz=10, vision_outages_s=gaps), 1, solve)
+    assert run.worst < 3.0
+    assert run.assessment.status == "calibrated"
+    time, error = run.attitude_error()
+    normal = error[time > 8.0].max() if solve is solve_batch else error[(time > 6.0) & (time < 10.0)].max()
+    for _, end in gaps:
+        assert error[np.flatnonzero(time > end)[0]] <= normal
+
+
+@SOLVERS
+@pytest.mark.parametrize("mount", [(20.0, -15.0, 17.0), (-30.0, 0.0, 0.0)])
+def test_mounts_thirty_degrees_off_converge(solve: Solve, mount: tuple[float, float, float]) -> None:
+    run = Run(scenario(helmet_mount_deg=mount, camera_mount_deg=mount[::-1]), 1, solve)
+    assert run.worst < 3.0
+    assert run.assessment.status == "calibrated"
