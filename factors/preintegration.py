@@ -1,9 +1,10 @@
 """Rotation of a gyro over any window, with its derivatives with respect to the gyro's bias and the window's end.
 
 A gyro sample is the mean rate over an interval centred on its stamp. The rate is taken as linear between stamps
-(trapezoid), through points a little off the means: with m + h^2 m''/24 for the point rate w and the trapezoid's own
-error of h^2 w''/12, trapezoids on m - (second difference of m) / 8 integrate the true rate to fourth order. Inside a sample interval of rates w0, w1 = w0 + a T the rotation vector is
-w0 s + a s^2 / 2 + (w0 x a) s^3 / 12, the Magnus expansion of a linear rate (Iserles et al., Acta Numerica 2000).
+(trapezoid), through points a little off the means: a mean m is w + h^2 w''/24 of the point rate w, the trapezoid's own
+error is h^2 w''/12, so trapezoids on m - (second difference of m) / 8 integrate the true rate to fourth order. Inside a
+sample interval of rates w0, w1 = w0 + a T the rotation vector is w0 s + a s^2 / 2 + (w0 x a) s^3 / 12, the Magnus
+expansion of a linear rate (Iserles et al., Acta Numerica 2000).
 """
 
 from __future__ import annotations
