@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import re
 import sys
+import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +14,16 @@ import numpy as np
 import pytest
 
 from pipelines import cli
+from pipelines.fleet import engine
 from pipelines.sessions.head import write_head
 from pipelines.simulation.head import HeadScenario, head_config, simulate_head
 
-pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
+distributed = pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
 pytest.importorskip("arro3.io", reason="needs the extra alidade[fleet]")
 
-ROOT = Path(__file__).parents[1]
 DATES = ("20260301", "20260401")
 UNITS_VARY = 0.2  # deg, from unit to unit
-COMMON = ("--names", "{unit}_{date}", "--jobs", 2)
+NAMES = ("--names", "{unit}_{date}")
 
 
 def scenario(mount_deg: tuple[float, float, float], one_axis: bool = False) -> HeadScenario:
@@ -94,11 +96,18 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 
 @pytest.fixture(scope="module")
-def calibrated(forty: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scheduler() -> Iterator[str]:
+    """Address of a cluster with two workers."""
+    with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.fixture(scope="module")
+def calibrated(forty: Path, scheduler: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The results of the command on the forty."""
     out = tmp_path_factory.mktemp("fleet")
     with pytest.MonkeyPatch.context() as monkeypatch:
-        assert alidade(monkeypatch, "fleet", forty / "*.mcap", *COMMON, "--out", out) == 0
+        assert alidade(monkeypatch, "fleet", forty / "*.mcap", *NAMES, "--scheduler", scheduler, "--out", out) == 0
     return out
 
 
@@ -141,33 +150,129 @@ def test_parquet_and_csv_say_the_same(calibrated: Path) -> None:
     rows = rows_of(calibrated / "fleet.csv")
     assert list(table.column_names) == list(rows[0])
     for name in ("recording", "exit_code", "helmet_mount_x", "reason"):
-        cells = ["" if cell.as_py() is None else str(cell.as_py()) for cell in table[name]]
+        cells = ["" if cell is None else str(cell) for cell in table[name].to_pylist()]
         assert cells == [row[name] for row in rows]
 
 
 def test_nothing_is_done_twice(
-    forty: Path, calibrated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    forty: Path,
+    scheduler: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Of files, config and version that are the same; one new recording is calibrated, the others kept."""
+    """Of files, config and version that are the same."""
+
+    def run(pattern: str, *options: object) -> str:
+        common = (*NAMES, "--scheduler", scheduler, "--out", tmp_path / "out")
+        assert alidade(monkeypatch, "fleet", tmp_path / pattern, *common, *options) == 0
+        return capsys.readouterr().out
+
     for path in sorted(forty.glob("U0[0-3]*.mcap")):
-        (tmp_path / path.name).symlink_to(path)
-    first = [tmp_path / "U00*.mcap", tmp_path / "U01*.mcap", tmp_path / "U02*.mcap"]
-    assert alidade(monkeypatch, "fleet", *first, *COMMON, "--out", tmp_path / "out") == 0
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    assert "3 of 3 recordings, 0 from an earlier run" in run("U0[0-2]*.mcap")
     before = (tmp_path / "out" / "results.jsonl").read_text()
-    assert alidade(monkeypatch, "fleet", tmp_path / "*.mcap", *COMMON, "--out", tmp_path / "out") == 0
+    assert "4 of 4 recordings, 3 from an earlier run" in run("*.mcap")
     after = (tmp_path / "out" / "results.jsonl").read_text()
-    assert "4 of 4 recordings, 3 from an earlier run" in capsys.readouterr().out
     assert after.startswith(before)
     assert len(after.splitlines()) == 4
-
-    # Another content under the same name, and another config: done again.
-    (tmp_path / f"U00_{DATES[0]}.mcap").unlink()
+    # A line cut off by a fall of the machine costs that one.
+    (tmp_path / "out" / "results.jsonl").write_text(after[:-20])
+    assert "4 of 4 recordings, 3 from an earlier run" in run("*.mcap")
     write(tmp_path / f"U00_{DATES[0]}.mcap", 999, (0.0, 0.0, 0.0))
-    assert alidade(monkeypatch, "fleet", tmp_path / "*.mcap", *COMMON, "--out", tmp_path / "out") == 0
-    assert "3 from an earlier run" in capsys.readouterr().out
+    assert "4 of 4 recordings, 3 from an earlier run" in run("*.mcap")
     config = tmp_path / "config.yaml"
     config.write_text("noise: {vision_attitude: 0.009}\n")
-    assert (
-        alidade(monkeypatch, "fleet", tmp_path / "*.mcap", *COMMON, "--out", tmp_path / "out", "--config", config) == 0
-    )
-    assert "0 from an earlier run" in capsys.readouterr().out
+    assert "4 of 4 recordings, 0 from an earlier run" in run("*.mcap", "--config", config)
+
+
+def test_recordings_come_from_other_file_systems(
+    forty: Path, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An archive stands for S3: no path on this machine."""
+    with zipfile.ZipFile(tmp_path / "campaign.zip", "w") as archive:
+        for path in sorted(forty.glob("U0[01]*.mcap")):
+            archive.write(path, path.name)
+    where = f"zip://*.mcap::{tmp_path}/campaign.zip"
+    assert alidade(monkeypatch, "fleet", where, *NAMES, "--scheduler", scheduler, "--out", tmp_path / "out") == 0
+    rows = rows_of(tmp_path / "out" / "fleet.csv")
+    assert [(row["unit"], row["status"]) for row in rows] == [("U00", "calibrated"), ("U01", "calibrated")]
+
+
+def test_unit_and_date_come_from_metadata(
+    forty: Path, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of any record, or of rosbag2's custom data; else the file's name and the start of the recording stand in."""
+    source = next(iter(sorted(forty.glob("U00*.mcap"))))
+    yaml = "rosbag2_bagfile_information:\n  custom_data:\n    unit: U98\n    date: '2026-02-03'\n"
+    with_metadata(source, tmp_path / "a.mcap", "campaign", {"unit": "U99", "date": "2026-02-01T10:00"})
+    with_metadata(source, tmp_path / "b.mcap", "rosbag2", {"serialized_metadata": yaml})
+    (tmp_path / "c.mcap").write_bytes(source.read_bytes())
+    assert alidade(monkeypatch, "fleet", tmp_path / "*.mcap", "--scheduler", scheduler, "--out", tmp_path / "out") == 0
+    rows = rows_of(tmp_path / "out" / "fleet.csv")
+    assert [(row["unit"], row["date"]) for row in rows] == [
+        ("U99", "2026-02-01T10:00:00Z"),
+        ("U98", "2026-02-03T00:00:00Z"),
+        ("c", "2026-11-20T12:00:00Z"),
+    ]
+
+
+def with_metadata(source: Path, target: Path, name: str, content: dict[str, str]) -> None:
+    """A copy of a recording with a metadata record."""
+    from mcap.reader import make_reader
+    from mcap.writer import Writer
+
+    with source.open("rb") as stream, target.open("wb") as copy:
+        writer = Writer(copy)
+        writer.start("ros2")
+        reader = make_reader(stream)
+        channels: dict[int, int] = {}
+        for attachment in reader.iter_attachments():
+            writer.add_attachment(0, 0, attachment.name, attachment.media_type, attachment.data)
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None
+            if channel.id not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, known)
+            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+        writer.add_metadata(name, content)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["nowhere/*.mcap"], "no file matches nowhere/*.mcap"),
+        (["{forty}/*.mcap", "--names", "{unit}-{date}"], "does not fit --names {unit}-{date}"),
+        (["{forty}/*.mcap", "--names", "unit"], "needs {unit}, {date} or both"),
+        (["{forty}/*.mcap", "--method", "gyro"], "no method 'gyro'"),
+        (["{forty}/*.mcap", "--config", "nowhere.yaml"], "nowhere.yaml"),
+        (
+            ["{forty}/*.mcap", "--out", "{forty}/U00_20260301.mcap/out"],
+            "no folder to write results to (Not a directory)",
+        ),
+        (["{forty}/*.mcap", "--jobs", "0"], "--jobs 0"),
+        (["{forty}/*.mcap", "--jobs", "2", "--scheduler", "tcp://127.0.0.1:1"], "not together with --scheduler"),
+        (
+            ["{forty}/*.mcap", "--scheduler", "tcp://127.0.0.1:1"],
+            "no scheduler at tcp://127.0.0.1:1: start one with `dask scheduler`, and workers with `dask worker tcp",
+        ),
+        (["gopher://x/*.mcap"], "gopher"),
+    ],
+)
+def test_bad_input_is_one_line(
+    forty: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    said: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(engine, "_REACH", 1.0)
+    code = alidade(monkeypatch, "fleet", *(a.replace("{forty}", str(forty)) for a in arguments))
+    error = capsys.readouterr().err
+    assert code == 2
+    assert len(error.splitlines()) == 1
+    assert said in error
+    assert not (tmp_path / "alidade-fleet" / "fleet.csv").exists()

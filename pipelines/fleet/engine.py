@@ -41,6 +41,7 @@ class Killed:
     """Stands for the result of a task that killed its worker each time it was tried, at last alone."""
 
 
+@cache
 def source_version() -> str:
     """alidade's version with a hash of its source, `0.1.0+1c9f3b2a`: two checkouts may bear the same number."""
     return _source_version()()
@@ -130,16 +131,11 @@ def _ended(
 
 def _work(version: str, function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
     """What a worker does. Workers that joined late have not been asked for their version before."""
-    if (own := _own_version()) != version:
+    if (own := source_version()) != version:
         from distributed import get_worker
 
         raise InputError(_other_version(get_worker().address, own, version))
     return function(*arguments)
-
-
-@cache
-def _own_version() -> str:
-    return source_version()
 
 
 def _next(client: Client, ended: queue.SimpleQueue[Future]) -> Future:
@@ -171,7 +167,10 @@ def _local(jobs: int | None) -> Any:
     # Ctrl-C reaches every process on the terminal; workers inherit deafness to it and leave it to this one.
     with _deaf():
         return LocalCluster(
-            n_workers=jobs or CPU_COUNT, threads_per_worker=1, dashboard_address=None, silence_logs=logging.CRITICAL
+            n_workers=jobs or CPU_COUNT,
+            threads_per_worker=1,
+            dashboard_address="127.0.0.1:0",
+            silence_logs=logging.CRITICAL,
         )
 
 

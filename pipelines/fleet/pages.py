@@ -250,7 +250,7 @@ def _histogram(out: go.Figure, values: Array, low: float, high: float, density: 
     bars = 30
     counts, edges = np.histogram(values, bins=bars, range=(low, high))
     middles = 0.5 * (edges[1:] + edges[:-1])
-    out.add_bar(x=middles, y=counts, width=np.diff(edges), name="runs", marker={"color": COLORS[0]}, opacity=0.7)
+    out.add_bar(x=middles, y=counts, width=np.diff(edges), showlegend=False, marker={"color": COLORS[0]}, opacity=0.7)
     x = np.linspace(low, high, 300)[1:]
     expected = len(values) * (high - low) / bars * density(x)
     out.add_scatter(x=x, y=expected, mode="lines", name=name, line={"color": COLORS[1]})

@@ -1,0 +1,226 @@
+"""The engine on real processes: killed workers, recordings that kill, other versions, Ctrl-C, overhead."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipelines.errors import InputError
+from pipelines.fleet import engine, fleet
+from pipelines.fleet.engine import Killed, cluster, completed, source_version
+from pipelines.fleet.fleet import Settings, calibrate_fleet
+from pipelines.fleet.recordings import find
+from pipelines.sessions.head import write_head
+from pipelines.simulation.head import HeadScenario, head_config, simulate_head
+
+pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
+pytest.importorskip("arro3.io", reason="needs the extra alidade[fleet]")
+
+ROOT = Path(__file__).parents[1]
+COUNT = 24
+
+Start = Callable[..., subprocess.Popen[str]]
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recordings")
+    scenario = HeadScenario(duration_s=4.0, gyro_rate_hz=100.0, vision_rate_hz=20.0, truth_rate_hz=1.0)
+    for seed in range(COUNT):
+        data, truth = simulate_head(scenario, seed)
+        write_head(folder / f"U{seed:02}.mcap", data, truth, head_config(scenario))
+    return folder
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    """Starts a process of its own group on this checkout or another; all end with the test."""
+    processes: list[subprocess.Popen[str]] = []
+
+    def run(*words: object, root: Path = ROOT, **environment: str) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-m", *map(str, words)],
+            cwd=root,
+            env={**os.environ, "PYTHONPATH": str(root), **environment},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        processes.append(process)
+        return process
+
+    yield run
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture
+def scheduler(start: Start, tmp_path: Path) -> str:
+    """Address of a scheduler in a process of its own."""
+    import json
+
+    file = tmp_path / "scheduler.json"
+    start("dask", "scheduler", "--host", "127.0.0.1", "--port", 0, "--no-dashboard", "--scheduler-file", file)
+    until(file.exists)
+    return str(json.loads(file.read_text())["address"])
+
+
+def worker(start: Start, scheduler: str, root: Path = ROOT) -> subprocess.Popen[str]:
+    return start("dask", "worker", scheduler, "--nthreads", 1, "--no-nanny", "--no-dashboard", root=root)
+
+
+def until(true: Callable[[], bool], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+def finished(out: Path) -> list[str]:
+    file = out / "results.jsonl"
+    return file.read_text().splitlines() if file.exists() else []
+
+
+def rows_of(out: Path) -> list[dict[str, str]]:
+    with (out / "fleet.csv").open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_a_worker_killed_midway_costs_nothing(start: Start, scheduler: str, recordings: Path, tmp_path: Path) -> None:
+    first, second = worker(start, scheduler), worker(start, scheduler)
+    out = tmp_path / "out"
+    command = start("pipelines.cli", "fleet", recordings / "*.mcap", "--scheduler", scheduler, "--out", out)
+    until(lambda: len(finished(out)) >= 4)
+    first.send_signal(signal.SIGKILL)
+    assert len(finished(out)) < COUNT - 2, "too fast to be midway"
+    output, error = command.communicate(timeout=60)
+    assert (command.returncode, error) == (0, "")
+    assert f"{COUNT} of {COUNT} recordings, 0 from an earlier run" in output
+    rows = rows_of(out)
+    assert [Path(row["recording"]).name for row in rows] == [f"U{i:02}.mcap" for i in range(COUNT)]
+    assert {row["status"] for row in rows} <= {"calibrated", "weak"}
+    assert len(finished(out)) == COUNT
+    assert first.wait() == -signal.SIGKILL
+    assert second.poll() is None
+
+
+def test_ctrl_c_keeps_what_is_finished(start: Start, recordings: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    words = ("pipelines.cli", "fleet", recordings / "*.mcap", "--jobs", 2, "--out", out)
+    command = start(*words)
+    until(lambda: len(finished(out)) >= 3)
+    # As a terminal does: to every process of the group.
+    os.killpg(command.pid, signal.SIGINT)
+    output, error = command.communicate(timeout=60)
+    assert (command.returncode, error) == (130, "")
+    assert "interrupted; the same command continues" in output
+    kept = len(finished(out))
+    assert 3 <= kept < COUNT
+    assert len(rows_of(out)) == kept
+    again = start(*words)
+    output, error = again.communicate(timeout=60)
+    assert f"{COUNT} of {COUNT} recordings, {kept} from an earlier run" in output
+    assert (again.returncode, error) == (0, "")
+    assert len(rows_of(out)) == COUNT
+
+
+def test_a_recording_that_kills_workers_is_set_aside(
+    recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And those that only waited on the same worker are not."""
+    import dask
+
+    def deadly(file: Any, *_: object) -> Any:
+        if file.path.endswith("U03.mcap"):
+            os.kill(os.getpid(), signal.SIGKILL)
+        return {"sha256": file.path, "status": "calibrated", "exit_code": 0, "reason": "", "parameters": {}}
+
+    monkeypatch.setattr(fleet, "calibrate_recording", deadly)
+    # One worker and no second chance make every neighbour a suspect.
+    with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
+        outcome = calibrate_fleet(find([f"{recordings}/*.mcap"]), Settings(), tmp_path / "out", jobs=1)
+    bad = {name for name, result in outcome.results.items() if result["exit_code"] != 0}
+    assert {Path(name).name for name in bad} == {"U03.mcap"}
+    assert len(outcome.results) == COUNT
+    assert any("set aside" in line and "U03.mcap" in line for line in outcome.summary)
+    assert outcome.results[bad.pop()]["exit_code"] == 137
+    assert len(finished(tmp_path / "out")) == COUNT - 1
+
+
+def test_workers_of_another_version_are_refused(start: Start, scheduler: str, recordings: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    for package in ("factors", "pipelines"):
+        shutil.copytree(ROOT / package, other / package, ignore=shutil.ignore_patterns("__pycache__"))
+    with (other / "factors" / "so3.py").open("a") as stream:
+        stream.write("# another\n")
+    process = worker(start, scheduler, root=other)
+    out = tmp_path / "out"
+    command = start("pipelines.cli", "fleet", recordings / "*.mcap", "--scheduler", scheduler, "--out", out)
+    output, error = command.communicate(timeout=60)
+    assert process.poll() is None
+    assert (command.returncode, output) == (2, "")
+    assert len(error.splitlines()) == 1
+    assert source_version() in error
+    assert "install the same on both" in error
+    named = error.split(" has alidade ")[1].split(",")[0]
+    assert named != source_version()
+    assert named.split("+")[0] == source_version().split("+")[0]
+
+
+def test_a_scheduler_without_workers_is_told(scheduler: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(engine, "_REACH", 2.0)
+    with pytest.raises(InputError, match=f"{scheduler} has no workers: start some with `dask worker {scheduler}`"):
+        cluster(scheduler, None).__enter__()
+
+
+def test_overhead_and_order() -> None:
+    """Nothing to do, many times over: what a task costs besides its work, far below 5 % of 2 s on two workers."""
+
+    def nothing(number: int) -> dict[str, float]:
+        return {f"parameter {i}": float(number) for i in range(50)}
+
+    count = 200
+    with cluster(None, 2) as client:
+        list(completed(client, nothing, {str(i): (i,) for i in range(10)}))
+        begin = time.perf_counter()
+        results = dict(completed(client, nothing, {str(i): (i,) for i in range(count)}))
+        overhead = (time.perf_counter() - begin) / count
+    assert results == {str(i): nothing(i) for i in range(count)}
+    # Two workers do 2 s tasks at one a second.
+    assert overhead < 0.05 * 2.0 / 2
+
+
+def test_a_fault_of_a_task_reaches_the_caller() -> None:
+    def refuse(number: int) -> int:
+        if number == 3:
+            raise InputError("number 3: not this one")
+        return number
+
+    with cluster(None, 1) as client, pytest.raises(InputError, match="number 3: not this one"):
+        list(completed(client, refuse, {str(i): (i,) for i in range(5)}))
+
+
+def test_killed_is_no_result_of_the_others() -> None:
+    def deadly(number: int) -> int:
+        if number in (1, 4):
+            os.kill(os.getpid(), signal.SIGKILL)
+        return number
+
+    import dask
+
+    with dask.config.set({"distributed.scheduler.allowed-failures": 1}), cluster(None, 2) as client:
+        results = dict(completed(client, deadly, {str(i): (i,) for i in range(12)}))
+    assert {name for name, result in results.items() if isinstance(result, Killed)} == {"1", "4"}
+    assert {name for name, result in results.items() if result == int(name)} == set(map(str, range(12))) - {"1", "4"}

@@ -1,0 +1,134 @@
+"""Monte Carlo studies: same seeds, same numbers; files; bad input."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines import cli
+from pipelines.fleet import consistency
+from pipelines.fleet.montecarlo import SOLVERS, run_study, simulate_and_solve
+
+distributed = pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
+
+SHORT = """
+duration_s: 4
+gyro_rate_hz: 100
+vision_rate_hz: 20
+truth_rate_hz: 1
+priors: {helmet_mount_x: 0, helmet_mount_y: 0, helmet_mount_z: 0, time_offset: 0}
+"""
+
+
+@pytest.fixture(scope="module")
+def scheduler() -> Iterator[str]:
+    """Address of a cluster with two workers."""
+    with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.fixture
+def scenario(tmp_path: Path) -> Path:
+    path = tmp_path / "short.yaml"
+    path.write_text(SHORT)
+    return path
+
+
+def alidade(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    monkeypatch.setattr(sys, "argv", ["alidade", *map(str, arguments)])
+    try:
+        cli.main()
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    return 0
+
+
+def test_same_seeds_same_numbers_whatever_the_workers(
+    scheduler: str, scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    common = ("montecarlo", "head", "--runs", 6, "--seed", 3, "--scenario", scenario)
+    assert alidade(monkeypatch, *common, "--scheduler", scheduler, "--out", tmp_path / "two") == 0
+    assert alidade(monkeypatch, *common, "--jobs", 1, "--out", tmp_path / "one") == 0
+    for name in ("runs.csv", "summary.csv"):
+        assert (tmp_path / "two" / name).read_bytes() == (tmp_path / "one" / name).read_bytes()
+    with (tmp_path / "one" / "runs.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [(row["seed"], row["solver"]) for row in rows] == [(str(s), k) for s in range(3, 9) for k in SOLVERS]
+
+
+def test_numbers_are_those_of_a_run_by_hand() -> None:
+    result = simulate_and_solve("head", "", SHORT, 3, ["batch"], 1.0)["batch"]
+    assert list(result["parameters"]) == ["gyro_bias_x", "gyro_bias_y", "gyro_bias_z"]
+    normalised = np.array([p["error"] / p["sigma"] for p in result["parameters"].values()])
+    assert result["dof"] == 3
+    # Biases of the three axes are nearly uncorrelated.
+    assert result["nees"] == pytest.approx(float(normalised @ normalised), rel=0.1)
+
+
+def test_study_goes_on_and_sums_up(
+    scheduler: str, scenario: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    common = ("montecarlo", "head", "--scenario", scenario, "--solvers", "batch", "--scheduler", scheduler)
+    out = tmp_path / "out"
+    assert alidade(monkeypatch, *common, "--runs", 4, "--out", out) == 0
+    assert "4 of 4 runs, 0 from an earlier run" in capsys.readouterr().out
+    assert alidade(monkeypatch, *common, "--runs", 6, "--out", out) == 0
+    said = capsys.readouterr().out
+    assert "6 of 6 runs, 4 from an earlier run" in said
+    assert "batch: mean NEES" in said
+    page = (out / "montecarlo.html").read_text()
+    assert "default-src 'none'" in page
+    for text in ("mean NEES", "gyro_bias_x", "batch: NEES", "batch: errors in sigmas"):
+        assert text in page
+    # Another scenario is another study.
+    scenario.write_text(SHORT + "gyro_turn_on_bias_deg_s: 0.1\n")
+    assert alidade(monkeypatch, *common, "--runs", 4, "--out", out) == 0
+    assert "4 of 4 runs, 0 from an earlier run" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["gyro"], "method gyro is not built yet"),
+        (["head", "--scenario", "nothing"], "no scenario file nothing"),
+        (["head", "--solvers", "magic"], "no solver 'magic'; the solvers are published, batch, incremental, or all"),
+        (["head", "--runs", "0"], "at least one run"),
+        (["head", "--out", "/dev/null/out"], "no folder to write results to"),
+        (["head", "--jobs", "1", "--scheduler", "tcp://127.0.0.1:1"], "not together with --scheduler"),
+    ],
+)
+def test_bad_input_is_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    said: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code = alidade(monkeypatch, "montecarlo", *arguments)
+    error = capsys.readouterr().err
+    assert code == 2
+    assert len(error.splitlines()) == 1
+    assert said in error
+
+
+def test_the_consistency_page_lists_every_solver(scheduler: str, scenario: Path, tmp_path: Path) -> None:
+    study = run_study("head", str(scenario), range(4), SOLVERS, tmp_path / "out", scheduler)
+    page = consistency.page([study], 4)
+    rows = [line.split(" | ")[:3] for line in page.splitlines() if line.startswith("| head")]
+    assert rows == [["| head", solver, "4"] for solver in SOLVERS]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["los", "indexer", "head"])
+def test_batch_and_incremental_are_consistent(method: str, tmp_path: Path) -> None:
+    study = run_study(method, None, range(200), ("batch", "incremental"), tmp_path, jobs=2)
+    for solver in study.solvers:
+        assert not study.failures(solver)
+        nees = study.nees(solver)
+        assert nees.consistent, f"{solver}: mean NEES {nees.mean:.3f} outside {nees.low:.3f} to {nees.high:.3f}"
