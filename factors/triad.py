@@ -171,8 +171,8 @@ class GyroRotationFactor:
     """A gyro's rotation between two attitudes, integrated with its whole triad: nRb_j = Exp(w_ie T)^T nRb_i dR(A, c).
 
     Blocks: nRb_i, nRb_j (rotations), triad (12), d_i, d_j (3 each; how far the gyro's offset has wandered at both ends,
-    in the unit of raw: their mean adds to c). Samples are mean rates centred on their stamps (trapezoid); the arc
-    between the rates w0 and w1 is T (w0 + w1) / 2 + T^2 (w0 x w1) / 12 (Magnus, see factors.preintegration).
+    in the unit of raw: their mean adds to c). Samples are mean rates centred on their stamps, integrated as
+    factors.preintegration does: the arc between point rates w0 and w1 is T (w0 + w1) / 2 + T^2 (w0 x w1) / 12.
 
     Attributes:
         time: (n,) ends of the turns, s.
@@ -236,17 +236,20 @@ class WeightedSumFactor:
 
 def _turn_by_triad(path: GyroPath, rate: Array, K: Array) -> Array:
     """Jacobian (3, 12) of a turn's rotation, perturbed on the right, by the triad; dw = -K (dA w + dc)."""
+    # The rates that the path takes as linear in between; at its last stamp that is the sample itself.
+    points = path.increments(path.t, path.t).rate
+    points[-1] = rate[-1]
     dt = np.diff(path.t)[:, None, None]
-    w0, w1 = rate[:-1], rate[1:]
+    w0, w1 = points[:-1], points[1:]
     arcs = 0.5 * dt[..., 0] * (w0 + w1) + dt[..., 0] ** 2 / 12.0 * so3.cross(w0, w1)
     attitude = so3.matrix(path.attitude(path.t))
     # What a change of each arc does to the end.
     carried = attitude[-1].T @ attitude[1:] @ so3.right_jacobian(arcs)
-    by_rate = np.zeros((len(rate), 3, 3))
+    by_rate = np.zeros((len(points), 3, 3))
     by_rate[:-1] += carried @ (0.5 * dt * np.eye(3) - dt**2 / 12.0 * so3.hat(w1))
     by_rate[1:] += carried @ (0.5 * dt * np.eye(3) + dt**2 / 12.0 * so3.hat(w0))
     by_c = -by_rate @ K
-    by_A = np.einsum("kia,kb->iab", by_c, rate).reshape(3, 9)
+    by_A = np.einsum("kia,kb->iab", by_c, points).reshape(3, 9)
     return np.concatenate([by_A, by_c.sum(axis=0)], axis=1)
 
 

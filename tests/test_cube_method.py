@@ -16,6 +16,8 @@ from factors import so3
 from pipelines.errors import InputError
 from pipelines.methods.base import Estimate, Problem
 from pipelines.methods.cube import problem
+from pipelines.methods.cube_validation import validate
+from pipelines.methods.validation import rms
 from pipelines.observability import Assessment, assess
 from pipelines.published.cube import published_estimate
 from pipelines.sessions.config import Config, Raw, RawConversion, load_config
@@ -31,7 +33,7 @@ FIELD = {"field_e": 1e-8, "field_n": 1e-8, "field_u": 1e-8}
 
 @cache
 def _simulated(seed: int, **options: Any) -> tuple[CubeData, dict[str, float], Config]:
-    scenario = CubeScenario(**options)
+    scenario = CubeScenario(**({"camera_rate_hz": 10.0} | options))
     data, truth = simulate_cube(scenario, seed)
     return data, truth, load_config(cube_config(scenario).encode())
 
@@ -86,7 +88,7 @@ def _upper(K: np.ndarray) -> np.ndarray:
 
 
 def test_incremental_ends_where_batch_does() -> None:
-    data, _, config = _simulated(6, poses=12)
+    data, _, config = _simulated(6, poses=8)
     batch = solve_batch(problem(data, config))
     incremental = solve_incremental(problem(data, config))
     free = batch.sigmas > 0.0
@@ -104,7 +106,7 @@ def test_three_poses_are_too_few_and_the_directions_are_named() -> None:
 
 
 def test_axes_never_turned_are_named() -> None:
-    data, _, config = _simulated(8, turn_axes=((0, 0, 1),), poses=12)
+    data, _, config = _simulated(8, turn_axes=((0, 0, 1),), poses=6)
     _, _, judged = _solved(data, config)
     assert judged.status == "unobservable"
     weak = {name for name, verdict in judged.verdicts.items() if verdict in ("weak", "unobservable")}
@@ -207,6 +209,15 @@ def test_counts_are_calibrated_as_recorded() -> None:
         assert b[f"accel_b{i}"] == pytest.approx(a[f"accel_b{i}"] - sum(row) * scale * offset, abs=0.02)
     assert truth["accel_k11"] == pytest.approx(a["accel_k11"], abs=1e-3)
     assert found.sigmas[0] == pytest.approx(plain.sigmas[0] * scale, rel=0.05)
+
+
+def test_validation_shows_the_errors_shrink() -> None:
+    data, _, config = _simulated(16)
+    estimate = _solved(data, config)[1]
+    found = validate(data, config, dict(zip(estimate.names, estimate.values, strict=True)))
+    assert [v.unit for v in found] == ["m/s^2", "T", "rad"]
+    for v in found:
+        assert rms(v.after) < 0.1 * rms(v.before), v.name
 
 
 def test_unknown_place_and_unknown_prior() -> None:

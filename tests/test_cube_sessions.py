@@ -175,7 +175,7 @@ def test_blurred_pictures_only(tmp_path: Path, session: CubeData) -> None:
 
     t = rests(session, _config()).mean(axis=1)
     nothing = Sightings(t, *(np.zeros(0, dtype=np.int64),) * 2, np.zeros((0, 4, 2)), None)
-    grey = encode(np.full((960, 1280), 90, dtype=np.uint8))
+    grey = encode(np.full((960, 1280), 90, dtype=np.uint8), "jpeg")
     write_cube(tmp_path / "s.mcap", replace(session, sightings=nothing), None, cube_config(SCENARIO), [grey] * len(t))
     with pytest.raises(InputError, match="no tag is seen sharply in any of the 4 pictures"):
         read_cube(open_recording(tmp_path / "s.mcap"), _config())

@@ -21,8 +21,8 @@ from factors import so3
 from factors.earth import EARTH_RATE, earth_rate, gravity
 from pipelines.errors import InputError
 from pipelines.methods.base import Estimate, Problem, Residuals
-from pipelines.sessions.config import Config, RawConversion
-from pipelines.sessions.cube import CubeData, local_field
+from pipelines.sessions.config import Config
+from pipelines.sessions.cube import CubeData, local_field, recorded
 from pipelines.sessions.cube_poses import StaticPoses, static_poses
 
 Array = NDArray[np.float64]
@@ -119,12 +119,12 @@ def published_estimate(data: CubeData, config: Config, problem: Problem) -> Esti
         means = raw[name]
         assert means is not None
         good = np.isfinite(means[k]).all(axis=1)
-        recorded = _recorded(means[k][good], getattr(config.cube.raw, name))
-        found = regression(recorded, vectors[good])
+        recorded_means = recorded(means[k][good], getattr(config.cube.raw, name))
+        found = regression(recorded_means, vectors[good])
         names += [f"{name}_k{r}{c}" for r in "123" for c in "123"] + [f"{name}_b{r}" for r in "123"]
         values += [*found.K.ravel(), *found.b]
         covariance[12 * i : 12 * i + 12, 12 * i : 12 * i + 12] = found.covariance
-        misses = vectors[good] - recorded @ found.K.T - found.b
+        misses = vectors[good] - recorded_means @ found.K.T - found.b
         sigma = np.sqrt(np.diag(found.residual_covariance))
         used = np.ones(len(misses), dtype=bool)
         residuals[name] = Residuals(poses.span[k][good].mean(axis=1), misses / np.where(sigma > 0.0, sigma, 1.0), used)
@@ -162,11 +162,6 @@ def attitudes(data: CubeData, config: Config, poses: StaticPoses) -> tuple[NDArr
         seen.append(k)
         found.append(so3.compose(nRB, config.cube.camera_rotation, tags.pose.cRb))
     return np.array(seen, dtype=np.intp), np.array(found).reshape(-1, 4)
-
-
-def _recorded(nominal: Array, conversion: RawConversion | None) -> Array:
-    """What was recorded, from what the config's `raw` makes of it."""
-    return nominal if conversion is None else nominal / conversion.scale + conversion.offset
 
 
 def _coverage(nRb: Array) -> str:

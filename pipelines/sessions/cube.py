@@ -100,6 +100,11 @@ def nominal(values: Array, conversion: RawConversion | None) -> Array:
     return values if conversion is None else (values - conversion.offset) * conversion.scale
 
 
+def recorded(values: Array, conversion: RawConversion | None) -> Array:
+    """The inverse of `nominal`."""
+    return values if conversion is None else values / conversion.scale + conversion.offset
+
+
 def rests(data: CubeData, config: Config) -> Array:
     """Beginnings and ends, (P, 2) s, of the device's static poses. Raises InputError when there is none."""
     return _rests(data.imu_t, data.gyro, data.accel, data.gyro_density, data.accel_density, config)
@@ -226,7 +231,7 @@ def write_cube(
 ) -> None:
     """Write a cube session under the default topic names, with its truth and config as attachments.
 
-    Stamps are rounded to ns. With pictures (PNG files, one for each frame of the sightings, in their order) these are
+    Stamps are rounded to ns. With pictures (JPEG files, one for each frame of the sightings, in their order) these are
     written instead of the detections. read_cube gives the same data back if the first sample is the one at t = 0.
     """
     epoch = data.epoch_ns
@@ -292,7 +297,7 @@ def _info_message(camera: Camera, epoch_ns: int) -> series.CameraInfo:
 def _pictures_or_tags(seen: Sightings, epoch_ns: int, pictures: Iterable[bytes] | None) -> dict[str, series.Topic]:
     t_ns = nanoseconds(seen.t, epoch_ns)
     if pictures is not None:
-        return {TOPICS["image"].name: series.ImageSeries(t_ns, pictures, format="png", frame_id="camera")}
+        return {TOPICS["image"].name: series.ImageSeries(t_ns, pictures, format="jpeg", frame_id="camera")}
     m = len(seen.ids)
     zero = np.zeros(m, dtype=np.int64)
     found = series.DetectionSeries(

@@ -353,14 +353,14 @@ class _World:
         return Sightings(times, frame[order], np.concatenate(ids)[order], np.concatenate(corners)[order], None)
 
     def pictures(self, times: Array) -> Iterator[bytes]:
-        """PNG files of what the camera sees at the times, blurred by the motion while the shutter is open."""
+        """JPEG files of what the camera sees at the times, blurred by the motion while the shutter is open."""
         s, renderer = self.scenario, Renderer(self.camera)
         for t in times:
             finger = self._finger(float(t))
             still = bool(((self.motion.start <= t) & (t <= self.motion.stop)).any())
-            moments = [t] if still else t + s.exposure_s * np.array([-1 / 3, 0.0, 1 / 3])
+            moments = [t] if still else t + s.exposure_s * np.array([-0.25, 0.25])
             light = np.mean([renderer.radiance(self._quads(float(m), finger)) for m in moments], axis=0)
-            yield encode(expose(light, s.blur_px, s.grey_noise, self.rng))
+            yield encode(expose(light, s.blur_px, s.grey_noise, self.rng), "jpeg", 95)
 
     def _tags_at(self, t: float) -> dict[int, tuple[Array, Array]]:
         """Attitude cRt and place (3,) m of the tags that face the camera."""
