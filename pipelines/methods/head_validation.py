@@ -90,7 +90,7 @@ def _windows(data: HeadData, time_offset: float) -> tuple[NDArray[np.intp], NDAr
     gyros = [g for g in (data.head_t, data.platform_t) if g is not None]
     first = max(g[0] for g in gyros) - min(time_offset, 0.0)
     last = min(g[-1] for g in gyros) - max(time_offset, 0.0)
-    use = (np.abs(t[stop] - t - _SPAN) <= _SLACK) & (t >= first) & (t[stop] <= last)
+    use = (np.abs(t[stop] - t - _SPAN) <= _SLACK) & (t + _SPAN <= t[-1]) & (t >= first) & (t[stop] <= last)
     if not use.any():
         raise InputError("vision: no two frames about 1 s apart within the gyros' record; validation needs some")
     return start[use], stop[use]
