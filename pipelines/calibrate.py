@@ -7,8 +7,9 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from pipelines.consistency import find_causes, mostly_rejected
 from pipelines.methods.base import Estimate, Problem
-from pipelines.observability import assess
+from pipelines.observability import Cause, assess
 from pipelines.registry import Method, method
 from pipelines.reports.result import Calibration
 from pipelines.sessions.config import ATTACHMENT, Config, load_config
@@ -48,14 +49,19 @@ def calibrate(
     sha256, truth = recording.sha256(), _truth(recording)
     read = time.perf_counter() - start
     calibrations = []
+    causes: tuple[Cause, ...] | None = None
     for solver in solvers:
         estimate, problem = _solve(solver, chosen, data, config, window)
         quantities = tuple(q for q in problem.quantities if q.name in estimate.names)
+        assessment = assess(quantities, estimate.covariance, estimate.chi_square, problem.advice)
+        if solver != "published" and (assessment.status == "inconsistent" or mostly_rejected(estimate)):
+            causes = find_causes(chosen, data, config, estimate.residuals) if causes is None else causes
+            assessment = assessment.explained(causes)
         calibrations.append(
             Calibration(
                 problem=problem,
                 estimate=estimate,
-                assessment=assess(quantities, estimate.covariance, estimate.chi_square, problem.advice),
+                assessment=assessment,
                 recording=path.name,
                 sha256=sha256,
                 facts=facts,

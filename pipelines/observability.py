@@ -9,7 +9,7 @@ The rules are those of the contract, section Verdicts.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -134,6 +134,19 @@ class Consistency:
 
 
 @dataclass(frozen=True)
+class Cause:
+    """Why residuals may not fit, tried by solving again.
+
+    Attributes:
+        label: what is wrong.
+        evidence: what changing it does.
+    """
+
+    label: str
+    evidence: str
+
+
+@dataclass(frozen=True)
 class Assessment:
     """The verdict on an estimate.
 
@@ -144,6 +157,7 @@ class Assessment:
         covariance: (n, n), the one judged: symmetric and finite whatever was given.
         consistency: None when the solver has no chi-square.
         headline: the verdict in one sentence.
+        causes: of residuals that do not fit, the likeliest first; see pipelines.consistency.
     """
 
     status: Status
@@ -152,6 +166,14 @@ class Assessment:
     covariance: Array
     consistency: Consistency | None
     headline: str
+    causes: tuple[Cause, ...] = ()
+
+    def explained(self, causes: Sequence[Cause]) -> Assessment:
+        """The same with causes, the first of them named before anything else."""
+        if not causes:
+            return self
+        first = f"{causes[0].label[:1].upper()}{causes[0].label[1:]}: {causes[0].evidence}."
+        return replace(self, causes=tuple(causes), headline=f"{first} {self.headline}")
 
     @property
     def sigmas(self) -> Array:

@@ -176,6 +176,13 @@ class ChiSquareResult(FitResult):
     families: dict[str, FitResult]
 
 
+class CauseResult(_Record):
+    """Why the residuals may not fit, tried by solving again."""
+
+    label: str
+    evidence: str
+
+
 class SessionResult(_Record):
     """What went in."""
 
@@ -209,6 +216,7 @@ class Result(_Record):
     timing_s: dict[str, float]
     headline: str
     notes: list[str]
+    causes: list[CauseResult]
     truth: dict[str, TruthResult] | None = None
 
 
@@ -230,6 +238,7 @@ def result(calibration: Calibration) -> Result:
         timing_s=c.timing,
         headline=a.headline,
         notes=list(c.notes),
+        causes=[CauseResult(label=cause.label, evidence=cause.evidence) for cause in a.causes],
         truth=truth_errors(c) if c.truth is not None else None,
     )
 

@@ -1,0 +1,142 @@
+"""Causes of residuals that do not fit: each made in a simulated recording, each to be named first."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.consistency import cut, find_causes, mostly_rejected
+from pipelines.methods.base import Estimate, Residuals
+from pipelines.registry import Method, method
+from pipelines.sessions.config import Config, load_config
+from pipelines.simulation.head import HeadScenario, head_config, simulate_head
+from pipelines.simulation.indexer import IndexerScenario, indexer_config, simulate_indexer
+from pipelines.simulation.los import LosScenario, los_config, simulate_los
+from pipelines.simulation.motion import EulerMotion, Swing
+
+Case = tuple[Method, Any, Config]
+
+
+@pytest.fixture(scope="module")
+def head() -> Case:
+    """15 s, mounts known, no time offset."""
+    known = [f"{mount}_{axis}" for mount in ("helmet_mount", "camera_mount") for axis in "xyz"]
+    scenario = HeadScenario(
+        duration_s=15,
+        vision_rate_hz=15,
+        gyro_rate_hz=100,
+        platform_gyro_rate_hz=100,
+        platform=EulerMotion(
+            yaw=[Swing(amplitude_deg=10, frequency_hz=0.3)], pitch=[Swing(amplitude_deg=12, frequency_hz=0.2)]
+        ),
+        priors={**dict.fromkeys(known, 0.0), "time_offset": 0.0},
+    )
+    data, _ = simulate_head(scenario, 1)
+    return method("head"), data, load_config(head_config(scenario).encode())
+
+
+@pytest.fixture(scope="module")
+def los() -> Case:
+    """15 s of sway about three axes."""
+    scenario = LosScenario(duration_s=15, image_rate_hz=20, gyro_rate_hz=200)
+    data, _ = simulate_los(scenario, 1)
+    return method("los"), data, load_config(los_config(scenario).encode())
+
+
+@pytest.fixture(scope="module")
+def indexer() -> Case:
+    """The four positions, a turn each way."""
+    scenario = IndexerScenario(gyro_rate_hz=50, encoder_rate_hz=50)
+    data, _ = simulate_indexer(scenario, 1)
+    return method("indexer"), data, load_config(indexer_config(scenario).encode())
+
+
+def with_noise(config: Config, **factors: float) -> Config:
+    noise = {key: getattr(config.noise, key) * factor for key, factor in factors.items()}
+    return config.model_copy(update={"noise": config.noise.model_copy(update=noise)})
+
+
+def first_cause(case: Case) -> str:
+    return find_causes(*case)[0].label
+
+
+def test_what_fits_has_no_cause(head: Case) -> None:
+    assert find_causes(*head) == ()
+
+
+def test_noise_stated_five_times_too_small_is_named_with_its_factor(head: Case) -> None:
+    find, data, config = head
+    wrong = replace(data, vision_cov=data.vision_cov / 25.0)
+    label = first_cause((find, wrong, with_noise(config, vision_attitude=0.2)))
+    name, said = label.split(" is stated ")
+    assert name == "noise.vision_attitude"
+    assert float(said.split()[0]) == pytest.approx(5.0, rel=0.1)
+
+
+@pytest.mark.parametrize("signs", [(-1.0, 1.0, 1.0), (1.0, -1.0, -1.0)])
+def test_signs_of_the_helmet_gyro(head: Case, signs: tuple[float, ...]) -> None:
+    find, data, config = head
+    axes = " and ".join(axis for axis, sign in zip("xyz", signs, strict=True) if sign < 0.0)
+    label = first_cause((find, replace(data, head_gyro=data.head_gyro * np.array(signs)), config))
+    assert label == f"the sign of the helmet gyro's {axes} is wrong"
+
+
+def test_sign_of_the_platform_gyro(head: Case) -> None:
+    find, data, config = head
+    wrong = replace(data, platform_gyro=data.platform_gyro * np.array([1.0, -1.0, 1.0]))
+    assert first_cause((find, wrong, config)) == "the sign of the platform gyro's y is wrong"
+
+
+def test_delay_of_20_ms_with_the_time_offset_fixed(head: Case) -> None:
+    find, data, config = head
+    label = first_cause((find, replace(data, vision_t=data.vision_t - 0.02), config))
+    assert label.startswith("a time offset of ")
+    assert float(label.split()[4]) == pytest.approx(20.0, abs=3.0)
+
+
+def test_delay_of_20_ms_of_the_los_pictures(los: Case) -> None:
+    find, data, config = los
+    label = first_cause((find, replace(data, image_t=data.image_t - 0.02), config))
+    assert float(label.split()[4]) == pytest.approx(20.0, abs=1.0)
+
+
+@pytest.mark.parametrize("key", ["los_error", "gyro_density"])
+def test_the_noise_that_is_too_small_is_told_from_the_others(los: Case, key: str) -> None:
+    find, data, config = los
+    assert first_cause((find, data, with_noise(config, **{key: 0.2}))).startswith(f"noise.{key} ")
+
+
+@pytest.mark.slow
+def test_sign_of_the_los_gyro(los: Case) -> None:
+    find, data, config = los
+    wrong = replace(data, gyro=data.gyro * np.array([-1.0, 1.0, 1.0]))
+    assert first_cause((find, wrong, config)) == "the sign of the gyro's x is wrong"
+
+
+def test_late_encoders(indexer: Case) -> None:
+    find, data, config = indexer
+    label = first_cause((find, replace(data, encoder_t=data.encoder_t + 0.02), config))
+    assert label == "the stamps of the encoders are 20 ms too late"
+
+
+def test_a_cut_keeps_stamps_and_readings_together(head: Case) -> None:
+    _, data, _ = head
+    part = cut("head", data, 3.0, 7.0)
+    for stamps, values in ((part.head_t, part.head_gyro), (part.vision_t, part.vision_wxyz)):
+        assert len(stamps) == len(values)
+        assert 3.0 <= stamps[0] < stamps[-1] < 7.0
+    rows = np.searchsorted(data.vision_t, part.vision_t)
+    np.testing.assert_array_equal(part.vision_cov, data.vision_cov[rows])
+
+
+def test_mostly_rejected() -> None:
+    def estimate(share: float) -> Estimate:
+        used = np.arange(100) < 100 * share
+        residuals = {"vision": Residuals(np.arange(100.0), np.zeros((100, 3)), used)}
+        return Estimate("batch", (), np.zeros(0), np.zeros((0, 0)), True, "", residuals)
+
+    assert mostly_rejected(estimate(0.5))
+    assert not mostly_rejected(estimate(0.95))
