@@ -71,20 +71,12 @@ def test_without_a_camera_the_accelerometer_defines_the_body() -> None:
     data, truth, config = _simulated(5, camera=False, reference=False, magnetometer=False, poses=30)
     _, estimate, judged = _solved(data, config)
     assert judged.status == "calibrated", judged.headline
-    values = dict(zip(estimate.names, estimate.values, strict=True))
-
-    def gain(numbers: dict[str, float], name: str) -> np.ndarray:
-        return np.array([[numbers[f"{name}_k{i}{j}"] for j in "123"] for i in "123"])
-
-    u = _upper(gain(truth, "accel"))
-    np.testing.assert_allclose(gain(values, "accel"), u @ gain(truth, "accel"), atol=2e-3)
-    np.testing.assert_allclose(gain(values, "gyro"), u @ gain(truth, "gyro"), atol=2e-3)
-
-
-def _upper(K: np.ndarray) -> np.ndarray:
-    """The rotation U with U K upper triangular, its diagonal positive."""
-    q, r = np.linalg.qr(K)
-    return np.diag(np.sign(np.diag(r))) @ q.T
+    assert max(_sigmas_off(estimate, truth).values()) < 4.0
+    assert {q for q, verdict in judged.verdicts.items() if verdict == "fixed"} == {
+        "accel_k21",
+        "accel_k31",
+        "accel_k32",
+    }
 
 
 def test_incremental_ends_where_batch_does() -> None:

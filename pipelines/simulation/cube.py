@@ -230,6 +230,10 @@ class _World:
             name: np.eye(3) + scenario.gain_error * self.rng.standard_normal((3, 3))
             for name in ("accel", "gyro", "mag")
         }
+        if not scenario.camera:
+            # The accelerometer's own axes define the body frame: its K is upper triangular.
+            upper = np.linalg.qr(self.K["accel"])[1]
+            self.K["accel"] = np.sign(np.diag(upper))[:, None] * upper
         sigmas = {"accel": scenario.accel_bias, "gyro": scenario.gyro_bias, "mag": scenario.mag_bias}
         self.b = {name: sigma * self.rng.standard_normal(3) for name, sigma in sigmas.items()}
         self.motion = self._motion()
