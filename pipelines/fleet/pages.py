@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 # Rows of a list on the page; the CSV has all.
 _MOST_LISTED = 200
 _MONTH = 30.0
+_MOST_BARS = 60
 
 
 @dataclass(frozen=True)
@@ -153,10 +154,11 @@ def _population_plot(p: Population) -> Plot:
     flagged[[i for c in p.changes if c.changed for i in (c.before, c.after)]] = True
     good = np.flatnonzero(~flagged)
     _add_recordings(out, p, good[thin(len(good))], factor, "recording", COLORS[0])
-    out.add_histogram(y=factor * p.values[good], xaxis="x2", marker={"color": COLORS[0]}, showlegend=False)
+    edges = np.histogram_bin_edges(factor * p.values, bins=int(np.clip(2.0 * math.sqrt(len(p.values)), 10, _MOST_BARS)))
+    _add_counts(out, factor * p.values[good], edges, COLORS[0])
     if flagged.any():
         _add_recordings(out, p, np.flatnonzero(flagged), factor, "outlying or changed", REJECTED)
-        out.add_histogram(y=factor * p.values[flagged], xaxis="x2", marker={"color": REJECTED}, showlegend=False)
+        _add_counts(out, factor * p.values[flagged], edges, REJECTED)
     if p.spread and p.control:
         for bound, dash in ((p.spread.centre, "solid"), *((limit, "dash") for limit in p.control)):
             out.add_hline(y=factor * bound, line={"color": "#888888", "width": 1, "dash": dash})
@@ -174,6 +176,19 @@ def _add_recordings(out: go.Figure, p: Population, some: Any, factor: float, nam
         mode="markers",
         name=name,
         marker={"color": color, "size": 6},
+    )
+
+
+def _add_counts(out: go.Figure, values: Array, edges: Array, color: str) -> None:
+    """Bars that lie down beside the values, counted here: the page does not grow with the fleet."""
+    out.add_bar(
+        x=np.histogram(values, edges)[0],
+        y=0.5 * (edges[1:] + edges[:-1]),
+        width=np.diff(edges),
+        orientation="h",
+        xaxis="x2",
+        marker={"color": color},
+        showlegend=False,
     )
 
 
