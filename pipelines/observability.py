@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from statistics import NormalDist
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factors.chi_square import quantile
-from pipelines.methods.base import Array, ChiSquare, Quantity
+from pipelines.methods.base import Array, ChiSquare, History, Quantity, Residuals
 
 Verdict = Literal["fixed", "observable", "prior", "weak", "unobservable"]
 Status = Literal["calibrated", "weak", "inconsistent", "unobservable"]
@@ -32,6 +33,11 @@ _SMALL_WEIGHT = 0.1
 _ALIKE = 0.9
 # Sigma, in prior scales, of what is not a number.
 _UNKNOWN = 1e4
+
+# Lags of the autocorrelation, and from how many innovations on it says something.
+_LAGS, _FEWEST_INNOVATIONS = 5, 20
+# Parts of a recording whose information is compared, and from how many moments on.
+_TENTHS, _FEWEST_MOMENTS = 10, 20
 
 _DEFAULT_ADVICE = "vary the motion while recording, record longer, or give these parameters a tighter prior"
 
@@ -131,6 +137,89 @@ class Consistency:
         families = self.families or {"the whole": self.total}
         family, fit = max(families.items(), key=lambda item: sign * item[1].excess)
         return f"{family} (it would have to be {fit.noise_factor:.2g} times as large)"
+
+
+@dataclass(frozen=True)
+class Innovations:
+    """Whether the innovations of a family are white and as large as they should be.
+
+    Attributes:
+        autocorrelation: at the lags 1, 2, ... measurements; 0 expected.
+        bound: 99.9 % of white innovations have an autocorrelation within plus and minus this.
+        nis: mean of the squared norms; `rows` expected.
+        low, high: 99.9 % interval of that mean.
+        rows: numbers in a measurement.
+    """
+
+    autocorrelation: tuple[float, ...]
+    bound: float
+    nis: float
+    low: float
+    high: float
+    rows: int
+
+    @classmethod
+    def of(cls, residuals: Residuals) -> Innovations | None:
+        """Of those used; None when there are too few to say anything."""
+        used = residuals.whitened[residuals.used]
+        n, rows = used.shape
+        if n < _FEWEST_INNOVATIONS:
+            return None
+        square = float((used**2).sum())
+        lags = tuple(float((used[lag:] * used[:-lag]).sum()) / square for lag in range(1, _LAGS + 1))
+        fit = Fit.of(square, float(n * rows))
+        bound = NormalDist().inv_cdf(1.0 - _TAIL) / float(np.sqrt(n * rows))
+        return cls(lags, bound, square / n, fit.low / n, fit.high / n, rows)
+
+    @property
+    def white(self) -> bool:
+        """Whether all autocorrelations lie within the bound."""
+        return max(map(abs, self.autocorrelation)) <= self.bound
+
+
+@dataclass(frozen=True)
+class Learning:
+    """How a parameter became known while recording.
+
+    Attributes:
+        met_s: from when on its sigma was as required, s; None: never.
+        stretch: (start, end), s, of the tenth of the recording that brought most information.
+        share: that tenth's part of all information.
+    """
+
+    met_s: float | None
+    stretch: tuple[float, float]
+    share: float
+
+
+def learning(history: History, names: Sequence[str], quantities: Sequence[Quantity]) -> dict[str, Learning]:
+    """For each parameter that is estimated, from the history of a filter.
+
+    Information is the inverse of the variance; what a walking parameter loses counts as none gained.
+
+    Args:
+        history: sigmas as they were at each time.
+        names: of the history's columns.
+        quantities: those to tell about.
+    """
+    required = {q.name: q.require for q in quantities if q.prior_sigma != 0.0}
+    found = {}
+    for i, name in enumerate(names):
+        sigma = history.sigmas[:, i]
+        if name not in required or len(sigma) < _FEWEST_MOMENTS or not (sigma > 0.0).all():
+            continue
+        late = np.flatnonzero(sigma > required[name])
+        after = 0 if len(late) == 0 else int(late[-1]) + 1
+        edges = np.linspace(history.time[0], history.time[-1], _TENTHS + 1)
+        gained = np.maximum(np.diff(np.interp(edges, history.time, sigma**-2.0)), 0.0)
+        gained[0] += sigma[0] ** -2.0
+        best = int(np.argmax(gained))
+        found[name] = Learning(
+            met_s=float(history.time[after]) if after < len(sigma) else None,
+            stretch=(float(edges[best]), float(edges[best + 1])),
+            share=float(gained[best] / gained.sum()),
+        )
+    return found
 
 
 @dataclass(frozen=True)

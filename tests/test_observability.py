@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pipelines.methods.base import ChiSquare, Quantity
-from pipelines.observability import Assessment, assess
+from pipelines.methods.base import ChiSquare, History, Quantity, Residuals
+from pipelines.observability import Assessment, Cause, Innovations, assess, learning
 
 GOOD_FIT = ChiSquare(1000.0, 1000.0, {"vision": (1000.0, 1000.0)})
 
@@ -209,3 +209,42 @@ def test_calibrated_by_prior_alone_says_so() -> None:
     found = judged([quantity("a"), quantity("b", 0.05)], np.diag([1e-4, 0.05**2]))
     assert found.status == "calibrated"
     assert "b by prior alone" in found.headline
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_white_innovations_pass_and_correlated_ones_do_not(seed: int) -> None:
+    rows = np.random.default_rng(seed).standard_normal((2000, 3))
+    time, used = np.arange(2000.0), np.ones(2000, dtype=bool)
+    white = Innovations.of(Residuals(time, rows, used))
+    assert white is not None
+    assert white.white
+    assert white.low < white.nis < white.high
+    coloured = Innovations.of(Residuals(time, rows + 0.5 * np.roll(rows, 1, axis=0), used))
+    assert coloured is not None
+    assert coloured.autocorrelation[0] == pytest.approx(0.4, abs=0.05)  # 0.5 / (1 + 0.5^2)
+    assert not coloured.white
+    assert coloured.nis > coloured.high
+    assert Innovations.of(Residuals(time[:5], rows[:5], used[:5])) is None
+
+
+def test_learning_finds_when_and_where_a_parameter_became_known() -> None:
+    """Information at a steady small rate, and at a hundred times that rate from 40 to 50 s."""
+    time = np.linspace(0.0, 100.0, 501)
+    information = 1.0 + 0.1 * time + 10.0 * np.clip(time - 40.0, 0.0, 10.0)
+    sigmas = np.column_stack([information**-0.5, np.ones(501), np.zeros(501)])
+    quantities = [quantity("a", require=0.2), quantity("b", require=0.2), quantity("c", 0.0)]
+    found = learning(History(time, np.zeros((501, 3)), sigmas), ("a", "b", "c"), quantities)
+    assert set(found) == {"a", "b"}
+    assert found["a"].stretch == pytest.approx((40.0, 50.0))
+    assert found["a"].share == pytest.approx(101.0 / 111.0)
+    assert found["a"].met_s == pytest.approx(42.0, abs=0.5)  # 1 + 4 + 10 * 2 = 1 / 0.2^2
+    assert found["b"].met_s is None
+
+
+def test_causes_come_first_in_the_headline() -> None:
+    found = judged([quantity("a")], 1e-4 * np.eye(1), ChiSquare(2000.0, 1000.0, {}))
+    assert found.explained([]) == found
+    explained = found.explained([Cause("the clock is late", "moved, it fits"), Cause("other", "too")])
+    assert explained.headline.startswith("The clock is late: moved, it fits. ")
+    assert explained.headline.endswith(found.headline)
+    assert len(explained.causes) == 2

@@ -81,6 +81,8 @@ def common_plots(calibration: Calibration) -> list[Plot]:
     estimate = calibration.estimate
     history = estimate.history
     plots = _histories(calibration, history) if history is not None and len(history.time) else []
+    if calibration.learning and history is not None:
+        plots.append(_learning(calibration, history))
     for family, residuals in estimate.residuals.items():
         if len(residuals.time):
             plots.append(_residuals(family, residuals, estimate.solver == "incremental"))
@@ -167,6 +169,23 @@ def _histories(calibration: Calibration, history: History) -> list[Plot]:
                 )
             )
     return plots
+
+
+def _learning(calibration: Calibration, history: History) -> Plot:
+    """Sigmas over what is required, as they fell."""
+    column = {name: i for i, name in enumerate(calibration.estimate.names)}
+    out = figure("sigma / required")
+    require = {q.name: q.require for q in calibration.problem.quantities}
+    for name, color in zip(calibration.learning, cycle(COLORS)):
+        add_line(out, history.time, history.sigmas[:, column[name]] / require[name], name, color)
+    out.add_hline(y=1.0, line={"color": "#888888", "width": 1, "dash": "dot"})
+    out.update_yaxes(type="log", exponentformat="power")
+    return Plot(
+        "What was known when",
+        "Sigma of each parameter over the one required, as the recording went on; below the dotted line it is as "
+        "accurate as required. Where a line falls steeply the motion said much.",
+        out,
+    )
 
 
 def _band(out: go.Figure, time: Array, values: Array, sigmas: Array, color: str) -> None:

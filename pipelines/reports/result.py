@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 import platform
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from importlib import metadata
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from pipelines.methods.base import Estimate, Problem, Quantity, Residuals
-from pipelines.observability import Assessment, Fit, Status, Verdict
+from pipelines.observability import Assessment, Fit, Innovations, Learning, Status, Verdict, learning
 from pipelines.reports.units import robust_sigma
 from pipelines.sessions.info import SessionFacts
 
@@ -111,6 +111,22 @@ class Calibration:
         return {**self.seconds, **self.estimate.seconds}
 
     @property
+    def innovations(self) -> dict[str, Innovations]:
+        """Family -> whiteness and size of its innovations; only the incremental solver has innovations."""
+        if self.estimate.solver != "incremental":
+            return {}
+        found = {family: Innovations.of(r) for family, r in self.estimate.residuals.items()}
+        return {family: innovations for family, innovations in found.items() if innovations is not None}
+
+    @property
+    def learning(self) -> dict[str, Learning]:
+        """Parameter -> how it became known; only the incremental solver knows."""
+        history = self.estimate.history
+        if self.estimate.solver != "incremental" or history is None:
+            return {}
+        return learning(history, self.estimate.names, self.problem.quantities)
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """What a reader has to know beside the headline."""
         trouble = () if self.estimate.converged else (f"the solver did not converge: {self.estimate.message}",)
@@ -183,6 +199,25 @@ class CauseResult(_Record):
     evidence: str
 
 
+class InnovationsResult(_Record):
+    """Whether the innovations of a family are white, and the mean of their squares (NIS) with its 99.9 % interval."""
+
+    autocorrelation: list[float]
+    bound: float
+    nis: float
+    low: float
+    high: float
+    rows: int
+
+
+class LearningResult(_Record):
+    """From when on a parameter was as accurate as required, s, and the tenth of the recording that said most of it."""
+
+    met_s: float | None
+    stretch: tuple[float, float]
+    share: float
+
+
 class SessionResult(_Record):
     """What went in."""
 
@@ -217,6 +252,8 @@ class Result(_Record):
     headline: str
     notes: list[str]
     causes: list[CauseResult]
+    innovations: dict[str, InnovationsResult]
+    learning: dict[str, LearningResult]
     truth: dict[str, TruthResult] | None = None
 
 
@@ -238,7 +275,9 @@ def result(calibration: Calibration) -> Result:
         timing_s=c.timing,
         headline=a.headline,
         notes=list(c.notes),
-        causes=[CauseResult(label=cause.label, evidence=cause.evidence) for cause in a.causes],
+        causes=[CauseResult(**asdict(cause)) for cause in a.causes],
+        innovations={family: InnovationsResult(**asdict(found)) for family, found in c.innovations.items()},
+        learning={name: LearningResult(**asdict(found)) for name, found in c.learning.items()},
         truth=truth_errors(c) if c.truth is not None else None,
     )
 
