@@ -204,7 +204,7 @@ def test_unit_and_date_come_from_metadata(
 ) -> None:
     """Of any record, or of rosbag2's custom data; else the file's name and the start of the recording stand in."""
     source = next(iter(sorted(forty.glob("U00*.mcap"))))
-    yaml = "rosbag2_bagfile_information:\n  custom_data:\n    unit: U98\n    date: '2026-02-03'\n"
+    yaml = "version: 9\nstorage_identifier: mcap\ncustom_data:\n  unit: 007\n  date: 2026-02-03\n"
     with_metadata(source, tmp_path / "a.mcap", "campaign", {"unit": "U99", "date": "2026-02-01T10:00"})
     with_metadata(source, tmp_path / "b.mcap", "rosbag2", {"serialized_metadata": yaml})
     (tmp_path / "c.mcap").write_bytes(source.read_bytes())
@@ -212,7 +212,7 @@ def test_unit_and_date_come_from_metadata(
     rows = rows_of(tmp_path / "out" / "fleet.csv")
     assert [(row["unit"], row["date"]) for row in rows] == [
         ("U99", "2026-02-01T10:00:00Z"),
-        ("U98", "2026-02-03T00:00:00Z"),
+        ("007", "2026-02-03T00:00:00Z"),
         ("c", "2026-11-20T12:00:00Z"),
     ]
 

@@ -30,8 +30,9 @@ def find(patterns: Sequence[str]) -> dict[str, OpenFile]:
     for pattern in patterns:
         try:
             matches = fsspec.open_files(pattern)
-            # A name without wildcards is taken as it is, there or not.
-            matches = [file for file in matches if file.fs.isfile(file.path)]
+            # A name without wildcards has not been looked up; of many remote ones each would be asked for.
+            if len(matches) == 1 or all(map(_is_local, matches)):
+                matches = [file for file in matches if file.fs.isfile(file.path)]
         except (OSError, ValueError, ImportError) as error:
             raise InputError(f"{pattern}: cannot be looked up: {' '.join(str(error).split())}") from error
         if not matches:
@@ -110,17 +111,16 @@ def as_date(text: str) -> datetime.datetime:
 
 
 def _custom(metadata: dict[str, str]) -> dict[str, str]:
-    """rosbag2's custom data: YAML inside one metadata record."""
+    """rosbag2's custom data: YAML inside one metadata record. All of it is text, `unit: 007` too."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
     try:
-        content = YAML(typ="safe", pure=True).load(metadata.get("serialized_metadata", ""))
+        content = YAML(typ="base", pure=True).load(metadata.get("serialized_metadata", ""))
     except YAMLError:
         return {}
-    information = content.get("rosbag2_bagfile_information", content) if isinstance(content, dict) else {}
-    custom = (information or {}).get("custom_data")
-    return {str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {}
+    custom = content.get("custom_data") if isinstance(content, dict) else None
+    return custom if isinstance(custom, dict) else {}
 
 
 def _is_local(file: OpenFile) -> bool:
