@@ -105,6 +105,28 @@ def simulate(
 
 
 @app.command()
+def plan(
+    method: Annotated[str, typer.Argument(help="los, indexer, head or cube.")],
+    scenario: Annotated[
+        str | None, typer.Option(help="The planned motion: YAML file or a name, as simulate has.")
+    ] = None,
+    config: _ConfigFile = None,
+    require: Annotated[list[str] | None, typer.Option(help="NAME=SIGMA wanted, SI; may be repeated.")] = None,
+    out: Annotated[Path | None, typer.Option(help="File for the better motion, as a scenario.")] = None,
+) -> None:
+    """How well a planned motion would tell each parameter, and a better one. Exit code 3 if less than required."""
+    from pipelines import terminal
+    from pipelines.planning import make_plan, requirements, write_scenario
+
+    planned = make_plan(method, scenario, config, requirements(require or []))
+    terminal.show_plan(planned)
+    if out is not None:
+        write_scenario(out, planned)
+        terminal.say(f"The better motion is in {out}")
+    raise typer.Exit(exit_codes.OF_STATUS[planned.now.assessment.status])
+
+
+@app.command()
 def info(session: _Session, config: _ConfigFile = None) -> None:
     """What is in a recording: topics, rates, gaps, and the methods it can serve."""
     from pipelines import terminal

@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 if TYPE_CHECKING:
+    from pipelines.planning import Plan
     from pipelines.reports.result import Calibration, ParameterResult
     from pipelines.sessions.info import SessionFacts
 
@@ -97,6 +98,37 @@ def show_facts(name: str, facts: SessionFacts) -> None:
             say(f"{method}: no, it lacks {'; '.join(missing)}")
         else:
             _console.print(f"[green]{method}: yes[/]")
+
+
+def show_plan(plan: Plan) -> None:
+    """Predicted sigmas of a motion and of the better one, what falls short, and what to change."""
+    from pipelines.reports.units import human_unit
+
+    table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
+    table.add_column("parameter", no_wrap=True)
+    table.add_column("unit", no_wrap=True)
+    for column in ("required", "predicted", *(["with changes"] if plan.steps else [])):
+        table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
+    now, best = plan.now.sigmas, plan.best.sigmas
+    for q in plan.now.quantities:
+        unit, factor = human_unit(q)
+        cells = [f"{factor * sigma:.2g}" for sigma in (q.require, now[q.name], best[q.name])]
+        verdict = plan.now.assessment.verdicts[q.name]
+        table.add_row(q.name, unit, *cells[: 3 if plan.steps else 2], f"[{_COLOURS[verdict]}]{verdict}[/]")
+    _console.print(table)
+    for direction in plan.now.assessment.directions:
+        say(f"  {direction.verdict}: {direction.label}: {direction.advice}")
+    if not plan.now.missing:
+        say(f"This motion, {plan.now.duration:.0f} s of it, tells everything as accurately as required.")
+        return
+    say("Better:" if plan.steps else "None of the changes tried tells what is missing.")
+    for step in plan.steps:
+        say(f"  {step.change} ({step.gain:.1f} nats of what is missing)")
+    if plan.best.missing:
+        say(f"Still short: {', '.join(f'{name} by {ratio:.2g}' for name, ratio in plan.best.missing.items())}.")
+    else:
+        say(f"With that, {plan.best.duration:.0f} s tell everything as accurately as required.")
 
 
 def _cell(parameter: ParameterResult, factor: float, error_sigmas: float | None, alone: bool) -> str:

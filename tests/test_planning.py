@@ -1,0 +1,111 @@
+"""Predicted sigmas of planned motions, and better motions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.errors import InputError
+from pipelines.planning import Prediction, make_plan, predict, requirements, write_scenario
+from pipelines.registry import method
+from pipelines.sessions.config import load_config
+from pipelines.simulation.head import HeadScenario, head_config, simulate_head
+from pipelines.simulation.los import LosScenario, los_config, simulate_los
+from pipelines.simulation.motion import EulerMotion, Swing
+from pipelines.simulation.scenario import load_scenario
+from pipelines.solvers.batch import solve_batch
+
+LOS = LosScenario(duration_s=12, image_rate_hz=10, gyro_rate_hz=100, gimbal_rate_hz=100)
+SWAY = EulerMotion(
+    yaw=[Swing(amplitude_deg=20, frequency_hz=0.3)],
+    pitch=[Swing(amplitude_deg=15, frequency_hz=0.4)],
+    roll=[Swing(amplitude_deg=10, frequency_hz=0.5)],
+)
+HEAD = HeadScenario(
+    duration_s=15, vision_rate_hz=10, gyro_rate_hz=100, platform_gyro_rate_hz=100, head=SWAY, platform=SWAY
+)
+
+
+def errors_in_sigmas(scenario: LosScenario | HeadScenario, prediction: Prediction, runs: int) -> np.ndarray:
+    """(runs, n) errors of simulated recordings over the predicted sigmas, and checks the sigmas they report."""
+    out = []
+    for seed in range(1, runs + 1):
+        data: Any
+        if isinstance(scenario, LosScenario):
+            chosen, text = method("los"), los_config(scenario)
+            data, truth = simulate_los(scenario, seed)
+        else:
+            chosen, text = method("head"), head_config(scenario)
+            data, truth = simulate_head(scenario, seed)
+        estimate = solve_batch(chosen.problem(data, load_config(text.encode())))
+        predicted = np.array(list(prediction.sigmas.values()))
+        np.testing.assert_allclose(estimate.sigmas, predicted, rtol=0.2)
+        out.append((estimate.values - [truth[name] for name in estimate.names]) / predicted)
+    return np.array(out)
+
+
+@pytest.mark.parametrize("scenario", [LOS, HEAD], ids=["los", "head"])
+def test_plan_against_outcome(scenario: LosScenario | HeadScenario) -> None:
+    """Sigmas reported by simulated runs agree within 20 %, and their errors scatter by them."""
+    name = "los" if isinstance(scenario, LosScenario) else "head"
+    prediction = predict(name, scenario.model_dump(), None, {})
+    scatter = np.sqrt((errors_in_sigmas(scenario, prediction, 12) ** 2).mean())
+    # 12 runs of 7 or 10 numbers, correlated: the mean square of as many independent ones is known to 10 %.
+    assert scatter == pytest.approx(1.0, abs=0.2)
+
+
+def scenario_file(folder: Path, text: str) -> str:
+    path = folder / "scenario.yaml"
+    path.write_text(text)
+    return str(path)
+
+
+def test_what_is_weak_gets_advice_and_a_motion_that_mends_it(tmp_path: Path) -> None:
+    """Without sway in azimuth delta_px cannot be told from delta_gx and delta_gy."""
+    weak = scenario_file(
+        tmp_path,
+        "{duration_s: 12, image_rate_hz: 10, gyro_rate_hz: 100, gimbal_rate_hz: 100, azimuth_deg: 20, elevation_deg: 0,"
+        " carrier: {roll: [{amplitude_deg: 6, frequency_hz: 0.21}], pitch: [{amplitude_deg: 5, frequency_hz: 0.17}]}}",
+    )
+    plan = make_plan("los", weak, require={"delta_px": 5e-4}, most_steps=2)
+    assert plan.now.assessment.status in ("weak", "unobservable")
+    assert any("azimuth" in direction.advice for direction in plan.now.assessment.directions)
+    assert plan.steps
+    assert plan.best.sigmas["delta_px"] < 0.1 * plan.now.sigmas["delta_px"]
+    better = tmp_path / "better.yaml"
+    write_scenario(better, plan)
+    again = predict("los", load_scenario(LosScenario, better).model_dump(), None, {})
+    assert again.sigmas == pytest.approx(plan.best.sigmas)
+
+
+def test_a_motion_that_tells_everything_is_left_as_it_is(tmp_path: Path) -> None:
+    good = scenario_file(tmp_path, "{duration_s: 12, image_rate_hz: 10, gyro_rate_hz: 100, gimbal_rate_hz: 100}")
+    plan = make_plan("los", good)
+    assert plan.now.assessment.status == "calibrated"
+    assert plan.steps == ()
+    assert plan.best is plan.now
+
+
+def test_what_no_motion_can_tell_gets_no_change(tmp_path: Path) -> None:
+    """delta_pz and delta_gz asked for apart: only their difference is ever known."""
+    asked = tmp_path / "config.yaml"
+    asked.write_text("priors: {delta_pz: 0.1, delta_gz: 0.1}\n")
+    good = scenario_file(tmp_path, "{duration_s: 6, image_rate_hz: 10, gyro_rate_hz: 100, gimbal_rate_hz: 100}")
+    plan = make_plan("los", good, asked)
+    assert plan.now.assessment.status == "unobservable"
+    for name in ("delta_pz", "delta_gz"):
+        assert plan.best.missing[name] == pytest.approx(plan.now.missing[name], rel=0.01)
+
+
+def test_requirements_are_read_and_checked() -> None:
+    assert requirements(["delta_px=1e-4", "gyro_bias_x=2"]) == {"delta_px": 1e-4, "gyro_bias_x": 2.0}
+    for wrong in ("delta_px", "delta_px=", "=1", "delta_px=-1", "delta_px=nan", "delta_px=inf"):
+        with pytest.raises(InputError, match="NAME=SIGMA"):
+            requirements([wrong])
+    with pytest.raises(InputError, match="nearest known key is delta_px"):
+        make_plan("los", require={"deltapx": 1.0})
+    with pytest.raises(InputError, match="no method gimbal"):
+        make_plan("gimbal")
