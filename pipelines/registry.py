@@ -87,4 +87,14 @@ def _indexer() -> Method:
     )
 
 
-_METHODS: dict[str, Callable[[], Method]] = {"los": _los, "indexer": _indexer, "head": _head}
+def _cube() -> Method:
+    from pipelines.methods.cube import problem
+    from pipelines.methods.cube_validation import validate
+    from pipelines.published.cube import published_estimate
+    from pipelines.sessions.cube import read_cube
+    from pipelines.simulation.cube import write_simulation
+
+    return Method(read_cube, problem, published_estimate, write_simulation, validate=validate)
+
+
+_METHODS: dict[str, Callable[[], Method]] = {"los": _los, "indexer": _indexer, "head": _head, "cube": _cube}

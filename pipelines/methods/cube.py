@@ -43,7 +43,6 @@ from pipelines.methods.cube_parameters import (
     Parameters,
     cube_parameters,
     first_priors,
-    joining,
     tag_key,
 )
 from pipelines.methods.cube_reference import Reference, cube_reference, from_vectors
@@ -241,7 +240,6 @@ def _step(model: _Model, k: int) -> Step:
             measured = so3.to_gtsam(model.reference.nRB[k])
             noise = gtsam.noiseModel.Gaussian.Covariance(model.reference.covariance[k])
             factors.append(Factor("reference", gtsam.PriorFactorRot3(_reference_key(k), measured, noise)))
-    factors += joining(initial) if k == 0 else []
     factors += _sensor_factors(model, k)
     if seen is not None:
         factors.append(_tag_factor(model, k, seen))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -20,6 +19,9 @@ from pipelines.sessions.config import Config, RawConversion, check_names
 TRIADS = ("accel", "gyro", "mag")
 TRIAD_KEYS: dict[str, int] = {name: int(gtsam.symbol(c, 0)) for name, c in zip(TRIADS, "AGM", strict=True)}
 MOUNT_KEY, HEADING_KEY, FIELD_KEY = (int(gtsam.symbol(c, 0)) for c in "CHF")
+
+# Of the total intensity by WMM 2025, T: global error model of its technical report (NOAA/NCEI and BGS, 2024).
+_STRENGTH_SIGMA = 1.38e-7
 
 # Triad -> unit of its nominal value, default prior sigma and accuracy wanted of its bias.
 _BIAS: Mapping[str, tuple[str, float, float]] = {
@@ -95,25 +97,21 @@ def first_priors(parameters: Parameters) -> list[Factor]:
         factors.append(vector_prior(parameters.heading, np.zeros(1)))
     if parameters.field is not None and parameters.field_model is not None:
         factors.append(vector_prior(parameters.field, parameters.field_model))
+        factors.append(_strength(parameters.field.key, parameters.field_model))
     return factors
 
 
-def joining(values: gtsam.Values) -> list[Factor]:
-    """Factors without information that join the variables in a chain.
+def _strength(key: int, model: Array) -> Factor:
+    """The field's strength is as the model says, to the model's own error.
 
-    gtsam's METIS ordering crashes the process on a variable that shares no factor with another (a tag not seen yet).
+    No motion tells it from the magnetometer's scale, and the priors on the components are made for its direction, which
+    iron nearby turns.
     """
-    keys, sizes = list(values.keys()), values.dims()
-    one = gtsam.noiseModel.Unit.Create(1)
-    return [
-        Factor(
-            "prior",
-            gtsam.LinearContainerFactor(
-                gtsam.JacobianFactor(a, np.zeros((1, sizes[a])), b, np.zeros((1, sizes[b])), np.zeros(1), one), values
-            ),
-        )
-        for a, b in pairwise(keys)
-    ]
+    along = (model / np.linalg.norm(model))[None]
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, _STRENGTH_SIGMA)
+    at = gtsam.Values()
+    at.insert(key, model)
+    return Factor("prior", gtsam.LinearContainerFactor(gtsam.JacobianFactor(key, along, np.zeros(1), noise), at))
 
 
 def cube_parameters(config: Config, camera: bool, reference: bool, field: Array | None) -> Parameters:

@@ -110,6 +110,10 @@ def _lack(key: str, recording: Recording, config: Config) -> str:
         return "" if config.latitude_deg is not None else "latitude_deg in the config"
     if key == "head.board":
         return "" if config.head.board is not None else "head.board in the config"
+    if key == "cube.tags":
+        return "" if config.cube.tags else "cube.tags in the config"
+    if key == "method: cube":
+        return "" if config.method == "cube" else "`method: cube` in the config"
     name = config.topic(key)
     found = recording.topics.get(name)
     types = " or ".join(TOPICS[key].types)

@@ -44,10 +44,8 @@ NEEDED: dict[str, tuple[tuple[tuple[str, ...], ...], ...]] = {
     "head": ((("head_imu",),), (("vision_attitude",), ("image", "camera_info", "head.board"))),
     "cube": (
         (("imu",),),
-        (("mag",),),
-        (("reference_fix",),),
-        (("reference_imu",),),
-        (("image", "camera_info"), ("tag_detections", "camera_info")),
+        # Without camera the turns between poses and gravity serve; the config has to say that this is meant.
+        (("image", "camera_info", "cube.tags"), ("tag_detections", "camera_info", "cube.tags"), ("method: cube",)),
     ),
 }
 

@@ -104,13 +104,20 @@ def graph_of(factors: Sequence[Factor]) -> gtsam.NonlinearFactorGraph:
 
 def elimination_ordering(graph: gtsam.NonlinearFactorGraph, shared: Sequence[int]) -> gtsam.Ordering:
     """Nested dissection of the chain with the shared variables last, which suits chains with a few common variables."""
+    # METIS wants variables that share a factor with another, or it brings the process down.
+    joined = gtsam.NonlinearFactorGraph()
+    alone = dict.fromkeys(shared)
+    for i in range(graph.size()):
+        keys = graph.at(i).keys()
+        if len(keys) > 1:
+            joined.push_back(graph.at(i))
+        else:
+            alone.update(dict.fromkeys(keys))
     last = set(shared)
+    metis = gtsam.Ordering.MetisNonlinearFactorGraph(joined) if joined.size() else gtsam.Ordering()
+    chain = [metis.at(i) for i in range(metis.size()) if metis.at(i) not in last]
     ordering = gtsam.Ordering()
-    metis = gtsam.Ordering.MetisNonlinearFactorGraph(graph)
-    for i in range(metis.size()):
-        if metis.at(i) not in last:
-            ordering.push_back(metis.at(i))
-    for key in shared:
+    for key in [*(alone.keys() - last - set(chain)), *chain, *shared]:
         ordering.push_back(key)
     return ordering
 
