@@ -118,6 +118,16 @@ def test_bad_input_is_one_line(
     assert said in error
 
 
+@pytest.mark.parametrize("words", [("montecarlo", "head"), ("fleet", "*.mcap")])
+def test_a_missing_extra_is_told(
+    words: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("pipelines.fleet.find_spec", lambda name: None if name == "arro3" else True)
+    assert alidade(monkeypatch, *words) == 2
+    assert capsys.readouterr().err == "alidade: this command needs arro3: pip install 'alidade[fleet]'\n"
+
+
 def test_the_consistency_page_lists_every_solver(scheduler: str, scenario: Path, tmp_path: Path) -> None:
     study = run_study("head", str(scenario), range(4), SOLVERS, tmp_path / "out", scheduler)
     page = consistency.page([study], 4)

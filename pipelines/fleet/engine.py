@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.errors import InputError
+from pipelines.fleet import require_extra
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -59,10 +60,9 @@ def cluster(scheduler: str | None, jobs: int | None) -> Iterator[Client]:
         InputError: the extra is missing, nothing answers at the address, it has no workers, or one of them runs
             another alidade.
     """
-    try:
-        from distributed import Client
-    except ImportError as error:
-        raise InputError(f"this command needs the extra: pip install 'alidade[fleet]' ({error})") from error
+    require_extra()
+    from distributed import Client
+
     if jobs is not None and (scheduler is not None or jobs < 1):
         raise InputError(f"--jobs {jobs}: a number of local workers, 1 or more, and not together with --scheduler")
     # What it logs of lost workers is told by the results.

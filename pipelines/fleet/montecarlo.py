@@ -20,7 +20,7 @@ import numpy as np
 
 from pipelines import exit_codes
 from pipelines.errors import InputError
-from pipelines.fleet import statistics
+from pipelines.fleet import require_extra, statistics
 from pipelines.fleet.engine import Killed, cluster, completed, source_version
 from pipelines.fleet.progress import progress
 from pipelines.fleet.store import Result, Store, settings_key
@@ -136,6 +136,7 @@ def run_study(
     Raises:
         InputError: no such method, scenario or solver, out cannot be written to, or no cluster can be had.
     """
+    require_extra()
     unknown = [solver for solver in solvers if solver not in SOLVERS]
     if unknown or not solvers:
         raise InputError(f"no solver {', '.join(unknown)!r}; the solvers are {', '.join(SOLVERS)}, or all")

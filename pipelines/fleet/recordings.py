@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from pipelines.errors import InputError
+from pipelines.fleet import require_extra
 
 if TYPE_CHECKING:
     from fsspec.core import OpenFile
@@ -24,6 +25,7 @@ _FIELDS = {"{unit}": r"(?P<unit>.+?)", "{date}": r"(?P<date>\d{4}-?\d\d-?\d\d(?:
 
 def find(patterns: Sequence[str]) -> dict[str, OpenFile]:
     """The files that match, by name, in order. Raises InputError when a pattern matches none or cannot be looked up."""
+    require_extra()
     import fsspec
 
     found: dict[str, OpenFile] = {}
