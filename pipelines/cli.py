@@ -217,6 +217,67 @@ def fleet(
         raise typer.Exit(exit_codes.INTERRUPTED)
 
 
+@app.command()
+def export(
+    calibration: Annotated[Path, typer.Argument(metavar="CALIBRATION.yaml", help="Of a cube calibration.")],
+    form: Annotated[str, typer.Option("--format", help="px4, ardupilot or ros2.")],
+    out: Annotated[Path | None, typer.Option(help="The file to write; default: printed.")] = None,
+) -> None:
+    """A cube calibration as the parameters of an autopilot, in its own conventions."""
+    from pipelines import terminal
+    from pipelines.reports.calibration import load_calibration
+    from pipelines.reports.export import exported
+
+    text = exported(load_calibration(calibration), form)
+    if out is None:
+        print(text, end="")
+    else:
+        _write(out, text)
+        terminal.say(f"Wrote {out}")
+
+
+@app.command("cube-layout")
+def cube_layout(
+    session: _Session,
+    out: Annotated[Path, typer.Option(help="The config to write, with where the tags are.")],
+    config: _ConfigFile = None,
+) -> None:
+    """Where the tags are on a cube, from pictures of it on all sides; the config gives their ids and sizes."""
+    from pipelines import terminal
+    from pipelines.sessions.config import ATTACHMENT, load_config
+    from pipelines.sessions.cube_layout import cube_layout as estimate
+    from pipelines.sessions.cube_layout import layout_yaml
+    from pipelines.sessions.reading import open_recording
+
+    recording = open_recording(session)
+    layout = estimate(recording, load_config(recording.attachment(ATTACHMENT), config))
+    _write(out, layout_yaml(layout))
+    terminal.say(f"Wrote {out}")
+
+
+@app.command("cube-print")
+def cube_print(
+    edge: Annotated[float, typer.Option(help="Of the cube, m.")],
+    out: Annotated[Path, typer.Option(help="The PDF to write.")],
+    first_id: Annotated[int, typer.Option(help="Tag on the top face; the others follow.")] = 16,
+) -> None:
+    """Sheets with the six faces of a tag cube, true to scale."""
+    from pipelines import terminal
+    from pipelines.reports.printing import print_cube
+
+    print_cube(out, edge, first_id)
+    terminal.say(f"Wrote {out}: print at 100 % and check the ruler")
+
+
+def _write(path: Path, text: str) -> None:
+    from pipelines.errors import InputError
+
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+
+
 def _seconds(window: str) -> float | None:
     from pipelines.errors import InputError
 
