@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
 import shutil
 import signal
@@ -69,8 +70,6 @@ def start() -> Iterator[Start]:
 @pytest.fixture
 def scheduler(start: Start, tmp_path: Path) -> str:
     """Address of a scheduler in a process of its own."""
-    import json
-
     file = tmp_path / "scheduler.json"
     start("dask", "scheduler", "--host", "127.0.0.1", "--port", 0, "--no-dashboard", "--scheduler-file", file)
     until(file.exists)
@@ -224,3 +223,20 @@ def test_killed_is_no_result_of_the_others() -> None:
         results = dict(completed(client, deadly, {str(i): (i,) for i in range(12)}))
     assert {name for name, result in results.items() if isinstance(result, Killed)} == {"1", "4"}
     assert {name for name, result in results.items() if result == int(name)} == set(map(str, range(12))) - {"1", "4"}
+
+
+def test_a_scheduler_that_dies_midway_is_told(start: Start, recordings: Path, tmp_path: Path) -> None:
+    file, out = tmp_path / "scheduler.json", tmp_path / "out"
+    process = start("dask", "scheduler", "--host", "127.0.0.1", "--port", 0, "--no-dashboard", "--scheduler-file", file)
+    until(file.exists)
+    address = str(json.loads(file.read_text())["address"])
+    worker(start, address)
+    command = start("pipelines.cli", "fleet", recordings / "*.mcap", "--scheduler", address, "--out", out)
+    until(lambda: len(finished(out)) >= 2)
+    process.kill()
+    _, error = command.communicate(timeout=60)
+    assert command.returncode == 2
+    assert error.splitlines() == [
+        f"alidade: the scheduler at {address} is gone; what is finished is kept, the same command continues"
+    ]
+    assert 2 <= len(finished(out)) < COUNT

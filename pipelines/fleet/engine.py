@@ -65,8 +65,9 @@ def cluster(scheduler: str | None, jobs: int | None) -> Iterator[Client]:
 
     if jobs is not None and (scheduler is not None or jobs < 1):
         raise InputError(f"--jobs {jobs}: a number of local workers, 1 or more, and not together with --scheduler")
-    # What it logs of lost workers is told by the results.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    # What it logs of lost workers and connections is told by the results, or in one line.
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     with contextlib.ExitStack() as stack:
         address = scheduler or stack.enter_context(_local(jobs))
         try:
