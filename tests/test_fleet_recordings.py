@@ -15,6 +15,8 @@ import pytest
 
 from pipelines import cli
 from pipelines.fleet import engine
+from pipelines.fleet.fleet import Settings, calibrate_recording
+from pipelines.fleet.recordings import find
 from pipelines.sessions.head import write_head
 from pipelines.simulation.head import HeadScenario, head_config, simulate_head
 
@@ -184,6 +186,25 @@ def test_nothing_is_done_twice(
     config = tmp_path / "config.yaml"
     config.write_text("noise: {vision_attitude: 0.009}\n")
     assert "4 of 4 recordings, 0 from an earlier run" in run("*.mcap", "--config", config)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_no_damage_of_a_file_costs_more_than_its_row(forty: Path, tmp_path: Path, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    content = bytearray((forty / f"U00_{DATES[0]}.mcap").read_bytes())
+    if seed % 2:
+        del content[int(rng.integers(len(content))) :]
+    else:
+        # Half of the changes near the end, where the index and the metadata's place are.
+        first = len(content) - 3000 if seed % 4 else 0
+        for place in rng.integers(first, len(content), 20):
+            content[place] ^= int(rng.integers(1, 256))
+    (tmp_path / "U.mcap").write_bytes(content)
+    (file,) = find([str(tmp_path / "U.mcap")]).values()
+    result = calibrate_recording(file, Settings(), None)
+    assert result is not None
+    assert result["exit_code"] in (0, 2, 3, 4)
+    assert "\n" not in result["reason"]
 
 
 def test_recordings_come_from_other_file_systems(

@@ -90,7 +90,6 @@ def from_metadata(path: Path) -> dict[str, str]:
     Any MCAP metadata record with a key `unit` or `date`, or the custom data of rosbag2 (`ros2 bag record --custom-data
     unit=U17`).
     """
-    from mcap.exceptions import McapError
     from mcap.reader import make_reader
 
     found: dict[str, str] = {}
@@ -98,8 +97,9 @@ def from_metadata(path: Path) -> dict[str, str]:
         try:
             for record in make_reader(stream).iter_metadata():
                 found |= {k: v for k, v in {**_custom(record.metadata), **record.metadata}.items() if v}
-        except McapError:
-            return {}  # the messages can be read by other means; nobody can find metadata in such a file
+        except Exception:
+            # A damaged file fails in any way here. What is wrong with it is told when its messages are read.
+            return {}
     return {key: found[key] for key in ("unit", "date") if key in found}
 
 

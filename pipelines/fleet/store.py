@@ -35,7 +35,7 @@ class Store:
             self._load()
 
     def add(self, name: str, result: Result) -> None:
-        """Keep a result, on the disk before this returns."""
+        """Keep a result, in the file before this returns."""
         line = json.dumps({"settings": self._settings, "name": name, "result": result}, allow_nan=False)
         with self._path.open("a", encoding="utf-8") as stream:
             stream.write(line + "\n")
