@@ -65,9 +65,12 @@ def test_what_is_missing_is_named_and_renames_are_honoured(tmp_path: Path) -> No
     )
     config = load_config(b"topics: {imu: /xsens}\nlatitude_deg: 40")
     assert missing_for("indexer", recording, config) == ()
-    assert "/mag as sensor_msgs/msg/MagneticField, not geometry_msgs/msg/Vector3Stamped" in missing_for(
-        "cube", recording, config
-    )
+    (cube,) = missing_for("cube", recording, config)
+    assert cube.startswith("/tag_detections (apriltag_msgs/msg/AprilTagDetectionArray) and /camera/camera_info")
+    assert cube.endswith("cube.tags in the config, or `method: cube` in the config")
+    assert missing_for("cube", recording, load_config(b"topics: {imu: /xsens}\nmethod: cube")) == ()
+    los = missing_for("los", recording, load_config(b"topics: {imu: /xsens, gimbal: /mag}"))
+    assert "/mag as sensor_msgs/msg/JointState, not geometry_msgs/msg/Vector3Stamped" in los
     head = missing_for("head", recording, config)
     assert head[0] == "/head/imu (sensor_msgs/msg/Imu)"
     assert head[1].endswith("/camera/camera_info (sensor_msgs/msg/CameraInfo) and head.board in the config")
@@ -104,7 +107,7 @@ def test_several_methods_served_is_an_error_that_names_them(tmp_path: Path) -> N
 
 def test_needs_are_made_of_known_keys() -> None:
     keys = {key for needs in NEEDED.values() for groups in needs for group in groups for key in group}
-    assert keys <= {*TOPICS, "latitude_deg", "head.board"}
+    assert keys <= {*TOPICS, "latitude_deg", "head.board", "cube.tags", "method: cube"}
     assert {topic_name(key, {}) for key in TOPICS} >= {"/imu", "/los/error", "/platform/imu"}
 
 

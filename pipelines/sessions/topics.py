@@ -44,8 +44,14 @@ NEEDED: dict[str, tuple[tuple[tuple[str, ...], ...], ...]] = {
     "head": ((("head_imu",),), (("vision_attitude",), ("image", "camera_info", "head.board"))),
     "cube": (
         (("imu",),),
-        # Without camera the turns between poses and gravity serve; the config has to say that this is meant.
-        (("image", "camera_info", "cube.tags"), ("tag_detections", "camera_info", "cube.tags"), ("method: cube",)),
+        # Pictures alone could be of anything. Without camera the turns between poses and gravity serve; the config has
+        # to say that this is meant.
+        (
+            ("tag_detections", "camera_info"),
+            ("image", "camera_info", "reference_imu"),
+            ("image", "camera_info", "cube.tags"),
+            ("method: cube",),
+        ),
     ),
 }
 
