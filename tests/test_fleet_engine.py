@@ -18,7 +18,7 @@ import pytest
 
 from pipelines.errors import InputError
 from pipelines.fleet import engine, fleet
-from pipelines.fleet.engine import Killed, cluster, completed, source_version
+from pipelines.fleet.engine import cluster, completed, source_version
 from pipelines.fleet.fleet import Settings, calibrate_fleet
 from pipelines.fleet.recordings import find
 from pipelines.sessions.head import write_head
@@ -184,10 +184,12 @@ def test_a_scheduler_without_workers_is_told(scheduler: str, monkeypatch: pytest
         cluster(scheduler, None).__enter__()
 
 
-def test_overhead_and_order() -> None:
+def test_overhead_order_and_faults() -> None:
     """Nothing to do, many times over: what a task costs besides its work, far below 5 % of 2 s on two workers."""
 
     def nothing(number: int) -> dict[str, float]:
+        if number < 0:
+            raise InputError(f"number {number}: not this one")
         return {f"parameter {i}": float(number) for i in range(50)}
 
     count = 200
@@ -196,33 +198,11 @@ def test_overhead_and_order() -> None:
         begin = time.perf_counter()
         results = dict(completed(client, nothing, {str(i): (i,) for i in range(count)}))
         overhead = (time.perf_counter() - begin) / count
+        with pytest.raises(InputError, match="number -1: not this one"):
+            list(completed(client, nothing, {str(i): (i,) for i in range(-1, 5)}))
     assert results == {str(i): nothing(i) for i in range(count)}
     # Two workers do 2 s tasks at one a second.
     assert overhead < 0.05 * 2.0 / 2
-
-
-def test_a_fault_of_a_task_reaches_the_caller() -> None:
-    def refuse(number: int) -> int:
-        if number == 3:
-            raise InputError("number 3: not this one")
-        return number
-
-    with cluster(None, 1) as client, pytest.raises(InputError, match="number 3: not this one"):
-        list(completed(client, refuse, {str(i): (i,) for i in range(5)}))
-
-
-def test_killed_is_no_result_of_the_others() -> None:
-    def deadly(number: int) -> int:
-        if number in (1, 4):
-            os.kill(os.getpid(), signal.SIGKILL)
-        return number
-
-    import dask
-
-    with dask.config.set({"distributed.scheduler.allowed-failures": 1}), cluster(None, 2) as client:
-        results = dict(completed(client, deadly, {str(i): (i,) for i in range(12)}))
-    assert {name for name, result in results.items() if isinstance(result, Killed)} == {"1", "4"}
-    assert {name for name, result in results.items() if result == int(name)} == set(map(str, range(12))) - {"1", "4"}
 
 
 def test_a_scheduler_that_dies_midway_is_told(start: Start, recordings: Path, tmp_path: Path) -> None:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import csv
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pipelines import cli
 from pipelines.fleet import consistency
 from pipelines.fleet.montecarlo import SOLVERS, run_study, simulate_and_solve
 from pipelines.sessions.topics import METHODS
+from tests.test_fleet_recordings import alidade
 
 distributed = pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
 
@@ -38,15 +37,6 @@ def scenario(tmp_path: Path) -> Path:
     path = tmp_path / "short.yaml"
     path.write_text(SHORT)
     return path
-
-
-def alidade(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["alidade", *map(str, arguments)])
-    try:
-        cli.main()
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    return 0
 
 
 def test_same_seeds_same_numbers_whatever_the_workers(

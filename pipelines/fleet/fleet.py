@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from pipelines import exit_codes
 from pipelines.errors import InputError
+from pipelines.fleet.attempt import attempt, failure, set_aside
 from pipelines.fleet.engine import Killed, cluster, completed, source_version
 from pipelines.fleet.progress import progress
 from pipelines.fleet.recordings import as_date, from_metadata, from_name, local
@@ -116,7 +117,7 @@ def calibrate_fleet(
         try:
             for name, result in completed(client, calibrate_recording, tasks):
                 if isinstance(result, Killed):
-                    fresh[name] = _failure(exit_codes.KILLED, "killed its worker again and again; set aside")
+                    fresh[name] = set_aside()
                 elif result is None:
                     kept.append(name)
                 elif "sha256" in result:
@@ -143,7 +144,7 @@ def calibrate_recording(file: OpenFile, settings: Settings, known_sha256: str | 
                 return None
             return {"sha256": sha256, **_told(path), **_calibrated(path, settings)}
     except (OSError, InputError) as error:
-        return _failure(exit_codes.BAD_INPUT, str(error))
+        return failure(exit_codes.BAD_INPUT, str(error))
 
 
 def _told(path: Path) -> Result:
@@ -152,38 +153,20 @@ def _told(path: Path) -> Result:
 
 
 def _calibrated(path: Path, settings: Settings) -> Result:
-    from pipelines.calibrate import calibrate
-    from pipelines.solvers.marginals import IndeterminateError
-
     with TemporaryDirectory(prefix="alidade.") as folder:
         config = None
         if settings.config is not None:
             config = Path(folder) / "config.yaml"
             config.write_text(settings.config, encoding="utf-8")
-        try:
-            (calibration,) = calibrate(path, [settings.solver], settings.method, config, settings.window)
-        except InputError as error:
-            return _failure(exit_codes.BAD_INPUT, str(error))
-        except IndeterminateError as error:
-            return _failure(exit_codes.UNDETERMINED, str(error))
-        except Exception as error:
-            # One recording that meets a fault of the program must not cost the others.
-            return _failure(exit_codes.CRASHED, f"{type(error).__name__}: {error}")
-    return _summary(calibration)
+        return attempt(_summary, path, settings.solver, settings.method, config, settings.window)
 
 
 def _summary(calibration: Calibration) -> Result:
     """The numbers of a calibration that a fleet is about; SI."""
-    assessment = calibration.assessment
-    good = assessment.status == "calibrated"
     return {
         "start_ns": calibration.facts.epoch_ns,
         "duration_s": calibration.facts.duration_s,
         "method": calibration.problem.method,
-        "status": assessment.status,
-        "exit_code": exit_codes.OF_STATUS[assessment.status],
-        "reason": "" if good else assessment.headline,
-        "seconds": sum(calibration.timing.values()),
         "parameters": {
             p.name: {
                 "value": p.value,
@@ -195,10 +178,6 @@ def _summary(calibration: Calibration) -> Result:
             for p in calibration.parameters
         },
     }
-
-
-def _failure(exit_code: int, reason: str) -> Result:
-    return {"status": "failed", "exit_code": exit_code, "reason": " ".join(reason.split()), "parameters": {}}
 
 
 def _placed(name: str, result: Result, told: Mapping[str, str]) -> Result:

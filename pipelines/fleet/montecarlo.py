@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines import exit_codes
 from pipelines.errors import InputError
 from pipelines.fleet import require_extra, statistics
+from pipelines.fleet.attempt import attempt, set_aside
 from pipelines.fleet.engine import Killed, cluster, completed, source_version
 from pipelines.fleet.progress import progress
 from pipelines.fleet.store import Result, Store, settings_key
@@ -160,8 +160,7 @@ def run_study(
             try:
                 for name, result in completed(client, simulate_and_solve, tasks):
                     if isinstance(result, Killed):
-                        failure = _failure(exit_codes.KILLED, "killed its worker again and again; set aside")
-                        killed[name] = dict.fromkeys(solvers, failure)
+                        killed[name] = dict.fromkeys(solvers, set_aside())
                     else:
                         store.add(name, result)
                     advance()
@@ -185,7 +184,7 @@ def simulate_and_solve(
             Path(scenario).write_text(text, encoding="utf-8")
         session = Path(folder) / "session.mcap"
         find(method).simulate(scenario, seed, session, False)
-        return {solver: _solved(session, method, solver, window) for solver in solvers}
+        return {solver: attempt(_numbers, session, solver, method, None, window) for solver in solvers}
 
 
 def run_table(study: Study) -> list[Row]:
@@ -241,47 +240,22 @@ def _fingerprint(method: str, scenario: str, seed: int) -> str:
             return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def _solved(session: Path, method: str, solver: str, window: float | None) -> Result:
-    from pipelines.calibrate import calibrate
-    from pipelines.solvers.marginals import IndeterminateError
-
-    try:
-        (calibration,) = calibrate(session, [solver], method, None, window)
-    except InputError as error:
-        return _failure(exit_codes.BAD_INPUT, str(error))
-    except IndeterminateError as error:
-        return _failure(exit_codes.UNDETERMINED, str(error))
-    except Exception as error:
-        # One seed that meets a fault of the program must not cost the others.
-        return _failure(exit_codes.CRASHED, f"{type(error).__name__}: {error}")
-    return _numbers(calibration)
-
-
-def _failure(exit_code: int, reason: str) -> Result:
-    return {"status": "failed", "exit_code": exit_code, "reason": " ".join(reason.split()), "parameters": {}}
-
-
 def _numbers(calibration: Calibration) -> Result:
     """Errors against sigmas, of what was estimated and whose truth is known."""
     from pipelines.reports.result import truth_errors
 
     errors = truth_errors(calibration)
     judged = [p for p in calibration.parameters if p.name in errors and p.sigma > 0.0]
-    assessment = calibration.assessment
     numbers: Result = {
-        "status": assessment.status,
-        "exit_code": exit_codes.OF_STATUS[assessment.status],
-        "reason": "" if assessment.status == "calibrated" else assessment.headline,
         "parameters": {
             p.name: {"error": errors[p.name].error, "sigma": p.sigma, "unit": p.unit, "require": p.require}
             for p in judged
-        },
-        "seconds": sum(calibration.timing.values()),
+        }
     }
     if judged:
         places = [calibration.estimate.names.index(p.name) for p in judged]
         sigmas = np.array([p.sigma for p in judged])
-        correlation = assessment.covariance[np.ix_(places, places)] / np.outer(sigmas, sigmas)
+        correlation = calibration.assessment.covariance[np.ix_(places, places)] / np.outer(sigmas, sigmas)
         normalised = np.array([errors[p.name].error for p in judged]) / sigmas
         numbers |= {"nees": float(normalised @ np.linalg.solve(correlation, normalised)), "dof": len(judged)}
     if calibration.estimate.chi_square is not None:

@@ -1,0 +1,57 @@
+"""One calibration among many: whatever goes wrong with it is its result, and costs the others nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipelines import exit_codes
+from pipelines.errors import InputError
+from pipelines.fleet.store import Result
+
+if TYPE_CHECKING:
+    from pipelines.reports.result import Calibration
+
+
+def attempt(
+    summarise: Callable[[Calibration], Result],
+    path: Path,
+    solver: str,
+    method: str | None,
+    config: Path | None,
+    window: float | None,
+) -> Result:
+    """Status, exit code, reason, seconds of wall time, and what `summarise` takes from the calibration.
+
+    The other arguments are those of `pipelines.calibrate.calibrate`. Never raises.
+    """
+    from pipelines.calibrate import calibrate
+    from pipelines.solvers.marginals import IndeterminateError
+
+    try:
+        (calibration,) = calibrate(path, [solver], method, config, window)
+        assessment = calibration.assessment
+        return {
+            "status": assessment.status,
+            "exit_code": exit_codes.OF_STATUS[assessment.status],
+            "reason": "" if assessment.status == "calibrated" else assessment.headline,
+            "seconds": sum(calibration.timing.values()),
+            **summarise(calibration),
+        }
+    except InputError as error:
+        return failure(exit_codes.BAD_INPUT, str(error))
+    except IndeterminateError as error:
+        return failure(exit_codes.UNDETERMINED, str(error))
+    except Exception as error:
+        return failure(exit_codes.CRASHED, f"{type(error).__name__}: {error}")
+
+
+def failure(exit_code: int, reason: str) -> Result:
+    """The result of what came to no estimate."""
+    return {"status": "failed", "exit_code": exit_code, "reason": " ".join(reason.split()), "parameters": {}}
+
+
+def set_aside() -> Result:
+    """The result of what killed its workers."""
+    return failure(exit_codes.KILLED, "killed its worker each time it was tried, at last alone; set aside")
