@@ -55,7 +55,7 @@ def calibrate(
         quantities = tuple(q for q in problem.quantities if q.name in estimate.names)
         assessment = assess(quantities, estimate.covariance, estimate.chi_square, problem.advice)
         if solver != "published" and (assessment.status == "inconsistent" or mostly_rejected(estimate)):
-            causes = find_causes(chosen, data, config, estimate.residuals) if causes is None else causes
+            causes = find_causes(chosen, data, config, estimate) if causes is None else causes
             assessment = assessment.explained(causes)
         calibrations.append(
             Calibration(

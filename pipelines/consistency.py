@@ -9,7 +9,7 @@ noise: noise large enough fits anything.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import TYPE_CHECKING, Any
@@ -35,12 +35,13 @@ _OFFSET = "time_offset"
 _OFFSET_PRIOR = 0.05
 _NOISE_STEPS = 5
 _NOISE_ACCURACY = 0.02
-# Stamps are moved by this much first, s, and so many times to the bottom of the parabola through three trials.
-_FIRST_SHIFT, _SHIFTS = 0.01, 3
+# Stamps are moved by this much first, s, and tags scaled by this much; then so many times to the bottom of a parabola.
+_FIRST_SHIFT, _FIRST_SCALING, _PARABOLAS = 0.01, 0.01, 3
 # A recording with more than this share rejected does not fit.
 _OUTLIERS = 0.1
 _MOST_NAMED = 3
-_FEWEST_USED = 0.6
+# A family of at least so many measurements is mostly rejected when less than this share is used.
+_FEWEST_MEASUREMENTS, _FEWEST_USED = 10, 0.6
 # Iterations of a first look at a change, and how far the typical residual has to fall for a second.
 _GLANCE = 5
 _PROMISING = 0.97
@@ -59,13 +60,15 @@ class _Suspects:
         streams: stamps -> what carries them.
         signs: readings (n,) or (n, k) -> how people call them, and their columns.
         noise: key of the config's noise -> the field that holds the messages' own, if any, and the families it is of.
-        clock: stamps that may be late and how people call their source; None: the method has a parameter for it.
+        offset: whether the method has a parameter `time_offset`.
+        clock: stamps that may be late, and how people call their source.
         cut: whether a stretch of the recording is a recording.
     """
 
     streams: Mapping[str, Sequence[str]]
     signs: Mapping[str, tuple[str, Sequence[str]]]
     noise: Mapping[str, tuple[str | None, Sequence[str]]]
+    offset: bool = False
     clock: tuple[str, str] | None = None
     cut: bool = True
 
@@ -85,6 +88,7 @@ _SUSPECTS: dict[str, _Suspects] = {
             "gyro_density": ("gyro_density", ("gyro",)),
             "platform_gyro_density": ("platform_gyro_density", ("gyro",)),
         },
+        offset=True,
     ),
     "los": _Suspects(
         streams={"gyro_t": ("gyro",), "gimbal_t": ("gimbal",), "image_t": ("error", "error_cov")},
@@ -93,6 +97,7 @@ _SUSPECTS: dict[str, _Suspects] = {
             "los_error": ("error_cov", ("los", "los with roll")),
             "gyro_density": ("gyro_density", ("gyro",)),
         },
+        offset=True,
     ),
     "indexer": _Suspects(
         streams={"gyro_t": ("gyro", "attitude"), "encoder_t": ("outer", "inner")},
@@ -102,6 +107,18 @@ _SUSPECTS: dict[str, _Suspects] = {
             "encoder": (None, ("turn", "move", "dwell")),
         },
         clock=("encoder_t", "encoders"),
+        cut=False,
+    ),
+    # Opposite signs of accelerometer and magnetometer are part of what is calibrated.
+    "cube": _Suspects(
+        streams={"imu_t": ("gyro", "accel"), "mag_t": ("mag",), "reference_t": ("reference_wxyz", "reference_cov")},
+        signs={"gyro": ("gyro", _AXES)},
+        noise={
+            "corner_px": (None, ("tags",)),
+            "accel_density": ("accel_density", ("accelerometer",)),
+            "gyro_density": ("gyro_density", ("gyro at rest", "gyro turns")),
+            "mag_density": ("mag_density", ("magnetometer",)),
+        },
         cut=False,
     ),
 }
@@ -166,30 +183,29 @@ class _Outcome:
 
 
 def mostly_rejected(estimate: Estimate) -> bool:
-    """Whether so much was rejected that what is left says nothing about the whole."""
-    used = [r.used for r in estimate.residuals.values()]
-    return bool(used) and float(np.concatenate(used).mean()) < _FEWEST_USED
+    """Whether so much of a family was rejected that these can be no outliers."""
+    many = (r.used for r in estimate.residuals.values() if len(r.used) >= _FEWEST_MEASUREMENTS)
+    return any(float(used.mean()) < _FEWEST_USED for used in many)
 
 
-def find_causes(
-    method: Method, data: Any, config: Config, residuals: Mapping[str, Residuals] | None = None
-) -> tuple[Cause, ...]:
+def find_causes(method: Method, data: Any, config: Config, estimate: Estimate | None = None) -> tuple[Cause, ...]:
     """What makes a recording fit that does not, the likeliest first; empty when nothing that was tried does.
 
     Args:
         method: of the registry.
         data: what the method read.
         config: of the recording.
-        residuals: of its calibration, which tell where to look; by default the whole is tried.
+        estimate: its calibration, which tells where to look; by default the whole is tried.
     """
-    name = method.problem(data, config).method
-    suspects = _SUSPECTS.get(name)
-    if suspects is None:
-        return ()
-    if suspects.cut and residuals:
-        data = cut(name, data, *_worst_stretch(residuals, _STRETCH))
-    before = _outcome(method, data, config)
-    if before is None or before.fits:
+    problem = method.problem(data, config)
+    suspects = _SUSPECTS[problem.method]
+    if estimate is not None and estimate.solver == "batch" and not suspects.cut:
+        before = _Outcome.of(problem, estimate)
+    else:
+        if estimate is not None and suspects.cut:
+            data = cut(problem.method, data, *_worst_stretch(estimate.residuals, _STRETCH))
+        before = _outcome(method, data, config)
+    if before is None or (before.fits and not mostly_rejected(before.estimate)):
         return ()
     found: list[tuple[_Outcome, str]] = []
     for label, changed, changed_config in _screened(method, suspects, data, config, before):
@@ -235,7 +251,11 @@ def _screened(method: Method, suspects: _Suspects, data: Any, config: Config, be
     """The changes worth a closer look, by the typical residual after a few iterations."""
     name = method.problem(data, config).method
     stretch = _worst_stretch(before.estimate.residuals, _SHORT) if suspects.cut else (-np.inf, np.inf)
-    trials = [*_flips(suspects, data, config), *_offset(method, suspects, data, config)]
+    trials = [
+        *_flips(suspects, data, config),
+        *_offset(method, suspects, data, config),
+        *_tag_sizes(method, data, config),
+    ]
     found = [_glance(method, cut(name, changed, *stretch), other) for _, changed, other in trials]
     enough = _PROMISING * _glance(method, cut(name, data, *stretch), config)
     return [trials[i] for i in np.argsort(found)[:_MOST_NAMED] if found[i] < enough]
@@ -299,25 +319,54 @@ def _flips(suspects: _Suspects, data: Any, config: Config) -> Iterator[_Trial]:
 
 
 def _offset(method: Method, suspects: _Suspects, data: Any, config: Config) -> Iterator[_Trial]:
-    """The time offset as a parameter, or the stamps that may be late moved to where chi-square is smallest."""
-    if suspects.clock is None:
+    """The time offset as a parameter, or the stamps that may be late moved to where residuals are smallest."""
+    if suspects.offset:
         free = config.model_copy(update={"priors": {**config.priors, _OFFSET: _OFFSET_PRIOR}})
         yield "a time offset of {time_offset} is taken for known", data, free
+    if suspects.clock is None:
         return
     stamps, source = suspects.clock
-    shift, step = 0.0, _FIRST_SHIFT
-    for _ in range(_SHIFTS):
-        costs = []
-        for move in (-step, 0.0, step):
-            moved = _outcome(method, replace(data, **{stamps: getattr(data, stamps) + shift + move}), config)
-            costs.append(moved.cost if moved else np.inf)
-        bend = costs[0] - 2.0 * costs[1] + costs[2]
-        if not np.isfinite(bend) or bend <= 0.0:
-            return
-        shift += float(np.clip(0.5 * step * (costs[0] - costs[2]) / bend, -5.0 * step, 5.0 * step))
-        step *= 0.2
-    label = f"the stamps of the {source} are {1e3 * abs(shift):.3g} ms too {'early' if shift > 0.0 else 'late'}"
-    yield label, replace(data, **{stamps: getattr(data, stamps) + shift}), config
+
+    def moved(shift: float) -> tuple[Any, Config]:
+        return replace(data, **{stamps: getattr(data, stamps) + shift}), config
+
+    def cost(shift: float) -> float:
+        outcome = _outcome(method, *moved(shift))
+        return outcome.cost if outcome else np.inf
+
+    shift = _lowest(cost, _FIRST_SHIFT)
+    if shift is not None:
+        side = "early" if shift > 0.0 else "late"
+        yield f"the stamps of the {source} are {1e3 * abs(shift):.3g} ms too {side}", *moved(shift)
+
+
+def _tag_sizes(method: Method, data: Any, config: Config) -> Iterator[_Trial]:
+    """All tags of the cube larger or smaller, to where residuals are smallest."""
+    if not config.cube.tags:
+        return
+
+    def scaled(more: float) -> tuple[Any, Config]:
+        tags = {i: tag.model_copy(update={"size": (1.0 + more) * tag.size}) for i, tag in config.cube.tags.items()}
+        return data, config.model_copy(update={"cube": config.cube.model_copy(update={"tags": tags})})
+
+    # Not chi-square, which levels off where most tags are rejected.
+    more = _lowest(lambda more: _glance(method, *scaled(more)) ** 2, _FIRST_SCALING)
+    if more is not None:
+        yield f"the tags are {1.0 + more:.3g} times as large as the config says", *scaled(more)
+
+
+def _lowest(cost: Callable[[float], float], step: float) -> float | None:
+    """The size of a change that costs least, by parabolas through three trials; None when there is none."""
+    best = 0.0
+    for _ in range(_PARABOLAS):
+        left, middle, right = (cost(best + move) for move in (-step, 0.0, step))
+        bend = left - 2.0 * middle + right
+        if not np.isfinite(bend):
+            return None
+        downhill = np.sign(left - right) * step
+        best += float(np.clip(0.5 * step * (left - right) / bend, -5.0 * step, 5.0 * step)) if bend > 0.0 else downhill
+        step *= 0.2 if bend > 0.0 else 1.0
+    return best
 
 
 def _named(label: str, after: _Outcome) -> str:

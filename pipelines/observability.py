@@ -258,11 +258,12 @@ class Assessment:
     causes: tuple[Cause, ...] = ()
 
     def explained(self, causes: Sequence[Cause]) -> Assessment:
-        """The same with causes, the first of them named before anything else."""
+        """The same with causes, the first of them named before anything else; what needs them is inconsistent."""
         if not causes:
             return self
         first = f"{causes[0].label[:1].upper()}{causes[0].label[1:]}: {causes[0].evidence}."
-        return replace(self, causes=tuple(causes), headline=f"{first} {self.headline}")
+        status: Status = "unobservable" if self.status == "unobservable" else "inconsistent"
+        return replace(self, status=status, causes=tuple(causes), headline=f"{first} {self.headline}")
 
     @property
     def sigmas(self) -> Array:

@@ -12,6 +12,7 @@ from pipelines.consistency import cut, find_causes, mostly_rejected
 from pipelines.methods.base import Estimate, Residuals
 from pipelines.registry import Method, method
 from pipelines.sessions.config import Config, load_config
+from pipelines.simulation.cube import CubeScenario, cube_config, simulate_cube
 from pipelines.simulation.head import HeadScenario, head_config, simulate_head
 from pipelines.simulation.indexer import IndexerScenario, indexer_config, simulate_indexer
 from pipelines.simulation.los import LosScenario, los_config, simulate_los
@@ -129,6 +130,17 @@ def test_late_encoders(indexer: Case) -> None:
     assert label == "the stamps of the encoders are 20 ms too late"
 
 
+def test_size_of_the_cubes_tags() -> None:
+    scenario = CubeScenario(poses=8, static_s=2, imu_rate_hz=50, camera_rate_hz=5)
+    data, _ = simulate_cube(scenario, 1)
+    config = load_config(cube_config(scenario).encode())
+    tags = {i: tag.model_copy(update={"size": 1.03 * tag.size}) for i, tag in config.cube.tags.items()}
+    wrong = config.model_copy(update={"cube": config.cube.model_copy(update={"tags": tags})})
+    label = first_cause((method("cube"), data, wrong))
+    assert label.startswith("the tags are ")
+    assert float(label.split()[3]) == pytest.approx(1.0 / 1.03, abs=0.005)
+
+
 def test_a_cut_keeps_stamps_and_readings_together(head: Case) -> None:
     _, data, _ = head
     part = cut("head", data, 3.0, 7.0)
@@ -139,7 +151,7 @@ def test_a_cut_keeps_stamps_and_readings_together(head: Case) -> None:
     np.testing.assert_array_equal(part.vision_cov, data.vision_cov[rows])
 
 
-def test_mostly_rejected() -> None:
+def test_mostly_rejected(head: Case) -> None:
     def estimate(share: float) -> Estimate:
         used = np.arange(100) < 100 * share
         residuals = {"vision": Residuals(np.arange(100.0), np.zeros((100, 3)), used)}
@@ -147,3 +159,5 @@ def test_mostly_rejected() -> None:
 
     assert mostly_rejected(estimate(0.5))
     assert not mostly_rejected(estimate(0.95))
+    find, data, config = head
+    assert find_causes(find, data, config, estimate(0.95)) == ()
