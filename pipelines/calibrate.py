@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipelines.consistency import find_causes, mostly_rejected
+from pipelines.consistency import Halves, find_causes, held_out, mostly_rejected, split_halves
 from pipelines.methods.base import Estimate, Problem
 from pipelines.observability import Cause, assess
 from pipelines.registry import Method, method
@@ -72,6 +72,17 @@ def calibrate(
             )
         )
     return calibrations
+
+
+def self_agreement(
+    path: Path, method_name: str | None = None, config_file: Path | None = None
+) -> tuple[dict[str, Halves], dict[str, float]]:
+    """What either half of a recording says, and how well held-out measurements are predicted (arguments as above)."""
+    recording = open_recording(path)
+    config = load_config(recording.attachment(ATTACHMENT), config_file)
+    chosen = method(resolve_method(method_name, recording, config))
+    data = chosen.read(recording, config)
+    return split_halves(chosen, data, config), held_out(chosen.problem(data, config))
 
 
 def _solve(solver: str, chosen: Method, data: object, config: Config, window: float | None) -> tuple[Estimate, Problem]:

@@ -58,12 +58,24 @@ def calibrate(
 
 
 @app.command()
-def compare(session: _Session, method: _MethodName = None, config: _ConfigFile = None, window: _Window = "1") -> None:
+def compare(
+    session: _Session,
+    method: _MethodName = None,
+    config: _ConfigFile = None,
+    window: _Window = "1",
+    out: Annotated[Path | None, typer.Option(help="Folder for compare.html, which also splits the recording.")] = None,
+) -> None:
     """The published, batch and incremental solvers side by side, with errors where the truth is known."""
     from pipelines import terminal
     from pipelines.calibrate import calibrate as run
+    from pipelines.calibrate import self_agreement
+    from pipelines.reports.compare import write_compare
 
-    terminal.show(run(session, ["published", "batch", "incremental"], method, config, _seconds(window)))
+    calibrations = run(session, ["published", "batch", "incremental"], method, config, _seconds(window))
+    terminal.show(calibrations)
+    if out is not None:
+        written = write_compare(out, calibrations, *self_agreement(session, method, config))
+        terminal.say(f"Comparison in {written}")
 
 
 @app.command()

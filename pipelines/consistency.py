@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.errors import InputError
-from pipelines.methods.base import Array, ChiSquare, Estimate, Problem, Residuals
+from pipelines.methods.base import Array, ChiSquare, Estimate, Factor, Problem, Residuals
 from pipelines.observability import Cause, Fit
 from pipelines.reports.units import robust_sigma
 from pipelines.sessions.config import DEFAULT_NOISE, Config
@@ -45,6 +45,9 @@ _FEWEST_MEASUREMENTS, _FEWEST_USED = 10, 0.6
 # Iterations of a first look at a change, and how far the typical residual has to fall for a second.
 _GLANCE = 5
 _PROMISING = 0.97
+
+# A half tells a parameter when its sigma is below this share of the prior's; one chunk in so many is held out.
+_TOLD, _HELD_OUT = 0.5, 5
 
 # What it would be, data and config.
 _Trial = tuple[str, Any, Config]
@@ -233,6 +236,74 @@ def cut(method: str, data: Any, start: float, stop: float) -> Any:
             if values is not None:
                 changes[name] = values[inside]
     return replace(data, **changes)
+
+
+@dataclass(frozen=True)
+class Halves:
+    """A parameter from either half of a recording: values and sigmas, SI."""
+
+    first: float
+    first_sigma: float
+    second: float
+    second_sigma: float
+
+    @property
+    def difference_sigmas(self) -> float:
+        """Second less first, over the sigma of that difference."""
+        return (self.second - self.first) / float(np.hypot(self.first_sigma, self.second_sigma))
+
+
+def split_halves(method: Method, data: Any, config: Config) -> dict[str, Halves]:
+    """The parameters that each half of a recording tells by itself; none when a half cannot be solved.
+
+    Those that a prior holds in either half are left out: they would agree whatever was recorded. A bias that walks
+    differs between halves by its walk too.
+    """
+    name = method.problem(data, config).method
+    times = [time for stamps in _SUSPECTS[name].streams if (time := getattr(data, stamps)) is not None]
+    start, stop = min(t[0] for t in times), max(t[-1] for t in times)
+    middle = 0.5 * (start + stop)
+    first, second = (
+        _outcome(method, cut(name, data, *span), config) for span in ((start, middle), (middle, stop + 1.0))
+    )
+    if first is None or second is None:
+        return {}
+    a, b = first.estimate, second.estimate
+    found = {}
+    for i, q in enumerate(method.problem(data, config).quantities):
+        sigmas = float(a.sigmas[i]), float(b.sigmas[i])
+        if 0.0 < max(sigmas) < _TOLD * q.scale:
+            found[q.name] = Halves(float(a.values[i]), sigmas[0], float(b.values[i]), sigmas[1])
+    return found
+
+
+def held_out(problem: Problem) -> dict[str, float]:
+    """Family -> typical size of measurements that took no part in the solution, in sigmas of their own noise.
+
+    One chunk in five is held out. 1 is as good as the noise; a little more is the uncertainty of the prediction.
+    """
+    import gtsam
+
+    from pipelines.solvers.batch import CHUNK, optimize, residuals_of
+
+    if problem.loss is not None:
+        problem.loss.mu = np.inf
+    values = gtsam.Values()
+    stand_ins: dict[int, int] = {}
+    kept: list[Factor] = []
+    out: list[Factor] = []
+    for i, step in enumerate(problem.steps(CHUNK)):
+        values.insert(step.initial)
+        stand_ins.update(step.stand_ins)
+        for f in step.factors:
+            (out if f.measurement is not None and i % _HELD_OUT == _HELD_OUT - 1 else kept).append(f)
+    if not any(f.measurement is not None for f in kept):
+        return {}
+    shared = [stand_ins.get(p.key, p.key) for p in problem.parameters]
+    solution = optimize(kept, values, shared, problem.loss)
+    if not solution.converged:
+        return {}
+    return {family: robust_sigma(r.whitened) for family, r in residuals_of(out, solution.values).items()}
 
 
 def _outcome(method: Method, data: Any, config: Config) -> _Outcome | None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.consistency import cut, find_causes, mostly_rejected
+from pipelines.consistency import cut, find_causes, held_out, mostly_rejected, split_halves
 from pipelines.methods.base import Estimate, Residuals
 from pipelines.registry import Method, method
 from pipelines.sessions.config import Config, load_config
@@ -161,3 +161,22 @@ def test_mostly_rejected(head: Case) -> None:
     assert not mostly_rejected(estimate(0.95))
     find, data, config = head
     assert find_causes(find, data, config, estimate(0.95)) == ()
+
+
+def test_halves_of_a_recording_agree_and_those_of_two_do_not(head: Case) -> None:
+    find, data, config = head
+    halves = split_halves(find, data, config)
+    assert set(halves) == {"gyro_bias_x", "gyro_bias_y", "gyro_bias_z"}
+    assert max(abs(half.difference_sigmas) for half in halves.values()) < 4.0
+    late = data.head_t > 0.5 * data.head_t[-1]
+    jump = data.head_gyro + 0.02 * late[:, None] * np.array([1.0, 0.0, 0.0])
+    changed = split_halves(find, replace(data, head_gyro=jump), config)["gyro_bias_x"]
+    assert changed.difference_sigmas > 4.0
+    assert changed.second - changed.first == pytest.approx(0.02, rel=0.3)
+
+
+def test_measurements_held_out_are_predicted_as_well_as_the_noise_allows(head: Case) -> None:
+    find, data, config = head
+    assert held_out(find.problem(data, config))["vision"] == pytest.approx(1.0, abs=0.15)
+    wrong = with_noise(config, vision_attitude=0.2)
+    assert held_out(find.problem(replace(data, vision_cov=data.vision_cov / 25.0), wrong))["vision"] > 3.0

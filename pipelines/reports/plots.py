@@ -23,6 +23,8 @@ REJECTED = "#d11d1d"
 _MOST_POINTS = 3000
 # Numbers are written into the correlation map up to this many parameters.
 _MOST_LABELLED = 12
+# Ellipses are drawn of so many pairs that are correlated at least so much.
+_MOST_ELLIPSES, _STRONG = 5, 0.5
 # The estimates' axis shows what came after this part of the recording.
 _SETTLED = 0.1
 
@@ -88,8 +90,8 @@ def common_plots(calibration: Calibration) -> list[Plot]:
             plots.append(_residuals(family, residuals, estimate.solver == "incremental"))
             if estimate.solver == "incremental":
                 plots.append(_squares(family, residuals))
-    correlation = _correlation(calibration)
-    return [*plots, correlation] if correlation else plots
+    correlation, ellipses = _correlation(calibration), _ellipses(calibration)
+    return [*plots, *([correlation] if correlation else []), *([ellipses] if ellipses else [])]
 
 
 def _residuals(family: str, residuals: Residuals, innovations: bool) -> Plot:
@@ -153,7 +155,7 @@ def _histories(calibration: Calibration, history: History) -> list[Plot]:
             for q, color in zip(members, cycle(COLORS)):
                 values = factor * history.values[:, column[q.name]]
                 sigmas = factor * history.sigmas[:, column[q.name]]
-                _band(out, history.time, values, sigmas, color)
+                band(out, history.time, values, sigmas, color)
                 add_line(out, history.time, values, q.name, color)
                 reach += [(values - 2.0 * sigmas)[settled].min(), (values + 2.0 * sigmas)[settled].max()]
                 truth = (calibration.truth or {}).get(q.name)
@@ -188,7 +190,8 @@ def _learning(calibration: Calibration, history: History) -> Plot:
     )
 
 
-def _band(out: go.Figure, time: Array, values: Array, sigmas: Array, color: str) -> None:
+def band(out: go.Figure, time: Array, values: Array, sigmas: Array, color: str) -> None:
+    """A band of one sigma around values over time, thinned."""
     some = thin(2 * len(time))
     x = np.concatenate([time[some], time[some][::-1]])
     y = np.concatenate([(values + sigmas)[some], (values - sigmas)[some][::-1]])
@@ -245,5 +248,39 @@ def _correlation(calibration: Calibration) -> Plot | None:
     return Plot(
         "Correlation of the parameters",
         "Red +1, blue -1. Near either two parameters trade against each other: their errors are not independent.",
+        out,
+    )
+
+
+def _ellipses(calibration: Calibration) -> Plot | None:
+    """One-sigma ellipses of the pairs with the strongest correlation, each in units of its own two sigmas."""
+    quantities = quantities_of(calibration.problem, calibration.estimate)
+    covariance, sigmas = calibration.assessment.covariance, calibration.assessment.sigmas
+    pairs = [
+        (float(covariance[i, j] / (sigmas[i] * sigmas[j])), i, j)
+        for i in range(len(sigmas))
+        for j in range(i)
+        if sigmas[i] > 0.0 and sigmas[j] > 0.0
+    ]
+    strong = sorted((pair for pair in pairs if abs(pair[0]) > _STRONG), key=lambda pair: -abs(pair[0]))[:_MOST_ELLIPSES]
+    if not strong:
+        return None
+    out = figure("error of the second, sigmas", height=380, x_title="error of the first, sigmas")
+    angle = np.linspace(0.0, 2.0 * np.pi, 73)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    for (correlation, i, j), color in zip(strong, cycle(COLORS)):
+        correlation = float(np.clip(correlation, -1.0, 1.0))
+        x, y = np.array([[1.0, 0.0], [correlation, np.sqrt(1.0 - correlation**2)]]) @ circle
+        out.add_scatter(
+            x=np.round(x, 4),
+            y=np.round(y, 4),
+            mode="lines",
+            name=f"{quantities[j].name}, {quantities[i].name}: {correlation:+.2f}",
+            line={"color": color, "width": 1.5},
+        )
+    out.update_yaxes(scaleanchor="x")
+    return Plot(
+        "Parameters that trade against each other",
+        "One-sigma ellipses of the most correlated pairs: the thinner, the more the error of one is that of the other.",
         out,
     )

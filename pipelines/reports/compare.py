@@ -1,0 +1,185 @@
+"""compare.html: the solvers side by side, and whether the recording agrees with itself."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.consistency import Halves
+from pipelines.errors import InputError
+from pipelines.methods.base import Quantity
+from pipelines.reports.plots import COLORS, add_line, band, figure
+from pipelines.reports.result import Calibration, Plot, truth_errors
+from pipelines.reports.units import human_unit, to_digits_of
+
+FILE = "compare.html"
+# Lines of the solvers, the exact ones over the published.
+_STYLES = {"published": (COLORS[1], "dot"), "batch": (COLORS[6], "dash"), "incremental": (COLORS[0], None)}
+
+
+@dataclass(frozen=True)
+class _Cell:
+    """What one solver says of a parameter."""
+
+    value: str
+    sigma: str
+    from_batch: str
+    error: str
+
+
+def compare_html(
+    calibrations: Sequence[Calibration], halves: Mapping[str, Halves], predicted: Mapping[str, float]
+) -> str:
+    """The page as one HTML text.
+
+    Args:
+        calibrations: of one recording, by different solvers.
+        halves: of the recording, see pipelines.consistency.
+        predicted: family -> size of the errors of held-out measurements, sigmas.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("pipelines.reports"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    quantities = [q for q in calibrations[0].problem.quantities if q.prior_sigma != 0.0]
+    plots = [*_differences(calibrations, quantities), *_convergence(calibrations, quantities)]
+    return environment.get_template("compare.html").render(
+        calibrations=calibrations,
+        recording=calibrations[0].recording,
+        method=calibrations[0].problem.method,
+        truth_known=calibrations[0].truth is not None,
+        rows=[(q.name, human_unit(q)[0], [_cell(c, calibrations, q) for c in calibrations]) for q in quantities],
+        halves=[_half(q, halves[q.name]) for q in quantities if q.name in halves],
+        predicted=predicted,
+        plots=[(plot.title, plot.caption, _div(plot, first=i == 0)) for i, plot in enumerate(plots)],
+    )
+
+
+def write_compare(
+    out_dir: Path, calibrations: Sequence[Calibration], halves: Mapping[str, Halves], predicted: Mapping[str, float]
+) -> Path:
+    """Write compare.html; returns its path. Raises InputError when it cannot be written."""
+    text = compare_html(calibrations, halves, predicted)
+    try:
+        out_dir.mkdir(parents=True, exist_ok=True)
+        (out_dir / FILE).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{out_dir}: the comparison cannot be written ({error.strerror})") from error
+    return out_dir / FILE
+
+
+def _found(calibration: Calibration, name: str) -> tuple[float, float] | None:
+    """Value and sigma of a parameter, SI; None when the solver does not know it."""
+    return next(((p.value, p.sigma) for p in calibration.parameters if p.name == name), None)
+
+
+def _batch(calibrations: Sequence[Calibration]) -> Calibration | None:
+    return next((c for c in calibrations if c.estimate.solver == "batch"), None)
+
+
+def _from_batch(calibration: Calibration, calibrations: Sequence[Calibration], name: str) -> float | None:
+    """How far a solver is from batch, in batch's sigmas."""
+    batch = _batch(calibrations)
+    if batch is None or batch is calibration:
+        return None
+    mine, reference = _found(calibration, name), _found(batch, name)
+    if mine is None or reference is None or reference[1] == 0.0:
+        return None
+    return (mine[0] - reference[0]) / reference[1]
+
+
+def _cell(calibration: Calibration, calibrations: Sequence[Calibration], quantity: Quantity) -> _Cell | None:
+    found = _found(calibration, quantity.name)
+    if found is None:
+        return None
+    _, factor = human_unit(quantity)
+    value, sigma = (factor * number for number in found)
+    far = _from_batch(calibration, calibrations, quantity.name)
+    error = truth_errors(calibration).get(quantity.name)
+    return _Cell(
+        to_digits_of(value, sigma),
+        to_digits_of(sigma, sigma),
+        "" if far is None else f"{far:+.1f}",
+        "" if error is None or error.error_sigmas is None else f"{error.error_sigmas:+.1f}",
+    )
+
+
+def _half(quantity: Quantity, halves: Halves) -> tuple[str, str, str, str, str]:
+    unit, factor = human_unit(quantity)
+    first, second = (
+        f"{to_digits_of(factor * value, factor * sigma)} \u00b1 {to_digits_of(factor * sigma, factor * sigma)}"
+        for value, sigma in ((halves.first, halves.first_sigma), (halves.second, halves.second_sigma))
+    )
+    return quantity.name, unit, first, second, f"{halves.difference_sigmas:+.1f}"
+
+
+def _differences(calibrations: Sequence[Calibration], quantities: Sequence[Quantity]) -> list[Plot]:
+    """Errors, or differences from batch, in sigmas."""
+    known = any(truth_errors(c) for c in calibrations)
+    out = figure("error, sigmas of each solver" if known else "less batch, sigmas of batch", x_title="")
+    for c in calibrations:
+        errors = truth_errors(c)
+        numbers = [
+            (errors[q.name].error_sigmas if q.name in errors else None)
+            if known
+            else _from_batch(c, calibrations, q.name)
+            for q in quantities
+        ]
+        color = _STYLES[c.estimate.solver][0]
+        out.add_bar(x=[q.name for q in quantities], y=numbers, name=c.estimate.solver, marker_color=color)
+    for bound in (-3.0, 3.0):
+        out.add_hline(y=bound, line={"color": "#888888", "width": 1, "dash": "dot"})
+    out.update_xaxes(tickangle=-60, automargin=True)
+    what = (
+        "Error of each solver in units of the sigma it states" if known else "Each solver less batch, sigmas of batch"
+    )
+    return [Plot("Differences", f"{what}; dotted are three.", out)]
+
+
+def _convergence(calibrations: Sequence[Calibration], quantities: Sequence[Quantity]) -> list[Plot]:
+    """A figure a parameter: its estimate over time by every solver that has a history."""
+    plots = []
+    for q in quantities:
+        unit, factor = human_unit(q)
+        out = figure(unit, height=260)
+        reach: list[float] = []
+        for c in calibrations:
+            history, names = c.estimate.history, c.estimate.names
+            color, dash = _STYLES[c.estimate.solver]
+            if q.name not in names:
+                continue
+            i = names.index(q.name)
+            if c.estimate.solver == "batch" or history is None:
+                value, sigma = (factor * float(x[i]) for x in (c.estimate.values, c.estimate.sigmas))
+                out.add_hline(y=value, line={"color": color, "width": 1, "dash": "dash"}, annotation_text="batch")
+                reach += [value - 4.0 * sigma, value + 4.0 * sigma]
+                continue
+            values, sigmas = factor * history.values[:, i], factor * history.sigmas[:, i]
+            if c.estimate.solver == "incremental":
+                band(out, history.time, values, sigmas, color)
+            add_line(out, history.time, values, c.estimate.solver, color, dash)
+            settled = history.time >= history.time[0] + 0.2 * np.ptp(history.time)
+            reach += [float(values[settled].min()), float(values[settled].max())]
+        truth = (calibrations[0].truth or {}).get(q.name)
+        if isinstance(truth, int | float):
+            out.add_hline(y=factor * truth, line={"color": COLORS[2], "width": 1.5}, annotation_text="truth")
+            reach.append(factor * truth)
+        if reach and len(out.data):
+            edge = 0.05 * (max(reach) - min(reach))
+            out.update_yaxes(range=[min(reach) - edge, max(reach) + edge])
+            plots.append(Plot(f"{q.name} over time", f"{unit}; the band is one sigma of incremental.", out))
+    return plots
+
+
+def _div(plot: Plot, first: bool) -> str:
+    return str(
+        plot.figure.to_html(full_html=False, include_plotlyjs=first, config={"responsive": True, "displaylogo": False})
+    )
