@@ -13,15 +13,14 @@ from numpy.typing import NDArray
 from pipelines.errors import InputError
 from pipelines.sessions import series
 from pipelines.sessions.checks import (
-    check_gyro,
     check_overlap,
     clean,
     count,
-    gyro_density,
     nanoseconds,
     unit_quaternions,
 )
 from pipelines.sessions.config import ATTACHMENT, Config
+from pipelines.sessions.gyro import read_gyro
 from pipelines.sessions.reading import Recording
 from pipelines.sessions.topics import TOPICS
 from pipelines.sessions.writing import write_session
@@ -66,13 +65,13 @@ def read_head(recording: Recording, config: Config) -> HeadData:
     dropped: dict[str, int] = {}
     epoch = recording.epoch_ns
     name = config.topic("head_imu")
-    head_t, head_gyro, density = _gyro(recording, name, epoch, dropped)
+    head_t, head_gyro, density = read_gyro(recording, name, epoch, dropped)
     spans = {name: head_t}
 
     platform_t = platform_gyro = platform_density = None
     name = config.topic("platform_imu")
     if _wanted(recording, config, "platform_imu"):
-        platform_t, platform_gyro, platform_density = _gyro(recording, name, epoch, dropped)
+        platform_t, platform_gyro, platform_density = read_gyro(recording, name, epoch, dropped)
         spans[name] = platform_t
 
     name = config.topic("vision_attitude")
@@ -176,17 +175,6 @@ def _from_pictures(
         count(dropped, f"{topic}: {reason}", number)
     t, keep = clean(topic, seen.t_ns, epoch_ns, seen.cRh, dropped)
     return t, seen.cRh[keep], seen.covariance[keep]
-
-
-def _gyro(
-    recording: Recording, topic: str, epoch_ns: int, dropped: dict[str, int]
-) -> tuple[Array, Array, float | None]:
-    imu = recording.imu(topic)
-    count(dropped, f"{topic}: stamped by log time (kept)", imu.stamped_by_log)
-    t, keep = clean(topic, imu.t_ns, epoch_ns, imu.gyro, dropped)
-    gyro = imu.gyro[keep]
-    check_gyro(topic, t, gyro)
-    return t, gyro, gyro_density(t, imu.gyro_cov)
 
 
 def _vision(

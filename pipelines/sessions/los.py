@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from pipelines.errors import InputError
 from pipelines.sessions import series
-from pipelines.sessions.checks import check_gyro, check_overlap, clean, count, gyro_density, nanoseconds
+from pipelines.sessions.checks import check_overlap, clean, count, nanoseconds
 from pipelines.sessions.config import ATTACHMENT, Config
+from pipelines.sessions.gyro import read_gyro
 from pipelines.sessions.reading import Recording
 from pipelines.sessions.topics import TOPICS
 from pipelines.sessions.writing import write_session
@@ -66,7 +67,7 @@ def read_los(recording: Recording, config: Config) -> LosData:
     epoch = recording.epoch_ns
     gyro_name, gimbal_name, error_name = (config.topic(key) for key in ("imu", "gimbal", "los_error"))
     from_pictures = error_name not in recording.topics and config.topic("image") in recording.topics
-    gyro_t, gyro, density = _gyro(recording, gyro_name, epoch, dropped)
+    gyro_t, gyro, density = read_gyro(recording, gyro_name, epoch, dropped)
     gimbal_t, gimbal = _gimbal(recording, gimbal_name, epoch, dropped)
     covariance = None
     if from_pictures and "los_error" not in config.topics:
@@ -179,17 +180,6 @@ def _turned_by_carrier(data: LosData) -> Array:
 def _span(values: Array) -> Array:
     """Largest less smallest of each column; NaN, which compares as False, for fewer than two rows."""
     return np.asarray(np.ptp(values, axis=0)) if len(values) > 1 else np.full(values.shape[1], np.nan)
-
-
-def _gyro(
-    recording: Recording, topic: str, epoch_ns: int, dropped: dict[str, int]
-) -> tuple[Array, Array, float | None]:
-    imu = recording.imu(topic)
-    count(dropped, f"{topic}: stamped by log time (kept)", imu.stamped_by_log)
-    t, keep = clean(topic, imu.t_ns, epoch_ns, imu.gyro, dropped)
-    gyro = imu.gyro[keep]
-    check_gyro(topic, t, gyro)
-    return t, gyro, gyro_density(t, imu.gyro_cov[keep])
 
 
 def _gimbal(recording: Recording, topic: str, epoch_ns: int, dropped: dict[str, int]) -> tuple[Array, Array]:
