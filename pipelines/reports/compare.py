@@ -24,8 +24,7 @@ _STYLES = {"published": (COLORS[1], "dot"), "batch": (COLORS[6], "dash"), "incre
 class _Cell:
     """What one solver says of a parameter."""
 
-    value: str
-    sigma: str
+    value: str  # with its sigma
     from_batch: str
     error: str
 
@@ -105,19 +104,20 @@ def _cell(calibration: Calibration, calibrations: Sequence[Calibration], quantit
     far = _from_batch(calibration, calibrations, quantity.name)
     error = truth_errors(calibration).get(quantity.name)
     return _Cell(
-        to_digits_of(value, sigma),
-        to_digits_of(sigma, sigma),
+        _with_sigma(value, sigma),
         "" if far is None else f"{far:+.1f}",
         "" if error is None or error.error_sigmas is None else f"{error.error_sigmas:+.1f}",
     )
 
 
+def _with_sigma(value: float, sigma: float) -> str:
+    return f"{to_digits_of(value, sigma)} \u00b1 {to_digits_of(sigma, sigma)}"
+
+
 def _half(quantity: Quantity, halves: Halves) -> tuple[str, str, str, str, str]:
     unit, factor = human_unit(quantity)
-    first, second = (
-        f"{to_digits_of(factor * value, factor * sigma)} \u00b1 {to_digits_of(factor * sigma, factor * sigma)}"
-        for value, sigma in ((halves.first, halves.first_sigma), (halves.second, halves.second_sigma))
-    )
+    first = _with_sigma(factor * halves.first, factor * halves.first_sigma)
+    second = _with_sigma(factor * halves.second, factor * halves.second_sigma)
     return quantity.name, unit, first, second, f"{halves.difference_sigmas:+.1f}"
 
 

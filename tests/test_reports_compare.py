@@ -1,0 +1,59 @@
+"""compare.html: the solvers side by side."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.consistency import Halves
+from pipelines.errors import InputError
+from pipelines.reports.compare import compare_html, write_compare
+from pipelines.reports.plots import common_plots
+from pipelines.reports.result import Calibration
+from tests.test_reports_files import make_calibration
+from tests.test_reports_html import Page
+
+
+def solvers(truth: dict[str, object] | None = None) -> list[Calibration]:
+    """A batch result, and one that is two of its sigmas off."""
+    batch = make_calibration(truth=truth)
+    batch = replace(batch, estimate=replace(batch.estimate, solver="batch"))
+    off = batch.estimate.values + 2.0 * batch.estimate.sigmas
+    return [batch, replace(batch, estimate=replace(batch.estimate, solver="incremental", values=off))]
+
+
+def test_differences_are_in_sigmas_of_batch() -> None:
+    page = Page(compare_html(solvers(), {}, {}))
+    assert page.loaded == []
+    estimated = [q for q in solvers()[0].problem.quantities if q.prior_sigma != 0.0]
+    assert page.text.count("+2.0") == len(estimated)
+    assert "error, σ" not in page.text
+    assert "agree with itself" not in page.text
+
+
+def test_truth_halves_and_held_out_measurements_are_told() -> None:
+    halves = {"time_offset": Halves(0.010, 0.003, 0.020, 0.004)}
+    page = Page(compare_html(solvers({"time_offset": 0.0125}), halves, {"vision": 1.06}))
+    assert "error, σ" in page.text
+    assert "10.0 ± 3.0 20.0 ± 4.0 +2.0" in page.text
+    assert "1.06 sigmas (vision)" in page.text
+
+
+def test_ellipses_are_drawn_of_correlated_pairs_only() -> None:
+    def titles(correlation: float) -> list[str]:
+        covariance = np.diag([1e-6, 1e-6, 1e-6, 1e-8, 1e-8, 0.0])
+        covariance[0, 1] = covariance[1, 0] = correlation * 1e-6
+        return [plot.title for plot in common_plots(make_calibration(covariance=covariance))]
+
+    assert "Parameters that trade against each other" in titles(0.9)
+    assert "Parameters that trade against each other" not in titles(0.1)
+
+
+def test_what_cannot_be_written_is_bad_input(tmp_path: Path) -> None:
+    assert write_compare(tmp_path / "new", solvers(), {}, {}).read_text().startswith("<!doctype html>")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be written"):
+        write_compare(tmp_path / "file", solvers(), {}, {})
