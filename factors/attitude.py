@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import gtsam
 import numpy as np
@@ -114,6 +115,7 @@ class VisionAttitudeFactor:
     helmet: GyroPath
     platform: GyroPath | None
     rows: int = 3
+    stacked: ClassVar = ("time", "measured", "sqrt_information")
 
     def __call__(self, iRv: Array, bias: Array, cRb: Array, vRh: Array, dt: Array) -> Residuals:
         """Residual sqrt_information * Log(predicted^T measured), (n, 3)."""

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -100,6 +100,7 @@ class LocalMotion:
     acceleration: Array
     gimbal_rate: Array
     gimbal_acceleration: Array
+    stacked: ClassVar = ("rate", "acceleration", "gimbal_rate", "gimbal_acceleration")
 
     @classmethod
     def around(cls, at: Array, gyro_t: Array, gyro: Array, gimbal: GimbalPath) -> LocalMotion:
@@ -154,6 +155,7 @@ class LosDirectionFactor:
     gimbal: Array
     names: tuple[str, ...] = ("delta_px", "delta_gx", "delta_gy", "delta_z")
     motion: LocalMotion | None = None
+    stacked: ClassVar = ("time", "measured", "sqrt_information", "gimbal", "motion")
 
     @property
     def rows(self) -> int:

@@ -7,8 +7,10 @@ Python call for 20 measurements costs little more than for one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any, Literal, Protocol
 
 import gtsam
@@ -21,7 +23,11 @@ Kind = Literal["rotation"] | int
 
 
 class Model(Protocol):
-    """n measurements of m rows each, predicted from blocks of variables."""
+    """n measurements of m rows each, predicted from blocks of variables.
+
+    A dataclass whose `stacked` names the fields that hold something for each measurement may be evaluated together with
+    others that agree in all other fields.
+    """
 
     @property
     def time(self) -> Array:
@@ -85,8 +91,7 @@ class TruncatedLoss:
 class _Evaluation:
     """A model's residuals at some values, and its Jacobians once asked for."""
 
-    def __init__(self, variables: list[Any], residuals: Array, linearize: Callable[[], tuple[Array, ...]]) -> None:
-        self.variables = variables
+    def __init__(self, residuals: Array, linearize: Callable[[], tuple[Array, ...]]) -> None:
         self.residuals = residuals
         self._linearize: Callable[[], tuple[Array, ...]] | None = linearize
         self._jacobians: tuple[Array, ...] = ()
@@ -95,6 +100,12 @@ class _Evaluation:
         if self._linearize is not None:
             self._jacobians, self._linearize = self._linearize(), None
         return self._jacobians
+
+    def part(self, start: int, stop: int) -> _Evaluation:
+        """That of some consecutive measurements."""
+        return _Evaluation(
+            self.residuals[start:stop], lambda: tuple(jacobian[start:stop] for jacobian in self.jacobians())
+        )
 
 
 def _same(a: Any, b: Any) -> bool:
@@ -144,7 +155,8 @@ class VectorizedFactor:
             for column, kind in zip(self.columns, self.kinds, strict=True)
             for key in ([column] if isinstance(column, int) else column)
         ]
-        self._last: _Evaluation | None = None
+        self._last: tuple[list[Any], _Evaluation] | None = None
+        self._given: _Evaluation | None = None
 
     def residuals(self, values: gtsam.Values) -> Array:
         """Whitened residuals (n, m) at the values, outliers included."""
@@ -168,10 +180,12 @@ class VectorizedFactor:
         The last evaluation is kept: a solver asks for the error, then for the Jacobians at the same values, and a
         smoother asks again and again while its linearisation point stays.
         """
-        variables = [values.atRot3(k) if rotation else values.atVector(k) for k, rotation in self._reads]
-        if self._last is None or not all(map(_same, variables, self._last.variables)):
-            self._last = _Evaluation(variables, *self.model(*self._blocks(variables)))
-        return self._last
+        if self._given is not None:
+            return self._given
+        variables = [_read(values, key, rotation) for key, rotation in self._reads]
+        if self._last is None or not all(map(_same, variables, self._last[0])):
+            self._last = variables, _Evaluation(*self.model(*self._blocks(variables)))
+        return self._last[1]
 
     def _blocks(self, variables: list[Any]) -> Iterator[Array]:
         """For each column its variables' values, (n, 4) or (n, d)."""
@@ -179,10 +193,7 @@ class VectorizedFactor:
         start = 0
         for column, kind in zip(self.columns, self.kinds, strict=True):
             stop = start + (1 if isinstance(column, int) else len(column))
-            if kind == "rotation":
-                block = np.array([r.toQuaternion().coeffs() for r in variables[start:stop]])[:, [3, 0, 1, 2]]
-            else:
-                block = np.array(variables[start:stop])
+            block = _array(variables[start:stop], kind)
             yield np.broadcast_to(block, (n, block.shape[1]))
             start = stop
 
@@ -207,20 +218,38 @@ class VectorizedFactor:
         self._lay_out(blocks, jacobians)
         return residuals.ravel()
 
+    @cached_property
+    def _places(self) -> tuple[list[slice], list[Any]]:
+        """The columns of each key in the whole Jacobian (n, m, width), and the elements each block is added to."""
+        widths = [0] * len(self.keys)
+        for slots, kind in zip(self._slots, self.kinds, strict=True):
+            for slot in [slots] if isinstance(slots, int) else slots:
+                widths[slot] = 3 if kind == "rotation" else kind
+        ends = np.cumsum(widths)
+        columns = [slice(int(end) - width, int(end)) for end, width in zip(ends, widths, strict=True)]
+        n, m = len(self.model.time), self.model.rows
+        rows = (np.arange(n * m) * int(ends[-1])).reshape(n, m, 1)
+        targets: list[Any] = []
+        for slots in self._slots:
+            if isinstance(slots, int):
+                targets.append(columns[slots])
+            else:
+                first, width = (ends - widths)[slots], widths[slots[0]]
+                targets.append(rows + first[:, None, None] + np.arange(width))
+        return columns, targets
+
     def _lay_out(self, blocks: Sequence[Array], jacobians: list[Array]) -> None:
         n, m = blocks[0].shape[:2]
-        dense: dict[int, Array] = {}
-        for slots, block in zip(self._slots, blocks, strict=True):
-            d = block.shape[2]
-            if isinstance(slots, int):
-                dense[slots] = dense.get(slots, 0.0) + block.reshape(n * m, d)
-                continue
-            for i, slot in enumerate(slots):
-                if slot not in dense:
-                    dense[slot] = np.zeros((n * m, d))
-                dense[slot][i * m : (i + 1) * m] += block[i]
-        for slot, jacobian in dense.items():
-            jacobians[slot] = jacobian
+        columns, targets = self._places
+        whole = np.zeros((n * m, columns[-1].stop))
+        flat = whole.reshape(-1)
+        for target, block in zip(targets, blocks, strict=True):
+            if isinstance(target, slice):
+                whole[:, target] += block.reshape(n * m, -1)
+            else:
+                flat[target] += block
+        for slot, column in enumerate(columns):
+            jacobians[slot] = whole[:, column]
 
     def _compressed(self, residuals: Array, blocks: Sequence[Array], jacobians: list[Array]) -> Array:
         A = np.concatenate([b.reshape(-1, b.shape[2]) for b in blocks], axis=1)
@@ -232,6 +261,108 @@ class VectorizedFactor:
             jacobians[slot] = np.vstack([R[:, start:stop], np.zeros((1, stop - start))])
             start = stop
         return np.append(d, rest)
+
+
+class Ensemble:
+    """Vectorised factors evaluated together, models of one kind in one call.
+
+    A graph has its measurements in many factors, for the sake of sparsity; numpy would rather have them in one array.
+    """
+
+    def __init__(self, factors: Sequence[VectorizedFactor]) -> None:
+        groups: dict[Hashable, list[VectorizedFactor]] = {}
+        for factor in factors:
+            groups.setdefault(_kind(factor), []).append(factor)
+        self._groups = [_Group(group) for group in groups.values()]
+        self._values: gtsam.Values | None = None
+
+    @contextmanager
+    def at(self, values: gtsam.Values) -> Iterator[None]:
+        """Evaluated at the values, which nobody may change; within the block the factors answer for no others."""
+        if values is not self._values:
+            for group in self._groups:
+                group.evaluate(values)
+            self._values = values
+        try:
+            for group in self._groups:
+                group.give()
+            yield
+        finally:
+            for group in self._groups:
+                group.take()
+
+
+class _Group:
+    """Factors whose models are evaluated as one."""
+
+    def __init__(self, factors: Sequence[VectorizedFactor]) -> None:
+        self._factors = factors
+        self._model = _stack([f.model for f in factors])
+        ends = np.cumsum([len(f.model.time) for f in factors]).tolist()
+        self._spans = list(zip([0, *ends[:-1]], ends, strict=True))
+        self._columns = [self._column(i) for i in range(len(factors[0].columns))]
+        self._parts: list[_Evaluation] = []
+
+    def _column(self, i: int) -> tuple[list[int], NDArray[np.intp] | None]:
+        """The variables of a column and which of them each measurement takes; None: there is only one."""
+        keys: dict[int, int] = {}
+        index: list[Any] = []
+        for factor in self._factors:
+            column = factor.columns[i]
+            if isinstance(column, int):
+                index.append(np.broadcast_to(keys.setdefault(column, len(keys)), len(factor.model.time)))
+            else:
+                index.append([keys.setdefault(key, len(keys)) for key in column])
+        return list(keys), np.concatenate(index) if len(keys) > 1 else None
+
+    def evaluate(self, values: gtsam.Values) -> None:
+        n = self._spans[-1][1]
+        blocks = []
+        for (keys, index), kind in zip(self._columns, self._factors[0].kinds, strict=True):
+            block = _array([_read(values, key, kind == "rotation") for key in keys], kind)
+            blocks.append(np.broadcast_to(block, (n, block.shape[1])) if index is None else block[index])
+        whole = _Evaluation(*self._model(*blocks))
+        self._parts = [whole.part(start, stop) for start, stop in self._spans]
+
+    def give(self) -> None:
+        for factor, part in zip(self._factors, self._parts, strict=True):
+            factor._given = part
+
+    def take(self) -> None:
+        for factor in self._factors:
+            factor._given = None
+
+
+def _kind(factor: VectorizedFactor) -> Hashable:
+    """Equal for factors whose models can be evaluated as one."""
+    stacked = getattr(factor.model, "stacked", None)
+    if stacked is None:
+        return id(factor)
+    model: Any = factor.model
+    shared = tuple(getattr(model, f.name) for f in fields(model) if f.name not in stacked)
+    absent = tuple(getattr(model, name) is None for name in stacked)
+    return type(model), shared, absent, model.rows, tuple(factor.kinds)
+
+
+def _stack(parts: Sequence[Any]) -> Any:
+    """One array or dataclass of several, their `stacked` fields one after the other."""
+    first = parts[0]
+    if first is None or len(parts) == 1:
+        return first
+    if isinstance(first, np.ndarray):
+        return np.concatenate(parts)
+    return replace(first, **{name: _stack([getattr(part, name) for part in parts]) for name in first.stacked})
+
+
+def _read(values: gtsam.Values, key: int, rotation: bool) -> Any:
+    return values.atRot3(key) if rotation else values.atVector(key)
+
+
+def _array(variables: Sequence[Any], kind: Kind) -> Array:
+    """Values of variables, (n, 4) or (n, d)."""
+    if kind == "rotation":
+        return np.array([r.toQuaternion().coeffs() for r in variables])[:, [3, 0, 1, 2]]
+    return np.array(variables)
 
 
 def square_root(information: Array, projection: Array, square: float) -> tuple[Array, Array, float]:

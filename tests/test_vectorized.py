@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import gtsam
 import numpy as np
 import pytest
 
-from factors.vectorized import Array, TruncatedLoss, VectorizedFactor, square_root
+from factors.vectorized import Array, Ensemble, TruncatedLoss, VectorizedFactor, square_root
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,7 @@ class _Line:
     A: Array
     y: Array
     rows: int = 2
+    stacked: ClassVar = ("time", "A", "y")
 
     def __call__(self, x: Array, b: Array) -> tuple[Array, Callable[[], tuple[Array, ...]]]:
         residual = np.einsum("nij,nj->ni", self.A, x) + b - self.y
@@ -129,3 +131,40 @@ def test_loss_weight_is_the_slope_of_its_cost(mu: float) -> None:
     slope = (loss.cost(square + h) - loss.cost(square - h)) / (2 * h)
     np.testing.assert_allclose(loss.weight(square), slope, atol=1e-4)
     assert (np.diff(loss.cost(square)) >= -1e-12).all()
+
+
+def test_an_ensemble_evaluates_what_its_factors_would() -> None:
+    columns: list[tuple[list[int | list[int]], int]] = [([[0, 1], 5], 2), ([[1, 2, 1], 5], 3), ([3, 5], 4), ([3, 6], 4)]
+    factors = [VectorizedFactor(_line(n, seed), c, [3, 2]) for seed, (c, n) in enumerate(columns)]
+    rng = np.random.default_rng(1)
+    graph, values, others = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.Values()
+    for factor in factors:
+        graph.add(factor.factor)
+    for key in graph.keyVector():
+        values.insert(key, rng.normal(size=3 if key < 5 else 2))
+        others.insert(key, rng.normal(size=3 if key < 5 else 2))
+    error, jacobian = graph.error(values), graph.linearize(values).augmentedJacobian()
+    ensemble = Ensemble(factors)
+    for _ in range(2):
+        with ensemble.at(others):
+            assert graph.error(others) != pytest.approx(error)
+        with ensemble.at(values):
+            assert graph.error(values) == pytest.approx(error, rel=1e-14)
+            np.testing.assert_allclose(graph.linearize(values).augmentedJacobian(), jacobian, rtol=1e-14)
+    assert graph.error(others) != pytest.approx(error)
+
+
+def test_models_that_differ_in_more_than_measurements_are_evaluated_apart() -> None:
+    @dataclass(frozen=True)
+    class Offset(_Line):
+        offset: float = 0.0
+
+        def __call__(self, x: Array, b: Array) -> tuple[Array, Callable[[], tuple[Array, ...]]]:
+            residual, jacobians = super().__call__(x, b)
+            return residual + self.offset, jacobians
+
+    line = _line(2)
+    factors = [VectorizedFactor(Offset(line.time, line.A, line.y, offset=o), [0, 1], [3, 2]) for o in (0.0, 1.0)]
+    values = _values(np.zeros(3), np.zeros(2))
+    with Ensemble(factors).at(values):
+        np.testing.assert_allclose(factors[1].residuals(values), factors[0].residuals(values) + 1.0)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from factors.vectorized import TruncatedLoss
+from factors.vectorized import Ensemble, TruncatedLoss
 from pipelines.methods.base import Estimate, Factor, Problem, Residuals
 from pipelines.solvers.marginals import chi_square, history_of, joint_covariance, reported
 
@@ -32,10 +32,36 @@ _MILD_PULL = 0.5
 _FEWEST_USED = 0.5
 
 
+class System:
+    """A graph, the order in which its variables are eliminated, and its measurements evaluated all at once."""
+
+    def __init__(self, factors: Sequence[Factor], shared: Sequence[int]) -> None:
+        self.factors = factors
+        self.graph = graph_of(factors)
+        self.ordering = elimination_ordering(self.graph, shared)
+        self.measurements = Ensemble([f.measurement for f in factors if f.measurement is not None])
+
+    def error(self, values: gtsam.Values) -> float:
+        """Half the sum of squares."""
+        with self.measurements.at(values):
+            return float(self.graph.error(values))
+
+    def linearize(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
+        """The linear system about the values."""
+        with self.measurements.at(values):
+            return self.graph.linearize(values)
+
+    def residuals(self, values: gtsam.Values) -> dict[str, Residuals]:
+        """Residuals of all measurements, by family."""
+        with self.measurements.at(values):
+            return residuals_of(self.factors, values)
+
+
 @dataclass(frozen=True)
 class Solution:
-    """Values at a minimum, and how it was reached."""
+    """Values at a minimum of a system, and how it was reached."""
 
+    system: System
     values: gtsam.Values
     converged: bool
     message: str
@@ -69,12 +95,12 @@ def solve_batch(problem: Problem) -> Estimate:
     solution = optimize(factors, values, shared, problem.loss)
     solved = time.perf_counter()
     values = solution.values
-    graph = graph_of(factors)
-    ordering = elimination_ordering(graph, shared)
-    linear = graph.linearize(values)
+    system, ordering = solution.system, solution.system.ordering
+    linear = system.linearize(values)
     marginal = joint_covariance(problem, linear, ordering, values, stand_ins)
-    residuals = residuals_of(factors, values)
-    summary = chi_square(problem, factors, linear, ordering, values, marginal)
+    residuals = system.residuals(values)
+    with system.measurements.at(values):
+        summary = chi_square(problem, factors, linear, ordering, values, marginal)
     # The last stand-ins are what the session reports; those before them held the parameters over time.
     history = history_of(problem, linear, ordering, values, held[:-1], marginal) if len(held) > 2 else None
     done = time.perf_counter()
@@ -130,56 +156,53 @@ def optimize(
     most: int = _MOST_ITERATIONS,
 ) -> Solution:
     """Minimise; with a loss: plain least squares first, and the graduated relaxation only if it leaves outliers."""
-    graph = graph_of(factors)
-    ordering = elimination_ordering(graph, shared)
+    system = System(factors, shared)
     if loss is None:
-        return _minimize(graph, values, ordering, most)
+        return _minimize(system, values, most)
     loss.mu = 0.0
-    plain = _minimize(graph, values, ordering)
+    plain = _minimize(system, values)
     values, iterations = plain.values, plain.iterations
-    norms = np.concatenate([np.linalg.norm(r.whitened, axis=1) for r in residuals_of(factors, values).values()])
+    norms = np.concatenate([np.linalg.norm(r.whitened, axis=1) for r in system.residuals(values).values()])
     outlying = norms[norms > loss.gate]
     if outlying.sum() > _MILD_PULL * len(norms):
         loss.mu = loss.gate**2 / (2.0 * float(outlying.max()) ** 2 - loss.gate**2)
         while loss.mu < 1e3:
-            relaxed = _minimize(graph, values, ordering, most=2)
+            relaxed = _minimize(system, values, most=2)
             values, iterations = relaxed.values, iterations + relaxed.iterations
             loss.mu *= 4.0
     loss.mu = np.inf
     if len(outlying) == 0:
         return plain
-    final = _minimize(graph, values, ordering)
-    used = np.concatenate([r.used for r in residuals_of(factors, final.values).values()])
+    final = _minimize(system, values)
+    used = np.concatenate([r.used for r in system.residuals(final.values).values()])
     if used.mean() < _FEWEST_USED:
         loss.mu = 0.0
         return plain
-    return Solution(final.values, final.converged, final.message, iterations + final.iterations)
+    return Solution(system, final.values, final.converged, final.message, iterations + final.iterations)
 
 
-def _minimize(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering, most: int = _MOST_ITERATIONS
-) -> Solution:
+def _minimize(system: System, values: gtsam.Values, most: int = _MOST_ITERATIONS) -> Solution:
     """Gauss-Newton steps, damped (Levenberg-Marquardt) only when a full step fails."""
-    error = graph.error(values)
+    error = system.error(values)
     if not np.isfinite(error):
-        return Solution(values, False, "the residuals at the start are not finite", 0)
+        return Solution(system, values, False, "the residuals at the start are not finite", 0)
     damping = 0.0
     for iteration in range(1, most + 1):
-        linear = graph.linearize(values)
+        linear = system.linearize(values)
         while True:
-            candidate = _step(linear, values, ordering, damping)
-            new_error = graph.error(candidate) if candidate is not None else np.inf
+            candidate = _step(linear, values, system.ordering, damping)
+            new_error = system.error(candidate) if candidate is not None else np.inf
             if new_error <= error + _ERROR_TOLERANCE:
                 break
             damping = max(10.0 * damping, 1e-6)
             if damping > 1e8:
-                return Solution(values, False, f"no step lowers the error of {error:.6g}", iteration)
+                return Solution(system, values, False, f"no step lowers the error of {error:.6g}", iteration)
         assert candidate is not None
         values, fall, error = candidate, error - new_error, new_error
         damping = damping / 10.0 if damping > 1e-6 else 0.0
         if fall < _ERROR_TOLERANCE + 1e-10 * error and damping == 0.0:
-            return Solution(values, True, f"converged after {iteration} iterations", iteration)
-    return Solution(values, False, f"not converged after {most} iterations", most)
+            return Solution(system, values, True, f"converged after {iteration} iterations", iteration)
+    return Solution(system, values, False, f"not converged after {most} iterations", most)
 
 
 def _step(
