@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from pipelines.cli import app
 from pipelines.consistency import cut, find_causes, held_out, mostly_rejected, split_halves
 from pipelines.methods.base import Estimate, Residuals
 from pipelines.registry import Method, method
 from pipelines.sessions.config import Config, load_config
+from pipelines.sessions.head import write_head
 from pipelines.simulation.cube import CubeScenario, cube_config, simulate_cube
 from pipelines.simulation.head import HeadScenario, head_config, simulate_head
 from pipelines.simulation.indexer import IndexerScenario, indexer_config, simulate_indexer
@@ -180,3 +185,18 @@ def test_measurements_held_out_are_predicted_as_well_as_the_noise_allows(head: C
     assert held_out(find.problem(data, config))["vision"] == pytest.approx(1.0, abs=0.15)
     wrong = with_noise(config, vision_attitude=0.2)
     assert held_out(find.problem(replace(data, vision_cov=data.vision_cov / 25.0), wrong))["vision"] > 3.0
+
+
+def test_a_flipped_axis_ends_inconsistent_with_that_first(head: Case, tmp_path: Path) -> None:
+    """From the recording to the files: exit code 4, the cause at the head of the headline and in the report."""
+    _, data, config = head
+    session, out = tmp_path / "flipped.mcap", tmp_path / "out"
+    text = config.model_dump_json(exclude_defaults=True)
+    write_head(session, replace(data, head_gyro=data.head_gyro * np.array([1.0, -1.0, 1.0])), None, text)
+    ended = CliRunner().invoke(app, ["calibrate", str(session), "--out", str(out)])
+    assert ended.exit_code == 4
+    saved = json.loads((out / "result.json").read_text())
+    assert saved["status"] == "inconsistent"
+    assert saved["headline"].startswith("The sign of the helmet gyro's y is wrong: with that changed chi-square falls")
+    assert saved["causes"][0]["label"] == "the sign of the helmet gyro's y is wrong"
+    assert "Causes that were tried" in (out / "report.html").read_text()

@@ -14,7 +14,7 @@ from pipelines.reports.compare import compare_html, write_compare
 from pipelines.reports.plots import common_plots
 from pipelines.reports.result import Calibration
 from tests.test_reports_files import make_calibration
-from tests.test_reports_html import Page
+from tests.test_reports_html import CHROMIUM, Page, drawn
 
 
 def solvers(truth: dict[str, object] | None = None) -> list[Calibration]:
@@ -57,3 +57,10 @@ def test_what_cannot_be_written_is_bad_input(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written"):
         write_compare(tmp_path / "file", solvers(), {}, {})
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs a Chromium to draw the page; none is installed")
+@pytest.mark.parametrize("width", [1280, 500])
+def test_a_browser_draws_it_without_complaint(tmp_path: Path, width: int) -> None:
+    text = compare_html(solvers(), {"time_offset": Halves(0.010, 0.003, 0.020, 0.004)}, {"vision": 1.06})
+    assert drawn(text, tmp_path, width) >= 2

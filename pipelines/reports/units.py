@@ -28,10 +28,14 @@ def human_unit(quantity: Quantity) -> tuple[str, float]:
             return other, 1.0
 
 
+# What rounding leaves of a fixed parameter, in any unit people read.
+_NOTHING = 1e-9
+
+
 def to_digits_of(value: float, sigma: float) -> str:
     """A number with the digits down to the second one of its sigma; six digits where the sigma is zero."""
     if not (sigma > 0.0 and math.isfinite(sigma)):
-        return f"{value:.6g}"
+        return f"{value:.6g}" if abs(value) > _NOTHING else "0"
     decimals = 1 - math.floor(math.log10(sigma))
     if decimals > 9:
         return f"{value:.2e}"
