@@ -43,6 +43,11 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def _as_in_a_terminal() -> None:
+    """Ctrl-C is heard, which a shell's background jobs, and so these tests among them, are told to ignore."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @pytest.fixture
 def start() -> Iterator[Start]:
     """Starts a process of its own group on this checkout or another; all end with the test."""
@@ -57,6 +62,7 @@ def start() -> Iterator[Start]:
             stderr=subprocess.PIPE,
             text=True,
             start_new_session=True,
+            preexec_fn=_as_in_a_terminal,
         )
         processes.append(process)
         return process
