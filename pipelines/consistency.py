@@ -470,7 +470,7 @@ def _noise(
     for key in suspects.noise:
         scaled = _scaled_to_fit(method, suspects, data, config, key, before)
         if scaled is not None and scaled[1] > _NOTABLE:
-            found.append((scaled[0], f"noise.{key} is stated {scaled[1]:.2g} times too small"))
+            found.append((scaled[0], f"the noise {key} is stated {scaled[1]:.2g} times too small"))
     return sorted(found, key=lambda each: each[0].imbalance)[:1]
 
 

@@ -258,12 +258,16 @@ class Assessment:
     causes: tuple[Cause, ...] = ()
 
     def explained(self, causes: Sequence[Cause]) -> Assessment:
-        """The same with causes, the first of them named before anything else; what needs them is inconsistent."""
+        """The same with causes, the likeliest as the headline; what needs them is inconsistent."""
         if not causes:
             return self
-        first = f"{causes[0].label[:1].upper()}{causes[0].label[1:]}: {causes[0].evidence}."
+        likeliest = causes[0]
+        headline = f"{likeliest.label[:1].upper()}{likeliest.label[1:]}: {likeliest.evidence}."
+        if self.consistency is not None:
+            total = self.consistency.total
+            headline += f" As it is the whole has chi-square {total.value:.5g} for {total.dof:.5g}."
         status: Status = "unobservable" if self.status == "unobservable" else "inconsistent"
-        return replace(self, status=status, causes=tuple(causes), headline=f"{first} {self.headline}")
+        return replace(self, status=status, causes=tuple(causes), headline=headline)
 
     @property
     def sigmas(self) -> Array:

@@ -78,7 +78,7 @@ def test_noise_stated_five_times_too_small_is_named_with_its_factor(head: Case) 
     wrong = replace(data, vision_cov=data.vision_cov / 25.0)
     label = first_cause((find, wrong, with_noise(config, vision_attitude=0.2)))
     name, said = label.split(" is stated ")
-    assert name == "noise.vision_attitude"
+    assert name == "the noise vision_attitude"
     assert float(said.split()[0]) == pytest.approx(5.0, rel=0.1)
 
 
@@ -119,7 +119,7 @@ def test_delay_of_20_ms_of_the_los_pictures() -> None:
 @pytest.mark.parametrize("key", ["los_error", "gyro_density"])
 def test_the_noise_that_is_too_small_is_told_from_the_others(los: Case, key: str) -> None:
     find, data, config = los
-    assert first_cause((find, data, with_noise(config, **{key: 0.2}))).startswith(f"noise.{key} ")
+    assert first_cause((find, data, with_noise(config, **{key: 0.2}))).startswith(f"the noise {key} is stated ")
 
 
 @pytest.mark.slow
