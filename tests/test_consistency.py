@@ -82,6 +82,7 @@ def test_noise_stated_five_times_too_small_is_named_with_its_factor(head: Case) 
     assert float(said.split()[0]) == pytest.approx(5.0, rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("signs", [(-1.0, 1.0, 1.0), (1.0, -1.0, -1.0)])
 def test_signs_of_the_helmet_gyro(head: Case, signs: tuple[float, ...]) -> None:
     find, data, config = head
@@ -90,6 +91,7 @@ def test_signs_of_the_helmet_gyro(head: Case, signs: tuple[float, ...]) -> None:
     assert label == f"the sign of the helmet gyro's {axes} is wrong"
 
 
+@pytest.mark.slow
 def test_sign_of_the_platform_gyro(head: Case) -> None:
     find, data, config = head
     wrong = replace(data, platform_gyro=data.platform_gyro * np.array([1.0, -1.0, 1.0]))
@@ -135,6 +137,7 @@ def test_late_encoders(indexer: Case) -> None:
     assert label == "the stamps of the encoders are 20 ms too late"
 
 
+@pytest.mark.slow
 def test_size_of_the_cubes_tags() -> None:
     scenario = CubeScenario(poses=8, static_s=2, imu_rate_hz=50, camera_rate_hz=5)
     data, _ = simulate_cube(scenario, 1)
