@@ -171,36 +171,27 @@ def _family_dof(
     families: Sequence[str], linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
 ) -> dict[str, float]:
     """Expected sum of squares of each family: that of simulated unit noise after solving for the same unknowns."""
-    from scipy import sparse
-
     try:
         bayes_net = linear.eliminateSequential(ordering, gtsam.EliminateQR)
     except RuntimeError:  # singular: no sampling
         return dict.fromkeys(families, 0.0)
-    rows = [gtsam.JacobianFactor(linear.at(i)).rows() for i in range(len(families))]
-    solution = bayes_net.optimize()
-    # Columns stand in the order of the keys, as in VectorValues.vector(); the last is the right-hand side.
-    keys = sorted(linear.keyVector())
-    ends = np.cumsum([len(solution.at(key)) for key in keys])
-    i, j, entries = linear.sparseJacobian_()
-    where = i.astype(int) - 1, j.astype(int) - 1
-    A = sparse.csr_array((entries, where), shape=(sum(rows), ends[-1] + 1))[:, :-1]
-    transposed = A.T.tocsr()
+    rows = [gtsam.JacobianFactor(linear.at(i)) for i in range(len(families))]
+    zero = gtsam.VectorValues.Zero(bayes_net.optimize())
+    offsets = [factor.error_vector(zero) for factor in rows]
     # Rejected measurements and free priors have empty rows, which are no measurements.
-    counted = np.diff(A.indptr) > 0
-    square = np.zeros(len(counted))
+    counted = [factor.jacobian()[0].any(axis=1) for factor in rows]
+    dof = dict.fromkeys(families, 0.0)
     generator = np.random.default_rng(0)
     for _ in range(_SAMPLES):
-        y = generator.standard_normal(len(counted)) * counted
-        projection = gtsam.VectorValues()
-        parts = transposed @ y
-        for key, start, end in zip(keys, [0, *ends], ends, strict=False):
-            projection.insert(key, parts[start:end])
+        noise = [generator.standard_normal(len(offset)) * mask for offset, mask in zip(offsets, counted, strict=True)]
+        projection = gtsam.VectorValues.Zero(zero)
+        for factor, y in zip(rows, noise, strict=True):
+            factor.transposeMultiplyAdd(1.0, y, projection)
         x = bayes_net.backSubstitute(bayes_net.backSubstituteTranspose(projection))
-        square += (A @ x.vector() - y) ** 2 / _SAMPLES
-    names = list(dict.fromkeys(families))
-    of_rows = np.repeat([names.index(family) for family in families], rows)
-    return dict(zip(names, np.bincount(of_rows, square).tolist(), strict=True))
+        for family, factor, y, offset in zip(families, rows, noise, offsets, strict=True):
+            left = factor.error_vector(x) - offset - y
+            dof[family] += float(left @ left) / _SAMPLES
+    return dof
 
 
 def _explain(message: str) -> str:
