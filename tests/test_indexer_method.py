@@ -169,3 +169,14 @@ def test_real_turns_by_hand_against_imucal(shared_data: Path) -> None:
     mRt = so3.matrix(so3.inverse(mounting(theta)))
     np.testing.assert_allclose(np.rad2deg(mRt), -np.rad2deg(published["R_g"]), atol=0.25)
     np.testing.assert_allclose(np.rad2deg(bias) * COUNTS, published["b_g"], atol=0.1)
+
+
+def test_families_account_for_every_degree_of_freedom() -> None:
+    """A bias that hardly walks leaves nothing over: its tight rows take no freedom from the turns."""
+    scenario = load_scenario(IndexerScenario, "indexer_nominal")
+    data, _ = simulate_indexer(scenario, 0)
+    estimate = solve_batch(problem(data, load_config(indexer_config(scenario).encode())))
+    assert estimate.chi_square is not None
+    dof = {family: d for family, (_, d) in estimate.chi_square.families.items()}
+    assert dof["bias walk"] < 1.0
+    assert dof["turn"] > 0.8 * estimate.chi_square.dof

@@ -18,9 +18,10 @@ from pipelines.methods.base import Array, Factor
 _FRACTION = 0.2
 # ... and is never longer than this, s, so that the bias over time can be seen.
 _LONGEST = 10.0
-# What follows without error (a bias that does not walk, the mean of the nodes) is given this share of what gyro noise
-# leaves unknown of a stretch's bias, which keeps the arithmetic well conditioned.
+# What follows without error, a bias that does not walk and the mean of the nodes, is given these shares of what gyro
+# noise leaves unknown of a stretch's bias, which keeps the arithmetic well conditioned.
 _SLACK = 1e-4
+_MEAN_SLACK = 1e-2
 
 # The first stretch's node, which is the whole bias where it does not walk.
 FIRST = int(gtsam.symbol("b", 0))
@@ -70,11 +71,12 @@ class WalkingBias:
         """Joins a node to the one before it."""
         spacing = 0.5 * (self.edges[node + 1] - self.edges[node - 1])
         step = self.walk * np.sqrt(spacing)
-        noise = gtsam.noiseModel.Isotropic.Sigma(3, float(np.hypot(step, self._slack(spacing))))
+        noise = gtsam.noiseModel.Isotropic.Sigma(3, float(np.hypot(step, _SLACK * self._unknown(spacing))))
         return Factor("bias walk", gtsam.BetweenFactorVector(self.key(node - 1), self.key(node), np.zeros(3), noise))
 
-    def _slack(self, stretch: float) -> float:
-        return _SLACK * self.density / float(np.sqrt(stretch))
+    def _unknown(self, stretch: float) -> float:
+        """Sigma that gyro noise leaves to the bias of a stretch (s), rad/s."""
+        return self.density / float(np.sqrt(stretch))
 
     def mean_factor(self, node: int) -> Factor:
         """Defines the mean at the end of a node's stretch from the one before and the node (native, linear)."""
@@ -95,6 +97,8 @@ class WalkingBias:
             keys[2],
             -share * np.eye(3),
             np.zeros(3),
-            gtsam.noiseModel.Isotropic.Sigma(3, float(np.hypot(departure, self._slack(stretch) * share))),
+            gtsam.noiseModel.Isotropic.Sigma(
+                3, float(np.hypot(departure, _MEAN_SLACK * self._unknown(stretch) * share))
+            ),
         )
         return Factor("definition", gtsam.LinearContainerFactor(linear, zeros))

@@ -172,7 +172,8 @@ def _family_dof(
 ) -> dict[str, float]:
     """Expected sum of squares of each family: that of simulated unit noise after solving for the same unknowns."""
     try:
-        bayes_net = linear.eliminateSequential(ordering, gtsam.EliminateQR)
+        # By Cholesky: of the conditionals that QR leaves, backSubstituteTranspose forgets the sigmas.
+        bayes_net = linear.eliminateSequential(ordering)
     except RuntimeError:  # singular: no sampling
         return dict.fromkeys(families, 0.0)
     rows = [gtsam.JacobianFactor(linear.at(i)) for i in range(len(families))]
