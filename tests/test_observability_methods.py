@@ -64,7 +64,7 @@ def predicted(scenario: _Scenario) -> Prediction:
             {"camera_mount_x"},
             "platform",
         ),
-        (HeadScenario(**_HEAD, head=_ONE_AXIS), "weak", {"helmet_mount_z"}, "about two axes"),
+        (HeadScenario(**_HEAD, head=_ONE_AXIS), "unobservable", {"helmet_mount_z"}, "about two axes"),
         (CubeScenario(**_CUBE, poses=2), "unobservable", {"mag_k11"}, "poses"),
     ],
     ids=["los azimuth", "los gauge", "indexer theta_x", "head camera", "head one axis", "cube poses"],
