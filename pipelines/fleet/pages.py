@@ -15,6 +15,7 @@ from pipelines.fleet.analysis import Change, Population, iso
 from pipelines.methods.base import Array, Quantity
 from pipelines.reports.plots import COLORS, REJECTED, figure, thin
 from pipelines.reports.result import Plot
+from pipelines.reports.templating import environment
 from pipelines.reports.units import human_unit, to_digits_of
 
 if TYPE_CHECKING:
@@ -81,24 +82,20 @@ def study_html(study: Study) -> str:
 
 
 def _render(template: str, plots: Sequence[Plot], **context: Any) -> str:
-    from jinja2 import Environment, PackageLoader, StrictUndefined
     from plotly.offline import get_plotlyjs
 
-    environment = Environment(
-        loader=PackageLoader("pipelines.fleet"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     divs = [
         plot.figure.to_html(full_html=False, include_plotlyjs=False, config={"responsive": True, "displaylogo": False})
         for plot in plots
     ]
-    return environment.get_template(template).render(
-        plots=[(plot.title, plot.caption, div) for plot, div in zip(plots, divs, strict=True)],
-        plotly_js=get_plotlyjs() if plots else "",
-        **context,
+    return (
+        environment("pipelines.fleet")
+        .get_template(template)
+        .render(
+            plots=[(plot.title, plot.caption, div) for plot, div in zip(plots, divs, strict=True)],
+            plotly_js=get_plotlyjs() if plots else "",
+            **context,
+        )
     )
 
 

@@ -13,6 +13,7 @@ from pipelines.errors import InputError
 from pipelines.methods.base import Quantity
 from pipelines.reports.plots import COLORS, add_line, band, figure
 from pipelines.reports.result import Calibration, Plot, truth_errors
+from pipelines.reports.templating import environment
 from pipelines.reports.units import human_unit, to_digits_of
 
 FILE = "compare.html"
@@ -39,26 +40,22 @@ def compare_html(
         halves: of the recording, see pipelines.consistency.
         predicted: family -> size of the errors of held-out measurements, sigmas.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    environment = Environment(
-        loader=PackageLoader("pipelines.reports"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     quantities = [q for q in calibrations[0].problem.quantities if q.prior_sigma != 0.0]
     plots = [*_differences(calibrations, quantities), *_convergence(calibrations, quantities)]
-    return environment.get_template("compare.html").render(
-        calibrations=calibrations,
-        recording=calibrations[0].recording,
-        method=calibrations[0].problem.method,
-        truth_known=calibrations[0].truth is not None,
-        rows=[(q.name, human_unit(q)[0], [_cell(c, calibrations, q) for c in calibrations]) for q in quantities],
-        halves=[_half(q, halves[q.name]) for q in quantities if q.name in halves],
-        predicted=predicted,
-        plots=[(plot.title, plot.caption, _div(plot, first=i == 0)) for i, plot in enumerate(plots)],
+    return (
+        environment("pipelines.reports")
+        .get_template("compare.html")
+        .render(
+            calibrations=calibrations,
+            recording=calibrations[0].recording,
+            method=calibrations[0].problem.method,
+            truth_known=calibrations[0].truth is not None,
+            rows=[(q.name, human_unit(q)[0], [_cell(c, calibrations, q) for c in calibrations]) for q in quantities],
+            halves=[_half(q, halves[q.name]) for q in quantities if q.name in halves],
+            predicted=predicted,
+            plots=[(plot.title, plot.caption, _div(plot, first=i == 0)) for i, plot in enumerate(plots)],
+        )
     )
 
 

@@ -13,6 +13,7 @@ from pipelines.observability import by_advice
 from pipelines.reports.formulas import FORMULAS
 from pipelines.reports.plots import common_plots
 from pipelines.reports.result import Calibration, Plot, quantities_of, truth_errors
+from pipelines.reports.templating import environment
 from pipelines.reports.units import human_unit, to_digits_of
 
 # Beyond so many sigmas of its prior a number says nothing.
@@ -36,28 +37,24 @@ class _Row:
 
 def report_html(calibration: Calibration) -> str:
     """The report as one HTML text."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
     from plotly.offline import get_plotlyjs
 
-    environment = Environment(
-        loader=PackageLoader("pipelines.reports"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     own = list(calibration.plots(calibration)) if calibration.plots else []
     plots = [*own, *common_plots(calibration)]
     facts = calibration.facts
-    return environment.get_template("report.html").render(
-        c=calibration,
-        by_advice=by_advice,
-        method=_NAMES.get(calibration.problem.method, calibration.problem.method),
-        start=datetime.datetime.fromtimestamp(facts.epoch_ns // 1_000_000_000, datetime.UTC),
-        rows=_rows(calibration),
-        formulas=FORMULAS.get(calibration.problem.method, ()),
-        plots=[(plot.title, plot.caption, _div(plot, i)) for i, plot in enumerate(plots)],
-        plotly_js=get_plotlyjs() if plots else "",
+    return (
+        environment("pipelines.reports")
+        .get_template("report.html")
+        .render(
+            c=calibration,
+            by_advice=by_advice,
+            method=_NAMES.get(calibration.problem.method, calibration.problem.method),
+            start=datetime.datetime.fromtimestamp(facts.epoch_ns // 1_000_000_000, datetime.UTC),
+            rows=_rows(calibration),
+            formulas=FORMULAS.get(calibration.problem.method, ()),
+            plots=[(plot.title, plot.caption, _div(plot, i)) for i, plot in enumerate(plots)],
+            plotly_js=get_plotlyjs() if plots else "",
+        )
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from pipelines.methods.validation import Validation, peak, rms
 from pipelines.reports.calibration import SavedCalibration
 from pipelines.reports.plots import COLORS, add_points, figure
+from pipelines.reports.templating import environment
 
 # Angles of less than this, rad, are read in arc seconds.
 _FINE = 2e-4
@@ -33,20 +34,16 @@ def validation_html(validations: Sequence[Validation], calibration: SavedCalibra
         calibration: the one validated.
         recording: name of the file it was validated on.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    environment = Environment(
-        loader=PackageLoader("pipelines.reports"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("validation.html").render(
-        c=calibration,
-        recording=recording,
-        rows=validation_rows(validations),
-        plots=[(v.name, v.note, _plot(v, first=i == 0)) for i, v in enumerate(validations)],
+    return (
+        environment("pipelines.reports")
+        .get_template("validation.html")
+        .render(
+            c=calibration,
+            recording=recording,
+            rows=validation_rows(validations),
+            plots=[(v.name, v.note, _plot(v, first=i == 0)) for i, v in enumerate(validations)],
+        )
     )
 
 

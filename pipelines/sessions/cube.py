@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from factors.earth import magnetic_field
 from pipelines.errors import InputError
 from pipelines.sessions import series
+from pipelines.sessions.camera import camera_of
 from pipelines.sessions.checks import (
     check_gyro,
     check_overlap,
@@ -367,14 +368,11 @@ def _position(recording: Recording, config: Config) -> tuple[float | None, float
 
 def read_camera(recording: Recording, config: Config) -> Camera:
     """The camera that looks at the cube. Raises InputError when it, or the cube's tags, are not described."""
-    from pipelines.vision.camera import Camera
-
     if not config.cube.tags:
         raise InputError(
             "the tags on the cube are not given: name them in the config as cube.tags {id: {size, rotation, position}}"
         )
-    info = recording.camera_info(config.topic("camera_info"))
-    return Camera(info.width, info.height, info.k, info.distortion_model, info.d)
+    return camera_of(recording, config)
 
 
 def _detections(recording: Recording, config: Config, epoch_ns: int, dropped: dict[str, int]) -> Sightings:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pipelines.errors import InputError
 from pipelines.sessions import series
+from pipelines.sessions.camera import camera_of
 from pipelines.sessions.checks import (
     check_overlap,
     clean,
@@ -158,7 +159,6 @@ def _from_pictures(
     recording: Recording, config: Config, epoch_ns: int, dropped: dict[str, int]
 ) -> tuple[Array, Array, Array]:
     """Attitudes of the helmet's tag board, seen in the pictures."""
-    from pipelines.vision.camera import Camera
     from pipelines.vision.head import board_attitudes
     from pipelines.vision.pose import TagBody
 
@@ -167,8 +167,7 @@ def _from_pictures(
         raise InputError(
             f"topic {topic}: the pictures need the tags on the helmet: give them in the config as head.board"
         )
-    info = recording.camera_info(config.topic("camera_info"))
-    camera = Camera(info.width, info.height, info.k, info.distortion_model, info.d)
+    camera = camera_of(recording, config)
     board = TagBody.from_board(config.head.board)
     seen = board_attitudes(recording.images(topic), camera, board, config.noise.corner_px)
     for reason, number in seen.dropped.items():

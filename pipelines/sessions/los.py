@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pipelines.errors import InputError
 from pipelines.sessions import series
+from pipelines.sessions.camera import camera_of
 from pipelines.sessions.checks import check_overlap, clean, count, nanoseconds
 from pipelines.sessions.config import ATTACHMENT, Config
 from pipelines.sessions.gyro import read_gyro
@@ -228,12 +229,10 @@ def _from_pictures(
     recording: Recording, config: Config, epoch_ns: int, dropped: dict[str, int]
 ) -> tuple[Array, Array, Array]:
     """LOS errors of the target that the first picture shows, with the tracker's covariance."""
-    from pipelines.vision.camera import Camera
     from pipelines.vision.target import los_errors
 
     topic = config.topic("image")
-    info = recording.camera_info(config.topic("camera_info"))
-    camera = Camera(info.width, info.height, info.k, info.distortion_model, info.d)
+    camera = camera_of(recording, config)
     found = los_errors(recording.images(topic), camera)
     for reason, number in found.dropped.items():
         count(dropped, f"{topic}: {reason}", number)

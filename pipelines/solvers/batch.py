@@ -16,7 +16,7 @@ import numpy as np
 
 from factors.vectorized import Ensemble, TruncatedLoss
 from pipelines.methods.base import Estimate, Factor, Problem, Residuals
-from pipelines.solvers.marginals import chi_square, history_of, joint_covariance, reported
+from pipelines.solvers.marginals import chi_square, history_of, joint_covariance, ordering_of, reported
 
 # Frames in one vectorised factor: past this the Jacobians' zeros cost more than the Python calls they save.
 CHUNK = 20
@@ -142,10 +142,7 @@ def elimination_ordering(graph: gtsam.NonlinearFactorGraph, shared: Sequence[int
     last = set(shared)
     metis = gtsam.Ordering.MetisNonlinearFactorGraph(joined) if joined.size() else gtsam.Ordering()
     chain = [metis.at(i) for i in range(metis.size()) if metis.at(i) not in last]
-    ordering = gtsam.Ordering()
-    for key in [*(alone.keys() - last - set(chain)), *chain, *shared]:
-        ordering.push_back(key)
-    return ordering
+    return ordering_of([*(alone.keys() - last - set(chain)), *chain, *shared])
 
 
 def optimize(

@@ -28,7 +28,7 @@ from pipelines.methods.base import (
     Step,
 )
 from pipelines.solvers.batch import CHUNK, graph_of, optimize
-from pipelines.solvers.marginals import reported, reported_covariance
+from pipelines.solvers.marginals import ordering_of, reported, reported_covariance
 
 DEFAULT_WINDOW = 1.0
 
@@ -233,7 +233,7 @@ class _Run:
         where = _slices(held + fresh, dims)
         if fresh:
             order = [k for k in held if k in involved] + fresh
-            A = process.jacobian(_ordering(order))[0]
+            A = process.jacobian(ordering_of(order))[0]
             columns = _slices(order, dims)
             width = P.shape[0]
             inverse = np.linalg.pinv(A[:, columns[fresh[0]].start :])
@@ -296,13 +296,6 @@ def _slices(keys: Sequence[int], dims: Mapping[int, int]) -> dict[int, slice]:
     """Where each variable stands when they are stacked in this order."""
     ends = np.cumsum([dims[key] for key in keys])
     return {key: slice(int(end) - dims[key], int(end)) for key, end in zip(keys, ends, strict=True)}
-
-
-def _ordering(keys: Sequence[int]) -> gtsam.Ordering:
-    ordering = gtsam.Ordering()
-    for key in keys:
-        ordering.push_back(key)
-    return ordering
 
 
 def _joined(pieces: Iterable[Attitudes]) -> Attitudes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import gtsam
 import numpy as np
@@ -25,6 +25,14 @@ def reported(problem: Problem, values: gtsam.Values, stand_ins: Mapping[int, int
     return np.concatenate([p.coordinates(values, stand_ins.get(p.key, p.key))[0] for p in problem.parameters])
 
 
+def ordering_of(keys: Iterable[int]) -> gtsam.Ordering:
+    """The keys as gtsam's ordering."""
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    return ordering
+
+
 def joint_covariance(
     problem: Problem,
     linear: gtsam.GaussianFactorGraph,
@@ -41,17 +49,11 @@ def joint_covariance(
     rest = [ordering.at(i) for i in range(ordering.size()) if ordering.at(i) not in set(keys)]
     remaining = linear
     if rest:
-        first = gtsam.Ordering()
-        for key in rest:
-            first.push_back(key)
         try:
-            remaining = linear.eliminatePartialMultifrontal(first, gtsam.EliminateQR)[1]
+            remaining = linear.eliminatePartialMultifrontal(ordering_of(rest), gtsam.EliminateQR)[1]
         except RuntimeError as error:
             raise IndeterminateError(_explain(str(error))) from None
-    last = gtsam.Ordering()
-    for key in keys:
-        last.push_back(key)
-    information = remaining.hessian(last)[0]
+    information = remaining.hessian(ordering_of(keys))[0]
     return reported_covariance(problem.parameters, information, values, keys)
 
 
