@@ -64,13 +64,18 @@ def _head() -> Method:
 
 
 def _los() -> Method:
+    from functools import partial
+
     from pipelines.methods.los import problem
     from pipelines.methods.los_validation import validate
     from pipelines.published.los import published_estimate
+    from pipelines.reports.los import los_plots
     from pipelines.sessions.los import read_los
     from pipelines.simulation.los import write_simulation
 
-    return Method(read_los, problem, published_estimate, write_simulation, validate=validate)
+    return Method(
+        read_los, problem, published_estimate, write_simulation, lambda data: partial(los_plots, data), validate
+    )
 
 
 def _indexer() -> Method:

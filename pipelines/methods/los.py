@@ -35,7 +35,9 @@ _SPLIT = ("delta_pz", "delta_gz")
 _OPTIONS = ("camera_roll", "collimation", "axis_nonperpendicularity")
 _BIAS = ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")
 _OFFSET = "time_offset"
-NAMES = (*_ANGLES, "delta_z", *_SPLIT, *_OPTIONS, *_BIAS, _OFFSET)
+# Everything but gyro bias and time offset: the angles by which gyro, gimbal axes and camera are mounted.
+ANGLES = (*_ANGLES, "delta_z", *_SPLIT, *_OPTIONS)
+NAMES = (*ANGLES, *_BIAS, _OFFSET)
 
 _ANGLES_KEY, _OFFSET_KEY = int(gtsam.symbol("a", 0)), int(gtsam.symbol("T", 0))
 _PRIOR_ANGLE, _PRIOR_BIAS, _PRIOR_OFFSET = 0.1, 0.02, 0.05

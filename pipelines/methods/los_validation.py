@@ -59,6 +59,7 @@ def validate(data: LosData, config: Config, values: Mapping[str, float]) -> tupl
         np.concatenate(before),
         np.concatenate(after),
         "; ".join(filter(None, [bias, left_out])),
+        micro=True,
     )
     steady = Validation(
         "line of sight, steady drift removed",
@@ -67,6 +68,7 @@ def validate(data: LosData, config: Config, values: Mapping[str, float]) -> tupl
         np.concatenate([_without_drift(t, e) for t, e in zip(times, before, strict=True)]),
         np.concatenate([_without_drift(t, e) for t, e in zip(times, after, strict=True)]),
         left_out,
+        micro=True,
     )
     return drifting, steady
 

@@ -20,6 +20,7 @@ class Validation:
         before: (n, m) errors, one column an axis, with nothing compensated.
         after: (n, m) the same with the calibration applied.
         note: what a reader has to know beside it, a sentence without its full stop; may be empty.
+        micro: angles are read in urad, as in the trade of pointing, not in degrees.
     """
 
     name: str
@@ -28,6 +29,7 @@ class Validation:
     before: Array
     after: Array
     note: str = ""
+    micro: bool = False
 
 
 def rms(errors: Array) -> float:

@@ -21,7 +21,8 @@ def validation_rows(validations: Sequence[Validation]) -> list[tuple[str, str, s
     rows = []
     for v in validations:
         unit, factor = _readable(v)
-        numbers = [f"{factor * size(errors):.3g}" for size in (rms, peak) for errors in (v.before, v.after)]
+        sizes = (factor * size(errors) for size in (rms, peak) for errors in (v.before, v.after))
+        numbers = [np.format_float_positional(size, precision=3, fractional=False, trim="-") for size in sizes]
         rows.append((v.name, numbers[0], numbers[1], numbers[2], numbers[3], unit))
     return rows
 
@@ -62,5 +63,7 @@ def _readable(validation: Validation) -> tuple[str, float]:
     """The unit to show, and what to multiply SI by; the same before and after."""
     if validation.unit != "rad":
         return validation.unit, 1.0
+    if validation.micro:
+        return "urad", 1e6
     fine = rms(validation.after) < _FINE
     return ("arcsec", math.degrees(3600.0)) if fine else ("deg", math.degrees(1.0))

@@ -1,0 +1,39 @@
+"""The los method's own figures say what the calibration explains."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+
+from pipelines.methods.los import problem
+from pipelines.reports.los import los_plots
+from pipelines.reports.result import Calibration, Plot
+from pipelines.sessions.config import load_config
+from pipelines.simulation.los import LosScenario, los_config, simulate_los
+from pipelines.solvers.batch import solve_batch
+
+SCENARIO = LosScenario(duration_s=20.0, image_rate_hz=20.0, gyro_rate_hz=200.0, gimbal_rate_hz=100.0)
+
+
+def _plots(priors: str) -> list[Plot]:
+    data, _ = simulate_los(SCENARIO, 1)
+    config = load_config(los_config(SCENARIO).replace("priors: {}", f"priors: {priors}").encode())
+    estimate = solve_batch(problem(data, config))
+    text = config.model_dump_json(exclude_defaults=True)
+    return los_plots(data, cast(Calibration, SimpleNamespace(config_text=text, estimate=estimate)))
+
+
+@pytest.mark.parametrize("priors", ["{}", "{time_offset: 0.01}"])
+def test_the_prediction_follows_the_measured_error(priors: str) -> None:
+    both, left = _plots(priors)
+    measured, predicted = ({t.name.split()[0]: np.asarray(t.y) for t in both.figure.data[i::2]} for i in (0, 1))
+    for axis in ("phx", "phz"):
+        assert np.abs(measured[axis]).max() > 1.0  # mrad
+        # 30 urad/sqrt(s) of gyro over 20 s, and 20 urad of picture.
+        np.testing.assert_allclose(predicted[axis], measured[axis], atol=0.5)
+    spread = {trace.name: np.std(trace.y) for trace in left.figure.data}
+    assert spread["phx, mounting angles found"] < 150.0 < 500.0 < spread["phx, mounting angles zero"]
+    assert "urad" in left.caption
