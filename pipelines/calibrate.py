@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pipelines.consistency import Halves, find_causes, held_out, mostly_rejected, split_halves
+from pipelines.errors import InputError
 from pipelines.methods.base import Estimate, Problem
 from pipelines.observability import Cause, assess
 from pipelines.registry import Method, method
@@ -50,6 +51,7 @@ def calibrate(
     read = time.perf_counter() - start
     calibrations = []
     causes: tuple[Cause, ...] | None = None
+    beside = _published(chosen, data, config) if "incremental" in solvers else None
     for solver in solvers:
         estimate, problem = _solve(solver, chosen, data, config, window)
         quantities = tuple(q for q in problem.quantities if q.name in estimate.names)
@@ -69,6 +71,7 @@ def calibrate(
                 truth=truth,
                 seconds={"read": read},
                 plots=chosen.plots(data) if chosen.plots else None,
+                beside=beside if solver == "incremental" else None,
             )
         )
     return calibrations
@@ -96,6 +99,14 @@ def _solve(solver: str, chosen: Method, data: object, config: Config, window: fl
     from pipelines.solvers.batch import solve_batch
 
     return solve_batch(problem), problem
+
+
+def _published(chosen: Method, data: object, config: Config) -> Estimate | None:
+    """The published solver's estimate, where it can serve the recording: it needs more than the graphs."""
+    try:
+        return chosen.published(data, config, chosen.problem(data, config))
+    except InputError:
+        return None
 
 
 def _truth(recording: Recording) -> dict[str, object] | None:

@@ -245,6 +245,24 @@ def test_tum_has_absolute_times_to_the_nanosecond_in_order() -> None:
     np.testing.assert_allclose(rows[:, [7, 4, 5, 6]], wxyz[[2, 0, 1]], atol=1e-12)
 
 
+def test_evo_reads_the_trajectory(tmp_path: Path) -> None:
+    from evo.core import metrics, trajectory
+    from evo.tools import file_interface
+
+    calibration = make_calibration()
+    attitudes = calibration.estimate.attitudes
+    assert attitudes is not None
+    write_results(tmp_path, calibration)
+    read = file_interface.read_tum_trajectory_file(str(tmp_path / "attitude.tum"))
+    assert read.check()[0]
+    truth = trajectory.PoseTrajectory3D(
+        np.zeros((200, 3)), so3.multiply(attitudes.wxyz, so3.exp([0.0, 0.0, 0.01])), EPOCH_NS * 1e-9 + attitudes.time
+    )
+    error = metrics.APE(metrics.PoseRelation.rotation_angle_rad)
+    error.process_data((truth, read))
+    assert error.get_statistic(metrics.StatisticsType.rmse) == pytest.approx(0.01, rel=1e-6)
+
+
 def test_estimates_read_back_with_a_ros_decoder(tmp_path: Path) -> None:
     calibration = make_calibration()
     history = calibration.estimate.history
@@ -266,6 +284,22 @@ def test_estimates_read_back_with_a_ros_decoder(tmp_path: Path) -> None:
         assert (message.lower, message.upper) == pytest.approx((0.0118, 0.0122))
 
 
+def test_the_foxglove_layout_plots_what_the_estimates_hold(tmp_path: Path) -> None:
+    write_results(tmp_path, make_calibration())
+    layout = json.loads((tmp_path / "foxglove.json").read_text())
+    paths = {path["value"] for panel in layout["configById"].values() for path in panel["paths"]}
+    with (tmp_path / "estimates.mcap").open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    free = {channel.topic for channel in summary.channels.values()} - {"/estimate/pinned"}
+    assert paths == {f"{topic}.{field}" for topic in free for field in ("value", "lower", "upper")}
+
+    def leaves(node: Any) -> list[str]:
+        return [node] if isinstance(node, str) else leaves(node["first"]) + leaves(node["second"])
+
+    assert sorted(leaves(layout["layout"])) == sorted(layout["configById"])
+
+
 def test_all_files_are_written_and_others_left_alone(tmp_path: Path) -> None:
     out = tmp_path / "a" / "b"
     written = write_results(out, make_calibration())
@@ -273,8 +307,9 @@ def test_all_files_are_written_and_others_left_alone(tmp_path: Path) -> None:
     assert {path.name for path in out.iterdir()} == set(write.FILES)
     (out / "notes.txt").write_text("mine")
     batch = make_calibration(solver="batch", history=None)
-    assert {path.name for path in write_results(out, batch)} == set(write.FILES) - {"estimates.mcap"}
-    assert {path.name for path in out.iterdir()} == {*write.FILES, "notes.txt"} - {"estimates.mcap"}
+    over_time = {"estimates.mcap", "foxglove.json"}
+    assert {path.name for path in write_results(out, batch)} == set(write.FILES) - over_time
+    assert {path.name for path in out.iterdir()} == {*write.FILES, "notes.txt"} - over_time
     assert json.loads((out / "result.json").read_text())["solver"] == "batch"
 
 

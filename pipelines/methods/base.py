@@ -204,7 +204,9 @@ class Estimate:
         converged: whether the solver says so; `message` says how or why not.
         residuals: family -> residuals of measurements at the estimate (innovations for an incremental solver).
         chi_square: None for solvers that have none.
-        history: values and sigmas over time, for solvers that work through time.
+        history: values and sigmas from what was recorded until each moment.
+        smoothed: values and sigmas at each moment from the whole recording, where parameters move along; the others
+            are as they are at the end.
         attitudes: the trajectory, if the method has one.
         rejected: family -> number of measurements rejected as outliers.
         seconds: phase -> wall time.
@@ -219,6 +221,7 @@ class Estimate:
     residuals: Mapping[str, Residuals] = field(default_factory=dict)
     chi_square: ChiSquare | None = None
     history: History | None = None
+    smoothed: History | None = None
     attitudes: Attitudes | None = None
     rejected: Mapping[str, int] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)

@@ -154,7 +154,7 @@ def _convergence(calibrations: Sequence[Calibration], quantities: Sequence[Quant
             if q.name not in names:
                 continue
             i = names.index(q.name)
-            if c.estimate.solver == "batch" or history is None:
+            if history is None:
                 value, sigma = (factor * float(x[i]) for x in (c.estimate.values, c.estimate.sigmas))
                 out.add_hline(y=value, line={"color": color, "width": 1, "dash": "dash"}, annotation_text="batch")
                 reach += [value - 4.0 * sigma, value + 4.0 * sigma]

@@ -2,7 +2,8 @@
 
 One topic per parameter, `/estimate/<parameter>`, of one ROS 2 message whose definition stands in the file: both tools
 plot the numbers of any ROS 2 message as they come, and so does whatever reads the recordings themselves. The fields
-are value, sigma, lower and upper, the last two one sigma away, so that the band can be plotted too.
+are value, sigma, lower and upper, the last two one sigma away, so that the band can be plotted too. What moves along
+has `/smoothed/<parameter>` as well: its value at each moment from the whole recording.
 """
 
 from __future__ import annotations
@@ -35,24 +36,28 @@ _CDR_HEAD = np.void(b"\x00\x01\x00\x00")
 
 
 def write_estimates(path: Path, calibration: Calibration, history: History) -> None:
-    """Write the history of an estimate; each channel's metadata says its unit."""
+    """Write the history of an estimate and its smoothed values, if any; metadata of a channel says its unit."""
     from mcap.writer import Writer
 
-    stamps = calibration.facts.epoch_ns + np.round(history.time * 1e9).astype(np.int64)
+    smoothed = calibration.estimate.smoothed
+    epoch_ns = calibration.facts.epoch_ns
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start(profile="ros2", library="alidade")
         schema = writer.register_schema(MESSAGE, "ros2msg", DEFINITION.encode())
-        rows = []
+        messages: list[tuple[int, int, bytes]] = []
         for i, p in enumerate(calibration.parameters):
-            topic = f"/estimate/{p.name}"
-            channel = writer.register_channel(
-                topic, "cdr", schema, {"unit": p.unit, "method": calibration.problem.method}
-            )
-            rows.append((channel, _encode(stamps, history.values[:, i], history.sigmas[:, i])))
-        for k, t_ns in enumerate(stamps.tolist()):
-            for channel, messages in rows:
-                writer.add_message(channel, t_ns, messages[k].tobytes(), t_ns, k)
+            known = {"estimate": history}
+            if smoothed is not None and np.ptp(smoothed.values[:, i]) > 0.0:
+                known["smoothed"] = smoothed
+            for kind, over_time in known.items():
+                metadata = {"unit": p.unit, "method": calibration.problem.method}
+                channel = writer.register_channel(f"/{kind}/{p.name}", "cdr", schema, metadata)
+                stamps = epoch_ns + np.round(over_time.time * 1e9).astype(np.int64)
+                encoded = _encode(stamps, over_time.values[:, i], over_time.sigmas[:, i])
+                messages += [(t, channel, row.tobytes()) for t, row in zip(stamps.tolist(), encoded, strict=True)]
+        for k, (t_ns, channel, message) in enumerate(sorted(messages, key=lambda m: m[0])):
+            writer.add_message(channel, t_ns, message, t_ns, k)
         writer.finish()  # type: ignore[no-untyped-call]
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.methods.base import Array, History, Residuals
+from pipelines.methods.base import Array, History, Quantity, Residuals
 from pipelines.reports.result import Calibration, Plot, quantities_of
 from pipelines.reports.units import human_unit
 
@@ -141,36 +141,71 @@ def _squares(family: str, residuals: Residuals) -> Plot:
     )
 
 
+def variables(calibration: Calibration) -> list[tuple[str, str, list[Quantity]]]:
+    """Title, SI unit and quantities of each variable that was estimated; numbers of unlike units stand apart."""
+    found = []
+    for parameter in calibration.problem.parameters:
+        free = [q for q in parameter.quantities if q.name in calibration.estimate.names and q.prior_sigma != 0.0]
+        groups = {human_unit(q): [r for r in free if human_unit(r) == human_unit(q)] for q in free}
+        found += [(_common_name([q.name for q in members]), members[0].unit, members) for members in groups.values()]
+    return found
+
+
 def _histories(calibration: Calibration, history: History) -> list[Plot]:
     """One figure per variable: its numbers over time with a band of one sigma."""
     column = {name: i for i, name in enumerate(calibration.estimate.names)}
     plots = []
-    for parameter in calibration.problem.parameters:
-        quantities = [q for q in parameter.quantities if q.name in column and q.prior_sigma != 0.0]
-        groups = {human_unit(q): [r for r in quantities if human_unit(r) == human_unit(q)] for q in quantities}
-        for (unit, factor), members in groups.items():
-            out = figure(unit)
-            settled = history.time >= history.time[0] + _SETTLED * np.ptp(history.time)
-            reach = []
-            for q, color in zip(members, cycle(COLORS)):
-                values = factor * history.values[:, column[q.name]]
-                sigmas = factor * history.sigmas[:, column[q.name]]
-                band(out, history.time, values, sigmas, color)
-                add_line(out, history.time, values, q.name, color)
-                reach += [(values - 2.0 * sigmas)[settled].min(), (values + 2.0 * sigmas)[settled].max()]
-                truth = (calibration.truth or {}).get(q.name)
-                if isinstance(truth, int | float):
-                    out.add_hline(y=factor * truth, line={"color": color, "width": 1, "dash": "dash"})
-            out.update_yaxes(range=[min(reach), max(reach)])
-            plots.append(
-                Plot(
-                    f"{_common_name([q.name for q in members])} over time",
-                    f"Estimate at each moment from what was recorded until then, {unit}; the band is one sigma"
-                    + (", dashed is the truth." if calibration.truth else "."),
-                    out,
-                )
+    for title, _, members in variables(calibration):
+        unit, factor = human_unit(members[0])
+        out = figure(unit)
+        settled = history.time >= history.time[0] + _SETTLED * np.ptp(history.time)
+        reach, shown = [], set()
+        for q, color in zip(members, cycle(COLORS)):
+            values = factor * history.values[:, column[q.name]]
+            sigmas = factor * history.sigmas[:, column[q.name]]
+            band(out, history.time, values, sigmas, color)
+            add_line(out, history.time, values, q.name, color)
+            shown |= _others(out, calibration, q.name, factor, color)
+            reach += [(values - 2.0 * sigmas)[settled].min(), (values + 2.0 * sigmas)[settled].max()]
+        out.update_yaxes(range=[min(reach), max(reach)])
+        plots.append(
+            Plot(
+                f"{title} over time",
+                f"Estimate at each moment from what was recorded until then, {unit}; the band is one sigma"
+                + "".join(f", {line}" for line in _OTHERS if line in shown)
+                + ".",
+                out,
             )
+        )
     return plots
+
+
+# Lines beside the estimate, in the order in which captions name them.
+_OTHERS = (
+    "dotted is the published solver",
+    "dash-dotted is the value at that moment from the whole recording",
+    "dashed is the truth",
+)
+
+
+def _others(out: go.Figure, calibration: Calibration, name: str, factor: float, color: str) -> set[str]:
+    """Draws what else is known of a parameter over time; returns which of _OTHERS that was."""
+    estimate, beside = calibration.estimate, calibration.beside
+    published, smooth, truth = _OTHERS
+    shown = set()
+    if beside is not None and beside.history is not None and name in beside.names:
+        values = factor * beside.history.values[:, beside.names.index(name)]
+        add_line(out, beside.history.time, values, name, color, "dot", shown=False)
+        shown.add(published)
+    moving = estimate.smoothed
+    if moving is not None and np.ptp(values := factor * moving.values[:, estimate.names.index(name)]) > 0.0:
+        add_line(out, moving.time, values, name, color, "dashdot", shown=False)
+        shown.add(smooth)
+    known = (calibration.truth or {}).get(name)
+    if isinstance(known, int | float):
+        out.add_hline(y=factor * known, line={"color": color, "width": 1, "dash": "dash"})
+        shown.add(truth)
+    return shown
 
 
 def _learning(calibration: Calibration, history: History) -> Plot:

@@ -59,6 +59,7 @@ class Calibration:
         software: package -> version.
         seconds: phase -> wall time, beside those of the estimate.
         plots: makes the method's own figures.
+        beside: the published solver's estimate of the same recording, where the report shows it too.
     """
 
     problem: Problem
@@ -72,6 +73,7 @@ class Calibration:
     software: Mapping[str, str] = field(default_factory=lambda: software_versions())
     seconds: Mapping[str, float] = field(default_factory=dict)
     plots: Callable[[Calibration], Sequence[Plot]] | None = None
+    beside: Estimate | None = None
 
     @property
     def parameters(self) -> tuple[ParameterResult, ...]:
@@ -120,9 +122,9 @@ class Calibration:
 
     @property
     def learning(self) -> dict[str, Learning]:
-        """Parameter -> how it became known; only the incremental solver knows."""
+        """Parameter -> how it became known; of the published solver, whose sigmas may be far off, none."""
         history = self.estimate.history
-        if self.estimate.solver != "incremental" or history is None:
+        if self.estimate.solver == "published" or history is None:
             return {}
         return learning(history, self.estimate.names, self.problem.quantities)
 

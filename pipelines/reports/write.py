@@ -10,12 +10,13 @@ from pathlib import Path
 from pipelines.errors import InputError
 from pipelines.reports.calibration import calibration_yaml
 from pipelines.reports.estimates import write_estimates
+from pipelines.reports.foxglove import foxglove_layout
 from pipelines.reports.html import report_html
 from pipelines.reports.result import Calibration, result_json
 from pipelines.reports.trajectory import tum
 
 # In the order in which they take their places: result.json, gone first and back last, says that the others are its own.
-FILES = ("calibration.yaml", "attitude.tum", "estimates.mcap", "report.html", "result.json")
+FILES = ("calibration.yaml", "attitude.tum", "estimates.mcap", "foxglove.json", "report.html", "result.json")
 
 
 def write_results(out_dir: Path, calibration: Calibration) -> tuple[Path, ...]:
@@ -53,6 +54,7 @@ def _make(folder: Path, calibration: Calibration) -> None:
         (folder / "attitude.tum").write_text(tum(estimate.attitudes, calibration.facts.epoch_ns), encoding="utf-8")
     if estimate.history is not None and len(estimate.history.time):
         write_estimates(folder / "estimates.mcap", calibration, estimate.history)
+        (folder / "foxglove.json").write_text(foxglove_layout(calibration), encoding="utf-8")
 
 
 def _move(part: Path, out_dir: Path) -> tuple[Path, ...]:

@@ -16,7 +16,8 @@ import numpy as np
 
 from factors.vectorized import Ensemble, TruncatedLoss
 from pipelines.methods.base import Estimate, Factor, Problem, Residuals
-from pipelines.solvers.marginals import chi_square, history_of, joint_covariance, ordering_of, reported
+from pipelines.solvers.growth import Mark, growth
+from pipelines.solvers.marginals import chi_square, joint_covariance, ordering_of, reported, smoothed
 
 # Frames in one vectorised factor: past this the Jacobians' zeros cost more than the Python calls they save.
 CHUNK = 20
@@ -81,6 +82,7 @@ def solve_batch(problem: Problem) -> Estimate:
     factors: list[Factor] = []
     values = gtsam.Values()
     stand_ins: dict[int, int] = {}
+    marks: list[Mark] = []
     held: list[tuple[float, dict[int, int]]] = []
     keyframes: list[int] = []
     for step in problem.steps(CHUNK):
@@ -89,6 +91,7 @@ def solve_batch(problem: Problem) -> Estimate:
         if not held or step.stand_ins:
             held.append((step.time, {**stand_ins, **step.stand_ins}))
         stand_ins.update(step.stand_ins)
+        marks.append(Mark(step.time, len(factors), dict(stand_ins)))
         keyframes.extend(step.keyframes)
     built = time.perf_counter()
     shared = [stand_ins.get(p.key, p.key) for p in problem.parameters]
@@ -102,7 +105,8 @@ def solve_batch(problem: Problem) -> Estimate:
     with system.measurements.at(values):
         summary = chi_square(problem, factors, linear, ordering, values, marginal)
     # The last stand-ins are what the session reports; those before them held the parameters over time.
-    history = history_of(problem, linear, ordering, values, held[:-1], marginal) if len(held) > 2 else None
+    smooth = smoothed(problem, linear, ordering, values, held[:-1], marginal) if len(held) > 2 else None
+    history = growth(problem, linear, ordering, values, marks)
     done = time.perf_counter()
     return Estimate(
         solver="batch",
@@ -114,6 +118,7 @@ def solve_batch(problem: Problem) -> Estimate:
         residuals=residuals,
         chi_square=summary,
         history=history,
+        smoothed=smooth,
         attitudes=problem.attitudes(keyframes, values) if problem.attitudes else None,
         rejected={family: int((~r.used).sum()) for family, r in residuals.items()},
         seconds={"build": built - start, "solve": solved - built, "marginals": done - solved},

@@ -57,7 +57,7 @@ def joint_covariance(
     return reported_covariance(problem.parameters, information, values, keys)
 
 
-def history_of(
+def smoothed(
     problem: Problem,
     linear: gtsam.GaussianFactorGraph,
     ordering: gtsam.Ordering,
@@ -107,12 +107,7 @@ def reported_covariance(
 ) -> Array:
     """Covariance of the reported numbers from the information matrix of the variables' tangents, in this order."""
     quantities = [q for p in parameters for q in p.quantities]
-    blocks = [p.coordinates(values, key)[1] for p, key in zip(parameters, keys, strict=True)]
-    jacobian = np.zeros((len(quantities), information.shape[0]))
-    row = column = 0
-    for block in blocks:
-        jacobian[row : row + block.shape[0], column : column + block.shape[1]] = block
-        row, column = row + block.shape[0], column + block.shape[1]
+    jacobian = coordinate_jacobian(parameters, values, keys)
     scale = np.array([q.prior_scale for q in quantities])
     # Information in units of the prior scales, so that one threshold serves angles, rates and seconds.
     unit = np.linalg.pinv(jacobian) * scale
@@ -122,6 +117,17 @@ def reported_covariance(
     covariance += np.diag([q.extra_sigma**2 for q in quantities])
     known = np.array([q.prior_sigma != 0.0 for q in quantities])
     return np.where(np.outer(known, known), covariance, 0.0)
+
+
+def coordinate_jacobian(parameters: Sequence[Parameter], values: gtsam.Values, keys: Sequence[int]) -> Array:
+    """Jacobian of the reported numbers by the variables' tangents, stacked in this order."""
+    blocks = [p.coordinates(values, key)[1] for p, key in zip(parameters, keys, strict=True)]
+    jacobian = np.zeros((sum(b.shape[0] for b in blocks), sum(b.shape[1] for b in blocks)))
+    row = column = 0
+    for block in blocks:
+        jacobian[row : row + block.shape[0], column : column + block.shape[1]] = block
+        row, column = row + block.shape[0], column + block.shape[1]
+    return jacobian
 
 
 def chi_square(

@@ -1,0 +1,103 @@
+"""How the batch estimate grew: what the recording told until each of some moments, from one elimination in time order.
+
+The system is linearised at the final estimate. States are eliminated as soon as no later factor holds them; what stays,
+the parameters and the states at the moment, is solved there, and carried on to the next moment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.methods.base import Array, History, Problem
+from pipelines.solvers.marginals import coordinate_jacobian, ordering_of, reported, reported_covariance
+
+# Moments at which the recording is looked back upon.
+_MOMENTS = 50
+
+
+class Mark(NamedTuple):
+    """The end of a step: its time, the number of factors until then, and the variables that hold the parameters."""
+
+    time: float
+    factors: int
+    stand_ins: Mapping[int, int]
+
+
+def growth(
+    problem: Problem,
+    linear: gtsam.GaussianFactorGraph,
+    ordering: gtsam.Ordering,
+    values: gtsam.Values,
+    marks: Sequence[Mark],
+) -> History | None:
+    """Values and sigmas from what was recorded until some of the marks.
+
+    Args:
+        problem: the graph's.
+        linear: its factors linearised at the values, in their order.
+        ordering: of the whole; states are eliminated in this order.
+        values: the final estimate.
+        marks: ends of all steps, in time order.
+
+    Returns None when states are not determined until a later step, or there is but one moment.
+    """
+    place = {ordering.at(i): i for i in range(ordering.size())}
+    keys = [linear.at(i).keys() for i in range(linear.size())]
+    last = {key: i for i, own in enumerate(keys) for key in own}
+    carried, begin = gtsam.GaussianFactorGraph(), 0
+    rows: list[tuple[float, Array, Array]] = []
+    moments = _moments(marks)
+    if len(moments) < 2:
+        return None
+    for mark in moments:
+        held = [mark.stand_ins.get(p.key, p.key) for p in problem.parameters]
+        for i in range(begin, mark.factors):
+            carried.push_back(linear.at(i))
+        begin = mark.factors
+        try:
+            past = sorted({k for k in _keys(carried) if last[k] < begin} - set(held), key=place.__getitem__)
+            carried = _without(carried, past)
+            now = _without(carried, sorted(set(_keys(carried)) - set(held), key=place.__getitem__))
+        except RuntimeError:
+            return None
+        rows.append((mark.time, *_solved(problem, now, values, mark.stand_ins, held)))
+    times, numbers, sigmas = (np.array(column) for column in zip(*rows, strict=True))
+    return History(times, numbers, sigmas)
+
+
+def _moments(marks: Sequence[Mark]) -> list[Mark]:
+    """Marks spread over the recording, the last one among them."""
+    times = np.array([mark.time for mark in marks])
+    wanted = np.linspace(times[0], times[-1], _MOMENTS + 1)[1:]
+    chosen: NDArray[np.intp] = np.unique(np.searchsorted(times, wanted).clip(max=len(marks) - 1))
+    return [marks[i] for i in chosen]
+
+
+def _keys(graph: gtsam.GaussianFactorGraph) -> list[int]:
+    return list(graph.keyVector())
+
+
+def _without(graph: gtsam.GaussianFactorGraph, keys: Sequence[int]) -> gtsam.GaussianFactorGraph:
+    """What a graph says of its other variables. Raises RuntimeError when one of the keys is not determined."""
+    return graph.eliminatePartialMultifrontal(ordering_of(keys), gtsam.EliminateQR)[1] if keys else graph
+
+
+def _solved(
+    problem: Problem,
+    graph: gtsam.GaussianFactorGraph,
+    values: gtsam.Values,
+    stand_ins: Mapping[int, int],
+    held: Sequence[int],
+) -> tuple[Array, Array]:
+    """Reported numbers and their sigmas from a graph of nothing but the parameters."""
+    information, slope = graph.hessian(ordering_of(held))
+    covariance = reported_covariance(problem.parameters, information, values, held)
+    jacobian = coordinate_jacobian(problem.parameters, values, held)
+    extra = np.array([0.0 if q.prior_sigma == 0.0 else q.extra_sigma**2 for q in problem.quantities])
+    move = (covariance - np.diag(extra)) @ np.linalg.pinv(jacobian).T @ slope
+    return reported(problem, values, stand_ins) + move, np.sqrt(np.diag(covariance))
