@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 
 # Neighbouring intervals that differ by more than this share are not taken as even.
 _UNEVEN = 0.05
+# A pause between samples longer than this many intervals is a gap.
+_GAP = 1.5
 
 
 @dataclass(frozen=True)
@@ -31,12 +33,15 @@ class Increments:
         wxyz: (n, 4), with `bias_hat` taken off the rates.
         bias_jacobian: (n, 3, 3); for a bias near bias_hat the rotation is wxyz * Exp(J (bias - bias_hat)).
         rate: (n, 3), rate at the window's end with bias_hat taken off, rad/s.
+        unseen: (n,) rad^2 per axis, variance of what the sensor may have turned in gaps of its record, beyond the
+            straight line between the rates on either side.
     """
 
     duration: Array
     wxyz: Array
     bias_jacobian: Array
     rate: Array
+    unseen: Array
 
 
 class GyroPath:
@@ -63,6 +68,7 @@ class GyroPath:
         self._integral = np.concatenate(
             [np.zeros((1, 3, 3)), np.cumsum(so3.matrix(self._attitude[:-1]) @ pieces, axis=0)]
         )
+        self._unseen = np.append(0.0, np.cumsum(_gap_variance(self.t, mean)))
 
     def attitude(self, at: ArrayLike) -> Array:
         """Attitude (n, 4) of the sensor at the times, in its frame at the first stamp."""
@@ -77,7 +83,8 @@ class GyroPath:
         q0, c0, _ = self._at(start)
         q1, c1, rate = self._at(stop)
         jacobian = -so3.matrix(so3.inverse(q1)) @ (c1 - c0)
-        return Increments(stop - start, so3.multiply(so3.inverse(q0), q1), jacobian, rate)
+        unseen = np.abs(np.interp(stop, self.t, self._unseen) - np.interp(start, self.t, self._unseen))
+        return Increments(stop - start, so3.multiply(so3.inverse(q0), q1), jacobian, rate, unseen)
 
     def _at(self, at: Array) -> tuple[Array, Array, Array]:
         """Attitude, integral of the attitude matrix and rate at the times."""
@@ -102,6 +109,25 @@ def _trapezoid_excess(t: Array, mean: Array) -> Array:
     even = np.abs(after - before) < _UNEVEN * np.minimum(before, after)
     excess[1:-1] = np.where(even, (mean[2:] - 2.0 * mean[1:-1] + mean[:-2]) / 8.0, 0.0)
     return excess
+
+
+def _gap_variance(t: Array, mean: Array) -> Array:
+    """(N - 1,) rad^2 per axis that a straight line across each interval may be off: zero where it is no gap.
+
+    A line over T is off by T^3 w'' / 12, w'' as bent as between samples; but never by more than T times the spread of
+    the rates.
+    """
+    step = np.diff(t)
+    usual = float(np.median(step))
+    gap = step > _GAP * usual
+    if not gap.any():
+        return np.zeros(len(step))
+    even = ~(gap[1:] | gap[:-1])
+    bends = (mean[2:] - 2.0 * mean[1:-1] + mean[:-2])[even] / usual**2
+    bent = float(np.sqrt((bends**2).mean())) if len(bends) else np.inf
+    spread = float(np.sqrt(mean.var(axis=0).mean()))
+    sigma = np.minimum(step * spread, step**3 * bent / 12.0)
+    return np.where(gap, sigma**2, 0.0)
 
 
 def _arc(w0: Array, a: Array, s: Array) -> Array:

@@ -272,7 +272,7 @@ def _step(model: _Model, keyframes: range) -> Step:
         [model.bias.key(int(n)) for n in nodes],
         increments,
         model.bias_hat,
-        model.variance_rate * increments.duration + turned**2,
+        model.variance_rate * increments.duration + turned**2 + increments.unseen,
     )
     return Step(
         time=float(model.time[keyframes[-1]]),

@@ -330,7 +330,7 @@ def _gyro_factors(model: _Model, keyframes: range) -> list[Factor]:
         [model.bias.key(int(model.nodes[k])) for k in after],
         increments,
         model.gyro.bias_hat,
-        model.variance_rate * increments.duration + turned**2,
+        model.variance_rate * increments.duration + turned**2 + increments.unseen,
     )
     return [*(_start_factor(model, k) for k in found), *(Factor("gyro", f) for f in native)]
 

@@ -6,7 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.sessions.checks import check_gyro, clean, count, gyro_density
+from pipelines.sessions.faults import drop_faults
 from pipelines.sessions.reading import Recording
+from pipelines.sessions.series import ImuSeries
 
 Array = NDArray[np.float64]
 
@@ -19,8 +21,19 @@ def read_gyro(
     Samples that cannot be used are counted in `dropped`. Raises InputError as pipelines.sessions.checks does.
     """
     imu = recording.imu(topic)
+    t, keep = usable(topic, imu, epoch_ns, dropped)
+    return t, imu.gyro[keep], gyro_density(t, imu.gyro_cov[keep])
+
+
+def usable(
+    topic: str, imu: ImuSeries, epoch_ns: int, dropped: dict[str, int], least: int = 2
+) -> tuple[Array, NDArray[np.intp]]:
+    """Times (N,) s from the epoch of the samples whose rates can be used, and which they are (indexes into the series).
+
+    Raises InputError as pipelines.sessions.checks and pipelines.sessions.faults do.
+    """
     count(dropped, f"{topic}: stamped by log time (kept)", imu.stamped_by_log)
-    t, keep = clean(topic, imu.t_ns, epoch_ns, imu.gyro, dropped)
-    gyro = imu.gyro[keep]
-    check_gyro(topic, t, gyro)
-    return t, gyro, gyro_density(t, imu.gyro_cov[keep])
+    t, keep = clean(topic, imu.t_ns, epoch_ns, imu.gyro, dropped, least)
+    sound = drop_faults(topic, t, imu.gyro[keep], dropped, "rad/s")
+    check_gyro(topic, t[sound], imu.gyro[keep[sound]])
+    return t[sound], keep[sound]

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from pipelines.errors import InputError
 from pipelines.sessions import series
 from pipelines.sessions.checks import (
-    check_gyro,
     check_overlap,
     clean,
     count,
@@ -23,6 +22,7 @@ from pipelines.sessions.checks import (
     unit_quaternions,
 )
 from pipelines.sessions.config import ATTACHMENT, Config
+from pipelines.sessions.gyro import usable
 from pipelines.sessions.reading import Recording
 from pipelines.sessions.topics import TOPICS
 from pipelines.sessions.writing import write_session
@@ -64,10 +64,8 @@ def read_indexer(recording: Recording, config: Config) -> IndexerData:
     epoch = recording.epoch_ns
     imu_topic, encoder_topic = config.topic("imu"), config.topic("indexer")
     imu = recording.imu(imu_topic)
-    count(dropped, f"{imu_topic}: stamped by log time (kept)", imu.stamped_by_log)
-    gyro_t, keep = clean(imu_topic, imu.t_ns, epoch, imu.gyro, dropped, least=3)
+    gyro_t, keep = usable(imu_topic, imu, epoch, dropped, least=3)
     gyro = imu.gyro[keep]
-    check_gyro(imu_topic, gyro_t, gyro)
     attitude = None
     if (imu.wxyz_cov[keep, 0, 0] >= 0.0).all() and np.ptp(imu.wxyz[keep], axis=0).any():
         attitude = unit_quaternions(imu_topic, gyro_t, imu.wxyz[keep])

@@ -1,0 +1,182 @@
+"""Faults of sensors in otherwise good recordings: dropped and counted, or refused in one line; never a wrong answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipelines.errors import InputError
+from pipelines.methods import head, los
+from pipelines.methods.base import Array, Estimate, Problem
+from pipelines.observability import assess
+from pipelines.sessions.config import load_config
+from pipelines.sessions.faults import drop_faults
+from pipelines.sessions.head import HeadData, read_head, write_head
+from pipelines.sessions.los import LosData, read_los, write_los
+from pipelines.sessions.reading import open_recording
+from pipelines.simulation.head import HeadScenario, head_config, simulate_head
+from pipelines.simulation.los import LosScenario, los_config, simulate_los
+from pipelines.simulation.motion import EulerMotion, Swing
+from pipelines.solvers.batch import solve_batch
+
+SWAY = EulerMotion(
+    yaw=[Swing(amplitude_deg=20, frequency_hz=0.15)],
+    pitch=[Swing(amplitude_deg=8, frequency_hz=0.31)],
+    roll=[Swing(amplitude_deg=12, frequency_hz=0.21)],
+)
+LOS = LosScenario(duration_s=30.0, carrier=SWAY, image_rate_hz=20.0, gyro_rate_hz=200.0, gimbal_rate_hz=100.0)
+HEAD = HeadScenario(
+    duration_s=30.0, platform=SWAY, helmet_mount_deg=(3.0, -4.0, 2.0), gyro_rate_hz=200.0, vision_rate_hz=20.0
+)
+_RNG = np.random.default_rng(5)
+
+
+def _frozen(t: Array, rate: Array) -> tuple[Array, Array]:
+    rate = rate.copy()
+    rate[2301:2501] = rate[2300]
+    return t, rate
+
+
+def _one_axis_frozen(t: Array, rate: Array) -> tuple[Array, Array]:
+    rate = rate.copy()
+    rate[2301:2501, 1] = rate[2300, 1]
+    return t, rate
+
+
+def _clipped(t: Array, rate: Array) -> tuple[Array, Array]:
+    most = 0.93 * np.abs(rate).max(axis=0)
+    return t, np.clip(rate, -most, most)
+
+
+def _spiky(t: Array, rate: Array) -> tuple[Array, Array]:
+    rate = rate.copy()
+    rows = 7 + 60 * np.arange(len(t) // 60)
+    rate[rows, np.arange(len(rows)) % 3] = 300.0 * (-1.0) ** np.arange(len(rows))
+    return t, rate
+
+
+def _gappy(t: Array, rate: Array) -> tuple[Array, Array]:
+    keep = np.ones(len(t), dtype=bool)
+    keep[2000:2100] = False  # half a second
+    keep[_RNG.choice(len(t), len(t) // 20, replace=False)] = False  # and one sample in twenty
+    keep[[0, -1]] = True
+    return t[keep], rate[keep]
+
+
+def _half_the_rate(t: Array, rate: Array) -> tuple[Array, Array]:
+    half = len(t) // 2 // 2 * 2
+    paired = rate[half:][: (len(t) - half) // 2 * 2].reshape(-1, 2, 3).mean(axis=1)
+    times = t[half:][: 2 * len(paired)].reshape(-1, 2).mean(axis=1)
+    return np.concatenate([t[:half], times]), np.concatenate([rate[:half], paired])
+
+
+def _not_numbers(t: Array, rate: Array) -> tuple[Array, Array]:
+    rate = rate.copy()
+    rate[100:140] = np.nan
+    rate[900, 2] = np.inf
+    return t, rate
+
+
+Fault = Callable[[Array, Array], tuple[Array, Array]]
+FAULTS: dict[Fault, str] = {
+    _frozen: "frozen",
+    _one_axis_frozen: "frozen",
+    _clipped: "end of the sensor's range",
+    _spiky: "spike",
+    _gappy: "",
+    _half_the_rate: "",
+    _not_numbers: "not a finite number",
+}
+
+
+def _solved(problem: Problem) -> tuple[Estimate, str]:
+    estimate = solve_batch(problem)
+    return estimate, assess(problem.quantities, estimate.covariance, estimate.chi_square, problem.advice).status
+
+
+def _within(estimate: Estimate, truth: dict[str, float], clean: Estimate) -> None:
+    error = np.abs(estimate.values - [truth.get(name, 0.0) for name in estimate.names]) / estimate.sigmas
+    assert error.max() < 4.0
+    assert (estimate.sigmas > 0.99 * clean.sigmas).all()
+
+
+@pytest.fixture(scope="module")
+def los_session() -> tuple[LosData, dict[str, float], str, Estimate]:
+    data, truth = simulate_los(LOS, 3)
+    text = los_config(LOS)
+    return data, truth, text, solve_batch(los.problem(data, load_config(text.encode())))
+
+
+@pytest.fixture(scope="module")
+def head_session() -> tuple[HeadData, dict[str, float], str, Estimate]:
+    data, truth = simulate_head(HEAD, 3)
+    text = head_config(HEAD)
+    return data, truth, text, solve_batch(head.problem(data, load_config(text.encode())))
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_faulty_carrier_gyro_moves_no_angle(
+    fault: Fault, tmp_path: Path, los_session: tuple[LosData, dict[str, float], str, Estimate]
+) -> None:
+    data, truth, text, clean = los_session
+    t, gyro = fault(data.gyro_t, data.gyro)
+    write_los(tmp_path / "s.mcap", replace(data, gyro_t=t, gyro=gyro), truth, text)
+    config = load_config(text.encode())
+    read = read_los(open_recording(tmp_path / "s.mcap"), config)
+    assert any(FAULTS[fault] in reason for reason in read.dropped) or not FAULTS[fault]
+    estimate, status = _solved(los.problem(read, config))
+    assert status == "calibrated"
+    _within(estimate, truth, clean)
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_faulty_helmet_gyro_moves_no_mount(
+    fault: Fault, tmp_path: Path, head_session: tuple[HeadData, dict[str, float], str, Estimate]
+) -> None:
+    data, truth, text, clean = head_session
+    t, gyro = fault(data.head_t, data.head_gyro)
+    write_head(tmp_path / "s.mcap", replace(data, head_t=t, head_gyro=gyro), truth, text)
+    config = load_config(text.encode())
+    read = read_head(open_recording(tmp_path / "s.mcap"), config)
+    assert any(FAULTS[fault] in reason for reason in read.dropped) or not FAULTS[fault]
+    estimate, status = _solved(head.problem(read, config))
+    assert status == "calibrated"
+    _within(estimate, truth, clean)
+
+
+def test_what_is_dropped_is_what_was_spoilt(los_session: tuple[LosData, dict[str, float], str, Estimate]) -> None:
+    data = los_session[0]
+    for fault in (_frozen, _clipped, _spiky):
+        t, rate = fault(data.gyro_t, data.gyro)
+        spoilt = np.flatnonzero((rate != data.gyro).any(axis=1))
+        lost = np.setdiff1d(np.arange(len(t)), drop_faults("/imu", t, rate, {}, "rad/s"))
+        # A reading clipped alone or in pairs cannot be told from the peak that it is.
+        assert np.isin(lost, spoilt).all()
+        assert len(lost) > 0.8 * len(spoilt)
+    assert len(drop_faults("/imu", data.gyro_t, data.gyro, {}, "rad/s")) == len(data.gyro)
+
+
+def test_a_quantised_sensor_at_rest_is_sound() -> None:
+    t = np.arange(20_000) / 100.0
+    moving = (np.maximum(-np.sin(0.05 * np.pi * t), 0.0) ** 2 * np.sin(3.0 * t))[:, None] * [1.0, -0.5, 2.0]
+    counts = np.round((moving + 0.3e-3 * np.random.default_rng(0).standard_normal((len(t), 3))) / 1e-3) * 1e-3
+    assert len(drop_faults("/imu", t, counts, {}, "rad/s")) == len(t)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda g: g * [1.0, 1.0, 0.0], "topic /imu: axis z reads 0 throughout while the others move"),
+        (lambda g: np.clip(g, -0.05, 0.05), r"topic /imu: \d+ % of the samples cannot be used: at the end of the"),
+    ],
+)
+def test_a_useless_sensor_is_refused(
+    spoil: Callable[[Array], Array], message: str, los_session: tuple[LosData, dict[str, float], str, Estimate]
+) -> None:
+    data = los_session[0]
+    with pytest.raises(InputError, match=message):
+        drop_faults("/imu", data.gyro_t, spoil(data.gyro), {}, "rad/s")
