@@ -118,8 +118,8 @@ def _clipped(_: Array, x: Array) -> Mask:
     low, high = np.nanmin(x), np.nanmax(x)
     at_end = (stops - starts + 1 >= _CLIPPED) & ((x[starts] == low) | (x[starts] == high))
     at_end &= np.abs(x[starts] - 0.5 * (low + high)) > _QUANTA * quantum
-    # The rounded top of a smooth motion is entered and left by single quanta.
-    at_end &= _edge(step, starts, stops) > 1.5 * quantum
+    # The rounded top of a smooth motion is entered and left by a quantum or two.
+    at_end &= _edge(step, starts, stops) > 3.5 * quantum
     out = _mask(len(x), starts[at_end], stops[at_end])
     inside = np.diff(x)[~out[1:]] == 0.0
     noisy = len(inside) > 0 and inside.mean() < _MOST_REPEATED
