@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -22,9 +22,11 @@ from pipelines.solvers.marginals import chi_square, joint_covariance, ordering_o
 # Frames in one vectorised factor: past this the Jacobians' zeros cost more than the Python calls they save.
 CHUNK = 20
 _MOST_ITERATIONS = 60
-# A step that lowers the error (unit: half a squared sigma) by less moved nothing by more than 0.005 sigma, and the
-# next one would move it by the square of that.
+# An error (unit: half a squared sigma) less than this above the minimum has nothing more than 0.005 sigma off. What a
+# linearisation foresaw wrongly of its step is about what is left for the next one.
 _ERROR_TOLERANCE = 1e-5
+# So much a measurement is near enough to tell which ones lie outside the gate: on average they move by 0.05 sigma yet.
+_ROUGH_TOLERANCE = 1e-3
 # Below this mean pull of outliers on plain least squares, in sigmas a measurement, good measurements stay inside the
 # gate and the outliers can be cut off at once.
 _MILD_PULL = 0.5
@@ -160,9 +162,10 @@ def optimize(
     """Minimise; with a loss: plain least squares first, and the graduated relaxation only if it leaves outliers."""
     system = System(factors, shared)
     if loss is None:
-        return _minimize(system, values, most)
+        return _minimize(system, values, most=most)
     loss.mu = 0.0
-    plain = _minimize(system, values)
+    measurements = sum(len(f.measurement.model.time) for f in factors if f.measurement is not None)
+    plain = _minimize(system, values, _ROUGH_TOLERANCE * measurements)
     values, iterations = plain.values, plain.iterations
     norms = np.concatenate([np.linalg.norm(r.whitened, axis=1) for r in system.residuals(values).values()])
     outlying = norms[norms > loss.gate]
@@ -173,17 +176,17 @@ def optimize(
             values, iterations = relaxed.values, iterations + relaxed.iterations
             loss.mu *= 4.0
     loss.mu = np.inf
-    if len(outlying) == 0:
-        return plain
     final = _minimize(system, values)
     used = np.concatenate([r.used for r in system.residuals(final.values).values()])
     if used.mean() < _FEWEST_USED:
         loss.mu = 0.0
-        return plain
-    return Solution(system, final.values, final.converged, final.message, iterations + final.iterations)
+        final = _minimize(system, plain.values)
+    return replace(final, iterations=iterations + final.iterations)
 
 
-def _minimize(system: System, values: gtsam.Values, most: int = _MOST_ITERATIONS) -> Solution:
+def _minimize(
+    system: System, values: gtsam.Values, tolerance: float = _ERROR_TOLERANCE, most: int = _MOST_ITERATIONS
+) -> Solution:
     """Gauss-Newton steps, damped (Levenberg-Marquardt) only when a full step fails."""
     error = system.error(values)
     if not np.isfinite(error):
@@ -192,7 +195,7 @@ def _minimize(system: System, values: gtsam.Values, most: int = _MOST_ITERATIONS
     for iteration in range(1, most + 1):
         linear = system.linearize(values)
         while True:
-            candidate = _step(linear, values, system.ordering, damping)
+            candidate, foreseen = _step(linear, values, system.ordering, damping)
             new_error = system.error(candidate) if candidate is not None else np.inf
             if new_error <= error + _ERROR_TOLERANCE:
                 break
@@ -201,22 +204,23 @@ def _minimize(system: System, values: gtsam.Values, most: int = _MOST_ITERATIONS
                 return Solution(system, values, False, f"no step lowers the error of {error:.6g}", iteration)
         assert candidate is not None
         values, fall, error = candidate, error - new_error, new_error
-        damping = damping / 10.0 if damping > 1e-6 else 0.0
-        if fall < _ERROR_TOLERANCE + 1e-10 * error and damping == 0.0:
+        if damping == 0.0 and min(fall, abs(fall - foreseen)) < tolerance + 1e-10 * error:
             return Solution(system, values, True, f"converged after {iteration} iterations", iteration)
+        damping = damping / 10.0 if damping > 1e-6 else 0.0
     return Solution(system, values, False, f"not converged after {most} iterations", most)
 
 
 def _step(
     linear: gtsam.GaussianFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering, damping: float
-) -> gtsam.Values | None:
-    """Values after one (damped) step; None when the system is singular."""
+) -> tuple[gtsam.Values | None, float]:
+    """Values after one (damped) step and by how much it should lower the error; no values when the system is singular."""
     try:
         if damping > 0.0:
             linear = _damped(linear, damping)
-        return values.retract(linear.optimize(ordering, gtsam.EliminateQR))
+        delta = linear.optimize(ordering, gtsam.EliminateQR)
+        return values.retract(delta), -0.5 * linear.gradientAtZero().dot(delta)
     except RuntimeError:
-        return None
+        return None, 0.0
 
 
 def _damped(linear: gtsam.GaussianFactorGraph, damping: float) -> gtsam.GaussianFactorGraph:
