@@ -213,7 +213,7 @@ def _minimize(
 def _step(
     linear: gtsam.GaussianFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering, damping: float
 ) -> tuple[gtsam.Values | None, float]:
-    """Values after one (damped) step and by how much it should lower the error; no values when the system is singular."""
+    """Values after one (damped) step, None if the system is singular, and by how much it should lower the error."""
     try:
         if damping > 0.0:
             linear = _damped(linear, damping)
