@@ -52,7 +52,7 @@ def joint_covariance(
         try:
             remaining = linear.eliminatePartialMultifrontal(ordering_of(rest), gtsam.EliminateQR)[1]
         except RuntimeError as error:
-            raise IndeterminateError(_explain(str(error))) from None
+            raise IndeterminateError(explain(str(error))) from None
     information = remaining.hessian(ordering_of(keys))[0]
     return reported_covariance(problem.parameters, information, values, keys)
 
@@ -203,7 +203,7 @@ def _family_dof(
     return dof
 
 
-def _explain(message: str) -> str:
+def explain(message: str) -> str:
     """A sentence from gtsam's text about an indeterminate system, which names the variable by its key."""
     key = re.search(r"near variable\s+(\d+)", message)
     name = gtsam.Symbol(int(key.group(1))).string() if key else "unknown"
