@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from pipelines.consistency import Halves, find_causes, held_out, mostly_rejected, split_halves
 from pipelines.errors import InputError
@@ -41,51 +43,77 @@ def calibrate(
         IndeterminateError: states other than the parameters are not determined.
     """
     start = time.perf_counter()
-    recording = open_recording(path)
-    config = load_config(recording.attachment(ATTACHMENT), config_file)
-    name = resolve_method(method_name, recording, config)
-    chosen = method(name)
-    data = chosen.read(recording, config)
-    facts = session_facts(recording, config)
-    sha256, truth = recording.sha256(), _truth(recording)
+    session = Session.read(open_recording(path), method_name, config_file)
     read = time.perf_counter() - start
-    calibrations = []
+    solved = (_solve(solver, session.method, session.data, session.config, window) for solver in solvers)
+    return calibrations(session, solved, {"read": read})
+
+
+@dataclass(frozen=True)
+class Session:
+    """A recording as its method reads it: the config in force, the method and its data."""
+
+    recording: Recording
+    config: Config
+    name: str
+    method: Method
+    data: Any
+
+    @classmethod
+    def read(cls, recording: Recording, method_name: str | None, config_file: Path | None) -> Session:
+        """Read and check (arguments and exceptions as `calibrate` has them)."""
+        config = load_config(recording.attachment(ATTACHMENT), config_file)
+        name = resolve_method(method_name, recording, config)
+        chosen = method(name)
+        return cls(recording, config, name, chosen, chosen.read(recording, config))
+
+    def problem(self) -> Problem:
+        """The graph."""
+        return self.method.problem(self.data, self.config)
+
+
+def calibrations(
+    session: Session, solved: Iterable[tuple[Estimate, Problem]], seconds: Mapping[str, float]
+) -> list[Calibration]:
+    """Estimates, each with the problem it solves, judged and ready to be reported; `seconds` is what reading took."""
+    chosen, data, config = session.method, session.data, session.config
+    facts = session_facts(session.recording, config)
+    sha256, truth = session.recording.sha256(), _truth(session.recording)
+    found = []
     causes: tuple[Cause, ...] | None = None
-    beside = _published(chosen, data, config) if "incremental" in solvers else None
-    for solver in solvers:
-        estimate, problem = _solve(solver, chosen, data, config, window)
+    for estimate, problem in solved:
+        incremental = estimate.solver == "incremental"
         quantities = tuple(q for q in problem.quantities if q.name in estimate.names)
         assessment = assess(quantities, estimate.covariance, estimate.chi_square, problem.advice)
-        if solver != "published" and (assessment.status == "inconsistent" or mostly_rejected(estimate)):
+        if estimate.solver != "published" and not estimate.converged:
+            assessment = assessment.unsolved(estimate.message)
+        if estimate.solver != "published" and (assessment.status == "inconsistent" or mostly_rejected(estimate)):
             causes = find_causes(chosen, data, config, estimate) if causes is None else causes
             assessment = assessment.explained(causes)
-        calibrations.append(
+        found.append(
             Calibration(
                 problem=problem,
                 estimate=estimate,
                 assessment=assessment,
-                recording=path.name,
+                recording=session.recording.path.name,
                 sha256=sha256,
                 facts=facts,
                 config_text=config.model_dump_json(indent=1, exclude_defaults=True),
                 truth=truth,
-                seconds={"read": read},
+                seconds=seconds,
                 plots=chosen.plots(data) if chosen.plots else None,
-                beside=beside if solver == "incremental" else None,
+                beside=_published(chosen, data, config) if incremental else None,
             )
         )
-    return calibrations
+    return found
 
 
 def self_agreement(
     path: Path, method_name: str | None = None, config_file: Path | None = None
 ) -> tuple[dict[str, Halves], dict[str, float]]:
     """What either half of a recording says, and how well held-out measurements are predicted (arguments as above)."""
-    recording = open_recording(path)
-    config = load_config(recording.attachment(ATTACHMENT), config_file)
-    chosen = method(resolve_method(method_name, recording, config))
-    data = chosen.read(recording, config)
-    return split_halves(chosen, data, config), held_out(chosen.problem(data, config))
+    session = Session.read(open_recording(path), method_name, config_file)
+    return split_halves(session.method, session.data, session.config), held_out(session.problem())
 
 
 def _solve(solver: str, chosen: Method, data: object, config: Config, window: float | None) -> tuple[Estimate, Problem]:

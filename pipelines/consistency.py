@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import combinations, product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -324,6 +324,8 @@ def _screened(method: Method, suspects: _Suspects, data: Any, config: Config, be
     stretch = _worst_stretch(before.estimate.residuals, _SHORT) if suspects.cut else (-np.inf, np.inf)
     trials = [
         *_flips(suspects, data, config),
+        *_turned(suspects, data, config),
+        *_units(suspects, data, config),
         *_offset(method, suspects, data, config),
         *_tag_sizes(method, data, config),
     ]
@@ -387,6 +389,40 @@ def _flips(suspects: _Suspects, data: Any, config: Config) -> Iterator[_Trial]:
                 label = f"the sign of the {sensor}'s {axes} is wrong"
                 factor = np.array(signs) if values.ndim > 1 else signs[0]
                 yield label, replace(data, **{name: factor * values}), config
+
+
+def _turned(suspects: _Suspects, data: Any, config: Config) -> Iterator[_Trial]:
+    """Axes of a sensor in another order: two of them swapped, or turned by a right angle about the third."""
+    for name, (sensor, columns) in suspects.signs.items():
+        values = getattr(data, name)
+        if values is None or len(columns) < 3:
+            continue
+        for i, j in combinations(range(3), 2):
+            swapped = np.eye(3)
+            swapped[[i, j]] = swapped[[j, i]]
+            third = columns[3 - i - j]
+            labels = {
+                f"the {sensor}'s {columns[i]} and {columns[j]} are swapped": np.ones(3),
+                f"the {sensor} is turned by 90 deg about its {third}": np.where(np.arange(3) == i, -1.0, 1.0),
+                f"the {sensor} is turned by 90 deg the other way about its {third}": np.where(
+                    np.arange(3) == j, -1.0, 1.0
+                ),
+            }
+            for label, signs in labels.items():
+                yield label, replace(data, **{name: values @ swapped * signs}), config
+
+
+def _units(suspects: _Suspects, data: Any, config: Config) -> Iterator[_Trial]:
+    """Rates in degrees a second, or turned into radians twice."""
+    for name, (sensor, _) in suspects.signs.items():
+        values = getattr(data, name)
+        if values is not None and "gyro" in name:
+            yield f"the {sensor} is in deg/s, not rad/s", replace(data, **{name: np.deg2rad(values)}), config
+            yield (
+                f"the {sensor} was turned from deg/s to rad/s twice",
+                replace(data, **{name: np.rad2deg(values)}),
+                config,
+            )
 
 
 def _offset(method: Method, suspects: _Suspects, data: Any, config: Config) -> Iterator[_Trial]:

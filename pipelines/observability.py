@@ -269,6 +269,11 @@ class Assessment:
         status: Status = "unobservable" if self.status == "unobservable" else "inconsistent"
         return replace(self, status=status, causes=tuple(causes), headline=headline)
 
+    def unsolved(self, message: str) -> Assessment:
+        """The same for an estimate that is no solution: its numbers are not to be used, however small their sigmas."""
+        headline = f"The solver did not converge ({message}): the numbers are no solution, do not use them."
+        return replace(self, status="inconsistent", headline=headline)
+
     @property
     def sigmas(self) -> Array:
         """(n,) standard deviations."""

@@ -131,6 +131,25 @@ def test_sign_of_the_los_gyro(los: Case) -> None:
     assert first_cause((find, wrong, config)) == "the sign of the gyro's x is wrong"
 
 
+def test_swapped_axes(los: Case) -> None:
+    find, data, config = los
+    assert first_cause((find, replace(data, gyro=data.gyro[:, [1, 0, 2]]), config)) == "the gyro's x and y are swapped"
+
+
+@pytest.mark.slow
+def test_a_helmet_gyro_turned_by_a_right_angle(head: Case) -> None:
+    find, data, config = head
+    turned = np.stack([data.head_gyro[:, 1], -data.head_gyro[:, 0], data.head_gyro[:, 2]], axis=1)
+    label = first_cause((find, replace(data, head_gyro=turned), config))
+    assert label == "the helmet gyro is turned by 90 deg about its z"
+
+
+@pytest.mark.slow
+def test_a_gyro_in_degrees_that_is_too_slow_to_be_refused(los: Case) -> None:
+    find, data, config = los
+    assert first_cause((find, replace(data, gyro=np.rad2deg(data.gyro)), config)) == "the gyro is in deg/s, not rad/s"
+
+
 def test_late_encoders(indexer: Case) -> None:
     find, data, config = indexer
     label = first_cause((find, replace(data, encoder_t=data.encoder_t + 0.02), config))
