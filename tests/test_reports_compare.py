@@ -14,7 +14,8 @@ from pipelines.reports.compare import compare_html, write_compare
 from pipelines.reports.plots import common_plots
 from pipelines.reports.result import Calibration
 from tests.test_reports_files import make_calibration
-from tests.test_reports_html import CHROMIUM, Page, drawn
+from tests.browser import drawn, needs_browser
+from tests.test_reports_html import Page
 
 
 def solvers(truth: dict[str, object] | None = None) -> list[Calibration]:
@@ -59,8 +60,7 @@ def test_what_cannot_be_written_is_bad_input(tmp_path: Path) -> None:
         write_compare(tmp_path / "file", solvers(), {}, {})
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="needs a Chromium to draw the page; none is installed")
-@pytest.mark.parametrize("width", [1280, 500])
-def test_a_browser_draws_it_without_complaint(tmp_path: Path, width: int) -> None:
+@needs_browser
+def test_a_browser_draws_it_without_complaint(tmp_path: Path) -> None:
     text = compare_html(solvers(), {"time_offset": Halves(0.010, 0.003, 0.020, 0.004)}, {"vision": 1.06})
-    assert drawn(text, tmp_path, width) >= 2
+    assert drawn(text, tmp_path) >= 2

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
-import subprocess
 from dataclasses import replace
 from functools import partial
 from html.parser import HTMLParser
@@ -22,6 +20,7 @@ from pipelines.reports.plots import common_plots
 from pipelines.reports.result import Calibration, quantities_of
 from pipelines.reports.units import human_unit, robust_sigma, to_digits_of
 from pipelines.sessions.head import HeadData
+from tests.browser import drawn, needs_browser
 from tests.test_reports_files import make_calibration
 
 
@@ -214,29 +213,6 @@ def test_parameters_of_a_partial_estimate_keep_their_units() -> None:
     assert "Correlation" not in Page(report_html(calibration)).text
 
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-
-
-def drawn(text: str, folder: Path, width: int) -> int:
-    """Number of figures a browser draws of a page; nothing may stand out to the right or complain."""
-    page = folder / "page.html"
-    # The browser itself says in the title whether the page fits.
-    check = "document.title = document.documentElement.scrollWidth <= innerWidth ? 'fits' : 'too wide'"
-    page.write_text(text.replace("</body>", f"<script>addEventListener('load', () => {{ {check} }})</script></body>"))
-    command = [
-        str(CHROMIUM),
-        *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
-        *("--disable-background-networking", "--disable-component-update", f"--user-data-dir={folder / 'profile'}"),
-        *("--enable-logging=stderr", "--virtual-time-budget=5000", f"--window-size={width},2000"),
-        *("--dump-dom", page.as_uri()),
-    ]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    assert "CONSOLE" not in run.stderr
-    assert "<title>fits</title>" in run.stdout
-    return run.stdout.count('class="main-svg"')
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="needs a Chromium to draw the page; none is installed")
-@pytest.mark.parametrize("width", [1280, 500])  # no narrower window is to be had of it
-def test_a_browser_draws_the_figures_without_complaint(tmp_path: Path, width: int) -> None:
-    assert drawn(report_html(make_calibration()), tmp_path, width) >= len(common_plots(make_calibration()))
+@needs_browser
+def test_a_browser_draws_the_figures_without_complaint(tmp_path: Path) -> None:
+    assert drawn(report_html(make_calibration()), tmp_path) >= len(common_plots(make_calibration()))

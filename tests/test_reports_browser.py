@@ -1,0 +1,37 @@
+"""The report of every method, drawn by a browser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipelines.calibrate import calibrate
+from pipelines.registry import method
+from pipelines.reports.html import report_html
+from tests.browser import drawn, needs_browser
+
+SCENARIOS = {
+    "los": "{duration_s: 15, gyro_rate_hz: 200, image_rate_hz: 20}",
+    "indexer": "{gyro_rate_hz: 50, encoder_rate_hz: 50}",
+    "head": "{duration_s: 15, gyro_rate_hz: 100, vision_rate_hz: 20}",
+    "cube": "{poses: 12}",
+}
+
+
+@needs_browser
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_a_browser_draws_the_report_at_the_width_of_a_desktop_and_of_a_phone(name: str, tmp_path: Path) -> None:
+    (tmp_path / "scenario.yaml").write_text(SCENARIOS[name])
+    method(name).simulate(str(tmp_path / "scenario.yaml"), 1, tmp_path / "s.mcap", False)
+    solver = "incremental" if name == "los" else "batch"
+    (calibration,) = calibrate(tmp_path / "s.mcap", [solver])
+    text = report_html(calibration)
+    # plotly draws each figure in two layers.
+    assert drawn(text, tmp_path) >= 2 * text.count('id="plot') > 8
+
+
+@needs_browser
+def test_a_page_too_wide_for_a_phone_is_caught(tmp_path: Path) -> None:
+    with pytest.raises(AssertionError, match="at 390 px: too wide"):
+        drawn('<!doctype html><div style="width: 600px">wide</div>', tmp_path)
