@@ -80,6 +80,7 @@ def problem(data: HeadData, config: Config) -> Problem:
         method="head",
         parameters=model.parameters,
         steps=partial(_steps, model),
+        steps_after=partial(_steps, model, 1),
         loss=model.loss,
         attitudes=partial(_attitudes, model),
         attitude_name="bRv",
@@ -211,10 +212,12 @@ def _state(keyframe: int) -> int:
     return int(gtsam.symbol("x", keyframe))
 
 
-def _steps(model: _Model, chunk: int) -> Iterator[Step]:
+def _steps(model: _Model, chunk: int, after: float = -np.inf) -> Iterator[Step]:
     """The first keyframe with the calibration variables and their priors, then `chunk` keyframes at a time."""
-    yield _first_step(model)
-    for begin in range(1, len(model.time), chunk):
+    taken = int(np.searchsorted(model.time, after, side="right"))
+    if taken == 0:
+        yield _first_step(model)
+    for begin in range(max(taken, 1), len(model.time), chunk):
         yield _step(model, range(begin, min(begin + chunk, len(model.time))))
 
 

@@ -301,7 +301,7 @@ def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]
         data=data,
         motion=motion,
         groups=groups,
-        bias=WalkingBias(np.append(starts, groups[-1].rates.edges[-1]), walk, density),
+        bias=WalkingBias(np.append(starts, groups[-1].rates.edges[-1]), walk, density, groups[-1].rates.edges[-1]),
         density=density,
         encoder=scatter if slow > 0.0 else encoder,
         slow=slow,

@@ -92,6 +92,7 @@ def problem(data: LosData, config: Config) -> Problem:
         method="los",
         parameters=model.parameters,
         steps=partial(_steps, model),
+        steps_after=partial(_steps, model, 1),
         loss=model.loss,
         advice=_advice,
         dropped=dropped,
@@ -264,9 +265,9 @@ def _state(keyframe: int) -> int:
     return int(gtsam.symbol("x", keyframe))
 
 
-def _steps(model: _Model, chunk: int) -> Iterator[Step]:
+def _steps(model: _Model, chunk: int, after: float = -np.inf) -> Iterator[Step]:
     """`chunk` keyframes at a time; the first step brings the calibration variables and their priors too."""
-    for begin in range(0, len(model.time), chunk):
+    for begin in range(int(np.searchsorted(model.time, after, side="right")), len(model.time), chunk):
         yield _step(model, range(begin, min(begin + chunk, len(model.time))))
 
 

@@ -18,6 +18,8 @@ from pipelines.methods.base import Array, Factor
 _FRACTION = 0.2
 # ... and is never longer than this, s, so that the bias over time can be seen.
 _LONGEST = 10.0
+# The last stretch is at least this share of the others, and as much longer at most.
+_SHORTEST = 0.1
 # What follows without error, a bias that does not walk and the mean of the nodes, is given these shares of what gyro
 # noise leaves unknown of a stretch's bias, which keeps the arithmetic well conditioned.
 _SLACK = 1e-4
@@ -35,20 +37,25 @@ class WalkingBias:
         edges: (J + 1,) s, ends of the stretches.
         walk: rad/s/sqrt(s).
         density: of the gyro's white noise, rad/s/sqrt(Hz).
+        stop: s, where the last stretch really ends.
     """
 
     edges: Array
     walk: float
     density: float
+    stop: float
 
     @classmethod
     def over(cls, start: float, stop: float, walk: float, density: float) -> WalkingBias:
-        """Stretches short enough for the walk (rad/s/sqrt(s)) to stay below gyro noise (rad/s/sqrt(Hz))."""
+        """Stretches short enough for the walk (rad/s/sqrt(s)) to stay below gyro noise (rad/s/sqrt(Hz)).
+
+        All are of one length, so that those behind stay as they are while a recording grows.
+        """
         if walk <= 0.0:
-            return cls(np.array([start, stop]), 0.0, density)
-        longest = min(_LONGEST, _FRACTION * np.sqrt(3.0) * density / walk)
-        count = max(1, int(np.ceil((stop - start) / max(longest, 1e-3))))
-        return cls(np.linspace(start, stop, count + 1), walk, density)
+            return cls(np.array([start, stop]), 0.0, density, stop)
+        length = max(min(_LONGEST, _FRACTION * np.sqrt(3.0) * density / walk), 1e-3)
+        count = max(1, int(np.ceil((stop - start) / length - _SHORTEST)))
+        return cls(start + length * np.arange(count + 1), walk, density, stop)
 
     @property
     def nodes(self) -> int:
@@ -80,8 +87,8 @@ class WalkingBias:
 
     def mean_factor(self, node: int) -> Factor:
         """Defines the mean at the end of a node's stretch from the one before and the node (native, linear)."""
-        whole = self.edges[node + 1] - self.edges[0]
-        stretch = self.edges[node + 1] - self.edges[node]
+        end = self.stop if node == self.nodes - 1 else self.edges[node + 1]
+        whole, stretch = end - self.edges[0], end - self.edges[node]
         share = float(stretch / whole)
         # Within the stretch the walk's own mean departs from the node's constant by this much.
         departure = self.walk * np.sqrt(stretch / 12.0) * share
