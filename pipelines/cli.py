@@ -79,6 +79,33 @@ def compare(
 
 
 @app.command()
+def follow(
+    session: _Session,
+    method: _MethodName = None,
+    config: _ConfigFile = None,
+    window: _Window = "1",
+    patience: Annotated[float, typer.Option(help="Seconds without anything new that end an unfinished file.")] = 30.0,
+    checkpoint: Annotated[Path | None, typer.Option(help="File to save the run in, and to go on from.")] = None,
+    serve: Annotated[bool, typer.Option("--serve", help="Estimates live over Foxglove's WebSocket.")] = False,
+    port: Annotated[int, typer.Option(help="Of --serve, on this machine alone.")] = 8765,
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; default: SESSION-incremental.")] = None,
+) -> None:
+    """Calibrate a recording while it is being written, and say what is still missing. Ctrl-C ends it."""
+    from pipelines import terminal
+    from pipelines.follow.follow import follow as run
+    from pipelines.follow.follower import Settings
+    from pipelines.reports.write import write_results
+
+    settings = Settings(session, method, config, _seconds(window), patience, checkpoint)
+    calibration = run(settings, port if serve else None)
+    folder = out or session.with_name(f"{session.stem}-incremental")
+    written = write_results(folder, calibration)
+    terminal.show([calibration])
+    terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
+    raise typer.Exit(exit_codes.OF_STATUS[calibration.assessment.status])
+
+
+@app.command()
 def validate(
     session: _Session,
     calibration: Annotated[Path, typer.Option(help="The calibration.yaml to try on the recording.")],

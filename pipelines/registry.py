@@ -14,6 +14,7 @@ from pipelines.errors import InputError
 
 if TYPE_CHECKING:
     from pipelines.methods.base import Estimate, Problem
+    from pipelines.methods.collected import Collected
     from pipelines.methods.validation import Validation
     from pipelines.reports.result import Calibration, Plot
     from pipelines.sessions.config import Config
@@ -31,6 +32,7 @@ class Method:
         simulate: scenario (name, file or None for the nominal one), seed, file to write, whether with pictures.
         plots: the method's own figures for the report.
         validate: data, config and parameter values by name -> errors before and after compensation.
+        collected: data and config -> what there is by now of what the method needs, for the person recording.
     """
 
     read: Callable[[Recording, Config], Any]
@@ -39,6 +41,7 @@ class Method:
     simulate: Callable[[str | None, int, Path, bool], None]
     plots: Callable[[Any], Callable[[Calibration], Sequence[Plot]]] | None = None
     validate: Callable[[Any, Config, Mapping[str, float]], Sequence[Validation]] | None = None
+    collected: Callable[[Any, Config], Sequence[Collected]] | None = None
 
 
 def method(name: str) -> Method:
@@ -51,6 +54,7 @@ def method(name: str) -> Method:
 def _head() -> Method:
     from functools import partial
 
+    from pipelines.methods.collected import collected_head
     from pipelines.methods.head import problem
     from pipelines.methods.head_validation import validate
     from pipelines.published.head import published_estimate
@@ -59,13 +63,20 @@ def _head() -> Method:
     from pipelines.simulation.head import write_simulation
 
     return Method(
-        read_head, problem, published_estimate, write_simulation, lambda data: partial(head_plots, data), validate
+        read_head,
+        problem,
+        published_estimate,
+        write_simulation,
+        lambda data: partial(head_plots, data),
+        validate,
+        collected_head,
     )
 
 
 def _los() -> Method:
     from functools import partial
 
+    from pipelines.methods.collected import collected_los
     from pipelines.methods.los import problem
     from pipelines.methods.los_validation import validate
     from pipelines.published.los import published_estimate
@@ -74,13 +85,20 @@ def _los() -> Method:
     from pipelines.simulation.los import write_simulation
 
     return Method(
-        read_los, problem, published_estimate, write_simulation, lambda data: partial(los_plots, data), validate
+        read_los,
+        problem,
+        published_estimate,
+        write_simulation,
+        lambda data: partial(los_plots, data),
+        validate,
+        collected_los,
     )
 
 
 def _indexer() -> Method:
     from functools import partial
 
+    from pipelines.methods.collected import collected_indexer
     from pipelines.methods.indexer import problem, validate
     from pipelines.published.indexer import published_estimate
     from pipelines.reports.indexer import indexer_plots
@@ -88,18 +106,25 @@ def _indexer() -> Method:
     from pipelines.simulation.indexer import write_simulation
 
     return Method(
-        read_indexer, problem, published_estimate, write_simulation, lambda data: partial(indexer_plots, data), validate
+        read_indexer,
+        problem,
+        published_estimate,
+        write_simulation,
+        lambda data: partial(indexer_plots, data),
+        validate,
+        collected_indexer,
     )
 
 
 def _cube() -> Method:
+    from pipelines.methods.collected import collected_cube
     from pipelines.methods.cube import problem
     from pipelines.methods.cube_validation import validate
     from pipelines.published.cube import published_estimate
     from pipelines.sessions.cube import read_cube
     from pipelines.simulation.cube import write_simulation
 
-    return Method(read_cube, problem, published_estimate, write_simulation, validate=validate)
+    return Method(read_cube, problem, published_estimate, write_simulation, validate=validate, collected=collected_cube)
 
 
 _METHODS: dict[str, Callable[[], Method]] = {"los": _los, "indexer": _indexer, "head": _head, "cube": _cube}

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from pipelines.reports.result import Calibration, ParameterResult
     from pipelines.sessions.info import SessionFacts
 
-_console = Console(highlight=False)
+console = Console(highlight=False)
 
-_COLOURS = {
+COLOURS = {
     "calibrated": "green",
     "observable": "green",
     "weak": "yellow",
@@ -30,7 +30,7 @@ _COLOURS = {
 
 def say(text: str) -> None:
     """One line, never broken."""
-    _console.print(escape(text), soft_wrap=True)
+    console.print(escape(text), soft_wrap=True)
 
 
 def show(calibrations: Sequence[Calibration]) -> None:
@@ -62,9 +62,9 @@ def show(calibrations: Sequence[Calibration]) -> None:
             row.append(_cell(parameters[q.name], factor, error, alone) if q.name in parameters else "-")
         if alone and q.name in found[0]:
             verdict = found[0][q.name].observability
-            row.append(f"[{_COLOURS[verdict]}]{verdict}[/]")
+            row.append(f"[{COLOURS[verdict]}]{verdict}[/]")
         table.add_row(*row)
-    _console.print(table)
+    console.print(table)
     if any(errors):
         say("In brackets: error in sigmas.")
     for c in calibrations:
@@ -88,7 +88,7 @@ def show_facts(name: str, facts: SessionFacts) -> None:
         rate = "" if t.rate_hz is None else f"{t.rate_hz:.4g}"
         kind = t.type.rsplit("/", 1)[-1]
         table.add_row(escape(t.name), kind, str(t.count), rate, gap, str(t.duplicates), str(t.out_of_order))
-    _console.print(table)
+    console.print(table)
     if any(t.duplicates or t.out_of_order for t in facts.topics):
         say("twice: stamps that occur again; back: stamps before the one ahead of them")
     if facts.attachments:
@@ -97,7 +97,7 @@ def show_facts(name: str, facts: SessionFacts) -> None:
         if missing:
             say(f"{method}: no, it lacks {'; '.join(missing)}")
         else:
-            _console.print(f"[green]{method}: yes[/]")
+            console.print(f"[green]{method}: yes[/]")
 
 
 def show_plan(plan: Plan) -> None:
@@ -115,8 +115,8 @@ def show_plan(plan: Plan) -> None:
         unit, factor = human_unit(q)
         cells = [f"{factor * sigma:.2g}" for sigma in (q.require, now[q.name], best[q.name])]
         verdict = plan.now.assessment.verdicts[q.name]
-        table.add_row(q.name, unit, *cells[: 3 if plan.steps else 2], f"[{_COLOURS[verdict]}]{verdict}[/]")
-    _console.print(table)
+        table.add_row(q.name, unit, *cells[: 3 if plan.steps else 2], f"[{COLOURS[verdict]}]{verdict}[/]")
+    console.print(table)
     for direction in plan.now.assessment.directions:
         say(f"  {direction.verdict}: {direction.label}: {direction.advice}")
     if not plan.now.missing:
@@ -145,8 +145,8 @@ def _cell(parameter: ParameterResult, factor: float, error_sigmas: float | None,
 def _verdict(calibration: Calibration, name: bool) -> None:
     assessment = calibration.assessment
     solver = f"{calibration.estimate.solver}: " if name else ""
-    colour = _COLOURS[assessment.status]
-    _console.print(f"{solver}[bold {colour}]{assessment.status}.[/] {escape(assessment.headline)}", soft_wrap=True)
+    colour = COLOURS[assessment.status]
+    console.print(f"{solver}[bold {colour}]{assessment.status}.[/] {escape(assessment.headline)}", soft_wrap=True)
     for direction in assessment.directions:
         say(f"  {direction.verdict}: {direction.label}: {direction.advice}")
     for note in calibration.notes:

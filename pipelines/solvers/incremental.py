@@ -192,6 +192,11 @@ class Run:
         return -np.inf if self.base is None else self.base.time
 
     @property
+    def started(self) -> bool:
+        """Whether there is an estimate yet."""
+        return self._smoother is not None
+
+    @property
     def just_folded(self) -> bool:
         """Whether the run is at a point where it can be saved."""
         return self.base is not None and not self.past
@@ -237,6 +242,14 @@ class Run:
         if not np.isfinite(information).all():
             raise IndeterminateError(f"the parameters' covariance at {self.time:.3f} s is not finite")
         return reported_covariance(self.problem.parameters, information, self._estimate(), self.keys)
+
+    def chi_square(self) -> ChiSquare:
+        """The sum of the squared innovations of the measurements used."""
+        families = {}
+        for family, rows in self.innovations.items():
+            used = rows.array[rows.array[:, 1] > 0.0, 2:]
+            families[family] = float((used**2).sum()), float(used.size)
+        return ChiSquare(sum(v for v, _ in families.values()), sum(d for _, d in families.values()), families)
 
     def _estimate(self) -> gtsam.Values:
         if self._smoother is None:
@@ -420,10 +433,6 @@ class Run:
             family: Residuals(rows.array[:, 0].copy(), rows.array[:, 2:].copy(), rows.array[:, 1] > 0.0)
             for family, rows in self.innovations.items()
         }
-        families = {
-            family: (float((r.whitened[r.used] ** 2).sum()), float(r.whitened[r.used].size))
-            for family, r in residuals.items()
-        }
         history, n = self.history.array.copy(), len(values)
         attitudes = self.attitudes.array.copy()
         return Estimate(
@@ -434,7 +443,7 @@ class Run:
             converged=not self._trouble,
             message=self._trouble or "all steps taken",
             residuals=residuals,
-            chi_square=ChiSquare(sum(v for v, _ in families.values()), sum(d for _, d in families.values()), families),
+            chi_square=self.chi_square(),
             history=History(history[:, 0], history[:, 1 : 1 + n], history[:, 1 + n :]),
             attitudes=None if self.problem.attitudes is None else Attitudes(attitudes[:, 0], attitudes[:, 1:]),
             rejected={f: int((~r.used).sum()) + self.unusable.get(f, 0) for f, r in residuals.items()},

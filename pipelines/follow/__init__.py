@@ -1,0 +1,1 @@
+"""Calibrating while the recording is still being written."""

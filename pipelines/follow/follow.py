@@ -1,0 +1,52 @@
+"""`alidade follow`: the follower, its screen and its server put together."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from types import FrameType
+
+from pipelines.follow.follower import Follower, Settings
+from pipelines.follow.guidance import View
+from pipelines.follow.screen import Screen
+from pipelines.follow.serve import LiveServer
+from pipelines.reports.result import Calibration
+from pipelines.terminal import console
+
+
+def follow(settings: Settings, port: int | None) -> Calibration:
+    """Follow a recording until it ends, shown in the terminal and, with a port, served on it.
+
+    The first Ctrl-C ends it with what is there, the second at once. Raises as `Follower.follow` does.
+    """
+    with ExitStack() as stack:
+        server = None if port is None else stack.enter_context(LiveServer(port))
+        stopped = stack.enter_context(_interrupted())
+        screen = stack.enter_context(Screen(console))
+        if server is not None:
+            screen.say(f"estimates live at {server.url} (Foxglove: open connection)")
+
+        def show(view: View) -> None:
+            screen.show(view)
+            if server is not None:
+                server.show(view)
+
+        return Follower(settings, show, screen.say, stopped.is_set).follow()
+
+
+@contextmanager
+def _interrupted() -> Iterator[threading.Event]:
+    """An event that the first Ctrl-C sets; the next one is as ever."""
+    event = threading.Event()
+
+    def heard(_: int, __: FrameType | None) -> None:
+        event.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    before = signal.signal(signal.SIGINT, heard)
+    try:
+        yield event
+    finally:
+        signal.signal(signal.SIGINT, before)
