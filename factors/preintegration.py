@@ -9,7 +9,9 @@ expansion of a linear rate (Iserles et al., Acta Numerica 2000).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -43,6 +45,10 @@ class Increments:
     rate: Array
     unseen: Array
 
+    def __getitem__(self, rows: Any) -> Increments:
+        """Those over some of the windows."""
+        return Increments(*(getattr(self, f.name)[rows] for f in fields(self)))
+
 
 class GyroPath:
     """A gyro stream integrated once; the rotation over any window then costs the same as a look-up.
@@ -61,18 +67,20 @@ class GyroPath:
             raise ValueError(f"needs stamps (N,) and rates (N, 3), N >= 2; got {self.t.shape} and {mean.shape}")
         self._rate = mean - self.bias_hat - _trapezoid_excess(self.t, mean)
         self._slope = np.diff(self._rate, axis=0) / np.diff(self.t)[:, None]
-        arcs = _arc(self._rate[:-1], self._slope, np.diff(self.t)[:, None])
-        self._attitude = np.concatenate([so3.identity(1), _running_product(so3.exp(arcs))])
-        # Integral of the attitude matrix, from which every window's bias Jacobian follows.
-        pieces = np.diff(self.t)[:, None, None] * so3.right_jacobian(-arcs)
-        self._integral = np.concatenate(
-            [np.zeros((1, 3, 3)), np.cumsum(so3.matrix(self._attitude[:-1]) @ pieces, axis=0)]
-        )
+        self._arcs = _arc(self._rate[:-1], self._slope, np.diff(self.t)[:, None])
+        self._attitude = np.concatenate([so3.identity(1), _running_product(so3.exp(self._arcs))])
         self._unseen = np.append(0.0, np.cumsum(_gap_variance(self.t, mean)))
+
+    @cached_property
+    def _integral(self) -> Array:
+        """Integral (N, 3, 3) of the attitude matrix until each stamp: every window's bias Jacobian follows from it."""
+        pieces = np.diff(self.t)[:, None, None] * so3.right_jacobian(-self._arcs)
+        return np.concatenate([np.zeros((1, 3, 3)), np.cumsum(so3.matrix(self._attitude[:-1]) @ pieces, axis=0)])
 
     def attitude(self, at: ArrayLike) -> Array:
         """Attitude (n, 4) of the sensor at the times, in its frame at the first stamp."""
-        return self._at(np.asarray(at, dtype=float))[0]
+        i, s = self._place(np.asarray(at, dtype=float))
+        return so3.multiply(self._attitude[i], so3.exp(_arc(self._rate[i], self._slope[i], s)))
 
     def increments(self, start: ArrayLike, stop: ArrayLike) -> Increments:
         """Rotations over the windows [start, stop], (n,) each, s; a window may be empty or run backwards.
@@ -88,8 +96,7 @@ class GyroPath:
 
     def _at(self, at: Array) -> tuple[Array, Array, Array]:
         """Attitude, integral of the attitude matrix and rate at the times."""
-        i = np.clip(np.searchsorted(self.t, at, side="right") - 1, 0, len(self.t) - 2)
-        s = (at - self.t[i])[:, None]
+        i, s = self._place(at)
         w0, a = self._rate[i], self._slope[i]
         arc = _arc(w0, a, s)
         turn = so3.exp(arc)
@@ -97,6 +104,11 @@ class GyroPath:
         speed = w0 + a * s + so3.cross(w0, a) * s**2 / 4.0
         rate = np.einsum("nij,nj->ni", so3.right_jacobian(arc), speed)
         return so3.multiply(self._attitude[i], turn), integral, rate
+
+    def _place(self, at: Array) -> tuple[NDArray[np.intp], Array]:
+        """The sample intervals that hold the times, (n,), and the time since their start, (n, 1), s."""
+        i = np.clip(np.searchsorted(self.t, at, side="right") - 1, 0, len(self.t) - 2)
+        return i, (at - self.t[i])[:, None]
 
 
 def _trapezoid_excess(t: Array, mean: Array) -> Array:

@@ -152,17 +152,22 @@ def from_matrix(r: ArrayLike) -> Array:
 def right_jacobian(phi: ArrayLike) -> Array:
     """J with Exp(phi + d) = Exp(phi) * Exp(J d) to first order, shape (..., 3, 3).
 
-    Solà, Deray, Atchuthan, "A micro Lie theory", 2018, eq. 143.
+    Solà, Deray, Atchuthan, "A micro Lie theory", 2018, eq. 143, with hat(phi)^2 = phi phi' - phi'phi I.
     """
     phi = np.asarray(phi, dtype=float)
-    square = (phi * phi).sum(axis=-1)[..., None, None]
+    square = (phi * phi).sum(axis=-1)
     angle = np.sqrt(square)
     small = angle < _SMALL
     safe = np.where(small, 1.0, angle)
     a = np.where(small, 0.5 - square / 24.0, (1.0 - np.cos(safe)) / safe**2)
     b = np.where(small, 1.0 / 6.0 - square / 120.0, (safe - np.sin(safe)) / safe**3)
-    k = hat(phi)
-    return np.eye(3) - a * k + b * (k @ k)
+    x, y, z = phi[..., 0], phi[..., 1], phi[..., 2]
+    ax, ay, az, bx, by, bz = a * x, a * y, a * z, b * x, b * y, b * z
+    out = np.empty((*phi.shape, 3))
+    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = 1.0 - by * y - bz * z, bx * y + az, bx * z - ay
+    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = bx * y - az, 1.0 - bx * x - bz * z, by * z + ax
+    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = bx * z + ay, by * z - ax, 1.0 - bx * x - by * y
+    return out
 
 
 def right_jacobian_inverse(phi: ArrayLike) -> Array:

@@ -19,7 +19,7 @@ from factors import so3
 from factors.attitude import VisionAttitudeFactor, ahrs_factors
 from factors.chi_square import gate
 from factors.earth import EARTH_RATE
-from factors.preintegration import GyroPath
+from factors.preintegration import GyroPath, Increments
 from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
 from pipelines.errors import InputError
 from pipelines.methods.base import (
@@ -59,6 +59,7 @@ class _Model:
     measured: Array  # (frames, 4) cRh
     sqrt_information: Array  # (frames, 3, 3)
     helmet: GyroPath
+    turns: Increments  # (K - 1,) of the helmet from keyframe to keyframe
     platform: GyroPath | None
     variance_rate: float  # rad^2 / s of an increment, both gyros
     scale_error: float  # sigma of an increment per angle turned
@@ -115,13 +116,15 @@ def _prepare(data: HeadData, config: Config) -> _Model:
     bias_hat, vRh = _guess(data, vision_t, iRh, sigma)
     time, vision = _keyframes(vision_t)
     walk = first_given(config.noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk)
+    helmet = GyroPath(data.head_t, data.head_gyro, bias_hat)
     return _Model(
         time=time,
         vision=vision,
         initial=so3.interpolate(vision_t, so3.multiply(iRh, so3.inverse(vRh)), time),
         measured=measured,
         sqrt_information=sqrt_information,
-        helmet=GyroPath(data.head_t, data.head_gyro, bias_hat),
+        helmet=helmet,
+        turns=helmet.increments(time[:-1], time[1:]),
         platform=platform,
         variance_rate=density**2 + platform_density**2,
         scale_error=first_given(config.noise.gyro_scale, DEFAULT_NOISE.gyro_scale),
@@ -267,7 +270,7 @@ def _step(model: _Model, keyframes: range) -> Step:
         initial.insert(model.bias.mean_key(end), model.bias_hat)
         factors.append(model.bias.mean_factor(end))
         stand_ins[model.bias.key(0)] = model.bias.mean_key(end)
-    increments = model.helmet.increments(model.time[before], model.time[after])
+    increments = model.turns[before]
     turned = model.scale_error * np.linalg.norm(so3.log(increments.wxyz), axis=1)
     gyro = ahrs_factors(
         [_state(k) for k in before],
@@ -340,9 +343,9 @@ def _predict(model: _Model, keyframes: range, initial: gtsam.Values, current: gt
             out.insert(key, bias)
     attitude = so3.from_gtsam([current.atRot3(_state(keyframes.start - 1))])[0]
     for k in keyframes:
-        step = model.helmet.increments(model.time[k - 1 : k], model.time[k : k + 1])
-        correction = step.bias_jacobian[0] @ (bias - model.bias_hat)
-        attitude = so3.compose(attitude, step.wxyz[0], so3.exp(correction))
+        step = model.turns[k - 1]
+        correction = step.bias_jacobian @ (bias - model.bias_hat)
+        attitude = so3.compose(attitude, step.wxyz, so3.exp(correction))
         out.insert(_state(k), so3.to_gtsam(attitude))
     return out
 

@@ -19,7 +19,7 @@ from factors import so3
 from factors.attitude import ahrs_factors
 from factors.chi_square import gate
 from factors.los import SMOOTHING, GimbalPath, LocalMotion, LosDirectionFactor
-from factors.preintegration import GyroPath
+from factors.preintegration import GyroPath, Increments
 from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
 from pipelines.errors import InputError
 from pipelines.methods.base import Array, Factor, Parameter, Problem, Quantity, Step
@@ -65,7 +65,8 @@ class _Model:
     measured: Array  # (K, 3) phx, phz, roll
     sqrt_information: Array  # (K, 3, 3), zero rows for a roll not measured
     angles: Array  # (K, 2) azimuth, elevation
-    gyro: GyroPath  # with the first guess of its bias taken off
+    turns: Increments  # (K - 1,) of the gyro from keyframe to keyframe
+    bias_hat: Array  # first guess of the gyro's bias
     motion: LocalMotion | None  # around the keyframes, when the time offset is a variable
     variance_rate: float  # rad^2 / s of an increment
     scale_error: float  # sigma of an increment per angle turned
@@ -126,7 +127,8 @@ def _prepare(data: LosData, config: Config) -> tuple[_Model, dict[str, int]]:
         measured=measured,
         sqrt_information=_sqrt_information(covariance[rows]),
         angles=angles,
-        gyro=gyro,
+        turns=gyro.increments(time[:-1], time[1:]),
+        bias_hat=bias_hat,
         motion=motion,
         variance_rate=density**2,
         scale_error=first_given(noise.gyro_scale, DEFAULT_NOISE.gyro_scale),
@@ -277,7 +279,7 @@ def _step(model: _Model, keyframes: range) -> Step:
     if keyframes.start == 0:
         factors += [vector_prior(p, np.zeros(len(p.quantities))) for p in model.parameters]
         initial.insert(_ANGLES_KEY, model.mount)
-        initial.insert(model.bias.key(0), model.gyro.bias_hat)
+        initial.insert(model.bias.key(0), model.bias_hat)
         if model.motion is not None:
             initial.insert(_OFFSET_KEY, np.zeros(1))
     stand_ins = _bias_step(model, keyframes, initial, factors)
@@ -302,7 +304,7 @@ def _before(model: _Model, keyframes: range) -> int:
 
 def _bias_step(model: _Model, keyframes: range, initial: gtsam.Values, factors: list[Factor]) -> dict[int, int]:
     """Adds the bias nodes that begin with these keyframes; returns what holds the reported bias from now on."""
-    bias, bias_hat = model.bias, model.gyro.bias_hat
+    bias, bias_hat = model.bias, model.bias_hat
     stand_ins: dict[int, int] = {}
     for node in range(_before(model, keyframes) + 1, int(model.nodes[keyframes[-1]]) + 1):
         initial.insert(bias.key(node), bias_hat)
@@ -323,14 +325,14 @@ def _gyro_factors(model: _Model, keyframes: range) -> list[Factor]:
     """The gyro between pictures of one target; a wide prior where a target is found."""
     found = [k for k in keyframes if model.starts[k]]
     after = np.array([k for k in keyframes if not model.starts[k]], dtype=int)
-    increments = model.gyro.increments(model.time[after - 1], model.time[after])
+    increments = model.turns[after - 1]
     turned = model.scale_error * np.linalg.norm(so3.log(increments.wxyz), axis=1)
     native = ahrs_factors(
         [_state(k) for k in after - 1],
         [_state(k) for k in after],
         [model.bias.key(int(model.nodes[k])) for k in after],
         increments,
-        model.gyro.bias_hat,
+        model.bias_hat,
         model.variance_rate * increments.duration + turned**2 + increments.unseen,
     )
     return [*(_start_factor(model, k) for k in found), *(Factor("gyro", f) for f in native)]
@@ -401,11 +403,9 @@ def _predict(model: _Model, keyframes: range, initial: gtsam.Values, current: gt
             attitude = seen(cRm, model.measured[k : k + 1])[0]
         else:
             before = out if out.exists(_state(k - 1)) else current
-            step = model.gyro.increments(model.time[k - 1 : k], model.time[k : k + 1])
+            step = model.turns[k - 1]
             previous = so3.from_gtsam([before.atRot3(_state(k - 1))])[0]
-            attitude = so3.compose(
-                previous, step.wxyz[0], so3.exp(step.bias_jacobian[0] @ (bias - model.gyro.bias_hat))
-            )
+            attitude = so3.compose(previous, step.wxyz, so3.exp(step.bias_jacobian @ (bias - model.bias_hat)))
         out.insert(_state(k), so3.to_gtsam(attitude))
     return out
 

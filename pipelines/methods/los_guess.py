@@ -67,8 +67,8 @@ def initial_attitudes(
 
 def carried_errors(time: Array, cRm: Array, measured: Array, gyro: GyroPath) -> Array:
     """phx, phz (n, 2), rad, that one target's pictures would show if the gyro told all since the first of them."""
-    increments = gyro.increments(np.repeat(time[:1], len(time)), time)
-    tRm = so3.multiply(seen(cRm[:1], measured[:1]), increments.wxyz)
+    turned = gyro.attitude(time)
+    tRm = so3.compose(seen(cRm[:1], measured[:1]), so3.inverse(turned[:1]), turned)
     return los_error(so3.rotate(so3.multiply(cRm, so3.inverse(tRm)), [0.0, 1.0, 0.0]))
 
 
