@@ -38,17 +38,18 @@ def ahrs_factors(
         variance: (n,), rad^2 per axis, of each increment.
     """
     factors = []
+    covariance = variance[:, None, None] * np.eye(3)
     for n, (i, j, b) in enumerate(zip(keys_i, keys_j, bias_keys, strict=True)):
         duration = float(increments.duration[n])
         params = gtsam.PreintegratedRotationParams()
-        params.setGyroscopeCovariance(np.eye(3) * (variance[n] / duration))
+        params.setGyroscopeCovariance(covariance[n] / duration)
         measured = gtsam.PreintegratedAhrsMeasurements(
             params,
             bias_hat,
             duration,
             so3.to_gtsam(increments.wxyz[n]),
             increments.bias_jacobian[n],
-            np.eye(3) * variance[n],
+            covariance[n],
         )
         factors.append(gtsam.AHRSFactor(i, j, b, measured))
     return factors
