@@ -18,12 +18,12 @@ from pathlib import Path
 
 from pipelines.calibrate import Session, calibrations
 from pipelines.errors import InputError
-from pipelines.follow.growing import GrowingRecording, is_finished, size_of
+from pipelines.follow.growing import is_finished, size_of
 from pipelines.follow.guidance import View, view_of
 from pipelines.methods.base import Problem, Step
 from pipelines.methods.collected import Collected
 from pipelines.reports.result import Calibration
-from pipelines.sessions.reading import Recording, open_recording
+from pipelines.sessions.reading import open_recording
 from pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
 from pipelines.solvers.incremental import Run
 
@@ -112,7 +112,7 @@ class Follower:
     def _look(self) -> None:
         """Take what is settled of what is there now."""
         try:
-            session = self._read(GrowingRecording(self.settings.path))
+            session = self._read()
             problem = session.problem()
         except InputError as error:
             self._wait(str(error))
@@ -129,8 +129,8 @@ class Follower:
             self._waiting = reason
             self._say(f"not enough yet: {reason}")
 
-    def _read(self, recording: Recording) -> Session:
-        return Session.read(recording, self.settings.method, self.settings.config)
+    def _read(self) -> Session:
+        return Session.read(open_recording(self.settings.path), self.settings.method, self.settings.config)
 
     def _new_steps(self, session: Session, problem: Problem) -> Iterator[Step]:
         """The steps not taken yet, for a run that is the one to take them: a new one if the past has changed."""
@@ -205,7 +205,7 @@ class Follower:
             why = "stopped" if self._stopped() else f"nothing new for {self.settings.patience:g} s"
             self._say(f"{why}: the recording is not finished, the result is that of what is there")
         started = time.perf_counter()
-        session = self._read(open_recording(path) if finished else GrowingRecording(path))
+        session = self._read()
         problem = session.problem()
         read = time.perf_counter() - started
         started = time.perf_counter()

@@ -14,6 +14,7 @@ from pipelines.follow.guidance import View
 
 if TYPE_CHECKING:
     from foxglove import Channel
+    from foxglove.websocket import ChannelView, Client
 
 # Others on the network have no business with a calibration bench.
 HOST = "127.0.0.1"
@@ -53,11 +54,14 @@ class LiveServer:
                 "--serve needs foxglove-sdk, which is not installed: pip install 'alidade[serve]'"
             ) from error
         self._context = foxglove.Context()
+        self._channels: dict[str, Channel] = {}
+        self._last: dict[str, tuple[dict[str, Any], int]] = {}
         try:
-            self._server = foxglove.start_server(name="alidade", host=HOST, port=port, context=self._context)
+            self._server = foxglove.start_server(
+                name="alidade", host=HOST, port=port, context=self._context, server_listener=self
+            )
         except (RuntimeError, OSError) as error:
             raise InputError(f"--port {port}: no server can be started there ({error}); give another") from error
-        self._channels: dict[str, Channel] = {}
 
     @property
     def url(self) -> str:
@@ -104,4 +108,16 @@ class LiveServer:
             self._channels[topic] = Channel(
                 topic, schema=schema, message_encoding="json", context=self._context, metadata=metadata
             )
+        self._last[topic] = message, at
         self._channels[topic].log(message, log_time=at)
+
+    # -- what foxglove-sdk asks of a listener
+
+    def on_subscribe(self, _: Client, channel: ChannelView) -> None:
+        """Whoever comes late sees the last message at once."""
+        if channel.topic in self._last:
+            message, at = self._last[channel.topic]
+            self._channels[channel.topic].log(message, log_time=at)
+
+    def on_unsubscribe(self, _: Client, __: ChannelView) -> None:
+        """Nothing to do."""

@@ -1,0 +1,237 @@
+"""alidade follow: a recording calibrated while another process writes it, killed, resumed, and shown live."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tornado.websocket import websocket_connect
+
+from pipelines.calibrate import calibrate
+from pipelines.errors import InputError
+from pipelines.follow.follower import Follower, Settings
+from pipelines.follow.guidance import View
+from pipelines.follow.serve import LiveServer
+from pipelines.reports.result import Calibration
+from pipelines.sessions.los import write_los
+from pipelines.simulation.los import LosScenario, los_config, simulate_los
+from pipelines.simulation.motion import EulerMotion, Swing
+
+ROOT = Path(__file__).resolve().parents[1]
+BRISK = EulerMotion(
+    roll=[Swing(amplitude_deg=6, frequency_hz=0.31)],
+    pitch=[Swing(amplitude_deg=5, frequency_hz=0.27)],
+    yaw=[Swing(amplitude_deg=6, frequency_hz=0.23)],
+)
+# Longer than it takes the smoother to be folded for the first time, 40 s.
+SCENARIO = LosScenario(duration_s=52.0, carrier=BRISK, image_rate_hz=6.0, gyro_rate_hz=50.0, gimbal_rate_hz=50.0)
+SPEED = 10.0
+
+# Another process that records: what is in one file, into another, at a multiple of real time.
+RECORDER = """
+import sys, time
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+source, target, speed, chunks = sys.argv[1], sys.argv[2], float(sys.argv[3]), sys.argv[4] == "chunks"
+with open(source, "rb") as stream, open(target, "wb") as out:
+    reader = make_reader(stream)
+    writer = Writer(out, chunk_size=8192, use_chunking=chunks)
+    writer.start("ros2", "recorder")
+    for a in reader.iter_attachments():
+        writer.add_attachment(a.create_time, a.log_time, a.name, a.media_type, a.data)
+    schemas, channels, first, start = {}, {}, None, time.monotonic()
+    for schema, channel, message in reader.iter_messages():
+        first = message.log_time if first is None else first
+        wait = (message.log_time - first) / 1e9 / speed - (time.monotonic() - start)
+        if wait > 0.02:
+            out.flush()
+            time.sleep(wait)
+        if schema.id not in schemas:
+            schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+        if channel.id not in channels:
+            coding = channel.message_encoding
+            channels[channel.id] = writer.register_channel(channel.topic, coding, schemas[schema.id])
+        writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
+    writer.finish()
+"""
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished recording, which the tests have recorded anew."""
+    path = tmp_path_factory.mktemp("whole") / "whole.mcap"
+    data, truth = simulate_los(SCENARIO, 2)
+    write_los(path, data, truth, los_config(SCENARIO))
+    return path
+
+
+def _recorder(source: Path, target: Path, speed: float, chunks: bool = True) -> subprocess.Popen[bytes]:
+    how = "chunks" if chunks else "raw"
+    return subprocess.Popen([sys.executable, "-c", RECORDER, str(source), str(target), str(speed), how])
+
+
+def _alidade(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "pipelines.cli", *arguments]
+
+
+async def _received(url: str, topic: str, seconds: float) -> dict[str, Any]:
+    """The first message on a topic of a Foxglove server, as any client gets it."""
+    protocols = ["foxglove.sdk.v1", "foxglove.websocket.v1"]
+    until = time.monotonic() + seconds
+    while True:
+        try:
+            connection = await websocket_connect(url, subprotocols=protocols)
+            break
+        except OSError:
+            assert time.monotonic() < until, "no server"
+            await asyncio.sleep(0.1)
+    try:
+        while True:
+            message = await asyncio.wait_for(connection.read_message(), until - time.monotonic())
+            assert message is not None, "the server has gone"
+            if isinstance(message, bytes):
+                if message[0] == 1:  # message data: subscription, time, payload
+                    struct.unpack_from("<BIQ", message)
+                    return dict(json.loads(message[13:]))
+                continue
+            told = json.loads(message)
+            for channel in told.get("channels", []) if told["op"] == "advertise" else []:
+                if channel["topic"] == topic:
+                    wanted = [{"id": 7, "channelId": channel["id"]}]
+                    await connection.write_message(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+    finally:
+        connection.close()
+
+
+def test_live_killed_and_resumed_it_ends_as_batch_on_the_finished_file(whole: Path, tmp_path: Path) -> None:
+    session, checkpoint, out = tmp_path / "s.mcap", tmp_path / "s.checkpoint", tmp_path / "out"
+    recorder = _recorder(whole, session, SPEED)
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    common = ["follow", str(session), "--checkpoint", str(checkpoint), "--out", str(out)]
+    first = subprocess.Popen(
+        _alidade(*common, "--serve", "--port", str(port)), cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+    estimate = asyncio.run(_received(f"ws://127.0.0.1:{port}", "/estimate/delta_gx", 15.0))
+    assert estimate["lower"] < estimate["value"] < estimate["upper"]
+    assert not (session.read_bytes().endswith(b"\x89MCAP0\r\n")), "it was to be seen while recording"
+    until = time.monotonic() + 15.0
+    while not checkpoint.exists() and first.poll() is None and time.monotonic() < until:
+        time.sleep(0.02)
+    first.send_signal(signal.SIGKILL)
+    text = first.communicate()[0].decode()
+    assert checkpoint.exists(), text
+    assert not out.exists()
+
+    done = subprocess.run(_alidade(*common), cwd=ROOT, capture_output=True, text=True, check=False)
+    assert recorder.wait() == 0
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "resumed at 4" in done.stdout
+    result = json.loads((out / "result.json").read_text())
+    batch, again = calibrate(session, ["batch", "incremental"])
+    assert result["session"]["sha256"] == batch.sha256
+    found = {p["name"]: p["value"] for p in result["parameters"]}
+    for finished, tolerance in ((batch, 0.1), (again, 0.02)):
+        for p in finished.parameters:
+            assert found[p.name] == pytest.approx(p.value, abs=tolerance * p.sigma), p.name
+    assert {p.name for p in (out).iterdir()} >= {"result.json", "report.html", "calibration.yaml", "estimates.mcap"}
+
+
+def _follow(settings: Settings, stop_after: int | None = None) -> tuple[Calibration, list[View], list[str]]:
+    views: list[View] = []
+    said: list[str] = []
+    follower = Follower(settings, views.append, said.append, lambda: stop_after is not None and len(views) > stop_after)
+    return follower.follow(), views, said
+
+
+def _unfinished(whole: Path, target: Path, share: float) -> Path:
+    content = whole.read_bytes()
+    target.write_bytes(content[: int(share * len(content))])
+    return target
+
+
+def test_a_recording_that_stops_growing_unfinished_gives_what_is_there(whole: Path, tmp_path: Path) -> None:
+    raw = tmp_path / "raw.mcap"
+    assert _recorder(whole, raw, 1e9, chunks=False).wait() == 0
+    session = _unfinished(raw, tmp_path / "s.mcap", 0.4)
+    calibration, views, said = _follow(Settings(session, patience=1.5))
+    assert said[-1] == "nothing new for 1.5 s: the recording is not finished, the result is that of what is there"
+    assert 20.0 < calibration.facts.duration_s < 26.0
+    assert views[-1].values is not None
+    assert views[-1].time > views[0].time
+
+
+def test_what_is_missing_is_said_until_the_accuracy_is_reached(whole: Path, tmp_path: Path) -> None:
+    session = tmp_path / "s.mcap"
+    recorder = _recorder(whole, session, 40.0)
+    calibration, views, _ = _follow(Settings(session, patience=5.0))
+    assert recorder.wait() == 0
+    assert calibration.assessment.status == "calibrated"
+    last = views[-1]
+    assert last.done
+    assert last.headline == "the accuracy wanted is reached: recording may end"
+    early = [view for view in views if not view.done]
+    assert early, "it was to be seen before enough was there"
+    assert all(view.missing or view.assessment is None for view in early)
+    assert {c.what for c in last.collected} >= {"target", "sway about x", "sway about y", "sway about z"}
+
+
+def test_no_file(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"s\.mcap: no such file, or nothing in it, after 0\.3 s of waiting"):
+        _follow(Settings(tmp_path / "s.mcap", patience=0.3))
+
+
+def test_no_mcap(tmp_path: Path) -> None:
+    (tmp_path / "s.mcap").write_bytes(b"SQLite format 3\0" + bytes(100))
+    with pytest.raises(InputError, match="not an MCAP file"):
+        _follow(Settings(tmp_path / "s.mcap", patience=60.0))
+
+
+def test_too_little_to_calibrate_is_the_readers_own_line(whole: Path, tmp_path: Path) -> None:
+    session = _unfinished(whole, tmp_path / "s.mcap", 0.002)
+    with pytest.raises(InputError, match=r"no (topic|usable topics)"):
+        _follow(Settings(session, patience=1.0))
+
+
+def test_a_checkpoint_of_another_config_is_refused(whole: Path, tmp_path: Path) -> None:
+    checkpoint, config = tmp_path / "c", tmp_path / "c.yaml"
+    _follow(Settings(whole, checkpoint=checkpoint))
+    assert checkpoint.exists()
+    config.write_text("require: {delta_px: 0.5}\n")
+    with pytest.raises(InputError, match=r"checkpoint is of another config, \{.*\}, not \{.*delta_px"):
+        _follow(Settings(whole, config=config, checkpoint=checkpoint))
+    _, _, said = _follow(Settings(whole, checkpoint=checkpoint))
+    assert said[0].startswith("resumed at 4")
+
+
+def test_without_foxglove_sdk_serving_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    with pytest.raises(InputError, match=r"--serve needs foxglove-sdk.*alidade\[serve\]"):
+        LiveServer()
+
+
+def test_ctrl_c_ends_with_what_is_there(whole: Path, tmp_path: Path) -> None:
+    session = _unfinished(whole, tmp_path / "s.mcap", 0.9)
+    command = _alidade("follow", str(session), "--patience", "60", "--out", str(tmp_path / "out"))
+    follower = subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"}
+    )
+    assert follower.stdout is not None
+    assert follower.stdout.readline()
+    follower.send_signal(signal.SIGINT)
+    text = follower.communicate(timeout=20)[0]
+    assert follower.returncode in (0, 3), text
+    assert "stopped: the recording is not finished" in text
+    assert (tmp_path / "out" / "result.json").exists()
