@@ -28,6 +28,7 @@ def calibrate(
     method_name: str | None = None,
     config_file: Path | None = None,
     window: float | None = 1.0,
+    strict: bool = False,
 ) -> list[Calibration]:
     """One calibration a solver, from one reading of the recording.
 
@@ -37,13 +38,14 @@ def calibrate(
         method_name: overrides the config's.
         config_file: overrides the recording's own config key by key.
         window: s, of the incremental solver; None keeps the whole history.
+        strict: refuse a recording of which anything is lost.
 
     Raises:
         InputError: recording or config cannot be used.
         IndeterminateError: states other than the parameters are not determined.
     """
     start = time.perf_counter()
-    session = Session.read(open_recording(path), method_name, config_file)
+    session = Session.read(open_recording(path, strict), method_name, config_file)
     read = time.perf_counter() - start
     solved = (_solve(solver, session.method, session.data, session.config, window) for solver in solvers)
     return calibrations(session, solved, {"read": read})
@@ -85,9 +87,11 @@ def calibrations(
         incremental = estimate.solver == "incremental"
         quantities = tuple(q for q in problem.quantities if q.name in estimate.names)
         assessment = assess(quantities, estimate.covariance, estimate.chi_square, problem.advice)
-        if estimate.solver != "published" and not estimate.converged:
+        # The published solvers stand beside as they are.
+        ours = estimate.solver != "published"
+        if ours and not estimate.converged:
             assessment = assessment.unsolved(estimate.message)
-        if estimate.solver != "published" and (assessment.status == "inconsistent" or mostly_rejected(estimate)):
+        elif ours and (assessment.status == "inconsistent" or mostly_rejected(estimate)):
             causes = find_causes(chosen, data, config, estimate) if causes is None else causes
             assessment = assessment.explained(causes)
         found.append(
@@ -138,5 +142,10 @@ def _published(chosen: Method, data: object, config: Config) -> Estimate | None:
 
 
 def _truth(recording: Recording) -> dict[str, object] | None:
-    attachment = recording.attachment("truth.json")
-    return None if attachment is None else dict(json.loads(attachment))
+    attachment = recording.attachment("truth.json", needed=False)
+    try:
+        return None if attachment is None else dict(json.loads(attachment, parse_int=float))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise InputError(
+            f"{recording.path}: the attachment truth.json is no JSON object of parameters and their values"
+        ) from error
