@@ -114,10 +114,10 @@ class Follower:
         try:
             session = self._read()
             problem = session.problem()
+            self._collect(session)
         except InputError as error:
             self._wait(str(error))
             return
-        self._collect(session)
         self._take(problem, _settled(self._new_steps(session, problem)))
 
     def _wait(self, reason: str) -> None:
@@ -159,11 +159,12 @@ class Follower:
     def _take(self, problem: Problem, steps: Iterable[Step]) -> None:
         run, saved = self._run, self.settings.checkpoint
         assert run is not None
+        goes_on = problem.steps_after is not None
         for step in steps:
             run.take(step)
-            if saved is not None and run.just_folded and problem.steps_after is not None:
+            if saved is not None and run.just_folded and goes_on:
                 save_checkpoint(saved, run, self._identity)
-            if time.monotonic() - self._shown > _VIEW:
+            if goes_on and time.monotonic() - self._shown > _VIEW:
                 self._view()
         self._view()
 

@@ -11,6 +11,9 @@ from pipelines.methods.collected import Collected
 from pipelines.observability import Assessment, assess
 from pipelines.solvers.incremental import Run
 
+# Parameters a sentence names.
+_MOST_NAMED = 6
+
 
 @dataclass(frozen=True)
 class View:
@@ -65,7 +68,9 @@ class View:
             return "the accuracy wanted is reached: recording may end"
         if not self.short:
             return self.assessment.headline
-        return f"not yet as accurate as required: {', '.join(self.short)}"
+        more = len(self.short) - _MOST_NAMED
+        names = ", ".join(self.short[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+        return f"not yet as accurate as required: {names}"
 
 
 def view_of(epoch_ns: int, run: Run, collected: tuple[Collected, ...]) -> View:

@@ -18,6 +18,8 @@ from pipelines.terminal import COLOURS
 
 # A line at most this often where there is no terminal, s.
 _LINE = 5.0
+# Of many parameters so many are shown, the least accurate ones.
+_MOST_ROWS = 14
 
 
 class Screen:
@@ -51,14 +53,15 @@ class Screen:
         now = time.monotonic()
         if now - self._last >= _LINE or view.headline != self._headline:
             self._last, self._headline = now, view.headline
-            wanted = f"; next: {view.missing[0]}" if view.missing else ""
+            wanted = f"; next: {view.missing[0]}" if view.missing and not view.done else ""
             self.say(f"{view.time:.1f} s: {view.headline}{wanted}")
 
 
 def _page(view: View) -> Group:
     headline = Text(f"{view.time:.1f} s: {view.headline}", style="bold green" if view.done else "bold")
     parts: list[RenderableType] = [headline, _parameters(view), _collected(view)]
-    parts += [Text(f"- {sentence}") for sentence in view.missing]
+    if not view.done:
+        parts += [Text(f"- {sentence}") for sentence in view.missing]
     return Group(*parts)
 
 
@@ -69,7 +72,8 @@ def _parameters(view: View) -> Table:
     for column in ("value", "sigma", "required"):
         table.add_column(column, justify="right", no_wrap=True)
     table.add_column("verdict", no_wrap=True)
-    for i, q in enumerate(view.quantities):
+    for i in _shown(view):
+        q = view.quantities[i]
         unit, factor = human_unit(q)
         required = f"{factor * q.require:.2g}"
         if view.values is None or view.assessment is None or view.sigmas is None:
@@ -78,7 +82,18 @@ def _parameters(view: View) -> Table:
         sigma, verdict = float(view.sigmas[i]), view.assessment.verdicts[q.name]
         value = to_digits_of(factor * float(view.values[i]), factor * sigma)
         table.add_row(q.name, unit, value, f"{factor * sigma:.2g}", required, f"[{COLOURS[verdict]}]{verdict}[/]")
+    if len(view.quantities) > _MOST_ROWS:
+        table.caption = f"the least accurate of {len(view.quantities)} parameters"
     return table
+
+
+def _shown(view: View) -> list[int]:
+    """The parameters shown: all, or those furthest from what is required, in their order."""
+    indexes = range(len(view.quantities))
+    if view.sigmas is None:
+        return list(indexes[:_MOST_ROWS])
+    ratio = [sigma / q.require for q, sigma in zip(view.quantities, view.sigmas.tolist(), strict=True)]
+    return sorted(sorted(indexes, key=lambda i: -ratio[i])[:_MOST_ROWS])
 
 
 def _collected(view: View) -> Table:
