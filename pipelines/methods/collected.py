@@ -112,30 +112,30 @@ def collected_cube(data: CubeData, config: Config) -> Sequence[Collected]:
     if data.camera is not None:
         found.append(Collected("tags seen", ", ".join(map(str, tags)) or "none", "" if tags else "show the cube"))
     if few:
-        found.append(Collected("next", f"{len(up) + 1}. pose", _next_pose(up, poses.mag)))
+        found.append(Collected("next", f"{len(up) + 1}. pose", next_pose(up, poses.mag)))
     return found
 
 
-def _next_pose(up: Array, mag: Array | None) -> str:
+def next_pose(up: Array, mag: Array | None) -> str:
     """The one of 24 attitudes along the axes that says most about accelerometer and magnetometer.
 
     What a pose with nominal vector n adds to what a triad's twelve numbers are known by is x'N^-1x, x = (n, 1), N the
     sum of xx' over the poses there are.
     """
-    field = None if mag is None else mag[np.isfinite(mag).all(axis=1)]
-    dip = None
-    if field is not None and len(field):
-        field = field / np.linalg.norm(field, axis=1, keepdims=True)
-        dip = float(np.median((field * up[np.isfinite(mag).all(axis=1)]).sum(axis=1)))  # type: ignore[union-attr]
+    field, dip = None, 0.0  # directions of the earth's field, and the sine of its angle above the horizon
+    if mag is not None and np.isfinite(mag).all(axis=1).any():
+        seen = np.isfinite(mag).all(axis=1)
+        field = mag[seen] / np.linalg.norm(mag[seen], axis=1, keepdims=True)
+        dip = float(np.median((field * up[seen]).sum(axis=1)))
     known = _information(up)
-    known_field = None if field is None or dip is None else _information(field)
+    known_field = None if field is None else _information(field)
     best, most = "", -1.0
     axes = [sign * unit for unit in np.eye(3) for sign in (1.0, -1.0)]
     for (i, above), (k, north) in permutations(enumerate(axes), 2):
         if i // 2 == k // 2:
             continue
         gain = _gain(known, above)
-        if known_field is not None and dip is not None:
+        if known_field is not None:
             gain += _gain(known_field, dip * above + np.sqrt(max(1.0 - dip**2, 0.0)) * north)
         if gain > most * (1.0 + 1e-9):
             ahead = f" and {_FACES[k]} to the north" if known_field is not None else ""
