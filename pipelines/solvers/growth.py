@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.methods.base import Array, History, Problem
-from pipelines.solvers.marginals import coordinate_jacobian, ordering_of, reported, reported_covariance
+from pipelines.solvers.marginals import coordinate_inverse, ordering_of, reported, reported_covariance
 
 # Moments at which the recording is looked back upon.
 _MOMENTS = 50
@@ -97,7 +97,7 @@ def _solved(
     """Reported numbers and their sigmas from a graph of nothing but the parameters."""
     information, slope = graph.hessian(ordering_of(held))
     covariance = reported_covariance(problem.parameters, information, values, held)
-    jacobian = coordinate_jacobian(problem.parameters, values, held)
+    inverse = coordinate_inverse(problem.parameters, values, held)
     extra = np.array([0.0 if q.prior_sigma == 0.0 else q.extra_sigma**2 for q in problem.quantities])
-    move = (covariance - np.diag(extra)) @ np.linalg.pinv(jacobian).T @ slope
+    move = (covariance - np.diag(extra)) @ inverse.T @ slope
     return reported(problem, values, stand_ins) + move, np.sqrt(np.diag(covariance))

@@ -107,10 +107,9 @@ def reported_covariance(
 ) -> Array:
     """Covariance of the reported numbers from the information matrix of the variables' tangents, in this order."""
     quantities = [q for p in parameters for q in p.quantities]
-    jacobian = coordinate_jacobian(parameters, values, keys)
     scale = np.array([q.prior_scale for q in quantities])
     # Information in units of the prior scales, so that one threshold serves angles, rates and seconds.
-    unit = np.linalg.pinv(jacobian) * scale
+    unit = coordinate_inverse(parameters, values, keys) * scale
     eigenvalues, vectors = np.linalg.eigh(unit.T @ information @ unit)
     variance = 1.0 / np.maximum(eigenvalues, _UNKNOWN**-2)
     covariance = (vectors * variance) @ vectors.T * np.outer(scale, scale)
@@ -119,15 +118,18 @@ def reported_covariance(
     return np.where(np.outer(known, known), covariance, 0.0)
 
 
-def coordinate_jacobian(parameters: Sequence[Parameter], values: gtsam.Values, keys: Sequence[int]) -> Array:
-    """Jacobian of the reported numbers by the variables' tangents, stacked in this order."""
-    blocks = [p.coordinates(values, key)[1] for p, key in zip(parameters, keys, strict=True)]
-    jacobian = np.zeros((sum(b.shape[0] for b in blocks), sum(b.shape[1] for b in blocks)))
+def coordinate_inverse(parameters: Sequence[Parameter], values: gtsam.Values, keys: Sequence[int]) -> Array:
+    """Pseudo-inverse of the Jacobian of the reported numbers by the variables' tangents, stacked in this order.
+
+    Each number follows from one variable, so that the inverse has the same blocks.
+    """
+    blocks = [np.linalg.pinv(p.coordinates(values, key)[1]) for p, key in zip(parameters, keys, strict=True)]
+    inverse = np.zeros((sum(b.shape[0] for b in blocks), sum(b.shape[1] for b in blocks)))
     row = column = 0
     for block in blocks:
-        jacobian[row : row + block.shape[0], column : column + block.shape[1]] = block
+        inverse[row : row + block.shape[0], column : column + block.shape[1]] = block
         row, column = row + block.shape[0], column + block.shape[1]
-    return jacobian
+    return inverse
 
 
 def chi_square(
