@@ -64,7 +64,7 @@ class Session:
     @classmethod
     def read(cls, recording: Recording, method_name: str | None, config_file: Path | None) -> Session:
         """Read and check (arguments and exceptions as `calibrate` has them)."""
-        config = load_config(recording.attachment(ATTACHMENT), config_file)
+        config = load_config(recording.attachment(ATTACHMENT, needed=config_file is None), config_file)
         name = resolve_method(method_name, recording, config)
         chosen = method(name)
         return cls(recording, config, name, chosen, chosen.read(recording, config))

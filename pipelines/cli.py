@@ -32,6 +32,7 @@ _MethodName = Annotated[str | None, typer.Option("--method", help="los, indexer,
 _ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML that overrides the recording's own config.")]
 _Scheduler = Annotated[str | None, typer.Option(help="Of a dask cluster, tcp://host:8786; default: this machine.")]
 _Jobs = Annotated[int | None, typer.Option(help="Local worker processes; default: one a core.")]
+_Strict = Annotated[bool, typer.Option("--strict", help="Refuse a recording of which anything is lost.")]
 _Window = Annotated[str, typer.Option(help="Of the incremental solver: seconds kept, or 'all'.")]
 
 
@@ -43,13 +44,14 @@ def calibrate(
     solver: Annotated[Solver, typer.Option(help="How to solve.")] = Solver.batch,
     window: _Window = "1",
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: SESSION-SOLVER.")] = None,
+    strict: _Strict = False,
 ) -> None:
     """Calibrate a recording. Exit code 0 calibrated, 2 unusable input, 3 weak or unobservable, 4 inconsistent."""
     from pipelines import terminal
     from pipelines.calibrate import calibrate as run
     from pipelines.reports.write import write_results
 
-    (calibration,) = run(session, [solver.value], method, config, _seconds(window))
+    (calibration,) = run(session, [solver.value], method, config, _seconds(window), strict)
     folder = out or session.with_name(f"{session.stem}-{solver.value}")
     written = write_results(folder, calibration)
     terminal.show([calibration])
@@ -64,6 +66,7 @@ def compare(
     config: _ConfigFile = None,
     window: _Window = "1",
     out: Annotated[Path | None, typer.Option(help="Folder for compare.html, which also splits the recording.")] = None,
+    strict: _Strict = False,
 ) -> None:
     """The published, batch and incremental solvers side by side, with errors where the truth is known."""
     from pipelines import terminal
@@ -71,7 +74,7 @@ def compare(
     from pipelines.calibrate import self_agreement
     from pipelines.reports.compare import write_compare
 
-    calibrations = run(session, ["published", "batch", "incremental"], method, config, _seconds(window))
+    calibrations = run(session, ["published", "batch", "incremental"], method, config, _seconds(window), strict)
     terminal.show(calibrations)
     if out is not None:
         written = write_compare(out, calibrations, *self_agreement(session, method, config))
@@ -112,13 +115,14 @@ def validate(
     method: _MethodName = None,
     config: _ConfigFile = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the page; default: SESSION-validation.")] = None,
+    strict: _Strict = False,
 ) -> None:
     """Errors of a recording before and after compensation with a calibration made on another one."""
     from pipelines import terminal
     from pipelines.validate import table, write_validation
     from pipelines.validate import validate as run
 
-    validated = run(session, calibration, method, config)
+    validated = run(session, calibration, method, config, strict)
     written = write_validation(out or session.with_name(f"{session.stem}-validation"), validated)
     for line in table(validated):
         terminal.say(line)
@@ -166,15 +170,16 @@ def plan(
 
 
 @app.command()
-def info(session: _Session, config: _ConfigFile = None) -> None:
+def info(session: _Session, config: _ConfigFile = None, strict: _Strict = False) -> None:
     """What is in a recording: topics, rates, gaps, and the methods it can serve."""
     from pipelines import terminal
     from pipelines.sessions.config import ATTACHMENT, load_config
     from pipelines.sessions.info import session_facts
     from pipelines.sessions.reading import open_recording
 
-    recording = open_recording(session)
-    facts = session_facts(recording, load_config(recording.attachment(ATTACHMENT), config))
+    recording = open_recording(session, strict)
+    settings = load_config(recording.attachment(ATTACHMENT, needed=config is None), config)
+    facts = session_facts(recording, settings)
     terminal.show_facts(session.name, facts)
 
 

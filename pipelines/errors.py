@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+# Longer lines help nobody; names in a hostile recording can be as long as it likes.
+_LONGEST = 2000
+
 
 class InputError(Exception):
     """Input that cannot be used: a recording, a config, an option.
@@ -9,3 +12,14 @@ class InputError(Exception):
     The message is one line that says what is wrong, where (topic, time, key) and what to do. The command line prints it
     and exits with code 2.
     """
+
+    def __str__(self) -> str:
+        """The one line, whatever the names in it are made of."""
+        return printable(super().__str__(), _LONGEST)
+
+
+def printable(text: str, longest: int = 200) -> str:
+    """Text from a recording for a terminal: control characters as escapes, the middle of what is too long left out."""
+    if len(text) > longest:
+        text = f"{text[: longest // 2]} ... {text[-longest // 2 :]}"
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

@@ -10,12 +10,15 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from pipelines.errors import printable
+
 if TYPE_CHECKING:
     from pipelines.planning import Plan
     from pipelines.reports.result import Calibration, ParameterResult
     from pipelines.sessions.info import SessionFacts
 
 console = Console(highlight=False)
+_LONGEST = 10_000
 
 COLOURS = {
     "calibrated": "green",
@@ -30,7 +33,7 @@ COLOURS = {
 
 def say(text: str) -> None:
     """One line, never broken."""
-    console.print(escape(text), soft_wrap=True)
+    console.print(escape(printable(text, _LONGEST)), soft_wrap=True)
 
 
 def show(calibrations: Sequence[Calibration]) -> None:
@@ -86,11 +89,14 @@ def show_facts(name: str, facts: SessionFacts) -> None:
                 f" at {t.largest_gap_at_s:.0f}" if t.largest_gap_s * t.rate_hz > 2 else ""
             )
         rate = "" if t.rate_hz is None else f"{t.rate_hz:.4g}"
-        kind = t.type.rsplit("/", 1)[-1]
-        table.add_row(escape(t.name), kind, str(t.count), rate, gap, str(t.duplicates), str(t.out_of_order))
+        kind = printable(t.type.rsplit("/", 1)[-1])
+        name = escape(printable(t.name))
+        table.add_row(name, escape(kind), str(t.count), rate, gap, str(t.duplicates), str(t.out_of_order))
     console.print(table)
     if any(t.duplicates or t.out_of_order for t in facts.topics):
         say("twice: stamps that occur again; back: stamps before the one ahead of them")
+    for note in facts.notes:
+        say(f"note: {note}")
     if facts.attachments:
         say(f"attachments: {', '.join(facts.attachments)}")
     for method, missing in facts.missing.items():

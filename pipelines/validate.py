@@ -27,17 +27,19 @@ class Validated:
         recording: name of the file.
         validations: what the method says.
         same_recording: it was calibrated on the very recording.
+        lost: sentences about what of the recording cannot be used.
     """
 
     calibration: SavedCalibration
     recording: str
     validations: Sequence[Validation]
     same_recording: bool
+    lost: tuple[str, ...] = ()
 
     @property
     def notes(self) -> list[str]:
         """What a reader has to know beside the numbers."""
-        out = [f"{v.name}: {v.note}" for v in self.validations if v.note]
+        out = [*self.lost, *(f"{v.name}: {v.note}" for v in self.validations if v.note)]
         if self.same_recording:
             out.append("this is the recording it was calibrated on; another one tells more")
         if self.calibration.status != "calibrated":
@@ -46,7 +48,11 @@ class Validated:
 
 
 def validate(
-    path: Path, calibration_file: Path, method_name: str | None = None, config_file: Path | None = None
+    path: Path,
+    calibration_file: Path,
+    method_name: str | None = None,
+    config_file: Path | None = None,
+    strict: bool = False,
 ) -> Validated:
     """The errors of a recording before and after compensation.
 
@@ -55,13 +61,14 @@ def validate(
         calibration_file: calibration.yaml.
         method_name: overrides the config's.
         config_file: overrides the recording's own config key by key.
+        strict: refuse a recording of which anything is lost.
 
     Raises:
         InputError: recording, config or calibration cannot be used, or the calibration is another method's.
     """
     calibration = load_calibration(calibration_file)
-    recording = open_recording(path)
-    config = load_config(recording.attachment(ATTACHMENT), config_file)
+    recording = open_recording(path, strict)
+    config = load_config(recording.attachment(ATTACHMENT, needed=config_file is None), config_file)
     name = resolve_method(method_name or calibration.method, recording, config)
     if name != calibration.method:
         raise InputError(f"{calibration_file}: is a calibration of {calibration.method}, not of {name}")
@@ -70,7 +77,8 @@ def validate(
         raise InputError(f"method {name} has no validation")
     values = {parameter: saved.value for parameter, saved in calibration.parameters.items()}
     validations = chosen.validate(chosen.read(recording, config), config, values)
-    return Validated(calibration, path.name, validations, calibration.recording.sha256 == recording.sha256())
+    same = calibration.recording.sha256 == recording.sha256()
+    return Validated(calibration, path.name, validations, same, recording.notes)
 
 
 def table(validated: Validated) -> list[str]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.sessions.container import Rows, windows
-from pipelines.sessions.messages import Array, Definition, Layout, Leaf, at
+from pipelines.sessions.container import Rows
+from pipelines.sessions.messages import Array, Definition, Layout, Leaf, MessageError, at
+from pipelines.sessions.records import windows
 
 # Which numbers of a field, as indexes, given the message; None if the message has not got them.
 Order = Callable[[Any], Sequence[int] | None]
@@ -22,6 +24,8 @@ _STAMP = {
 
 # A topic with more kinds of messages than this (frame names, say) has its further ones decoded one by one.
 _MAX_LAYOUTS = 8
+# Bytes; messages of numbers have some hundred.
+_LARGEST = 1 << 20
 
 
 class Table:
@@ -50,6 +54,18 @@ class Table:
         for name, column in values.items():
             self._put(name, rows, column)
         self.filled[rows] = True
+
+    @property
+    def taken(self) -> int:
+        """Messages taken up so far: rows beyond them are those of damaged chunks."""
+        return self._next
+
+    def times(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Stamps, log times where there are none, and log times of the rows that were filled, in the file's order."""
+        t_ns = self._t_ns if self._t_ns.all() else np.where(self._t_ns == 0, self._log_ns, self._t_ns)
+        if self.filled.all():
+            return t_ns, self._log_ns
+        return t_ns[self.filled], self._log_ns[self.filled]
 
     def sorted(self) -> tuple[NDArray[np.int64], int, dict[str, Any]]:
         """Stamps, how many of them are log times, and the columns, of the rows that were filled, by log time."""
@@ -104,15 +120,21 @@ class Decoder:
         """Append the messages to the table; those for which an order is None stay unfilled."""
         if not len(rows.start):
             return
+        largest = int(np.argmax(rows.size))
+        if rows.size[largest] > _LARGEST:
+            with logged_at(int(rows.log_ns[largest])):
+                raise MessageError(f"a message of {rows.size[largest]} bytes, which is no {self._definition.name}")
         into = table.advance(rows.log_ns, header_stamps(self._definition, rows))
         left = np.arange(len(into) if self._fields else 0)
         for plan in self._plans:
             left = left[~self._append_alike(plan, rows, left, table, into)]
         while len(left) and len(self._plans) < _MAX_LAYOUTS:
-            self._plans.append(self._plan(rows.message(left[0])))
+            with logged_at(int(rows.log_ns[left[0]])):
+                self._plans.append(self._plan(rows.message(left[0])))
             left = left[~self._append_alike(self._plans[-1], rows, left, table, into)]
         for i in left.tolist():
-            values = self._one(self._definition.decode(rows.message(i)))
+            with logged_at(int(rows.log_ns[i])):
+                values = self._one(self._definition.decode(rows.message(i)))
             if values is not None:
                 table.put(into[i : i + 1], values)
 
@@ -151,6 +173,16 @@ class Decoder:
                 return None
             values[name] = self._definition.numbers(at(message, path))[None, chosen]
         return values
+
+
+@contextmanager
+def logged_at(log_ns: int) -> Iterator[None]:
+    """Notes the log time of the message that cannot be read in the error that says so."""
+    try:
+        yield
+    except MessageError as error:
+        error.log_ns = log_ns
+        raise
 
 
 def header_stamps(definition: Definition, rows: Rows) -> NDArray[np.int64]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.errors import InputError
 from pipelines.sessions.config import Config
-from pipelines.sessions.reading import ENCODING, Recording
+from pipelines.sessions.reading import ENCODING, Recording, Topic
 from pipelines.sessions.topics import METHODS, NEEDED, TOPICS
 
 
@@ -33,13 +34,18 @@ class TopicFacts:
 
 @dataclass(frozen=True)
 class SessionFacts:
-    """A recording: its start (Unix ns), its length, its topics, and for every method what it lacks for it."""
+    """A recording: its start (Unix ns), its length, its topics, and for every method what it lacks for it.
+
+    lost: topic -> messages that are known to be lost; notes: sentences about what of the file cannot be used.
+    """
 
     epoch_ns: int
     duration_s: float
     attachments: tuple[str, ...]
     topics: tuple[TopicFacts, ...]
     missing: dict[str, tuple[str, ...]]
+    lost: dict[str, int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -48,10 +54,13 @@ class SessionFacts:
 
 
 def session_facts(recording: Recording, config: Config) -> SessionFacts:
-    """Facts about all topics of a recording. Raises InputError when it is damaged."""
-    topics = tuple(_facts(recording, name) for name in recording.topics)
+    """Facts about all topics of a recording."""
+    epoch, times = recording.epoch_ns, recording.times
+    topics = tuple(_facts(recording.topics[name], epoch, *times[name]) for name in recording.topics)
     missing = {method: missing_for(method, recording, config) for method in METHODS}
-    return SessionFacts(recording.epoch_ns, recording.duration_s, recording.attachments, topics, missing)
+    return SessionFacts(
+        epoch, recording.duration_s, recording.attachments, topics, missing, recording.missing, recording.notes
+    )
 
 
 def missing_for(method: str, recording: Recording, config: Config) -> tuple[str, ...]:
@@ -79,17 +88,14 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
         return able[0]
     if able:
         raise InputError(f"{recording.path}: the topics serve {' and '.join(able)}; choose with --method")
-    ros1 = " (a ROS 1 recording)" if recording.profile == "ros1" else ""
-    there = f"topics there{ros1}: {', '.join(recording.topics) or 'none'}"
     raise InputError(
-        f"{recording.path}: no usable topics for any method; {there}; "
+        f"{recording.path}: no usable topics for any method; {recording.there()}; "
         "`alidade info` tells what each method needs, `topics:` in the config can rename"
     )
 
 
-def _facts(recording: Recording, name: str) -> TopicFacts:
-    topic = recording.topics[name]
-    stamps = recording.stamps(name) - recording.epoch_ns
+def _facts(topic: Topic, epoch_ns: int, t_ns: NDArray[np.int64], log_ns: NDArray[np.int64]) -> TopicFacts:
+    stamps = t_ns[np.argsort(log_ns, kind="stable")] - epoch_ns
     backward = int(np.count_nonzero(stamps < np.maximum.accumulate(stamps))) if len(stamps) else 0
     stamps = np.sort(stamps)
     steps = np.diff(stamps)
@@ -101,7 +107,7 @@ def _facts(recording: Recording, name: str) -> TopicFacts:
         widest = int(np.argmax(steps))
         gap, gap_at = float(steps[widest]) / 1e9, float(stamps[widest]) / 1e9
     duplicates = int(np.count_nonzero(steps == 0))
-    return TopicFacts(name, topic.type, topic.count, start, duration, rate, gap, gap_at, duplicates, backward)
+    return TopicFacts(topic.name, topic.type, len(stamps), start, duration, rate, gap, gap_at, duplicates, backward)
 
 
 def _lack(key: str, recording: Recording, config: Config) -> str:

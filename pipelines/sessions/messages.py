@@ -8,7 +8,7 @@ serves every message with the same size, strings and lengths; the others are dec
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache, reduce
+from functools import cached_property, lru_cache, reduce
 from typing import Any, Literal
 
 import numpy as np
@@ -41,6 +41,9 @@ _APRILTAG_MSGS = {
 }
 
 _CODES = {"bool": "u1", "byte": "u1", "char": "u1"}
+
+# No message of sensors comes near any of these.
+_LONGEST_TEXT, _MOST_FIELDS, _DEEPEST = 1 << 18, 10_000, 32
 
 
 @dataclass(frozen=True)
@@ -91,34 +94,41 @@ class Layout:
 
 
 class MessageError(Exception):
-    """A message or a definition that cannot be read; who reads knows the topic and the file."""
+    """A message or a definition that cannot be read; who reads knows the topic and the file.
+
+    log_ns is the log time of the message, Unix ns, where it is one.
+    """
+
+    log_ns: int | None = None
 
 
 class Definition:
-    """A message type as its definition text tells it, not as we would expect it."""
+    """A message type as its definition text tells it, not as we would expect it.
+
+    The text is another's, and rosbags makes code of it, so that its size is looked at before.
+    """
 
     def __init__(self, name: str, text: str) -> None:
         self.name = name
-        self._store = get_typestore(Stores.EMPTY)
+        if len(text) > _LONGEST_TEXT:
+            raise MessageError(f"the definition of message type {name} has {len(text)} letters")
         try:
-            self._store.register(get_types_from_msg(text, name))
-            self._store.get_msgdef(name)
-        except (TypesysError, KeyError, SyntaxError) as error:
-            reason = " ".join(str(error).split())
-            raise MessageError(f"the definition of message type {name} cannot be read ({reason})") from error
-
-    @property
-    def has_header(self) -> bool:
-        """Whether its messages begin with a std_msgs/Header."""
-        members = self._store.fielddefs[self.name][1]
-        return bool(members and members[0][1] == (Nodetype.NAME, "std_msgs/msg/Header"))
+            self._types = get_types_from_msg(text, name)
+            members = self._types[name][1]
+        except Exception as error:  # a parser on a text that may be anything
+            raise self._unreadable(error) from error
+        self.has_header = bool(members and members[0][1] == (Nodetype.NAME, "std_msgs/msg/Header"))
 
     def decode(self, data: bytes) -> Any:
         """One message, decoded by rosbags. Raises MessageError."""
+        store = self._store
         try:
-            return self._store.deserialize_cdr(data, self.name)
-        except SerdeError as error:
-            raise MessageError(f"a message does not agree with the definition of {self.name} ({error})") from error
+            return store.deserialize_cdr(data, self.name)
+        except (SerdeError, IndexError, TypeError, OverflowError, MemoryError) as error:
+            reason = " ".join(str(error).split())
+            raise MessageError(
+                f"a message of {len(data)} bytes does not agree with the definition of {self.name} ({reason})"
+            ) from error
 
     def numbers(self, value: Any) -> Array:
         """All numbers in a field of a decoded message, in order."""
@@ -153,6 +163,23 @@ class Definition:
         if not 0 <= len(data) - walk.end <= 3:
             return None
         return Layout(data, tuple(walk.leaves), ((0, 2), *walk.fixed))
+
+    @cached_property
+    def _store(self) -> Any:
+        store = get_typestore(Stores.EMPTY)
+        fields = _fields(self._types, self.name, {})
+        if fields > _MOST_FIELDS:
+            raise MessageError(f"the definition of message type {self.name} has {fields} fields")
+        try:
+            store.register(self._types)
+            store.get_msgdef(self.name)
+        except (TypesysError, KeyError, SyntaxError) as error:
+            raise self._unreadable(error) from error
+        return store
+
+    def _unreadable(self, error: Exception) -> MessageError:
+        reason = " ".join(str(error).split())
+        return MessageError(f"the definition of message type {self.name} cannot be read ({reason})")
 
     def _zero(self, kind: Any) -> Any:
         node, what = kind
@@ -190,6 +217,23 @@ def known(name: str) -> Definition:
 def at(message: Any, path: str) -> Any:
     """The field of a decoded message, by its path. Raises AttributeError."""
     return reduce(getattr, path.split("."), message)
+
+
+def _fields(types: Any, name: str, known: dict[str, int], depth: int = 0) -> int:
+    """Numbers and strings in a message of a type, those of arrays of fixed size included. Raises MessageError."""
+    if depth > _DEEPEST or name not in types:
+        what = "is nested too deep" if name in types else f"lacks the type {name}"
+        raise MessageError(f"the definition of a message type {what}")
+    if name not in known:
+        total = 0
+        for _, (node, what) in types[name][1]:
+            count = 1
+            if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+                count = what[1] if node == Nodetype.ARRAY else 1
+                node, what = what[0]
+            total += count * (_fields(types, what, known, depth + 1) if node == Nodetype.NAME else 1)
+        known[name] = total
+    return known[name]
 
 
 class _Walk:

@@ -5,7 +5,8 @@
 
 Time is header.stamp; log time stands in only where the stamp is zero, and the series counts those. Messages come in
 the order of their log times. Every method raises InputError, naming what is there, when the topic is missing or empty,
-holds another type, or cannot be decoded, and when a chunk of the file is damaged.
+holds another type, cannot be decoded, or its clock was set in between (pipelines.sessions.clocks). A chunk that is
+damaged is left out, see `Recording.notes`.
 """
 
 from __future__ import annotations
@@ -22,8 +23,10 @@ from numpy.typing import NDArray
 
 from pipelines.errors import InputError
 from pipelines.sessions import messages, series
+from pipelines.sessions.clocks import check_clock
 from pipelines.sessions.container import McapFile, Rows
-from pipelines.sessions.decoding import Decoder, Order, Table, header_stamps
+from pipelines.sessions.decoding import Decoder, Order, Table, header_stamps, logged_at
+from pipelines.sessions.losses import Loss
 from pipelines.sessions.messages import Definition, MessageError
 
 AnySeries = TypeVar("AnySeries", bound=series.Series)
@@ -36,6 +39,8 @@ _TIMED = {
 
 # Message and schema encoding as ROS 2 records.
 ENCODING = "cdr/ros2msg"
+# Topics an error lists.
+_MOST_NAMED = 30
 
 
 @dataclass(frozen=True)
@@ -48,17 +53,21 @@ class Topic:
     encoding: str
 
 
-def open_recording(path: Path | str) -> Recording:
-    """The recording in an MCAP file. Raises InputError when the file is missing, empty, no MCAP, cut or damaged."""
-    return Recording(Path(path))
+def open_recording(path: Path | str, strict: bool = False) -> Recording:
+    """The recording in an MCAP file, also in one that is still being written, as far as it is sound.
+
+    Raises InputError when the file is missing, empty or no MCAP, when nothing in it can be read, and with `strict` when
+    anything is lost: truncated, damaged, without summary.
+    """
+    return Recording(Path(path), strict)
 
 
 class Recording:
     """An MCAP recording of ROS 2 messages. Holds positions in the file, not the messages."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, strict: bool = False) -> None:
         self.path = path
-        self._file = McapFile(path)
+        self._file = McapFile(path, strict)
         self.topics = self._list_topics()
 
     def sha256(self) -> str:
@@ -76,20 +85,47 @@ class Recording:
         """Names of the attachments."""
         return self._file.attachments
 
-    def attachment(self, name: str) -> bytes | None:
-        """The attachment of that name, None if there is none."""
-        return self._file.attachment(name)
+    def attachment(self, name: str, needed: bool = True) -> bytes | None:
+        """The attachment of that name, None if there is none.
+
+        One that is damaged raises InputError; if it is not needed, it is noted as lost.
+        """
+        return self._file.attachment(name, needed)
+
+    @property
+    def losses(self) -> tuple[Loss, ...]:
+        """What of the file cannot be used; complete when all topics that matter have been read."""
+        return tuple(self._file.losses)
+
+    @property
+    def missing(self) -> dict[str, int]:
+        """Topic -> messages known to be lost."""
+        return self._file.missing
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences about what is lost."""
+        return self._file.notes(self.epoch_ns, self.duration_s) if self._file.losses or self._file.missing else ()
 
     @cached_property
     def epoch_ns(self) -> int:
         """Start of the session, Unix ns: the earliest first stamp of a sensor topic, else the first log time."""
-        timed = [topic.name for topic in self.topics.values() if topic.type in _TIMED and topic.count]
-        return min((self._first_stamp(name) for name in timed), default=self._file.first_ns)
+        timed = {name for name, topic in self.topics.items() if topic.type in _TIMED and topic.encoding == ENCODING}
+        wanted = {
+            n for n, channel in self._file.channels.items() if channel.topic in timed and self._file.counts.get(n)
+        }
+        first: dict[int, int] = {}
+        for rows in self._file.rows(wanted):
+            if rows.channel not in first:
+                first[rows.channel] = int(self._stamps(rows)[0])
+            if len(first) == len(wanted):
+                break
+        return min(first.values()) if first else self._span[0]
 
     @property
     def duration_s(self) -> float:
         """Time from the first message to the last, by their log times, s."""
-        return (self._file.last_ns - self._file.first_ns) * 1e-9
+        return (self._span[1] - self._span[0]) * 1e-9
 
     def imu(self, topic: str) -> series.ImuSeries:
         """A sensor_msgs/msg/Imu topic."""
@@ -137,8 +173,9 @@ class Recording:
                 f"{self.path}: topic {topic} has no message with positions of the joints {', '.join(names)}; "
                 f"its joints: {', '.join(seen) or 'none'}"
             )
+        check_clock(topic, *table.times(), self.epoch_ns)
         t_ns, by_log, columns = table.sorted()
-        without = int(np.count_nonzero(~table.filled))
+        without = table.taken - int(np.count_nonzero(table.filled))
         return series.JointSeries(t_ns, columns["position"], tuple(names), by_log, without)
 
     def camera_info(self, topic: str) -> series.CameraInfo:
@@ -191,19 +228,25 @@ class Recording:
             by_log,
         )
 
-    def stamps(self, topic: str) -> NDArray[np.int64]:
-        """Stamps, ns, of any topic in the order of the log times; log times where there is no header to be read."""
-        table = Table(self.topics[topic].count, {})
-        try:
-            self._require(topic)
-            self._fill(table, topic, {})
-        except InputError:
-            table = Table(self.topics[topic].count, {})
-            for rows in self._file.rows(self._channels(topic)):
-                table.advance(rows.log_ns, np.zeros_like(rows.log_ns))
-        return table.sorted()[0]
+    @cached_property
+    def times(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]:
+        """Topic -> stamps (log times where there is no header to be read) and log times, ns, in the file's order."""
+        found: dict[str, list[tuple[NDArray[np.int64], NDArray[np.int64]]]] = {name: [] for name in self.topics}
+        for rows in self._file.rows(set(self._file.channels)):
+            found[self._file.channels[rows.channel].topic].append((self._stamps(rows), rows.log_ns))
+        none = [(np.empty(0, np.int64), np.empty(0, np.int64))]
+        return {
+            name: (np.concatenate([t for t, _ in parts]), np.concatenate([log for _, log in parts]))
+            for name, parts in ((name, parts or none) for name, parts in found.items())
+        }
 
     # -- behind the methods above
+
+    @cached_property
+    def _span(self) -> tuple[int, int]:
+        """First and last log time, ns."""
+        logged = [log_ns for _, log_ns in self.times.values() if len(log_ns)]
+        return min((int(t.min()) for t in logged), default=0), max((int(t.max()) for t in logged), default=0)
 
     def _list_topics(self) -> dict[str, Topic]:
         topics: dict[str, Topic] = {}
@@ -224,14 +267,14 @@ class Recording:
         """Raise InputError unless the topic is there, has messages, and one of the types."""
         found = self.topics.get(topic)
         if found is None:
-            there = ", ".join(f"{name} ({t.type.split('/')[-1]})" for name, t in self.topics.items()) or "none"
-            ros1 = " (a ROS 1 recording)" if self.profile == "ros1" else ""
+            named = [f"{name} ({t.type.split('/')[-1]})" for name, t in self.topics.items()]
             raise InputError(
-                f"{self.path}: no topic {topic} ({' or '.join(types)}); topics there{ros1}: {there}; "
+                f"{self.path}: no topic {topic} ({' or '.join(types)}); {self.there(named)}; "
                 "`topics:` in the config can rename"
             )
         if types and found.type not in types:
-            raise InputError(f"{self.path}: topic {topic} holds {found.type}, needed is {' or '.join(types)}")
+            kind = found.type if found.encoding == ENCODING else f"{found.type} ({found.encoding})"
+            raise InputError(f"{self.path}: topic {topic} holds {kind}, needed is {' or '.join(types)} ({ENCODING})")
         if found.encoding != ENCODING:
             raise InputError(
                 f"{self.path}: topic {topic} has the encoding {found.encoding}, needed is {ENCODING} (ROS 2, as "
@@ -240,36 +283,74 @@ class Recording:
         if not found.count:
             raise InputError(f"{self.path}: topic {topic} has no messages")
 
+    def there(self, topics: Sequence[str] | None = None) -> str:
+        """A phrase that lists the topics of the recording, and what is lost of it."""
+        named = list(self.topics if topics is None else topics)
+        more = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
+        ros1 = " (a ROS 1 recording)" if self.profile == "ros1" else ""
+        return "; ".join(
+            [f"topics there{ros1}: {', '.join(named[:_MOST_NAMED]) or 'none'}{more}", *self._file.notes(None)]
+        )
+
     def _channels(self, topic: str) -> set[int]:
         return {number for number, channel in self._file.channels.items() if channel.topic == topic}
 
     def _rows(self, topic: str) -> Iterator[tuple[Definition, Rows]]:
         for rows in self._file.rows(self._channels(topic)):
-            schema = self._file.schemas[self._file.channels[rows.channel].schema_id]
             try:
-                yield messages.definition(schema.name, schema.data.decode()), rows
-            except (MessageError, UnicodeDecodeError) as error:
-                raise InputError(f"{self.path}: topic {topic}: {error}") from error
+                found = self._definition(rows.channel)
+            except MessageError as error:
+                raise self._unreadable(topic, error) from error
+            yield found, rows
+
+    def _definition(self, channel: int) -> Definition:
+        schema = self._file.schemas[self._file.channels[channel].schema_id]
+        return messages.definition(schema.name, schema.data.decode(errors="replace"))
+
+    def _stamps(self, rows: Rows) -> NDArray[np.int64]:
+        """Header stamps, ns; log times where there are none, or no header that can be read."""
+        topic = self.topics[self._file.channels[rows.channel].topic]
+        try:
+            stamps = header_stamps(self._definition(rows.channel), rows) if topic.encoding == ENCODING else rows.log_ns
+        except MessageError:
+            return rows.log_ns
+        return np.where(stamps == 0, rows.log_ns, stamps)
+
+    def _unreadable(self, topic: str, error: MessageError) -> InputError:
+        when = f", logged at {(error.log_ns - self.epoch_ns) * 1e-9:.3f} s" if error.log_ns is not None else ""
+        return InputError(f"{self.path}: topic {topic}: {error}{when}")
 
     def _decoded(self, topic: str, *types: str) -> Iterator[tuple[int, bool, Any, Definition]]:
         """(stamp, whether it is the log time, message, its definition) one by one, in file order."""
         self._require(topic, *types)
+        times = []
         for definition, rows in self._rows(topic):
             stamps = header_stamps(definition, rows)
+            times.append((self._stamps(rows), rows.log_ns))
             for i, (t_ns, log_ns) in enumerate(zip(stamps.tolist(), rows.log_ns.tolist(), strict=True)):
                 try:
-                    message = definition.decode(rows.message(i))
+                    with logged_at(log_ns):
+                        message = definition.decode(rows.message(i))
                 except MessageError as error:
-                    raise InputError(f"{self.path}: topic {topic}: {error}") from error
+                    raise self._unreadable(topic, error) from error
                 yield t_ns or log_ns, not t_ns, message, definition
+        self._check_read(topic, sum(len(t_ns) for t_ns, _ in times))
+        if self.topics[topic].type in _TIMED:
+            t_ns, log_ns = (np.concatenate(part) for part in zip(*times, strict=True))
+            check_clock(topic, t_ns, log_ns, self.epoch_ns)
 
-    def _first_stamp(self, topic: str) -> int:
-        return next(t_ns for t_ns, *_ in self._decoded(topic))
+    def _check_read(self, topic: str, number: int) -> None:
+        """Raise InputError if no message of the topic is left."""
+        if not number:
+            lost = "; ".join(self._file.notes(None))
+            raise InputError(f"{self.path}: topic {topic}: none of its messages can be read: {lost}")
 
     def _series(self, kind: type[AnySeries], topic: str) -> AnySeries:
         self._require(topic, kind.TYPE)
         table = Table(self.topics[topic].count, {name: column.shape for name, column in kind.COLUMNS.items()})
         self._fill(table, topic, {name: (column.path, _always(column.order)) for name, column in kind.COLUMNS.items()})
+        if kind.TYPE in _TIMED:
+            check_clock(topic, *table.times(), self.epoch_ns)
         t_ns, by_log, columns = table.sorted()
         return kind(t_ns, stamped_by_log=by_log, **columns)
 
@@ -281,9 +362,10 @@ class Recording:
                     decoders[rows.channel] = Decoder(definition, fields)
                 decoders[rows.channel].append(rows, table)
         except MessageError as error:
-            raise InputError(f"{self.path}: topic {topic}: {error}") from error
+            raise self._unreadable(topic, error) from error
         except (KeyError, AttributeError) as error:
             raise InputError(f"{self.path}: topic {topic}: the messages have no usable field {error}") from error
+        self._check_read(topic, table.taken)
 
 
 def _always(order: tuple[int, ...] | None) -> Order | None:

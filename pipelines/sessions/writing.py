@@ -35,8 +35,8 @@ from mcap.records import (
 from numpy.typing import NDArray
 
 from pipelines.sessions import messages, series
-from pipelines.sessions.container import MAGIC, MESSAGE_HEAD, windows
 from pipelines.sessions.messages import Array, Definition, known
+from pipelines.sessions.records import MAGIC, MESSAGE_HEAD, windows
 
 _CHUNK = 1 << 20
 _LEVEL = 1  # noise does not compress better at higher ones
