@@ -49,6 +49,7 @@ class Quantity:
         prior_scale: the contract's default prior sigma, the yardstick for a free one.
         require: the accuracy wanted, sigma.
         extra_sigma: known error that the graph does not model, added in square to the reported sigma.
+        prior_mean: of its prior.
     """
 
     name: str
@@ -57,6 +58,7 @@ class Quantity:
     prior_scale: float
     require: float
     extra_sigma: float = 0.0
+    prior_mean: float = 0.0
 
     @property
     def scale(self) -> float:

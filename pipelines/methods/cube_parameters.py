@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import gtsam
@@ -155,7 +155,11 @@ def cube_parameters(config: Config, camera: bool, reference: bool, field: Array 
     field_parameter = None
     if field is not None:
         names = ("field_e", "field_n", "field_u")
-        field_parameter = Parameter(FIELD_KEY, tuple(quantity(name, "T", 5e-7, 1e-6) for name in names))
+        modelled = [
+            replace(quantity(name, "T", 5e-7, 1e-6), prior_mean=float(mean))
+            for name, mean in zip(names, field, strict=True)
+        ]
+        field_parameter = Parameter(FIELD_KEY, tuple(modelled))
     return Parameters(triads, priors, tuple(rotations), heading, field_parameter, field)
 
 
@@ -174,8 +178,10 @@ def _triad_parameter(key: int, plain: Sequence[Quantity], conversion: RawConvers
     With nominal = K' (raw - offset) scale + b' it is K = K' scale, b = b' - K (offset, offset, offset); the sigmas of
     priors and the accuracies wanted follow.
     """
+    means = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
     if conversion is None:
-        return Parameter(key, tuple(plain), partial(_coordinates, np.eye(12)))
+        known = tuple(replace(q, prior_mean=float(mean)) for q, mean in zip(plain, means, strict=True))
+        return Parameter(key, known, partial(_coordinates, np.eye(12)))
     scale, offset = conversion.scale, conversion.offset
     linear = np.diag([scale] * 9 + [1.0] * 3)
     for i in range(3):
@@ -191,7 +197,8 @@ def _triad_parameter(key: int, plain: Sequence[Quantity], conversion: RawConvers
         on = plain[3 * (i - 9) : 3 * (i - 9) + 3] if i >= 9 else []
         free = any(p.prior_sigma is None for p in (q, *on))
         unit = f"{plain[9].unit}/count" if i < 9 else q.unit
-        reported.append(Quantity(q.name, unit, None if free else sigmas[i], scales[i], requires[i]))
+        sigma = None if free else sigmas[i]
+        reported.append(Quantity(q.name, unit, sigma, scales[i], requires[i], prior_mean=float(linear[i] @ means)))
     return Parameter(key, tuple(reported), partial(_coordinates, linear))
 
 
