@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 # Share of a family's measurements rejected that the reader is told of.
 _MANY_REJECTED = 0.2
+# Beyond so many of its prior's sigmas a parameter is not where it was said to be.
+_FAR_FROM_PRIOR = 5.0
 _PACKAGES = ("alidade", "gtsam", "numpy", "opencv-contrib-python-headless", "pycolmap")
 
 
@@ -105,7 +107,8 @@ class Calibration:
     def dropped(self) -> dict[str, int]:
         """Reason -> number of measurements left out, outliers included."""
         outliers = {f"{family}: outliers": n for family, n in self.estimate.rejected.items() if n}
-        return {**self.problem.dropped, **outliers}
+        lost = {f"{topic}: lost with damaged bytes of the file": n for topic, n in self.facts.lost.items()}
+        return {**lost, **self.problem.dropped, **outliers}
 
     @property
     def timing(self) -> dict[str, float]:
@@ -133,7 +136,28 @@ class Calibration:
         """What a reader has to know beside the headline."""
         trouble = () if self.estimate.converged else (f"the solver did not converge: {self.estimate.message}",)
         many = (_rejection(family, r) for family, r in self.estimate.residuals.items())
-        return (*trouble, *self.assessment.warnings, *(note for note in many if note))
+        far = _beyond_priors(self)
+        return (*trouble, *self.facts.notes, *self.assessment.warnings, *far, *(note for note in many if note))
+
+
+def _beyond_priors(calibration: Calibration) -> tuple[str, ...]:
+    """A sentence when the recording takes parameters to where their priors say they cannot be."""
+    if calibration.estimate.solver == "published":
+        return ()
+    quantities = quantities_of(calibration.problem, calibration.estimate)
+    away = {
+        q.name: abs(float(value) - q.prior_mean) / q.prior_sigma
+        for q, value in zip(quantities, calibration.estimate.values, strict=True)
+        if q.prior_sigma
+    }
+    far = {name: sigmas for name, sigmas in away.items() if sigmas > _FAR_FROM_PRIOR}
+    if not far:
+        return ()
+    named = ", ".join(f"{name} by {sigmas:.3g}" for name, sigmas in far.items())
+    return (
+        f"more than {_FAR_FROM_PRIOR:g} sigmas of its prior away: {named}; is a sensor turned or are its axes in another "
+        "order? if it is meant to be there, widen the prior",
+    )
 
 
 def _rejection(family: str, residuals: Residuals) -> str | None:
