@@ -1,18 +1,14 @@
-"""The batch solver against graphs of native GTSAM factors and against GTSAM's own optimizer, timed in turns.
-
-python -m benchmarks.batch
-"""
+"""The batch solver against graphs of native GTSAM factors and against GTSAM's own optimizer."""
 
 from __future__ import annotations
 
-import gc
-import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Iterator
+from functools import partial
 
 import gtsam
 import numpy as np
 
+from benchmarks.measure import Ratio, costs, growth
 from pipelines.methods import head, los
 from pipelines.methods.base import Factor, Problem
 from pipelines.sessions.config import load_config
@@ -111,50 +107,51 @@ def default_optimizer(problem: Problem, graph: Graph) -> int:
     return int(optimizer.iterations())
 
 
-def in_turns(work: Sequence[Callable[[], Any]], rounds: int) -> list[float]:
-    """Median seconds of each, run one after the other round after round, a round to warm up first."""
-    seconds = np.empty((rounds + 1, len(work)))
-    for row in seconds:
-        for i, run in enumerate(work):
-            gc.collect()
-            start = time.perf_counter()
-            run()
-            row[i] = time.perf_counter() - start
-    return [float(s) for s in np.median(seconds[1:], axis=0)]
-
-
-def against_native(name: str, problem: Problem, rounds: int = 3) -> tuple[float, float]:
-    """Prints the ratio of solve times; returns the batch solver's seconds, all in all and for one iteration."""
+def against_native(name: str, problem: Problem, compared: str) -> Ratio:
+    """The batch solver's outer loop, gate included, on our graph and on one of native factors."""
     ours, theirs = build(problem, CHUNK), native(problem)
-    keyframes = sum(gtsam.Symbol(key).chr() == ord("x") for key in ours[1].keys())
-    a, b = in_turns([lambda: solve(problem, ours), lambda: solve(problem, theirs)], rounds)
-    steps = solve(problem, ours).iterations, solve(problem, theirs).iterations
-    print(
-        f"{name}, {keyframes} keyframes: {a:.2f} s in {steps[0]} iterations, native-only {b:.2f} s in {steps[1]}: "
-        f"ratio {a / b:.2f} (3 wanted), {a * steps[1] / (b * steps[0]):.2f} an iteration",
-        flush=True,
-    )
-    return a, a / steps[0]
+    a, b = costs([lambda: solve(problem, ours), lambda: solve(problem, theirs)])
+    return Ratio(name, compared, a.seconds / b.seconds, wanted=3.0, ours=a, theirs=b)
 
 
-def against_default(keyframes: int) -> None:
-    """Prints the ratio of the default route's time to ours."""
+def against_default(keyframes: int) -> Ratio:
+    """The default route's time over ours."""
     problem = los_problem(keyframes)
     single, chunks = build(problem, 1), build(problem, CHUNK)
-    a, b = in_turns([lambda: default_optimizer(problem, single), lambda: solve(problem, chunks)], 1)
-    print(f"los, {keyframes} keyframes: default optimizer {a:.1f} s, ours {b:.2f} s: {a / b:.0f} times", flush=True)
+    a, b = costs([lambda: solve(problem, chunks), lambda: default_optimizer(problem, single)], 1, warm=False)
+    compared = f"LevenbergMarquardtOptimizer with a CustomFactor a measurement over ours, {keyframes} keyframes"
+    return Ratio(f"batch.default.{keyframes}", compared, b.seconds / a.seconds, "higher", 0.4, 20.0, a, b)
 
 
-def main() -> None:
-    sizes = (3_000, 6_000, 30_000)
-    seconds = [against_native("los", los_problem(n)) for n in sizes]
-    whole, one = np.log(np.divide(seconds[-1], seconds[0])) / np.log(sizes[-1] / sizes[0])
-    span = f"los, {sizes[0]} to {sizes[-1]} keyframes"
-    print(f"{span}: time grows with exponent {whole:.2f} (1.1 wanted), {one:.2f} an iteration")
-    for n in (1_500, 3_000, 6_000):
-        against_default(n)
-    against_native("head", head_problem(36_000))
-
-
-if __name__ == "__main__":
-    main()
+def run() -> Iterator[Ratio]:
+    """Batch against native-only graphs, its growth, and against the default optimizer with its growth."""
+    sizes = (3_000, 10_000, 30_000, 100_000)
+    seconds = []
+    for n in sizes:
+        problem = los_problem(n)
+        if n == 30_000:
+            ratio = against_native("batch.los", problem, "los direction graph over native-only, 30,000 keyframes")
+            yield ratio
+            assert ratio.ours is not None
+            seconds.append(ratio.ours.seconds)
+        else:
+            graph = build(problem, CHUNK)
+            seconds += [costs([partial(solve, problem, graph)])[0].seconds]
+    yield Ratio(
+        "batch.los.growth",
+        "exponent from 3,000 to 100,000 keyframes",
+        growth(sizes, seconds),
+        wanted=1.1,
+        tolerance=0.1,
+    )
+    yield against_native(
+        "batch.head", head_problem(36_000), "head graph over native-only, 36,000 frames, 300,000 samples"
+    )
+    small = against_default(3_000)
+    large = against_default(6_000)
+    yield small
+    yield large
+    assert small.theirs is not None
+    assert large.theirs is not None
+    exponent = growth((3_000, 6_000), (small.theirs.seconds, large.theirs.seconds))
+    yield Ratio("batch.default.growth", "exponent of the default optimizer", exponent, "higher")
