@@ -133,7 +133,6 @@ class VectorizedFactor:
     loss: TruncatedLoss | None = None
     compress: bool = False
     keys: list[int] = field(init=False)
-    factor: gtsam.CustomFactor = field(init=False)
 
     def __post_init__(self) -> None:
         if self.compress and any(not isinstance(c, int) for c in self.columns):
@@ -148,8 +147,7 @@ class VectorizedFactor:
             slots[column] if isinstance(column, int) else [slots[key] for key in column] for column in self.columns
         ]
         unknowns = sum(3 if kind == "rotation" else kind for kind in self.kinds)
-        rows = unknowns + 1 if self.compress else len(self.model.time) * self.model.rows
-        self.factor = gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(rows), self.keys, self._evaluate)
+        self._dim = unknowns + 1 if self.compress else len(self.model.time) * self.model.rows
         self._reads = [
             (key, kind == "rotation")
             for column, kind in zip(self.columns, self.kinds, strict=True)
@@ -157,6 +155,15 @@ class VectorizedFactor:
         ]
         self._last: tuple[list[Any], _Evaluation] | None = None
         self._given: _Evaluation | None = None
+
+    @property
+    def factor(self) -> gtsam.CustomFactor:
+        """A gtsam factor that asks this one, and keeps it.
+
+        It is not kept here: the two would keep each other for good, since Python's garbage collector cannot see what
+        gtsam holds.
+        """
+        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(self._dim), self.keys, self._evaluate)
 
     def residuals(self, values: gtsam.Values) -> Array:
         """Whitened residuals (n, m) at the values, outliers included."""
@@ -205,7 +212,7 @@ class VectorizedFactor:
             if self.loss is None and not self.compress:
                 return residuals.ravel()
             cost = square if self.loss is None else self.loss.cost(square)
-            error = np.zeros(self.factor.dim())
+            error = np.zeros(self._dim)
             error[0] = np.sqrt(cost.sum())
             return error
         blocks = evaluation.jacobians()
