@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,11 +15,11 @@ from pipelines.errors import InputError
 from pipelines.methods import head, los
 from pipelines.methods.base import Array, Estimate, Problem
 from pipelines.observability import assess
-from pipelines.sessions.config import load_config
+from pipelines.sessions.config import Config, load_config
 from pipelines.sessions.faults import drop_faults
-from pipelines.sessions.head import HeadData, read_head, write_head
-from pipelines.sessions.los import LosData, read_los, write_los
-from pipelines.sessions.reading import open_recording
+from pipelines.sessions.head import read_head, write_head
+from pipelines.sessions.los import read_los, write_los
+from pipelines.sessions.reading import Recording, open_recording
 from pipelines.simulation.head import HeadScenario, head_config, simulate_head
 from pipelines.simulation.los import LosScenario, los_config, simulate_los
 from pipelines.simulation.motion import EulerMotion, Swing
@@ -93,63 +95,54 @@ FAULTS: dict[Fault, str] = {
 }
 
 
-def _solved(problem: Problem) -> tuple[Estimate, str]:
+@dataclass(frozen=True)
+class Case:
+    """A good session and how its gyro is spoilt: the fields of its stamps and rates."""
+
+    data: Any
+    truth: dict[str, float]
+    config: str
+    gyro: tuple[str, str]
+    write: Callable[..., None]
+    read: Callable[[Recording, Config], Any]
+    problem: Callable[[Any, Config], Problem]
+
+    @cached_property
+    def clean(self) -> Estimate:
+        return solve_batch(self.problem(self.data, load_config(self.config.encode())))
+
+
+@pytest.fixture(scope="module")
+def cases() -> dict[str, Case]:
+    return {
+        "los": Case(*simulate_los(LOS, 3), los_config(LOS), ("gyro_t", "gyro"), write_los, read_los, los.problem),
+        "head": Case(
+            *simulate_head(HEAD, 3), head_config(HEAD), ("head_t", "head_gyro"), write_head, read_head, head.problem
+        ),
+    }
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("name", ["los", "head"])
+def test_a_faulty_gyro_moves_no_parameter(name: str, fault: Fault, tmp_path: Path, cases: dict[str, Case]) -> None:
+    case = cases[name]
+    fields = case.gyro
+    spoilt = dict(zip(fields, fault(*(getattr(case.data, field) for field in fields)), strict=True))
+    case.write(tmp_path / "s.mcap", replace(case.data, **spoilt), case.truth, case.config)
+    config = load_config(case.config.encode())
+    read = case.read(open_recording(tmp_path / "s.mcap"), config)
+    assert any(FAULTS[fault] in reason for reason in read.dropped) or not FAULTS[fault]
+    problem = case.problem(read, config)
     estimate = solve_batch(problem)
-    return estimate, assess(problem.quantities, estimate.covariance, estimate.chi_square, problem.advice).status
-
-
-def _within(estimate: Estimate, truth: dict[str, float], clean: Estimate) -> None:
-    error = np.abs(estimate.values - [truth.get(name, 0.0) for name in estimate.names]) / estimate.sigmas
+    judged = assess(problem.quantities, estimate.covariance, estimate.chi_square, problem.advice)
+    assert judged.status == "calibrated"
+    error = np.abs(estimate.values - [case.truth.get(name, 0.0) for name in estimate.names]) / estimate.sigmas
     assert error.max() < 4.0
-    assert (estimate.sigmas > 0.99 * clean.sigmas).all()
+    assert (estimate.sigmas > 0.99 * case.clean.sigmas).all()
 
 
-@pytest.fixture(scope="module")
-def los_session() -> tuple[LosData, dict[str, float], str, Estimate]:
-    data, truth = simulate_los(LOS, 3)
-    text = los_config(LOS)
-    return data, truth, text, solve_batch(los.problem(data, load_config(text.encode())))
-
-
-@pytest.fixture(scope="module")
-def head_session() -> tuple[HeadData, dict[str, float], str, Estimate]:
-    data, truth = simulate_head(HEAD, 3)
-    text = head_config(HEAD)
-    return data, truth, text, solve_batch(head.problem(data, load_config(text.encode())))
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_faulty_carrier_gyro_moves_no_angle(
-    fault: Fault, tmp_path: Path, los_session: tuple[LosData, dict[str, float], str, Estimate]
-) -> None:
-    data, truth, text, clean = los_session
-    t, gyro = fault(data.gyro_t, data.gyro)
-    write_los(tmp_path / "s.mcap", replace(data, gyro_t=t, gyro=gyro), truth, text)
-    config = load_config(text.encode())
-    read = read_los(open_recording(tmp_path / "s.mcap"), config)
-    assert any(FAULTS[fault] in reason for reason in read.dropped) or not FAULTS[fault]
-    estimate, status = _solved(los.problem(read, config))
-    assert status == "calibrated"
-    _within(estimate, truth, clean)
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_faulty_helmet_gyro_moves_no_mount(
-    fault: Fault, tmp_path: Path, head_session: tuple[HeadData, dict[str, float], str, Estimate]
-) -> None:
-    data, truth, text, clean = head_session
-    t, gyro = fault(data.head_t, data.head_gyro)
-    write_head(tmp_path / "s.mcap", replace(data, head_t=t, head_gyro=gyro), truth, text)
-    config = load_config(text.encode())
-    read = read_head(open_recording(tmp_path / "s.mcap"), config)
-    assert any(FAULTS[fault] in reason for reason in read.dropped) or not FAULTS[fault]
-    estimate, status = _solved(head.problem(read, config))
-    assert status == "calibrated"
-    _within(estimate, truth, clean)
-
-
-def test_what_is_dropped_is_what_was_spoilt(los_session: tuple[LosData, dict[str, float], str, Estimate]) -> None:
-    data = los_session[0]
+def test_what_is_dropped_is_what_was_spoilt(cases: dict[str, Case]) -> None:
+    data = cases["los"].data
     for fault in (_frozen, _clipped, _spiky):
         t, rate = fault(data.gyro_t, data.gyro)
         spoilt = np.flatnonzero((rate != data.gyro).any(axis=1))
@@ -174,9 +167,7 @@ def test_a_quantised_sensor_at_rest_is_sound() -> None:
         (lambda g: np.clip(g, -0.05, 0.05), r"topic /imu: \d+ % of the samples cannot be used: at the end of the"),
     ],
 )
-def test_a_useless_sensor_is_refused(
-    spoil: Callable[[Array], Array], message: str, los_session: tuple[LosData, dict[str, float], str, Estimate]
-) -> None:
-    data = los_session[0]
+def test_a_useless_sensor_is_refused(spoil: Callable[[Array], Array], message: str, cases: dict[str, Case]) -> None:
+    data = cases["los"].data
     with pytest.raises(InputError, match=message):
         drop_faults("/imu", data.gyro_t, spoil(data.gyro), {}, "rad/s")
