@@ -150,10 +150,16 @@ def _cell(parameter: ParameterResult, factor: float, error_sigmas: float | None,
 
 def _verdict(calibration: Calibration, name: bool) -> None:
     assessment = calibration.assessment
+    published = calibration.estimate.solver == "published"
     solver = f"{calibration.estimate.solver}: " if name else ""
     colour = COLOURS[assessment.status]
-    console.print(f"{solver}[bold {colour}]{assessment.status}.[/] {escape(assessment.headline)}", soft_wrap=True)
-    for direction in assessment.directions:
+    headline = assessment.headline
+    if published and assessment.directions:
+        # What a recording lacks is told by the graph's solvers; these know their own model only.
+        short = [p.name for p in calibration.parameters if p.observability in ("weak", "unobservable")]
+        headline = f"By its own sigmas less accurate than required: {', '.join(short)}."
+    console.print(f"{solver}[bold {colour}]{assessment.status}.[/] {escape(headline)}", soft_wrap=True)
+    for direction in () if published else assessment.directions:
         say(f"  {direction.verdict}: {direction.label}: {direction.advice}")
     for note in calibration.notes:
         say(f"  note: {note}")
