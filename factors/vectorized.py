@@ -207,17 +207,15 @@ class VectorizedFactor:
     def _evaluate(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         evaluation = self._at(values)
         residuals = evaluation.residuals
-        square = (residuals * residuals).sum(axis=1)
         if jacobians is None:
             if self.loss is None and not self.compress:
                 return residuals.ravel()
-            cost = square if self.loss is None else self.loss.cost(square)
             error = np.zeros(self._dim)
-            error[0] = np.sqrt(cost.sum())
+            error[0] = np.sqrt(_square(residuals) if self.loss is None else self.loss.cost(_squares(residuals)).sum())
             return error
         blocks = evaluation.jacobians()
         if self.loss is not None:
-            root = np.sqrt(self.loss.weight(square))[:, None]
+            root = np.sqrt(self.loss.weight(_squares(residuals)))[:, None]
             residuals = root * residuals
             blocks = tuple(root[..., None] * b for b in blocks)
         if self.compress:
@@ -259,8 +257,9 @@ class VectorizedFactor:
             jacobians[slot] = whole[:, column]
 
     def _compressed(self, residuals: Array, blocks: Sequence[Array], jacobians: list[Array]) -> Array:
-        A = np.concatenate([b.reshape(-1, b.shape[2]) for b in blocks], axis=1)
-        R, d, rest = square_root(A.T @ A, A.T @ residuals.ravel(), float((residuals * residuals).sum()))
+        rows = [b.reshape(-1, b.shape[2]) for b in blocks]
+        A = np.concatenate(rows, axis=1) if len(rows) > 1 else rows[0]
+        R, d, rest = square_root(A.T @ A, A.T @ residuals.ravel(), _square(residuals))
         start = 0
         for slot, block in zip(self._slots, blocks, strict=True):
             assert isinstance(slot, int)
@@ -359,6 +358,17 @@ def _stack(parts: Sequence[Any]) -> Any:
     if isinstance(first, np.ndarray):
         return np.concatenate(parts)
     return replace(first, **{name: _stack([getattr(part, name) for part in parts]) for name in first.stacked})
+
+
+def _square(residuals: Array) -> float:
+    """Sum of all squares."""
+    flat = residuals.ravel()
+    return float(flat @ flat)
+
+
+def _squares(residuals: Array) -> Array:
+    """Sum of squares of each measurement (n,)."""
+    return np.einsum("nm,nm->n", residuals, residuals)
 
 
 def _read(values: gtsam.Values, key: int, rotation: bool) -> Any:

@@ -203,8 +203,9 @@ def _minimize(
             if damping > 1e8:
                 return Solution(system, values, False, f"no step lowers the error of {error:.6g}", iteration)
         assert candidate is not None
-        values, fall, error = candidate, error - new_error, new_error
-        if damping == 0.0 and min(fall, abs(fall - foreseen)) < tolerance + 1e-10 * error:
+        fall, rounding = error - new_error, 1e-13 * error + 1e-10 * new_error
+        values, error = candidate, new_error
+        if damping == 0.0 and min(fall, abs(fall - foreseen)) < tolerance + rounding:
             return Solution(system, values, True, f"converged after {iteration} iterations", iteration)
         damping = damping / 10.0 if damping > 1e-6 else 0.0
     return Solution(system, values, False, f"not converged after {most} iterations", most)

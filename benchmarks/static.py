@@ -1,0 +1,93 @@
+"""Static problems, 2 million rows: the compressed factor in the batch solver's loop against numpy's normal equations.
+
+The indexer's graph is not here: its rows are means over turns, three a turn, and never many.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.measure import Ratio, costs
+from factors import so3
+from factors.los import LosRateFactor, rate_matrix
+from factors.triad import AccelFactor
+from factors.vectorized import Model, VectorizedFactor
+from pipelines.methods.base import Factor
+from pipelines.solvers.batch import optimize
+
+Array = NDArray[np.float64]
+
+ROWS = 2_000_000
+SAME = 1e-9  # relative
+GRAVITY = 9.8
+
+
+@dataclass(frozen=True)
+class AtKnownAttitudes:
+    """An accelerometer whose attitudes are known: of its factor, the triad alone is a variable."""
+
+    whole: AccelFactor
+    nRb: Array
+    rows: int = 3
+
+    @property
+    def time(self) -> Array:
+        return self.whole.time
+
+    def __call__(self, triads: Array) -> tuple[Array, Callable[[], tuple[Array, ...]]]:
+        residuals, jacobians = self.whole(self.nRb, triads)
+        return residuals, lambda: jacobians()[1:]
+
+
+def los_rates() -> tuple[Model, Array]:
+    """The linear model of the LOS rates, 4 unknowns, and a start."""
+    rng = np.random.default_rng(0)
+    n = ROWS // 2
+    H = rate_matrix(rng.uniform(-0.5, 0.5, (n, 2)), rng.normal(scale=0.2, size=(n, 3)))
+    sigma = rng.uniform(1e-3, 2e-3, n)
+    noise = sigma[:, None] * rng.standard_normal((n, 2))
+    return LosRateFactor(np.arange(n), H @ np.array([8e-3, -9e-3, 7e-3, 5e-3]) + noise, H, sigma), np.zeros(4)
+
+
+def accelerometer() -> tuple[Model, Array]:
+    """An accelerometer's matrix and offset, 12 unknowns, and the ideal one."""
+    rng = np.random.default_rng(1)
+    n = ROWS // 3
+    nRb = so3.exp(rng.normal(size=(n, 3)))
+    up = so3.rotate(so3.inverse(nRb), [0.0, 0.0, GRAVITY])
+    A = np.eye(3) + rng.normal(scale=1e-2, size=(3, 3))
+    sigma = rng.uniform(1e-3, 2e-3, n)
+    raw = up @ A.T + 0.1 + sigma[:, None] * rng.standard_normal((n, 3))
+    return AtKnownAttitudes(AccelFactor(np.arange(n), raw, sigma, GRAVITY), nRb), np.append(np.eye(3), np.zeros(3))
+
+
+def ours(model: Model, start: Array) -> Array:
+    """By the batch solver's loop."""
+    measurement = VectorizedFactor(model, [0], [len(start)], compress=True)
+    values = gtsam.Values()
+    values.insert(0, start)
+    return optimize([Factor.of("rows", measurement)], values, [0], None).values.atVector(0)
+
+
+def normal_equations(model: Model, start: Array) -> Array:
+    """By numpy from the same whitened rows."""
+    e, jacobians = model(np.broadcast_to(start, (len(model.time), len(start))))
+    A, b = jacobians()[0].reshape(-1, len(start)), e.reshape(-1)
+    return start - np.linalg.solve(A.T @ A, A.T @ b)
+
+
+def run() -> Iterator[Ratio]:
+    """LOS rates and an accelerometer. Raises AssertionError when the answers differ."""
+    for name, (model, start) in {"los": los_rates(), "cube": accelerometer()}.items():
+        work = [partial(ours, model, start), partial(normal_equations, model, start)]
+        x, y = (solve() for solve in work)
+        assert np.linalg.norm(x - y) < SAME * np.linalg.norm(y), f"{x} is not {y}"
+        a, b = costs(work)
+        compared = f"compressed factor over numpy normal equations, {ROWS:,} rows of {len(start)} unknowns"
+        yield Ratio(f"static.{name}", compared, a.seconds / b.seconds, wanted=2.0, ours=a, theirs=b)
