@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import datetime
 import difflib
+import reprlib
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -21,6 +22,7 @@ from pipelines.sessions.topics import TOPICS, topic_name
 
 ATTACHMENT = "alidade.yaml"
 _UNIT_TOLERANCE = 1e-3
+_LONGEST = 1 << 20
 
 
 def _unit(wxyz: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
@@ -207,10 +209,14 @@ def _read(data: bytes, where: str) -> dict[Any, Any]:
     from ruamel.yaml import YAML
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
+    if len(data) > _LONGEST:
+        raise InputError(f"{where}: {len(data)} bytes, which is no config")
     try:
         content = YAML(typ="safe", pure=True).load(data.decode())
     except UnicodeDecodeError as error:
         raise InputError(f"{where}: not a YAML file, byte {error.start} is not UTF-8 text") from error
+    except RecursionError as error:
+        raise InputError(f"{where}: unreadable YAML: it is nested too deep") from error
     except (YAMLError, ValueError) as error:
         mark = error.problem_mark if isinstance(error, MarkedYAMLError) else None
         line = f", line {mark.line + 1}" if mark else ""
@@ -252,7 +258,7 @@ def _explain(path: tuple[int | str, ...], error: Any) -> str:
     if error["type"] == "extra_forbidden":
         return f"unknown key {key}{nearest(str(path[-1]), _known_at(path[:-1]))}"
     given = error["input"]
-    shown = "" if error["type"] == "missing" or isinstance(given, dict) else f", not {given!r}"
+    shown = "" if error["type"] == "missing" or isinstance(given, dict) else f", not {reprlib.repr(given)}"
     text = "is missing" if error["type"] == "missing" else error["msg"].removeprefix("Value error, ")
     return f"{key}: {text.replace('Input should be', 'must be')}{shown}"
 
