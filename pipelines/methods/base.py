@@ -138,24 +138,24 @@ class Problem:
         parameters: what is calibrated, in reporting order.
         steps: yields the graph; its argument is how many measurements a step takes together (one when fed to a
             smoother, many in batch, where fewer and larger factors are faster).
-        steps_after: the steps of one measurement each that are later than a time, s, for graphs whose steps stay
-            as they are while the recording grows, but for those of its last second. None: all may change.
         loss: shared by all measurements that may be outliers; the batch solver anneals it. None: no outliers expected.
         attitudes: the trajectory at some keyframes, given values that hold them; None when the method has none.
         attitude_name: what the trajectory is, e.g. "bRv".
         advice: sentence for a weak direction, given its weights by parameter name.
         dropped: measurements left out before solving, reason -> count.
+        steps_after: the steps of one measurement each that are later than a time, s, for graphs whose steps stay
+            as they are while the recording grows, but for those of its last second. None: all may change.
     """
 
     method: str
     parameters: tuple[Parameter, ...]
     steps: Callable[[int], Iterator[Step]]
-    steps_after: Callable[[float], Iterator[Step]] | None = None
     loss: TruncatedLoss | None = None
     attitudes: Callable[[Sequence[int], gtsam.Values], Attitudes] | None = None
     attitude_name: str = ""
     advice: Callable[[Mapping[str, float]], str] | None = None
     dropped: Mapping[str, int] = field(default_factory=dict)
+    steps_after: Callable[[float], Iterator[Step]] | None = None
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
