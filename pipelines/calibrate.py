@@ -107,6 +107,7 @@ def calibrations(
                 seconds=seconds,
                 plots=chosen.plots(data) if chosen.plots else None,
                 beside=_published(chosen, data, config) if incremental else None,
+                findings=chosen.findings(data, config, estimate) if chosen.findings else {},
             )
         )
     return found

@@ -264,10 +264,10 @@ def fleet(
 @app.command()
 def export(
     calibration: Annotated[Path, typer.Argument(metavar="CALIBRATION.yaml", help="Of a cube calibration.")],
-    form: Annotated[str, typer.Option("--format", help="px4, ardupilot or ros2.")],
+    form: Annotated[str, typer.Option("--format", help="px4, ardupilot, ros2 or kalibr.")],
     out: Annotated[Path | None, typer.Option(help="The file to write; default: printed.")] = None,
 ) -> None:
-    """A cube calibration as the parameters of an autopilot, in its own conventions."""
+    """A cube calibration as the parameters of another program, in its own conventions."""
     from pipelines import terminal
     from pipelines.reports.calibration import load_calibration
     from pipelines.reports.export import exported

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 from pipelines.errors import InputError
 
 if TYPE_CHECKING:
-    from pipelines.methods.base import Estimate, Problem
+    from pipelines.methods.base import Estimate, Findings, Problem
     from pipelines.methods.collected import Collected
     from pipelines.methods.validation import Validation
-    from pipelines.reports.result import Calibration, Plot
+    from pipelines.reports.result import Calibration, Plot, Table
     from pipelines.sessions.config import Config
     from pipelines.sessions.reading import Recording
 
@@ -30,7 +30,8 @@ class Method:
         problem: data and config -> the graph.
         published: data, config and problem -> the published solver's estimate.
         simulate: scenario (name, file or None for the nominal one), seed, file to write, whether with pictures.
-        plots: the method's own figures for the report.
+        plots: the method's own figures and tables for the report.
+        findings: data, config and estimate -> what there is to tell beside the parameters.
         validate: data, config and parameter values by name -> errors before and after compensation.
         collected: data and config -> what there is by now of what the method needs, for the person recording.
     """
@@ -39,7 +40,8 @@ class Method:
     problem: Callable[[Any, Config], Problem]
     published: Callable[[Any, Config, Problem], Estimate]
     simulate: Callable[[str | None, int, Path, bool], None]
-    plots: Callable[[Any], Callable[[Calibration], Sequence[Plot]]] | None = None
+    plots: Callable[[Any], Callable[[Calibration], Sequence[Plot | Table]]] | None = None
+    findings: Callable[[Any, Config, Estimate], Findings] | None = None
     validate: Callable[[Any, Config, Mapping[str, float]], Sequence[Validation]] | None = None
     collected: Callable[[Any, Config], Sequence[Collected]] | None = None
 
@@ -68,8 +70,8 @@ def _head() -> Method:
         published_estimate,
         write_simulation,
         lambda data: partial(head_plots, data),
-        validate,
-        collected_head,
+        validate=validate,
+        collected=collected_head,
     )
 
 
@@ -90,8 +92,8 @@ def _los() -> Method:
         published_estimate,
         write_simulation,
         lambda data: partial(los_plots, data),
-        validate,
-        collected_los,
+        validate=validate,
+        collected=collected_los,
     )
 
 
@@ -111,20 +113,33 @@ def _indexer() -> Method:
         published_estimate,
         write_simulation,
         lambda data: partial(indexer_plots, data),
-        validate,
-        collected_indexer,
+        validate=validate,
+        collected=collected_indexer,
     )
 
 
 def _cube() -> Method:
+    from functools import partial
+
     from pipelines.methods.collected import collected_cube
     from pipelines.methods.cube import problem
+    from pipelines.methods.cube_findings import findings
     from pipelines.methods.cube_validation import validate
     from pipelines.published.cube import published_estimate
+    from pipelines.reports.cube import cube_plots
     from pipelines.sessions.cube import read_cube
     from pipelines.simulation.cube import write_simulation
 
-    return Method(read_cube, problem, published_estimate, write_simulation, validate=validate, collected=collected_cube)
+    return Method(
+        read_cube,
+        problem,
+        published_estimate,
+        write_simulation,
+        lambda data: partial(cube_plots, data),
+        findings,
+        validate,
+        collected_cube,
+    )
 
 
 _METHODS: dict[str, Callable[[], Method]] = {"los": _los, "indexer": _indexer, "head": _head, "cube": _cube}

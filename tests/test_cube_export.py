@@ -18,7 +18,13 @@ BIAS = {"accel": 0.3, "gyro": 0.02, "mag": 2e-5}
 NOMINAL = {"accel": 9.8, "gyro": 1.0, "mag": 5e-5}
 
 
-def _calibration(K: dict[str, np.ndarray], b: dict[str, np.ndarray], method: str = "cube") -> SavedCalibration:
+def _calibration(
+    K: dict[str, np.ndarray],
+    b: dict[str, np.ndarray],
+    method: str = "cube",
+    noise: list[dict[str, object]] | None = None,
+    unit: str = "1",
+) -> SavedCalibration:
     numbers = {f"{n}_k{i + 1}{j + 1}": K[n][i, j] for n in K for i in range(3) for j in range(3)}
     numbers |= {f"{n}_b{i + 1}": b[n][i] for n in K for i in range(3)}
     return SavedCalibration.model_validate(
@@ -29,9 +35,10 @@ def _calibration(K: dict[str, np.ndarray], b: dict[str, np.ndarray], method: str
             "status": "calibrated",
             "recording": {"file": "s.mcap", "sha256": "", "start": ""},
             "parameters": {
-                name: {"value": float(v), "sigma": 1e-4, "unit": "1", "verdict": "observable"}
+                name: {"value": float(v), "sigma": 1e-4, "unit": unit, "verdict": "observable"}
                 for name, v in numbers.items()
             },
+            "findings": {"noise": noise or []},
         }
     )
 
@@ -97,6 +104,45 @@ def test_ros2_holds_everything() -> None:
         np.testing.assert_allclose(found, nominal[name], rtol=1e-9, atol=1e-12)
 
 
+def test_kalibr_loads_and_holds_the_noise_measured() -> None:
+    noise: list[dict[str, object]] = [
+        {
+            "sensor": name,
+            "topic": "/imu",
+            "rate_hz": 200.0,
+            "density": [0.8 * density, density, 1.2 * density],
+            "walk": walk,
+            "walk_source": source,
+        }
+        for name, density, walk, source in (("accel", 2e-3, 3e-5, "upper bound"), ("gyro", 1e-4, 2e-6, "stated"))
+    ]
+    eye, zero = {"accel": np.eye(3), "gyro": np.eye(3)}, {"accel": np.zeros(3), "gyro": np.zeros(3)}
+    text = exported(_calibration(eye, zero, noise=noise), "kalibr")
+    yaml = YAML(typ="safe", pure=True)
+    yaml.version = (1, 1)  # as Kalibr's own loader: a number without a point would be a word
+    values = yaml.load("%YAML 1.1\n---\n" + text)
+    rms = np.sqrt(np.mean(np.square([0.8, 1.0, 1.2])))
+    assert values == {
+        "accelerometer_noise_density": pytest.approx(2e-3 * rms, rel=1e-4),
+        "accelerometer_random_walk": 3e-5,
+        "gyroscope_noise_density": pytest.approx(1e-4 * rms, rel=1e-4),
+        "gyroscope_random_walk": 2e-6,
+        "rostopic": "/imu",
+        "update_rate": 200,
+    }
+    assert all(isinstance(v, int | float) for name, v in values.items() if name != "rostopic")
+    assert "accelerometer_random_walk: 3.0000e-05 # m/s^2/s/sqrt(Hz), upper bound" in text
+    with pytest.raises(InputError, match="does not tell the noise of accelerometer and gyro"):
+        exported(_calibration(eye, zero), "kalibr")
+
+
+@pytest.mark.parametrize("form", ["px4", "ardupilot"])
+def test_counts_are_no_autopilots_units(form: str) -> None:
+    counts = _calibration({"accel": 2e-3 * np.eye(3)}, {"accel": np.zeros(3)}, unit="m/s^2/count")
+    with pytest.raises(InputError, match="accel is calibrated in m/s\\^2/count"):
+        exported(counts, form)
+
+
 @pytest.mark.parametrize("form", ["px4", "ardupilot"])
 def test_what_is_lost_is_said(form: str) -> None:
     K = {name: np.eye(3) for name in ("accel", "gyro", "mag")}
@@ -109,7 +155,7 @@ def test_what_is_lost_is_said(form: str) -> None:
 
 def test_wrong_format_and_method() -> None:
     saved, _, _ = _fits(_diagonal())
-    with pytest.raises(InputError, match="unknown format yaml; there are px4, ardupilot, ros2"):
+    with pytest.raises(InputError, match="unknown format yaml; there are px4, ardupilot, ros2, kalibr"):
         exported(saved, "yaml")
     with pytest.raises(InputError, match="only calibrations of the cube method"):
         exported(_calibration({"accel": np.eye(3)}, {"accel": np.zeros(3)}, "head"), "px4")

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+# What a method found beside its parameters: name of a table -> its rows, plain numbers and words in SI.
+Findings = Mapping[str, Sequence[Mapping[str, object]]]
+
 # Reported numbers (n,) of one variable and their Jacobian (n, d) with respect to its tangent.
 Coordinates = Callable[["gtsam.Values", int], tuple[Array, Array]]
 

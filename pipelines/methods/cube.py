@@ -12,7 +12,7 @@ accel_k31 and accel_k32 are zero unless given a prior.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -34,7 +34,7 @@ from factors.triad import (
 )
 from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
 from pipelines.errors import InputError
-from pipelines.methods.base import Array, Factor, Problem, Step
+from pipelines.methods.base import Array, Attitudes, Factor, Problem, Step
 from pipelines.methods.cube_parameters import (
     FIELD_KEY,
     HEADING_KEY,
@@ -123,6 +123,8 @@ def problem(data: CubeData, config: Config) -> Problem:
         parameters=model.parameters.all,
         steps=partial(_steps, model),
         loss=model.loss,
+        attitudes=partial(_trajectory, model),
+        attitude_name="nRb",
         advice=_advice,
         dropped={**data.dropped, **model.poses.dropped},
     )
@@ -248,7 +250,14 @@ def _step(model: _Model, k: int) -> Step:
         initial=initial,
         factors=factors,
         predict=partial(_predict, model, k, initial) if k > 0 and _turn_known(model, k) else None,
+        keyframes=range(k, k + 1),
     )
+
+
+def _trajectory(model: _Model, poses: Sequence[int], values: gtsam.Values) -> Attitudes:
+    """Attitudes nRb of the static poses, at their middles."""
+    wxyz = so3.from_gtsam([values.atRot3(_pose_key(k)) for k in poses])
+    return Attitudes(model.poses.span[list(poses)].mean(axis=1), wxyz)
 
 
 def _turn_known(model: _Model, k: int) -> bool:

@@ -10,11 +10,10 @@ from factors import so3
 from factors.earth import gravity
 from factors.preintegration import GyroPath
 from pipelines.errors import InputError
-from pipelines.methods.base import Array
-from pipelines.methods.cube_parameters import triad_names
+from pipelines.methods.cube_findings import calibrated
 from pipelines.methods.validation import Validation
 from pipelines.sessions.config import Config
-from pipelines.sessions.cube import CubeData, local_field, nominal, recorded
+from pipelines.sessions.cube import CubeData, local_field, nominal
 from pipelines.sessions.cube_poses import StaticPoses, static_poses, turn
 
 
@@ -45,19 +44,12 @@ def validate(data: CubeData, config: Config, values: Mapping[str, float]) -> lis
             good = np.isfinite(means[name]).all(axis=1)
             errors = [
                 np.linalg.norm(vectors[good], axis=1)[:, None] - strength[name]
-                for vectors in (means[name], _calibrated(name, means[name], config, values))
+                for vectors in (means[name], calibrated(name, means[name], config, values))
             ]
             found.append(Validation(f"{what} at rest, its strength", unit, time[good], *errors))
     if "gyro_k11" in values and sum(tags is not None for tags in poses.tags) > 1:
         found.append(_turns(data, config, poses, values))
     return found
-
-
-def _calibrated(name: str, vectors: Array, config: Config, values: Mapping[str, float]) -> Array:
-    """K raw + b of vectors (n, 3) given in nominal units."""
-    numbers = np.array([values[entry] for entry in triad_names(name)])
-    raw = recorded(vectors, getattr(config.cube.raw, name))
-    return np.asarray(raw @ numbers[:9].reshape(3, 3).T + numbers[9:])
 
 
 def _turns(data: CubeData, config: Config, poses: StaticPoses, values: Mapping[str, float]) -> Validation:
@@ -74,7 +66,7 @@ def _turns(data: CubeData, config: Config, poses: StaticPoses, values: Mapping[s
         samples = turn(data, poses.span[k - 1, 1], poses.span[k, 0])
         seen = so3.multiply(so3.inverse(before.pose.cRb), after.pose.cRb)
         pair = []
-        for gyro in (rates[samples], _calibrated("gyro", rates[samples], config, values)):
+        for gyro in (rates[samples], calibrated("gyro", rates[samples], config, values)):
             path = GyroPath(data.imu_t[samples], gyro)
             pair.append(so3.log(so3.multiply(so3.inverse(seen), path.attitude(path.t[-1:])[0])))
         time.append(poses.span[k, 0])

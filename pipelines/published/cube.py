@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from factors import so3
 from factors.earth import EARTH_RATE, earth_rate, gravity
 from pipelines.errors import InputError
-from pipelines.methods.base import Estimate, Problem, Residuals
+from pipelines.methods.base import Attitudes, Estimate, Problem, Residuals
 from pipelines.sessions.config import Config
 from pipelines.sessions.cube import CubeData, local_field, recorded
 from pipelines.sessions.cube_poses import StaticPoses, static_poses
@@ -137,6 +137,7 @@ def published_estimate(data: CubeData, config: Config, problem: Problem) -> Esti
         converged=True,
         message=_coverage(nRb),
         residuals=residuals,
+        attitudes=Attitudes(poses.span[k].mean(axis=1), nRb),
         seconds={"solve": time.perf_counter() - start},
     )
 

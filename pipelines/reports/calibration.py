@@ -28,6 +28,8 @@ _HEAD = """\
 """
 # More digits than any sigma needs, fewer than tire the eye.
 _DIGITS = 12
+# Of what was found beside the parameters.
+_FEWER_DIGITS = 6
 
 
 class _Record(BaseModel):
@@ -68,6 +70,7 @@ class SavedCalibration(_Record):
     recording: SavedRecording
     parameters: dict[str, SavedParameter]
     rotations: dict[str, SavedRotation] = {}
+    findings: dict[str, list[dict[str, object]]] = {}
     formulas: list[str] = []
 
     def value(self, name: str) -> float:
@@ -86,12 +89,16 @@ def calibration_yaml(calibration: Calibration) -> str:
     class Representer(RoundTripRepresenter):
         """With floats of our own."""
 
+    def one_line(entry: dict[str, object]) -> CommentedMap:
+        flat = CommentedMap(entry)
+        flat.fa.set_flow_style()
+        return flat
+
     Representer.add_representer(float, _float)
     content = saved(calibration).model_dump(by_alias=True, mode="json")
     for section in ("parameters", "rotations"):
-        for name, entry in content[section].items():
-            content[section][name] = CommentedMap(entry)
-            content[section][name].fa.set_flow_style()  # one line each
+        content[section] = {name: one_line(entry) for name, entry in content[section].items()}
+    content["findings"] = {name: [one_line(row) for row in rows] for name, rows in content["findings"].items()}
     yaml = YAML()
     yaml.Representer = Representer
     yaml.width = 200
@@ -115,6 +122,7 @@ def saved(calibration: Calibration) -> SavedCalibration:
         recording=SavedRecording(file=calibration.recording, sha256=calibration.sha256, start=start.isoformat()),
         parameters=parameters,
         rotations=_rotations(calibration),
+        findings={name: [_plain(row) for row in rows] for name, rows in calibration.findings.items()},
         formulas=list(FORMULAS.get(method, ())),
     )
 
@@ -142,13 +150,14 @@ def load_calibration(path: Path) -> SavedCalibration:
 def _rotations(calibration: Calibration) -> dict[str, SavedRotation]:
     """The parameters that are rotation vectors, as quaternions."""
     values: Mapping[str, float] = {p.name: p.value for p in calibration.parameters}
+    known = ROTATIONS.get(calibration.problem.method, {})
     found = {}
     for parameter in calibration.problem.parameters:
         names = [q.name for q in parameter.quantities]
         if parameter.coordinates is rotation_vector_coordinates and all(name in values for name in names):
             name = names[0].rsplit("_", 1)[0]
             w, x, y, z = (_rounded(v) for v in so3.exp(np.array([values[n] for n in names])).tolist())
-            found[name] = SavedRotation(name=ROTATIONS.get(name, name), wxyz=(w, x, y, z))
+            found[name] = SavedRotation(name=known.get(name, name), wxyz=(w, x, y, z))
     return found
 
 
@@ -158,5 +167,16 @@ def _float(representer: Any, value: float) -> Any:
     return representer.represent_scalar("tag:yaml.org,2002:float", text if "." in text else text.replace("e", ".0e"))
 
 
-def _rounded(value: float) -> float:
-    return float(f"{value:.{_DIGITS}g}")
+def _plain(row: Mapping[str, object]) -> dict[str, object]:
+    """A row of findings with rounded numbers."""
+
+    def rounded(value: object) -> object:
+        if isinstance(value, list):
+            return [rounded(v) for v in value]
+        return _rounded(value, _FEWER_DIGITS) if isinstance(value, float) else value
+
+    return {name: rounded(value) for name, value in row.items()}
+
+
+def _rounded(value: float, digits: int = _DIGITS) -> float:
+    return float(f"{value:.{digits}g}")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from io import StringIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +27,23 @@ def exported(saved: SavedCalibration, form: str) -> str:
         raise InputError(f"unknown format {form}; there are {', '.join(FORMATS)}")
     if saved.method != "cube":
         raise InputError(f"only calibrations of the cube method can be exported, this one is of {saved.method}")
+    return FORMATS[form](saved)
+
+
+def _triads(saved: SavedCalibration) -> dict[str, tuple[Array, Array]]:
+    """K and b of the sensors there are."""
     names = [name for name in ("accel", "gyro", "mag") if f"{name}_k11" in saved.parameters]
-    return FORMATS[form]({name: _triad(saved, name) for name in names})
+    return {name: _triad(saved, name) for name in names}
+
+
+def _in_si(saved: SavedCalibration) -> dict[str, tuple[Array, Array]]:
+    """K and b of sensors that are recorded in SI. Raises InputError when one is recorded in counts."""
+    for name in (triads := _triads(saved)):
+        if (unit := saved.parameters[f"{name}_k11"].unit) != "1":
+            raise InputError(
+                f"{name} is calibrated in {unit}; this format corrects SI units: calibrate what the program has"
+            )
+    return triads
 
 
 def _triad(saved: SavedCalibration, name: str) -> tuple[Array, Array]:
@@ -48,11 +64,12 @@ def symmetric_part(K: Array) -> tuple[Array, float]:
     return (vt.T * s) @ vt, angle
 
 
-def _px4(triads: Mapping[str, tuple[Array, Array]]) -> str:
+def _px4(saved: SavedCalibration) -> str:
     """QGroundControl's parameter file: vehicle, component, name, value, type (9: float).
 
     accelerometer: scale (raw - offset); gyro: raw - offset; magnetometer, in gauss: symmetric matrix (raw - offset).
     """
+    triads = _in_si(saved)
     rows: list[tuple[str, float]] = []
     notes = []
     if "accel" in triads:
@@ -73,11 +90,12 @@ def _px4(triads: Mapping[str, tuple[Array, Array]]) -> str:
     return "\n".join(["# Calibrated by alidade; give CAL_*0_ID the ids of the sensors.", *lines, ""])
 
 
-def _ardupilot(triads: Mapping[str, tuple[Array, Array]]) -> str:
+def _ardupilot(saved: SavedCalibration) -> str:
     """A parameter file NAME,value.
 
     accelerometer: scale (raw - offset); gyro: raw - offset; compass, in milligauss: symmetric matrix (raw + offset).
     """
+    triads = _in_si(saved)
     rows: list[tuple[str, float]] = []
     notes = []
     if "accel" in triads:
@@ -97,12 +115,13 @@ def _ardupilot(triads: Mapping[str, tuple[Array, Array]]) -> str:
     return "\n".join([*(f"# {note}" for note in notes), *(f"{name},{value:.9g}" for name, value in rows), ""])
 
 
-def _ros2(triads: Mapping[str, tuple[Array, Array]]) -> str:
+def _ros2(saved: SavedCalibration) -> str:
     """Parameters of a node: rows of K and b of each sensor, in the units of sensor_msgs, whole."""
     from ruamel.yaml import YAML
 
     parameters = {
-        name: {"gain": [float(x) for x in K.ravel()], "bias": [float(x) for x in b]} for name, (K, b) in triads.items()
+        name: {"gain": [float(x) for x in K.ravel()], "bias": [float(x) for x in b]}
+        for name, (K, b) in _triads(saved).items()
     }
     text = StringIO()
     yaml = YAML(typ="safe", pure=True)
@@ -111,10 +130,36 @@ def _ros2(triads: Mapping[str, tuple[Array, Array]]) -> str:
     return "# calibrated = gain raw + bias, gain a 3x3 matrix by rows\n" + text.getvalue()
 
 
-FORMATS: Mapping[str, Callable[[Mapping[str, tuple[Array, Array]]], str]] = {
+def _kalibr(saved: SavedCalibration) -> str:
+    """Kalibr's imu.yaml: noise of the calibrated sensors, one number for three axes.
+
+    Raises InputError when the calibration does not tell the noise.
+    """
+    noise: dict[str, Any] = {str(row.get("sensor")): row for row in saved.findings.get("noise", [])}
+    if not all(min(noise.get(name, {}).get("density", [0.0])) > 0.0 for name in ("accel", "gyro")):
+        raise InputError(
+            "the calibration does not tell the noise of accelerometer and gyro: let the device rest longer"
+        )
+    lines = [
+        "# Noise with K and b applied. Densities are measured at rest, root mean squares of the axes. Walks are not",
+        "# measured: stated is what the calibration took; an upper bound adds up over the recording to the error of",
+        "# the mean of one rest, and a larger one would have shown. Allan deviations over hours tell better.",
+    ]
+    for name, word, unit in (("accel", "accelerometer", "m/s^2"), ("gyro", "gyroscope", "rad/s")):
+        row = noise[name]
+        density = float(np.sqrt(np.mean(np.square(row["density"]))))
+        # With a point in it, else YAML 1.1 takes it for a word.
+        lines.append(f"{word}_noise_density: {density:.4e} # {unit}/sqrt(Hz), measured")
+        lines.append(f"{word}_random_walk: {row['walk']:.4e} # {unit}/s/sqrt(Hz), {row['walk_source']}")
+    lines += [f"rostopic: {noise['gyro']['topic']}", f"update_rate: {noise['gyro']['rate_hz']:.6g}"]
+    return "\n".join([*lines, ""])
+
+
+FORMATS: Mapping[str, Callable[[SavedCalibration], str]] = {
     "px4": _px4,
     "ardupilot": _ardupilot,
     "ros2": _ros2,
+    "kalibr": _kalibr,
 }
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-# Rotation-vector parameter -> the rotation it is.
-ROTATIONS = {"helmet_mount": "vRh", "camera_mount": "cRb"}
+# Method -> rotation-vector parameter -> the rotation it is.
+ROTATIONS = {"head": {"helmet_mount": "vRh", "camera_mount": "cRb"}, "cube": {"camera_mount": "correction of BRC"}}
 
 # Method -> formulas, in the names of the parameters.
 FORMULAS: dict[str, tuple[str, ...]] = {
@@ -26,5 +26,10 @@ FORMULAS: dict[str, tuple[str, ...]] = {
     ),
     "cube": (
         "each triad (accel, gyro, mag): nominal = K raw + b, K = [[k11, k12, k13], [k21, k22, k23], [k31, k32, k33]]",
+        "nominal is along the axes of the cube's body b, in m/s^2, rad/s and T; raw is as recorded",
+        "camera mount: BRC = camera_rotation * Exp(camera_mount), camera_rotation as the config gives it",
+        "tag on the cube: bodyRtag = rotation * Exp(tag_ID), rotation as the config gives it for that tag",
+        "reference: nRB = Exp(reference_heading ez) * its attitude in East-North-Up",
+        "attitude of the cube from a tag seen at CRT: nRb = nRB * BRC * CRT * inverse(bodyRtag)",
     ),
 }

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pipelines.observability import by_advice
 from pipelines.reports.formulas import FORMULAS
 from pipelines.reports.plots import common_plots
-from pipelines.reports.result import Calibration, Plot, quantities_of, truth_errors
+from pipelines.reports.result import Calibration, Plot, Table, quantities_of, truth_errors
 from pipelines.reports.templating import environment
 from pipelines.reports.units import human_unit, to_digits_of
 
@@ -40,7 +40,7 @@ def report_html(calibration: Calibration) -> str:
     from plotly.offline import get_plotlyjs
 
     own = list(calibration.plots(calibration)) if calibration.plots else []
-    plots = [*own, *common_plots(calibration)]
+    plots = [*(each for each in own if isinstance(each, Plot)), *common_plots(calibration)]
     facts = calibration.facts
     return (
         environment("pipelines.reports")
@@ -52,6 +52,7 @@ def report_html(calibration: Calibration) -> str:
             start=datetime.datetime.fromtimestamp(facts.epoch_ns // 1_000_000_000, datetime.UTC),
             rows=_rows(calibration),
             formulas=FORMULAS.get(calibration.problem.method, ()),
+            tables=[each for each in own if isinstance(each, Table)],
             plots=[(plot.title, plot.caption, _div(plot, i)) for i, plot in enumerate(plots)],
             plotly_js=get_plotlyjs() if plots else "",
         )

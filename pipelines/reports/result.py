@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from pipelines.methods.base import Estimate, Problem, Quantity, Residuals
+from pipelines.methods.base import Estimate, Findings, Problem, Quantity, Residuals
 from pipelines.observability import Assessment, Fit, Innovations, Learning, Status, Verdict, learning
 from pipelines.reports.units import robust_sigma
 from pipelines.sessions.info import SessionFacts
@@ -46,6 +46,16 @@ class Plot:
 
 
 @dataclass(frozen=True)
+class Table:
+    """A table of the report: title, caption, heads of the columns, and rows of as many texts."""
+
+    title: str
+    caption: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
 class Calibration:
     """Everything the reports tell about one calibration.
 
@@ -60,8 +70,9 @@ class Calibration:
         truth: parameter -> value, when known; other keys are ignored.
         software: package -> version.
         seconds: phase -> wall time, beside those of the estimate.
-        plots: makes the method's own figures.
+        plots: makes the method's own figures and tables.
         beside: the published solver's estimate of the same recording, where the report shows it too.
+        findings: what the method found beside its parameters.
     """
 
     problem: Problem
@@ -74,8 +85,9 @@ class Calibration:
     truth: Mapping[str, object] | None = None
     software: Mapping[str, str] = field(default_factory=lambda: software_versions())
     seconds: Mapping[str, float] = field(default_factory=dict)
-    plots: Callable[[Calibration], Sequence[Plot]] | None = None
+    plots: Callable[[Calibration], Sequence[Plot | Table]] | None = None
     beside: Estimate | None = None
+    findings: Findings = field(default_factory=dict)
 
     @property
     def parameters(self) -> tuple[ParameterResult, ...]:
@@ -155,8 +167,8 @@ def _beyond_priors(calibration: Calibration) -> tuple[str, ...]:
         return ()
     named = ", ".join(f"{name} by {sigmas:.3g}" for name, sigmas in far.items())
     return (
-        f"more than {_FAR_FROM_PRIOR:g} sigmas of its prior away: {named}; is a sensor turned or are its axes in another "
-        "order? if it is meant to be there, widen the prior",
+        f"more than {_FAR_FROM_PRIOR:g} sigmas of its prior away: {named}; is a sensor turned or are its axes in "
+        "another order? if it is meant to be there, widen the prior",
     )
 
 
@@ -280,6 +292,7 @@ class Result(_Record):
     causes: list[CauseResult]
     innovations: dict[str, InnovationsResult]
     learning: dict[str, LearningResult]
+    findings: dict[str, list[dict[str, object]]]
     truth: dict[str, TruthResult] | None = None
 
 
@@ -304,6 +317,7 @@ def result(calibration: Calibration) -> Result:
         causes=[CauseResult(**asdict(cause)) for cause in a.causes],
         innovations={family: InnovationsResult(**asdict(found)) for family, found in c.innovations.items()},
         learning={name: LearningResult(**asdict(found)) for name, found in c.learning.items()},
+        findings={name: [dict(row) for row in rows] for name, rows in c.findings.items()},
         truth=truth_errors(c) if c.truth is not None else None,
     )
 
