@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 import pytest
-from test_solvers import PARAMETER, Walk, state
 
 from factors.vectorized import VectorizedFactor
 from pipelines.errors import InputError
 from pipelines.methods.base import Array, Factor, Problem, Step
 from pipelines.solvers.incremental import solve_incremental
+from tests.test_solvers import PARAMETER, Walk, state
 
 
 def _with(problem: Problem, at: int, change: Callable[[Step], Step]) -> Problem:

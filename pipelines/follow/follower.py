@@ -157,13 +157,13 @@ class Follower:
         self._collected = () if collected is None else tuple(collected(session.data, session.config))
 
     def _take(self, problem: Problem, steps: Iterable[Step]) -> None:
-        run, saved = self._run, self.settings.checkpoint
+        run = self._run
         assert run is not None
         goes_on = problem.steps_after is not None
         for step in steps:
             run.take(step)
-            if saved is not None and run.just_folded and goes_on:
-                save_checkpoint(saved, run, self._identity)
+            if run.just_folded and goes_on:
+                self._save(run)
             if goes_on and time.monotonic() - self._shown > _VIEW:
                 self._view()
         self._view()
@@ -174,6 +174,14 @@ class Follower:
         self._shown = time.monotonic()
 
     # -- the checkpoint
+
+    def _save(self, run: Run) -> None:
+        if self.settings.checkpoint is None:
+            return
+        try:
+            save_checkpoint(self.settings.checkpoint, run, self._identity)
+        except InputError as error:  # a full disk is no reason to stop
+            self._say(str(error))
 
     def _resumed(self, problem: Problem) -> Run | None:
         if not self._resumable or self.settings.checkpoint is None:
