@@ -1,13 +1,15 @@
-"""Pictures per second of tag detection, and corner errors beside OpenCV's: `python -m benchmarks.detection`."""
+"""Tag detection with refined corners: time, memory and corner errors beside OpenCV's."""
 
 from __future__ import annotations
 
-import time
+from collections.abc import Iterator
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.measure import Ratio, costs, peak_mib
 from factors import so3
 from pipelines.simulation.rendering import Picture, Renderer, expose, tag_quad
 from pipelines.vision.camera import Camera
@@ -51,22 +53,18 @@ def _pictures(camera: Camera, case: tuple[float, float, float]) -> list[tuple[Pi
     return out
 
 
-def corner_errors() -> None:
-    """Prints RMS error and bias, px per axis, of each way to find corners."""
+def corner_errors() -> Iterator[Ratio]:
+    """RMS error, px per axis, over that of OpenCV's best way to find corners."""
     K = np.array([[600.0, 0, 320.3], [0, 605.0, 239.1], [0, 0, 1]])
     camera = Camera(640, 480, K, "plumb_bob", np.array([-0.25, 0.1, 1e-3, -5e-4, 0.02]))
-    detectors = {
-        "plain": _aruco(cv2.aruco.CORNER_REFINE_NONE),
-        "SUBPIX": _aruco(cv2.aruco.CORNER_REFINE_SUBPIX),
-        "APRILTAG": _aruco(cv2.aruco.CORNER_REFINE_APRILTAG),
-    }
-    print(f"corner error, px per axis: RMS (bias), {_PICTURES} pictures each")
-    print(f"{'':10s}" + "".join(f"{name:>20s}" for name in [*detectors, "alidade"]))
+    methods = (cv2.aruco.CORNER_REFINE_NONE, cv2.aruco.CORNER_REFINE_SUBPIX, cv2.aruco.CORNER_REFINE_APRILTAG)
+    detectors = [_aruco(method) for method in methods]
     for name, case in _CASES.items():
         pictures = _pictures(camera, case)
-        row = [_summary([(_by_opencv(d, picture), true) for picture, true in pictures]) for d in detectors.values()]
-        row.append(_summary([(_by_us(camera, picture), true) for picture, true in pictures]))
-        print(f"{name:10s}" + "".join(f"{cell:>20s}" for cell in row))
+        best = min(_rms([(_by_opencv(d, picture), true) for picture, true in pictures]) for d in detectors)
+        ours = _rms([(_by_us(camera, picture), true) for picture, true in pictures])
+        compared = f"corner error, {ours:.3f} px per axis, over the best of OpenCV, {best:.3f} px"
+        yield Ratio(f"detection.error.{name}", compared, ours / best)
 
 
 def _by_us(camera: Camera, picture: Picture) -> Array | None:
@@ -74,13 +72,13 @@ def _by_us(camera: Camera, picture: Picture) -> Array | None:
     return found.corners[0] if len(found) == 1 else None
 
 
-def _summary(pairs: list[tuple[Array | None, Array]]) -> str:
+def _rms(pairs: list[tuple[Array | None, Array]]) -> float:
     errors = np.array([found - true for found, true in pairs if found is not None])
-    return f"{np.sqrt((errors**2).mean()):.3f} ({errors.mean():+.3f})"
+    return float(np.sqrt((errors**2).mean()))
 
 
-def speed(rounds: int = 40) -> None:
-    """Prints pictures/s on one core for a 1280x960 picture of a tag cube before a textured background."""
+def cube_picture() -> tuple[Camera, Picture]:
+    """1280x960, three tags of a cube before a textured background."""
     K = np.array([[1150.0, 0, 641.3], [0, 1150.0, 477.8], [0, 0, 1]])
     camera = Camera(1280, 960, K, "plumb_bob", np.array([-0.2, 0.05, 0.0, 0.0, 0.0]))
     rng = np.random.default_rng(0)
@@ -90,34 +88,30 @@ def speed(rounds: int = 40) -> None:
     out = so3.rotate(faces, [0.0, 0.0, 0.08])
     quads = [tag_quad(16 + k, 0.12, so3.multiply(cRb, faces[k]), position + so3.rotate(cRb, out[k])) for k in range(3)]
     clutter = cv2.GaussianBlur(rng.normal(scale=200.0, size=(960, 1280)), (0, 0), 4.0) + 90.0
-    renderer = Renderer(camera)
-    start = time.perf_counter()
-    light = renderer.radiance(quads, clutter)
-    rendering = time.perf_counter() - start
-    picture = expose(light, 0.7, 2.0, rng)
-    threads = cv2.getNumThreads()
+    return camera, expose(Renderer(camera).radiance(quads, clutter), 0.7, 2.0, rng)
+
+
+def run() -> Iterator[Ratio]:
+    """Pictures a second, memory over many of them, corner errors."""
     cv2.setNumThreads(1)
+    camera, picture = cube_picture()
+    assert len(detect(picture, camera=camera)) >= 2
     plain = _aruco(cv2.aruco.CORNER_REFINE_NONE)
-    opencv, ours = (
-        float(np.median([_seconds(run, picture) for _ in range(rounds)]))
-        for run in (plain.detectMarkers, lambda p: detect(p, camera=camera))
+    a, b = costs([partial(detect, picture, camera=camera), partial(plain.detectMarkers, picture)], rounds=20)
+    compared = (
+        f"1280x960 with refined corners, {1.0 / a.seconds:.0f} pictures/s (30 wanted), over OpenCV's plain detector"
     )
-    cv2.setNumThreads(threads)
-    print(f"1280x960, tags {detect(picture, camera=camera).ids.tolist()} before clutter, one core:")
-    print(f"  OpenCV plain {1 / opencv:.0f} pictures/s, with refined corners {1 / ours:.0f} pictures/s")
-    print(f"  rendering {1e3 * rendering:.0f} ms a picture")
-
-
-def _seconds(run: object, picture: Picture) -> float:
-    start = time.process_time()
-    run(picture)  # type: ignore[operator]
-    return time.process_time() - start
-
-
-def main() -> None:
-    corner_errors()
-    speed()
-
-
-if __name__ == "__main__":
-    main()
+    yield Ratio("detection.time", compared, a.seconds / b.seconds, ours=a, theirs=b)
+    peaks = []
+    for _ in range(2):
+        for _ in range(100):
+            detect(picture, camera=camera)
+        peaks.append(peak_mib())
+    yield Ratio(
+        "detection.memory",
+        "peak after 200 pictures over that after 100",
+        peaks[1] / peaks[0],
+        tolerance=0.02,
+        wanted=1.02,
+    )
+    yield from corner_errors()

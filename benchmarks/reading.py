@@ -1,21 +1,18 @@
-"""How fast recordings are read and written, against rosbags' own reader in the same run.
-
-python -m benchmarks.reading [messages]
-"""
+"""How fast recordings are read, against rosbags' and mcap-ros2-support's readers and decompression alone."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tempfile
-import time
-from collections.abc import Callable
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap_ros2.reader import read_ros2_messages
 from rosbags.highlevel import AnyReader
 
+from benchmarks.measure import Ratio, costs
 from pipelines.sessions import series
 from pipelines.sessions.container import McapFile
 from pipelines.sessions.reading import open_recording
@@ -23,6 +20,7 @@ from pipelines.sessions.writing import write_session
 
 TOPIC = "/imu"
 HOUR = 3_600_000  # messages of an hour at 1 kHz
+FEW = 50_000  # messages for the readers that take them one by one
 
 
 def make_imu(count: int) -> series.ImuSeries:
@@ -49,64 +47,52 @@ def read_rosbags(path: Path) -> tuple[Any, Any]:
     return np.array(t_ns), np.array(gyro)
 
 
+def read_mcap_ros2(path: Path) -> tuple[Any, Any]:
+    t_ns, gyro = [], []
+    for message in read_ros2_messages(str(path), topics=[TOPIC]):
+        stamp, w = message.ros_msg.header.stamp, message.ros_msg.angular_velocity
+        t_ns.append(stamp.sec * 1_000_000_000 + stamp.nanosec)
+        gyro.append((w.x, w.y, w.z))
+    return np.array(t_ns), np.array(gyro)
+
+
 def decompress(path: Path) -> int:
     """Chunks decompressed and checked, messages located, nothing decoded."""
     file = McapFile(path)
     return sum(len(rows.start) for rows in file.rows(set(file.channels)))
 
 
-def seconds(work: Callable[[], Any], repeat: int) -> float:
-    """The shortest of several runs."""
-    best = np.inf
-    for _ in range(repeat):
-        start = time.perf_counter()
-        work()
-        best = min(best, time.perf_counter() - start)
-    return float(best)
-
-
-def measure_rates(path: Path, count: int) -> dict[str, float]:
-    """Messages per second of writing, reading, rosbags' reading and decompression of one file."""
-    imu = make_imu(count)
-    rates = {"write": count / seconds(lambda: write_session(path, {TOPIC: imu}), 3)}
-    for ours, theirs in zip(read_ours(path), read_rosbags(path), strict=True):
-        np.testing.assert_array_equal(ours, theirs)
-    rates["read"] = count / seconds(lambda: read_ours(path), 3)
-    rates["read by rosbags"] = count / seconds(lambda: read_rosbags(path), 1)
-    rates["decompress only"] = count / seconds(lambda: decompress(path), 3)
-    return rates
-
-
-def measure_peak_mib(path: Path, work: str) -> float:
-    """Peak memory of a process of its own that does nothing but `work`, a function of this module, on the file."""
-    code = f"from benchmarks.reading import *; {work}(Path({str(path)!r})); print(peak_mib())"
-    return float(subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout)
-
-
-def peak_mib() -> float:
-    """High-water mark of this process; getrusage would give the parent's, if that was larger."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(float(line.split()[1]) / 1024.0 for line in lines if line.startswith("VmHWM:"))
-
-
-def import_only(path: Path) -> None:
-    """The yardstick of memory."""
-
-
-def main(count: int = 200_000) -> None:
+def run() -> Iterator[Ratio]:
+    """Against each peer by time per message, and the memory for an hour."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "imu.mcap"
-        rates = measure_rates(path, count)
-        for name, rate in rates.items():
-            print(f"{name:16s} {rate / 1e3:8.0f} thousand Imu/s")
-        print(f"reading is {rates['read'] / rates['read by rosbags']:.1f} times rosbags' (10 wanted)")
-        print(f"reading is {rates['read'] / rates['decompress only']:.2f} of decompression alone")
-        write_session(path, {TOPIC: make_imu(HOUR)})
-        base, peak = (measure_peak_mib(path, work) for work in ("import_only", "read_ours"))
-        print(
-            f"peak memory of {HOUR / 1e6:.1f} million Imu: {peak:.0f} MiB (1024 wanted), {base:.0f} MiB of it imports"
+        few, hour = Path(folder) / "few.mcap", Path(folder) / "hour.mcap"
+        write_session(few, {TOPIC: make_imu(FEW)})
+        write_session(hour, {TOPIC: make_imu(HOUR)})
+        for name, whose, read in (
+            ("rosbags", "rosbags'", read_rosbags),
+            ("mcap_ros2", "mcap-ros2-support's", read_mcap_ros2),
+        ):
+            for ours, theirs in zip(read_ours(few), read(few), strict=True):
+                np.testing.assert_array_equal(ours, theirs)
+            # As many messages as one of them takes, read by each.
+            a, b = costs([partial(read_ours, few), partial(read, few)])
+            compared = f"{whose} time over ours, {FEW:,} Imu"
+            wanted = 10.0 if name == "rosbags" else None
+            yield Ratio(f"reading.{name}", compared, b.seconds / a.seconds, "higher", wanted=wanted, ours=a, theirs=b)
+        a, b = costs([partial(read_ours, hour), partial(decompress, hour)])
+        yield Ratio(
+            "reading.decompress",
+            f"decompression's time over ours, {HOUR:,} Imu",
+            b.seconds / a.seconds,
+            "higher",
+            wanted=0.25,
+            ours=a,
+            theirs=b,
         )
-
-
-if __name__ == "__main__":
-    main(*map(int, sys.argv[1:]))
+        yield Ratio(
+            "reading.memory",
+            f"peak, GiB, of reading {HOUR:,} Imu",
+            (a.peak_mib or 0.0) / 1024.0,
+            tolerance=0.1,
+            wanted=1.0,
+        )

@@ -1,0 +1,51 @@
+"""The command line, whole processes: `alidade --help` and `alidade calibrate` on ten minutes of los."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.batch import native, solve
+from benchmarks.measure import Cost, Ratio, costs
+from pipelines.methods import los
+from pipelines.sessions.config import load_config
+from pipelines.sessions.los import write_los
+from pipelines.simulation.los import LosScenario, los_config, simulate_los
+
+MINUTES = LosScenario(duration_s=600.0, gyro_rate_hz=1000.0, gimbal_rate_hz=1000.0, image_rate_hz=50.0)
+_ALIDADE = (sys.executable, "-m", "pipelines.cli")
+
+
+def process(*command: str, rounds: int = 3) -> Cost:
+    """Median processor time of a command, the first run left out, and the peak memory of this one's children."""
+    seconds = []
+    for _ in range(rounds + 1):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run(command, check=True, capture_output=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        seconds.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    return Cost(float(np.median(seconds[1:])), after.ru_maxrss / 1024.0)
+
+
+def run() -> Iterator[Ratio]:
+    """Help against importing what it needs, and a calibration with all outputs against the bare optimisation."""
+    a, b = process(*_ALIDADE, "--help", rounds=9), process(sys.executable, "-c", "import typer", rounds=9)
+    yield Ratio("command.help", "alidade --help over import typer", a.seconds / b.seconds, wanted=1.5, ours=a, theirs=b)
+    data, truth = simulate_los(MINUTES, 0)
+    with tempfile.TemporaryDirectory() as folder:
+        session = Path(folder) / "session.mcap"
+        write_los(session, data, truth, los_config(MINUTES))
+        a = process(*_ALIDADE, "calibrate", str(session), "--out", str(Path(folder) / "out"), rounds=2)
+    problem = los.problem(data, load_config(los_config(MINUTES).encode()))
+    graph = native(problem)
+    (b,) = costs([lambda: solve(problem, graph)])
+    compared = (
+        "alidade calibrate, 10 min of los at 1 kHz, all outputs (12 s wanted), over solving its native-only graph"
+    )
+    yield Ratio("command.calibrate", compared, a.seconds / b.seconds, ours=a, theirs=b)
