@@ -79,8 +79,8 @@ def calibrations(
 ) -> list[Calibration]:
     """Estimates, each with the problem it solves, judged and ready to be reported; `seconds` is what reading took."""
     chosen, data, config = session.method, session.data, session.config
-    facts = session_facts(session.recording, config)
     sha256, truth = session.recording.sha256(), _truth(session.recording)
+    facts = session_facts(session.recording, config)
     found = []
     causes: tuple[Cause, ...] | None = None
     for estimate, problem in solved:

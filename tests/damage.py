@@ -18,6 +18,8 @@ from pipelines.sessions.writing import write_session
 
 T0 = 1_700_000_000_123_456_789
 CONFIG = b"method: head\n"
+# Topic -> stamps (n,) and numbers (n, k).
+Whole = dict[str, tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]]
 # How the mcap package's own writer is asked to write: the forms that recorders use.
 FORMS: dict[str, dict[str, Any]] = {
     "zstd": {"compression": CompressionType.ZSTD},
@@ -80,8 +82,24 @@ def flips(data: bytes, number: int, seed: int) -> Iterator[bytes]:
         yield data[:at] + bytes([data[at] ^ int(other)]) + data[at + 1 :]
 
 
-def read(recording: Recording) -> dict[str, tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]]:
-    """Topic -> stamps and numbers (n, k), of those of `topics` that are there with messages."""
+def spoilt(data: bytes, number: int, seed: int) -> Iterator[bytes]:
+    """Copies with a stretch zeroed, missing, inserted or random, or with several bytes replaced."""
+    rng = np.random.default_rng(seed)
+    for i in range(number):
+        at, length = int(rng.integers(len(data))), int(rng.integers(1, 2000))
+        end = min(len(data), at + length)
+        if i % 5 == 4:
+            copy = bytearray(data)
+            for place in rng.integers(0, len(data), int(rng.integers(2, 40))):
+                copy[place] = int(rng.integers(256))
+            yield bytes(copy)
+        else:
+            middle = [bytes(end - at), b"", rng.bytes(length) + data[at:end], rng.bytes(end - at)][i % 5]
+            yield data[:at] + middle + data[end:]
+
+
+def read(recording: Recording) -> Whole:
+    """What can be read of those of `topics` that are there with messages."""
     found = {}
     for name, topic in recording.topics.items():
         if not topic.count or name not in ("/imu", "/joints", "/pose"):
@@ -98,7 +116,7 @@ def read(recording: Recording) -> dict[str, tuple[np.ndarray[Any, Any], np.ndarr
     return found
 
 
-def check_sound(path: Path, whole: dict[str, tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]]) -> str:
+def check_sound(path: Path, whole: Whole) -> str:
     """Read a damaged file: what comes out is a part of what was written, and what is missing is told.
 
     Returns what happened: `whole`, `part` or `refused`. Anything but an InputError of one line goes through.

@@ -108,6 +108,8 @@ def _against_log(t_ns: Stamps, log_ns: Stamps) -> Step | None:
         if min(len(before), len(after)) < _FEWEST:
             continue
         lasting = float(np.median(after) - np.median(before))
+        if ((t_ns > t_ns[i]) & (t_ns < t_ns[i + 1])).any():
+            continue  # messages that are late fill the hole
         runs_on = np.median(np.diff(t_ns[i + 1 : i + 1 + _AROUND])) > 0.5 * usual
         if runs_on and abs(lasting - jump) < 0.5 * abs(jump):
             return Step(jump * 1e-9, int(t_ns[i]), "the stamps")

@@ -80,7 +80,8 @@ class McapFile:
                     self._verify(stream, block)
             if self.losses or self._counted() != survey.stated:
                 for block in self._blocks:
-                    self._verify(stream, block)
+                    if not block.is_lost:
+                        self._verify(stream, block)
         undefined = {number: n for number, n in self._counted().items() if not self._defined(number)}
         if undefined:
             self.losses.append(Loss("definition", 0, sum(undefined.values())))
@@ -154,7 +155,9 @@ class McapFile:
             return fields.block("Q")
         except DamagedError as damaged:
             if needed or self._strict:
-                raise InputError(f"{self.path}: the attachment {name} is damaged ({damaged})") from damaged
+                raise InputError(
+                    f"{self.path}: the attachment {name} is damaged ({damaged}); a config can be given with --config"
+                ) from damaged
             self.losses.append(Loss("attachment", at, length, reason=name))
             return None
 
@@ -236,7 +239,7 @@ class McapFile:
             self._lost[number] = self._lost.get(number, 0) + n
             if number in self.counts:
                 self.counts[number] -= n
-        block.counts, block.index_at = {}, {}
+        block.counts, block.index_at, block.is_lost = {}, {}, True
         self.losses.append(Loss("damage", block.start, block.end - block.start, 1, block.span, str(damaged)))
         if self._strict:
             self._refuse()

@@ -124,7 +124,7 @@ class Decoder:
         if rows.size[largest] > _LARGEST:
             with logged_at(int(rows.log_ns[largest])):
                 raise MessageError(f"a message of {rows.size[largest]} bytes, which is no {self._definition.name}")
-        into = table.advance(rows.log_ns, header_stamps(self._definition, rows))
+        into = table.advance(rows.log_ns, header_stamps(self._definition.has_header, rows))
         left = np.arange(len(into) if self._fields else 0)
         for plan in self._plans:
             left = left[~self._append_alike(plan, rows, left, table, into)]
@@ -185,11 +185,11 @@ def logged_at(log_ns: int) -> Iterator[None]:
         raise
 
 
-def header_stamps(definition: Definition, rows: Rows) -> NDArray[np.int64]:
-    """Header stamps of messages, ns; 0 where the stamp is zero or the type has none."""
+def header_stamps(has_header: bool, rows: Rows) -> NDArray[np.int64]:
+    """Header stamps of messages, ns; 0 where the stamp is zero or the messages have no header."""
     stamps = np.zeros(len(rows.start), dtype=np.int64)
     long = rows.size >= _STAMP["<"].itemsize
-    if definition.has_header and long.any():
+    if has_header and long.any():
         heads = windows(rows.buffer, _STAMP["<"].itemsize)[rows.start[long]]
         little, big = heads.view(_STAMP["<"]), heads.view(_STAMP[">"])
         is_little = little["kind"][:, 1] == 1

@@ -114,10 +114,13 @@ class Definition:
             raise MessageError(f"the definition of message type {name} has {len(text)} letters")
         try:
             self._types = get_types_from_msg(text, name)
-            members = self._types[name][1]
         except Exception as error:  # a parser on a text that may be anything
             raise self._unreadable(error) from error
-        self.has_header = bool(members and members[0][1] == (Nodetype.NAME, "std_msgs/msg/Header"))
+        self.has_header = has_header(text)
+
+    def check(self) -> None:
+        """Raise MessageError if no messages can be read with the definition."""
+        _ = self._store
 
     def decode(self, data: bytes) -> Any:
         """One message, decoded by rosbags. Raises MessageError."""
@@ -198,6 +201,13 @@ class Definition:
 def definition(name: str, text: str) -> Definition:
     """The definition of a type in the text of a recording. Raises MessageError."""
     return Definition(name, text)
+
+
+def has_header(text: str) -> bool:
+    """Whether the messages that a text defines begin with a std_msgs/Header."""
+    lines = (line.partition("#")[0].split() for line in text.split("\n"))
+    first = next((words for words in lines if words and not any("=" in word for word in words)), [""])
+    return first[0] in ("Header", "std_msgs/Header", "std_msgs/msg/Header")
 
 
 @lru_cache(maxsize=64)

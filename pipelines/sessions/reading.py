@@ -297,23 +297,21 @@ class Recording:
 
     def _rows(self, topic: str) -> Iterator[tuple[Definition, Rows]]:
         for rows in self._file.rows(self._channels(topic)):
+            schema = self._file.schemas[self._file.channels[rows.channel].schema_id]
             try:
-                found = self._definition(rows.channel)
+                found = messages.definition(schema.name, schema.data.decode(errors="replace"))
+                found.check()
             except MessageError as error:
                 raise self._unreadable(topic, error) from error
             yield found, rows
 
-    def _definition(self, channel: int) -> Definition:
-        schema = self._file.schemas[self._file.channels[channel].schema_id]
-        return messages.definition(schema.name, schema.data.decode(errors="replace"))
-
     def _stamps(self, rows: Rows) -> NDArray[np.int64]:
-        """Header stamps, ns; log times where there are none, or no header that can be read."""
-        topic = self.topics[self._file.channels[rows.channel].topic]
-        try:
-            stamps = header_stamps(self._definition(rows.channel), rows) if topic.encoding == ENCODING else rows.log_ns
-        except MessageError:
+        """Header stamps, ns; log times where there are none."""
+        channel = self._file.channels[rows.channel]
+        if self.topics[channel.topic].encoding != ENCODING:
             return rows.log_ns
+        text = self._file.schemas[channel.schema_id].data.decode(errors="replace")
+        stamps = header_stamps(messages.has_header(text), rows)
         return np.where(stamps == 0, rows.log_ns, stamps)
 
     def _unreadable(self, topic: str, error: MessageError) -> InputError:
@@ -325,7 +323,7 @@ class Recording:
         self._require(topic, *types)
         times = []
         for definition, rows in self._rows(topic):
-            stamps = header_stamps(definition, rows)
+            stamps = header_stamps(definition.has_header, rows)
             times.append((self._stamps(rows), rows.log_ns))
             for i, (t_ns, log_ns) in enumerate(zip(stamps.tolist(), rows.log_ns.tolist(), strict=True)):
                 try:

@@ -52,6 +52,7 @@ class Block:
     span: tuple[int, int] | None = None  # log times, ns, as the chunk states them
     counts: dict[int, int] = field(default_factory=dict)  # channel -> messages
     index_at: dict[int, int] = field(default_factory=dict)  # channel -> byte where its index entries start
+    is_lost: bool = False  # found damaged within
 
 
 class Survey:
