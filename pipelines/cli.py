@@ -15,6 +15,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # boxes around the help would take three times as long to import as all else
     help="Calibrates how sensors are mounted and how wrong they are, from MCAP recordings, and says how sure it is.",
 )
 
