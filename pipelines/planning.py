@@ -31,6 +31,9 @@ _LEAST_GAIN = 0.1
 _LOS_SWAY = {"amplitude_deg": 5.0, "frequency_hz": 0.29}
 _HEAD_SWAY = {"amplitude_deg": 20.0, "frequency_hz": 0.29}
 
+# Poses of a cube that are proposed together, and the seed of all simulations.
+_SERIES, _SEED = 6, 0
+
 Scenario = dict[str, Any]
 
 
@@ -150,7 +153,7 @@ def predict(method_name: str, scenario: Scenario, config_file: Path | None, requ
     with tempfile.TemporaryDirectory(prefix="alidade.") as folder:
         file, session = Path(folder) / "scenario.yaml", Path(folder) / "planned.mcap"
         file.write_text(scenario_yaml(scenario), encoding="utf-8")
-        chosen.simulate(str(file), 0, session, False)
+        chosen.simulate(str(file), _SEED, session, False)
         recording = open_recording(session)
         config = load_config(recording.attachment(ATTACHMENT), config_file)
         config = config.model_copy(update={"require": {**config.require, **require}})
@@ -285,7 +288,17 @@ def _indexer_changes(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
 
 
 def _cube_changes(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
-    yield "six more poses", {**scenario, "poses": scenario["poses"] + 6}
+    from pipelines.next_poses import next_poses
+    from pipelines.simulation.cube import CubeScenario
+
+    single, series = next_poses(CubeScenario.model_validate(scenario), _SEED, _SERIES)
+    for poses in (*([pose] for pose in single), series):
+        more = [*scenario["attitudes"], *(pose.model_dump() for pose in poses)]
+        words = "; then ".join(str(pose) for pose in poses)
+        yield (
+            f"{'one more pose' if len(poses) == 1 else f'{len(poses)} more poses'}: {words}",
+            {**scenario, "attitudes": more},
+        )
     yield "rests twice as long", {**scenario, "static_s": 2.0 * scenario["static_s"]}
     if scenario["turn_axes"]:
         yield "turns about any axis", {**scenario, "turn_axes": []}

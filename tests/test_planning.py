@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +10,12 @@ import numpy as np
 import pytest
 
 from pipelines.errors import InputError
+from pipelines.next_poses import next_poses
 from pipelines.planning import Prediction, make_plan, predict, requirements, write_scenario
 from pipelines.registry import method
 from pipelines.sessions.config import load_config
+from pipelines.simulation.cube import CubeScenario
+from pipelines.simulation.cube_faces import Resting, Side
 from pipelines.simulation.head import HeadScenario, head_config, simulate_head
 from pipelines.simulation.los import LosScenario, los_config, simulate_los
 from pipelines.simulation.motion import EulerMotion, Swing
@@ -98,6 +102,39 @@ def test_what_no_motion_can_tell_gets_no_change(tmp_path: Path) -> None:
     assert plan.now.assessment.status == "unobservable"
     for name in ("delta_pz", "delta_gz"):
         assert plan.best.missing[name] == pytest.approx(plan.now.missing[name], rel=0.01)
+
+
+def test_the_next_best_poses_of_a_cube_are_named_and_mend_the_plan(tmp_path: Path) -> None:
+    """Three poses tell little; the scenario written holds the poses named, and simulates to what was foreseen."""
+    few = scenario_file(tmp_path, "{poses: 3, static_s: 1.5, turn_rad_s: 1.5, camera_rate_hz: 2, magnetometer: false}")
+    plan = make_plan("cube", few, most_steps=1)
+    assert plan.now.assessment.status == "unobservable"
+    (step,) = plan.steps
+    assert re.match(r"(one|6) more poses?: [+-][xyz] \(tag (1[6-9]|2[01])\) up, [+-][xyz] to the north", step.change)
+    assert step.gain > 5.0
+    write_scenario(tmp_path / "better.yaml", plan)
+    better = load_scenario(CubeScenario, tmp_path / "better.yaml")
+    assert [str(each) for each in better.attitudes] == step.change.split(": ")[1].split("; then ")
+    again = predict("cube", better.model_dump(), None, {})
+    assert again.sigmas == pytest.approx(plan.best.sigmas)
+
+
+def test_the_next_pose_fills_the_gap() -> None:
+    """All sides have been up but one, and level turns about all axes made: that side comes next."""
+    sides: list[tuple[Side, Side]] = [
+        ("+x", "+y"),
+        ("-x", "+z"),
+        ("+y", "+z"),
+        ("-y", "+x"),
+        ("+z", "+x"),
+        ("+z", "-y"),
+    ]
+    others = 3 * [Resting(up=up, north=north) for up, north in sides]
+    scenario = CubeScenario(poses=0, attitudes=others, magnetometer=False)
+    single, series = next_poses(scenario, 0, 2)
+    assert {"-z"} <= {pose.up for pose in single}
+    assert series[0] in single
+    assert len(series) == 2
 
 
 def test_requirements_are_read_and_checked() -> None:

@@ -9,11 +9,13 @@ import pytest
 
 from factors import so3
 from factors.earth import earth_rate, gravity
+from pipelines.errors import InputError
 from pipelines.sessions.config import load_config
 from pipelines.sessions.cube import read_cube, rests
 from pipelines.sessions.cube_poses import static_poses
 from pipelines.sessions.reading import open_recording
 from pipelines.simulation.cube import CubeNoise, CubeScenario, cube_config, simulate_cube, write_simulation
+from pipelines.simulation.cube_faces import Resting
 from pipelines.simulation.scenario import load_scenario
 
 QUIET = CubeNoise(gyro_density=1e-12, gyro_bias_walk=0.0, accel_density=1e-12, mag_density=1e-18, corner_px=1e-6)
@@ -100,6 +102,37 @@ def test_same_seed_same_session_and_another_one_differs() -> None:
     np.testing.assert_array_equal(a.gyro, b.gyro)
     assert truth_a == truth_b
     assert not np.array_equal(a.gyro, c.gyro[: len(a.gyro)])
+
+
+def test_given_attitudes_come_after_the_random_ones() -> None:
+    """A side up, one to the north, the top leaned to the east; what the sensors say at rest follows."""
+    given = [Resting(up="-x", north="+z"), Resting(up="+y", north="-x", lean_deg=30.0)]
+    scenario = EXACT.model_copy(update={"poses": 1, "attitudes": given, "gain_error": 0.0, "accel_bias": 0.0})
+    east, north, up = np.eye(3)
+    np.testing.assert_allclose(so3.rotate(given[0].nRb, [[-1, 0, 0], [0, 0, 1]]), [up, north], atol=1e-12)
+    lean = np.deg2rad(30.0)
+    leaned = [np.cos(lean) * up + np.sin(lean) * east, north]
+    np.testing.assert_allclose(so3.rotate(given[1].nRb, [[0, 1, 0], [-1, 0, 0]]), leaned, atol=1e-12)
+    assert str(given[1]) == "+y (tag 18) up, -x to the north, leaned by 30 deg to the east"
+    data, _ = simulate_cube(scenario, 4)
+    poses = static_poses(data, load_config(cube_config(scenario.model_copy(update={"noise": CubeNoise()})).encode()))
+    g = float(gravity(np.deg2rad(scenario.latitude_deg), scenario.height))
+    np.testing.assert_allclose(poses.accel[1] / g, [-1, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(poses.accel[2] / g, so3.rotate(so3.inverse(given[1].nRb), up), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{attitudes: [{up: +x, north: -x}]}", r"attitudes\.0: .*sides across each other are needed"),
+        ("{attitudes: [{up: +w, north: -x}]}", r"attitudes\.0\.up"),
+        ("{poses: 0}", "poses or attitudes are needed"),
+    ],
+)
+def test_attitudes_that_are_none(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "s.yaml").write_text(text)
+    with pytest.raises(InputError, match=message):
+        load_scenario(CubeScenario, tmp_path / "s.yaml")
 
 
 @pytest.mark.parametrize(

@@ -12,16 +12,17 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from io import StringIO
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from factors import so3
 from factors.earth import earth_rate, gravity, magnetic_field
 from pipelines.sessions.cube import CubeData, Sightings, write_cube
+from pipelines.simulation.cube_faces import FACES, Resting
 from pipelines.simulation.motion import sample_times
 from pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
 from pipelines.simulation.scenario import load_scenario
@@ -30,7 +31,7 @@ from pipelines.vision.camera import Camera
 Array = NDArray[np.float64]
 
 # 2026-11-20 12:00 UTC, and the year of that day for the field model.
-EPOCH_NS, _YEAR = 1_795_176_000_000_000_000, 2026.8849315068493
+EPOCH_NS, YEAR = 1_795_176_000_000_000_000, 2026.8849315068493
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -43,16 +44,6 @@ _SQUARE = 0.5 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 # A tag is read when the cosine between its normal and the way to the camera is more than this.
 _LEAST_COSINE = 0.3
 _FORWARD = (-0.5, 0.5, -0.5, 0.5)  # BRC of a camera that looks along x of the reference, z up
-_HALF = float(np.sqrt(0.5))
-# id -> (bodyRtag, normal), the faces of the cube.
-_FACES: dict[int, tuple[tuple[float, float, float, float], tuple[float, float, float]]] = {
-    16: ((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
-    17: ((0.5, 0.5, 0.5, 0.5), (1.0, 0.0, 0.0)),
-    18: ((0.0, 0.0, _HALF, _HALF), (0.0, 1.0, 0.0)),
-    19: ((0.5, 0.5, -0.5, -0.5), (-1.0, 0.0, 0.0)),
-    20: ((_HALF, _HALF, 0.0, 0.0), (0.0, -1.0, 0.0)),
-    21: ((0.0, 0.0, 1.0, 0.0), (0.0, 0.0, -1.0)),
-}
 
 
 class CubeNoise(BaseModel):
@@ -72,7 +63,8 @@ class CubeScenario(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    poses: Annotated[int, Field(ge=1)] = 24
+    poses: Annotated[int, Field(ge=0)] = 24  # in random attitudes
+    attitudes: list[Resting] = []  # of more poses, after those
     static_s: Positive = 4.0
     turn_rad_s: Positive = 0.8  # mean rate of the turns between poses
     turn_axes: list[tuple[float, float, float]] = []  # in b; turns about these only, in turn; none: any attitude
@@ -111,6 +103,12 @@ class CubeScenario(BaseModel):
     grey_noise: NotNegative = 2.0
     exposure_s: Positive = 4e-3
     priors: dict[str, float | None] = {}  # passed on to the recording's config
+
+    @model_validator(mode="after")
+    def _some(self) -> Self:
+        if not self.poses + len(self.attitudes):
+            raise ValueError("poses or attitudes are needed")
+        return self
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +191,7 @@ def cube_config(scenario: CubeScenario, images: bool = False) -> str:
                 "rotation": list(wxyz),
                 "position": [0.5 * scenario.edge * x for x in normal],
             }
-            for i, (wxyz, normal) in _FACES.items()
+            for i, (wxyz, normal) in FACES.items()
         }
         config["cube"] = {"tag_family": "36h11", "tags": tags, "camera_rotation": list(_FORWARD)}
     text = StringIO()
@@ -201,6 +199,25 @@ def cube_config(scenario: CubeScenario, images: bool = False) -> str:
     yaml.default_flow_style = None
     yaml.dump(config, text)
     return text.getvalue()
+
+
+def attitudes(scenario: CubeScenario, seed: int) -> Array:
+    """nRb (P, 4) of the poses of a scenario's session."""
+    return _World(scenario, seed).motion.nRb
+
+
+def _attitudes(scenario: CubeScenario, rng: np.random.Generator) -> Array:
+    """nRb (P, 4): the random ones, then those given."""
+    n = scenario.poses
+    given = np.array([each.nRb for each in scenario.attitudes]).reshape(-1, 4)
+    if not (n and scenario.turn_axes):
+        return np.vstack([so3.normalize(rng.standard_normal((n, 4))), given])
+    axes = np.array([scenario.turn_axes[k % len(scenario.turn_axes)] for k in range(n - 1)]).reshape(-1, 3)
+    angle = rng.uniform(0.8, 2.4, n - 1) * rng.choice([-1.0, 1.0], n - 1)
+    found = [so3.normalize(rng.standard_normal(4))]
+    for axis, a in zip(axes, angle, strict=True):
+        found.append(so3.multiply(found[-1], so3.exp(a * axis / np.linalg.norm(axis))))
+    return np.vstack([np.array(found), given])
 
 
 class _World:
@@ -211,7 +228,7 @@ class _World:
         self.rng = np.random.default_rng(seed)
         self.place_rad = np.deg2rad([scenario.latitude_deg, scenario.longitude_deg])
         latitude, longitude = self.place_rad
-        self.field = magnetic_field(latitude, longitude, scenario.height, _YEAR)
+        self.field = magnetic_field(latitude, longitude, scenario.height, YEAR)
         self.camera = Camera(
             1280,
             960,
@@ -225,7 +242,7 @@ class _World:
         self.mount = scenario.camera_mount * self.rng.standard_normal(3)
         self.nRC = so3.compose(self.nRB, _FORWARD, so3.exp(self.mount))
         # The lowest id defines the body frame.
-        self.tags = {i: scenario.tag_mount * self.rng.standard_normal(3) * (i != min(_FACES)) for i in _FACES}
+        self.tags = {i: scenario.tag_mount * self.rng.standard_normal(3) * (i != min(FACES)) for i in FACES}
         self.K = {
             name: np.eye(3) + scenario.gain_error * self.rng.standard_normal((3, 3))
             for name in ("accel", "gyro", "mag")
@@ -241,16 +258,9 @@ class _World:
         self.truth: dict[str, float] = {}
 
     def _motion(self) -> Motion:
-        s, rng, n = self.scenario, self.rng, self.scenario.poses
-        if s.turn_axes:
-            axes = np.array([s.turn_axes[k % len(s.turn_axes)] for k in range(n - 1)]).reshape(-1, 3)
-            angle = rng.uniform(0.8, 2.4, n - 1) * rng.choice([-1.0, 1.0], n - 1)
-            attitudes = [so3.normalize(rng.standard_normal(4))]
-            for axis, a in zip(axes, angle, strict=True):
-                attitudes.append(so3.multiply(attitudes[-1], so3.exp(a * axis / np.linalg.norm(axis))))
-            nRb = np.array(attitudes)
-        else:
-            nRb = so3.normalize(rng.standard_normal((n, 4)))
+        s, rng = self.scenario, self.rng
+        nRb = _attitudes(s, rng)
+        n = len(nRb)
         place = np.array([0.0, 0.0, s.distance]) + [0.04, 0.03, 0.05] * rng.uniform(-1, 1, (n, 3))
         angles = np.linalg.norm(so3.log(so3.multiply(so3.inverse(nRb[:-1]), nRb[1:])), axis=1)
         turning = np.maximum(angles, 0.5) / s.turn_rad_s
@@ -314,8 +324,8 @@ class _World:
         s, rate = self.scenario, self.scenario.mag_rate_hz
         t = sample_times(self.duration, rate, 0.25)
         moments = self._moments(t, rate)
-        iron = s.disturbance * self.rng.standard_normal((s.poses, 3))
-        iron *= self.rng.random((s.poses, 1)) < s.disturbed
+        iron = s.disturbance * self.rng.standard_normal((len(self.motion.start), 3))
+        iron *= self.rng.random((len(self.motion.start), 1)) < s.disturbed
         nearest = np.argmin(np.abs(moments[:, None] - 0.5 * (self.motion.start + self.motion.stop)), axis=1)
         field = so3.rotate(so3.inverse(self.motion.attitude(moments)), self.field + iron[nearest])
         return t, self._raw("mag", field.reshape(-1, _PARTS, 3).mean(axis=1), s.noise.mag_density, rate)
@@ -330,7 +340,7 @@ class _World:
 
     def _tag(self, tag: int, t: Array) -> tuple[Array, Array, Array]:
         """Attitudes cRt (N, 4), places (N, 3) m, and the cosines (N,) between the normal and the way to the camera."""
-        wxyz, normal = _FACES[tag]
+        wxyz, normal = FACES[tag]
         cRb = so3.multiply(so3.inverse(self.nRC), self.motion.attitude(t))
         cRt = so3.compose(cRb, wxyz, so3.exp(self.tags[tag]))
         centre = self.motion.position(t) + so3.rotate(cRb, 0.5 * self.scenario.edge * np.array(normal))
@@ -338,7 +348,7 @@ class _World:
         return cRt, centre, facing
 
     def _shown(self) -> list[int]:
-        return [i for i in _FACES if i not in self.scenario.faces_hidden]
+        return [i for i in FACES if i not in self.scenario.faces_hidden]
 
     def _sightings(self) -> Sightings:
         s, size = self.scenario, np.array([self.camera.width, self.camera.height])
