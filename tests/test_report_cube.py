@@ -12,7 +12,8 @@ from factors import so3
 from pipelines.methods.base import Estimate, Findings
 from pipelines.methods.cube import problem
 from pipelines.methods.cube_findings import findings, parts_of, white_noise
-from pipelines.reports.cube import cube_plots, described
+from pipelines.reports.cube import cube_plots
+from pipelines.reports.cube_tables import described
 from pipelines.reports.result import Calibration, Plot, Table
 from pipelines.sessions.config import Config, load_config
 from pipelines.sessions.cube import CubeData

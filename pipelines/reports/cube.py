@@ -1,9 +1,9 @@
-"""Figures and tables of the cube method: K taken apart, noise, errors before and after, spheres, attitudes covered."""
+"""Figures of the cube method: errors before and after, vectors on their spheres; with its tables and the map."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,9 +12,10 @@ from factors.earth import earth_rate, gravity
 from factors.preintegration import GyroPath
 from pipelines.methods.base import Array
 from pipelines.methods.cube_findings import calibrated, resting
+from pipelines.reports.cube_coverage import coverage
+from pipelines.reports.cube_tables import NAMES, cube_tables
 from pipelines.reports.plots import COLORS, add_points, figure, thin
 from pipelines.reports.result import Calibration, Plot, Table
-from pipelines.reports.units import to_digits_of
 from pipelines.sessions.config import Config
 from pipelines.sessions.cube import CubeData, local_field, nominal
 from pipelines.sessions.cube_poses import StaticPoses, turn
@@ -22,22 +23,9 @@ from pipelines.sessions.cube_poses import StaticPoses, turn
 if TYPE_CHECKING:
     import plotly.graph_objects as go
 
-_NAMES = {"accel": "accelerometer", "gyro": "gyro", "mag": "magnetometer"}
 # Unit that people read an error in, and what to multiply its SI number by.
 _ERRORS = {"accel": ("mg", 1e3 / 9.80665), "gyro": ("deg", np.rad2deg(1.0)), "mag": ("nT", 1e9)}
-_NOISE = {"accel": ("µg/√Hz", 1e6 / 9.80665), "gyro": ("deg/√h", np.rad2deg(60.0)), "mag": ("nT/√Hz", 1e9)}
-_PARTS = (
-    ("scale", "%", ("x", "y", "z")),
-    ("nonorthogonality", "deg", ("xy", "xz", "yz")),
-    ("mounting", "deg", ("x", "y", "z")),
-)
-# A part of K known no better than this, %, or deg, is not known.
-_UNKNOWN = 20.0
 _BEFORE, _AFTER = "#8a949e", COLORS[0]
-# Directions farther than this from every pose, rad, are gaps; the second ones wide.
-_GAPS = np.deg2rad([30.0, 45.0])
-_GAP_COLORS = ("#f6dfae", "#e69f00")
-_DIRECTIONS = 1500
 
 
 def cube_plots(data: CubeData, calibration: Calibration) -> list[Plot | Table]:
@@ -45,94 +33,11 @@ def cube_plots(data: CubeData, calibration: Calibration) -> list[Plot | Table]:
     config = Config.model_validate_json(calibration.config_text)
     values = dict(zip(calibration.estimate.names, calibration.estimate.values.tolist(), strict=True))
     poses = resting(data, config)
-    found: list[Plot | Table | None] = [_taken_apart(calibration), _noise(calibration), _static_poses(calibration)]
+    found: list[Plot | Table | None] = [*cube_tables(calibration)]
     found += [_before_and_after(*rows) for rows in _errors(data, config, poses, calibration, values)]
     for name, strength in _strengths(data, values).items():
         found.append(_sphere(name, strength, data, config, poses, values))
-    return [each for each in [*found, _coverage(calibration)] if each is not None]
-
-
-def _rows(calibration: Calibration, name: str) -> list[Mapping[str, Any]]:
-    return list(calibration.findings.get(name, []))
-
-
-def _taken_apart(calibration: Calibration) -> Table | None:
-    """K of each triad as scale, non-orthogonality and mounting."""
-    triads = _rows(calibration, "triads")
-    rows = []
-    for part, unit, axes in _PARTS:
-        for i, axis in enumerate(axes):
-            cells = [_number(part, triad[part][i], triad[f"{part}_sigma"][i], unit) for triad in triads]
-            what = {"nonorthogonality": "non-orthogonality", "scale": "scale error"}.get(part, part)
-            rows.append((f"{what} {axis}, {unit}", *cells))
-    return (
-        Table(
-            "Sensors taken apart",
-            "What is in K: by how much each axis says too much, by how much two of them are closer than a right angle, "
-            "and the rotation vector that turns the body's axes into the sensor's, with sigmas.",
-            ("", *(_NAMES[triad["sensor"]] for triad in triads)),
-            tuple(rows),
-        )
-        if triads
-        else None
-    )
-
-
-def _number(part: str, value: float, sigma: float, unit: str) -> str:
-    factor = 100.0 if unit == "%" else np.rad2deg(1.0)
-    shown, spread = factor * (value - (part == "scale")), factor * sigma
-    if not spread < _UNKNOWN:
-        return "unknown"
-    return f"{to_digits_of(shown, spread)} ± {spread:.2g}" if spread > 0.0 else f"{to_digits_of(shown, 0.0)} fixed"
-
-
-def _noise(calibration: Calibration) -> Table | None:
-    rows = []
-    for row in _rows(calibration, "noise"):
-        unit, factor = _NOISE[row["sensor"]]
-        axes = (f"{factor * density:.3g}" for density in row["density"])
-        rows.append((_NAMES[row["sensor"]], *axes, f"{factor * row['stated']:.3g}", unit, f"{row['rate_hz']:.5g}"))
-    return (
-        Table(
-            "White noise at rest",
-            "With K applied, from the Allan deviation over a quarter of a second in the static poses; stated is what "
-            "the solution took it to be.",
-            ("sensor", "x", "y", "z", "stated", "unit", "rate, Hz"),
-            tuple(rows),
-        )
-        if rows
-        else None
-    )
-
-
-def _static_poses(calibration: Calibration) -> Table | None:
-    rows = [
-        (str(k + 1), f"{row['start_s']:.2f}", f"{row['end_s']:.2f}", described(row["up"]), ", ".join(row["used"]))
-        for k, row in enumerate(_rows(calibration, "static_poses"))
-    ]
-    return (
-        Table(
-            "Static poses",
-            "When gyro and accelerometer were quiet, which side was up, and what was used of it.",
-            ("pose", "from, s", "to, s", "up", "used"),
-            tuple(rows),
-        )
-        if rows
-        else None
-    )
-
-
-def described(up: object) -> str:
-    """The side of the body that is up, and where it leans, in words; `up` (3,) is the direction of up in the body."""
-    direction = np.asarray(up, dtype=float) / np.linalg.norm(np.asarray(up, dtype=float))
-    first, second = np.argsort(-np.abs(direction))[:2]
-    lean = np.rad2deg(np.arccos(np.clip(abs(direction[first]), 0.0, 1.0)))
-    words = _side(first, direction[first])
-    return words if lean < 5.0 else f"{words}, {lean:.0f} deg towards {_side(second, direction[second])}"
-
-
-def _side(axis: int, value: float) -> str:
-    return f"{'+' if value > 0.0 else '-'}{'xyz'[axis]}"
+    return [each for each in [*found, coverage(calibration)] if each is not None]
 
 
 def _errors(
@@ -197,7 +102,7 @@ def _before_and_after(name: str, time: Array, before: Array, after: Array) -> Pl
     what = "Rotation over each turn, against the attitudes found" if name == "gyro" else "Mean of each static pose"
     against = "" if name == "gyro" else " against what it should say at the attitude found"
     return Plot(
-        f"{_NAMES[name].capitalize()} before and after",
+        f"{NAMES[name].capitalize()} before and after",
         f"{what}{against}: {rms[0]:.3g} {unit} RMS as recorded, {rms[1]:.3g} {unit} calibrated.",
         out,
     )
@@ -244,7 +149,7 @@ def _sphere(
     out.update_yaxes(title_text="length, % off", row=2, col=1)
     rms = [float(np.sqrt((miss**2).mean())) for miss in misses]
     return Plot(
-        f"Sphere of the {_NAMES[name]}",
+        f"Sphere of the {NAMES[name]}",
         f"Means of the static poses over the strength they should have, seen along z and along y, and below how far "
         f"their lengths are off: {rms[0]:.2g} % RMS as recorded, {rms[1]:.2g} % calibrated.",
         out,
@@ -262,95 +167,3 @@ def _add_both(out: go.Figure, x: list[Array], y: list[Array], row: int, column: 
         out.add_scatter(
             x=across, y=along, mode="markers", name=name, marker=marker, showlegend=shown, row=row, col=column
         )
-
-
-def _coverage(calibration: Calibration) -> Plot | None:
-    """Directions of up in the body, on an equal-area map of the sphere, with the gaps between them."""
-    up = np.array([row["up"] for row in _rows(calibration, "static_poses")])
-    if not len(up):
-        return None
-    away = _distances(up)
-    widest = int(np.argmax(away))
-    out = figure("", height=420, x_title="")
-    latitude = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 61)
-    for longitude in (-np.pi, np.pi):
-        edge = _map(
-            np.stack(
-                [
-                    np.cos(latitude) * np.cos(longitude * 0.999999),
-                    np.cos(latitude) * np.sin(longitude * 0.999999),
-                    np.sin(latitude),
-                ],
-                axis=1,
-            )
-        )
-        out.add_scatter(
-            x=edge[:, 0], y=edge[:, 1], mode="lines", line={"color": "#c3ccd4"}, hoverinfo="skip", showlegend=False
-        )
-    ends = (*_GAPS[1:], np.inf)
-    for low, high, color in zip(_GAPS, ends, _GAP_COLORS, strict=True):
-        some = _map(_SPHERE[(away > low) & (away <= high)])
-        out.add_scatter(
-            x=some[:, 0],
-            y=some[:, 1],
-            mode="markers",
-            hoverinfo="skip",
-            name=f"no pose within {np.rad2deg(low):.0f} deg",
-            marker={"color": color, "size": 6},
-        )
-    at = _map(up)
-    hover = [f"pose {k + 1}: {described(direction)}" for k, direction in enumerate(up)]
-    out.add_scatter(
-        x=at[:, 0],
-        y=at[:, 1],
-        mode="markers",
-        name="poses",
-        text=hover,
-        hoverinfo="text",
-        marker={"color": _AFTER, "size": 9, "line": {"color": "white", "width": 1}},
-    )
-    faces = np.vstack([np.eye(3), -np.eye(3)])
-    where = _map(faces)
-    out.add_scatter(
-        x=where[:, 0],
-        y=where[:, 1],
-        mode="text",
-        text=["+x", "+y", "+z", "-x", "-y", "-z"],
-        textfont={"size": 14, "color": "#1b2530"},
-        hoverinfo="skip",
-        showlegend=False,
-    )
-    out.update_xaxes(visible=False, range=[-3.0, 3.0])
-    out.update_yaxes(visible=False, scaleanchor="x", range=[-1.6, 1.6])
-    return Plot(
-        "Attitudes covered",
-        f"Which direction of the body was up in each of the {len(up)} static poses, on an equal-area map of all "
-        f"directions. The middle of the widest gap is {np.rad2deg(away[widest]):.0f} deg from every pose, "
-        f"at {described(_SPHERE[widest])}.",
-        out,
-    )
-
-
-def _spread(count: int) -> Array:
-    """Directions (count, 3) spread evenly over the sphere, by the golden angle."""
-    z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
-    turn_ = np.arange(count) * np.pi * (3.0 - np.sqrt(5.0))
-    return np.stack([np.sqrt(1.0 - z**2) * np.cos(turn_), np.sqrt(1.0 - z**2) * np.sin(turn_), z], axis=1)
-
-
-_SPHERE = _spread(_DIRECTIONS)
-
-
-def _distances(up: Array) -> Array:
-    """Angles, rad, from each direction of the sphere to the nearest of `up` (P, 3)."""
-    return np.asarray(np.arccos(np.clip((_SPHERE @ up.T).max(axis=1), -1.0, 1.0)))
-
-
-def _map(directions: Array) -> Array:
-    """Places (n, 2) of directions (n, 3) on Hammer's equal-area map, +x in the middle, +z on top."""
-    longitude = np.arctan2(directions[:, 1], directions[:, 0])
-    sine = np.clip(directions[:, 2], -1.0, 1.0)
-    cosine = np.sqrt(1.0 - sine**2)
-    z = np.sqrt(1.0 + cosine * np.cos(0.5 * longitude))
-    x, y = 2.0 * np.sqrt(2.0) * cosine * np.sin(0.5 * longitude) / z, np.sqrt(2.0) * sine / z
-    return np.stack([-x, y], axis=1)

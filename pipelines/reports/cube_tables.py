@@ -1,0 +1,99 @@
+"""Tables of the cube method: K taken apart, noise at rest, static poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from pipelines.reports.result import Calibration, Table
+from pipelines.reports.units import to_digits_of
+
+NAMES = {"accel": "accelerometer", "gyro": "gyro", "mag": "magnetometer"}
+_NOISE = {"accel": ("µg/√Hz", 1e6 / 9.80665), "gyro": ("deg/√h", np.rad2deg(60.0)), "mag": ("nT/√Hz", 1e9)}
+_PARTS = (
+    ("scale", "%", ("x", "y", "z")),
+    ("nonorthogonality", "deg", ("xy", "xz", "yz")),
+    ("mounting", "deg", ("x", "y", "z")),
+)
+# A part of K known no better than this, %, or deg, is not known.
+_UNKNOWN = 20.0
+
+
+def cube_tables(calibration: Calibration) -> list[Table]:
+    """Of what was found beside the parameters; empty ones are left out."""
+    tables = (_taken_apart(calibration), _noise(calibration), _static_poses(calibration))
+    return [table for table in tables if table.rows]
+
+
+def rows_of(calibration: Calibration, name: str) -> Sequence[Mapping[str, Any]]:
+    """Rows of a table of findings; none if there is no such table."""
+    return calibration.findings.get(name, ())
+
+
+def _taken_apart(calibration: Calibration) -> Table:
+    """K of each triad as scale, non-orthogonality and mounting."""
+    triads = rows_of(calibration, "triads")
+    rows = []
+    for part, unit, axes in _PARTS if triads else ():
+        for i, axis in enumerate(axes):
+            cells = [_number(part, triad[part][i], triad[f"{part}_sigma"][i], unit) for triad in triads]
+            what = {"nonorthogonality": "non-orthogonality", "scale": "scale error"}.get(part, part)
+            rows.append((f"{what} {axis}, {unit}", *cells))
+    return Table(
+        "Sensors taken apart",
+        "What is in K: by how much each axis says too much, by how much two of them are closer than a right angle, "
+        "and the rotation vector that turns the body's axes into the sensor's, with sigmas.",
+        ("", *(NAMES[triad["sensor"]] for triad in triads)),
+        tuple(rows),
+    )
+
+
+def _number(part: str, value: float, sigma: float, unit: str) -> str:
+    factor = 100.0 if unit == "%" else np.rad2deg(1.0)
+    shown, spread = factor * (value - (part == "scale")), factor * sigma
+    if not spread < _UNKNOWN:
+        return "unknown"
+    return f"{to_digits_of(shown, spread)} ± {spread:.2g}" if spread > 0.0 else f"{to_digits_of(shown, 0.0)} fixed"
+
+
+def _noise(calibration: Calibration) -> Table:
+    rows = []
+    for row in rows_of(calibration, "noise"):
+        unit, factor = _NOISE[row["sensor"]]
+        axes = (f"{factor * density:.3g}" for density in row["density"])
+        rows.append((NAMES[row["sensor"]], *axes, f"{factor * row['stated']:.3g}", unit, f"{row['rate_hz']:.5g}"))
+    return Table(
+        "White noise at rest",
+        "With K applied, from the Allan deviation over a quarter of a second in the static poses; stated is what "
+        "the solution took it to be.",
+        ("sensor", "x", "y", "z", "stated", "unit", "rate, Hz"),
+        tuple(rows),
+    )
+
+
+def _static_poses(calibration: Calibration) -> Table:
+    rows = [
+        (str(k + 1), f"{row['start_s']:.2f}", f"{row['end_s']:.2f}", described(row["up"]), ", ".join(row["used"]))
+        for k, row in enumerate(rows_of(calibration, "static_poses"))
+    ]
+    return Table(
+        "Static poses",
+        "When gyro and accelerometer were quiet, which side was up, and what was used of it.",
+        ("pose", "from, s", "to, s", "up", "used"),
+        tuple(rows),
+    )
+
+
+def described(up: object) -> str:
+    """The side of the body that is up, and where it leans, in words; `up` (3,) is the direction of up in the body."""
+    direction = np.asarray(up, dtype=float) / np.linalg.norm(np.asarray(up, dtype=float))
+    first, second = np.argsort(-np.abs(direction))[:2]
+    lean = np.rad2deg(np.arccos(np.clip(abs(direction[first]), 0.0, 1.0)))
+    words = _side(first, direction[first])
+    return words if lean < 5.0 else f"{words}, {lean:.0f} deg towards {_side(second, direction[second])}"
+
+
+def _side(axis: int, value: float) -> str:
+    return f"{'+' if value > 0.0 else '-'}{'xyz'[axis]}"
