@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
@@ -47,8 +48,8 @@ def write_small(path: Path, form: str, chunk_size: int = 4000, n: int = 120) -> 
     return rewrite(path, path.with_name(f"{form}.mcap"), chunk_size=chunk_size, **FORMS[form])
 
 
-def rewrite(source: Path, path: Path, **options: Any) -> Path:
-    """The same messages and attachments through the mcap package's own writer, with options of its."""
+def rewrite(source: Path, path: Path, renamed: Mapping[str, str] | None = None, **options: Any) -> Path:
+    """The same messages and attachments through the mcap package's own writer, with options of its; topics renamed."""
     with source.open("rb") as stream, path.open("wb") as out:
         reader = make_reader(stream)
         writer = Writer(out, **options)
@@ -60,7 +61,9 @@ def rewrite(source: Path, path: Path, **options: Any) -> Path:
             if channel.id not in channels:
                 assert schema is not None
                 number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.id] = writer.register_channel(channel.topic, "cdr", number)
+                channels[channel.id] = writer.register_channel(
+                    (renamed or {}).get(channel.topic, channel.topic), "cdr", number
+                )
             writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
         writer.finish()  # type: ignore[no-untyped-call]
     return path
@@ -73,6 +76,15 @@ def boundaries(data: bytes) -> list[int]:
         places.append(at)
         at += HEAD.size + HEAD.unpack_from(data, at)[1]
     return places
+
+
+def has_chunks(data: bytes) -> bool:
+    return any(data[at] == Opcode.CHUNK for at in boundaries(data)[:-1])
+
+
+def cuts(data: bytes) -> list[bytes]:
+    """Cut at every record boundary and one byte beside it."""
+    return [data[: at + off] for at in boundaries(data) for off in (-1, 0, 1)]
 
 
 def flips(data: bytes, number: int, seed: int) -> Iterator[bytes]:

@@ -137,7 +137,7 @@ def load_calibration(path: Path) -> SavedCalibration:
         return SavedCalibration.model_validate(content)
     except OSError as error:
         raise InputError(f"{path}: cannot be opened ({error.strerror})") from error
-    except (UnicodeDecodeError, YAMLError) as error:
+    except (UnicodeDecodeError, YAMLError, RecursionError) as error:
         raise InputError(
             f"{path}: unreadable YAML; a calibration.yaml as `alidade calibrate` writes it is needed"
         ) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from pathlib import Path
 from typing import TypeVar
 
@@ -30,7 +31,7 @@ def load_scenario(model: type[Model], name_or_path: str | Path) -> Model:
     try:
         content = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
         return model.model_validate({} if content is None else content)
-    except (OSError, UnicodeDecodeError, YAMLError) as error:
+    except (OSError, UnicodeDecodeError, YAMLError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from error
     except ValidationError as error:
         raise InputError(f"{path}: {_explain(error.errors()[0], model)}") from error
@@ -50,7 +51,7 @@ def _explain(error: ErrorDetails, model: type[BaseModel]) -> str:
     """One line about the first thing pydantic rejected."""
     where = ".".join(str(part) for part in error["loc"])
     if error["type"] != "extra_forbidden":
-        return f"{where or 'the scenario'}: {error['msg']} (got {error['input']!r})"
+        return f"{where or 'the scenario'}: {error['msg']} (got {reprlib.repr(error['input'])})"
     return f"unknown key {where}{nearest(str(error['loc'][-1]), _keys(model))}"
 
 
