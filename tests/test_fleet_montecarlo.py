@@ -120,7 +120,7 @@ def test_a_missing_extra_is_told(
 
 def test_the_consistency_page_lists_every_solver(scheduler: str, scenario: Path, tmp_path: Path) -> None:
     study = run_study("head", str(scenario), range(4), SOLVERS, tmp_path / "out", scheduler)
-    page = consistency.page([study], 4)
+    page = consistency.page([(solver, study) for solver in SOLVERS], 4)
     rows = [line.split(" | ")[:3] for line in page.splitlines() if line.startswith("| head")]
     assert rows == [["| head", solver, "4"] for solver in SOLVERS]
 
