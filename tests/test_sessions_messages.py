@@ -13,6 +13,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipelines.errors import InputError
 from pipelines.sessions import messages
+from pipelines.sessions.config import Config
+from pipelines.sessions.info import resolve_method, session_facts
 from pipelines.sessions.reading import open_recording
 
 T0 = 1_700_000_000_000_000_000
@@ -262,3 +264,69 @@ def test_unreadable_definition_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read") as caught:
         open_recording(path).imu("/i")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        (messages.IMU, "std_msgs/Header header\nstring angular_velocity"),
+        (messages.IMU, "std_msgs/Header header\nfloat64[4] angular_velocity"),
+        (messages.JOINT_STATE, "std_msgs/Header header\nfloat64[] name\nfloat64[] position"),
+        (messages.JOINT_STATE, "std_msgs/Header header\nstring[] name\nstring[] position"),
+        (messages.CAMERA_INFO, "std_msgs/Header header\nuint32 height\nuint32 width"),
+        (messages.CAMERA_INFO, "std_msgs/Header header\nstring k\nstring r\nstring p"),
+        (messages.COMPRESSED_IMAGE, "std_msgs/Header header\nstring format\nstring data"),
+        (messages.TAG_DETECTIONS, "std_msgs/Header header\nuint8[] detections"),
+        (messages.TAG_DETECTIONS, "std_msgs/Header header\nstring detections"),
+        (messages.IMU, "float64 x"),
+    ],
+)
+def test_a_wrong_schema_of_the_right_name_is_one_line(kind: str, text: str, tmp_path: Path) -> None:
+    header = OLD_TAGS[OLD_TAGS.index("=" * 80) : OLD_TAGS.index("=" * 80 + "\nMSG: apriltag")]
+    store = get_typestore(Stores.EMPTY)
+    full = f"{text}\n{header}"
+    store.register(get_types_from_msg(full, kind))
+    made = messages.Definition(kind, full).new(kind) if "header" not in text else None
+    rng = np.random.default_rng(0)
+    data = store.serialize_cdr(made or random_message(kind, rng, T0, "abc", store), kind)
+    path = write_raw(tmp_path / "x.mcap", "/x", kind, full, [bytes(data)] * 2, [T0, T0 + 1])
+    recording = open_recording(path)
+    with pytest.raises(InputError, match=r"topic /x: the messages have no usable field|/x has no message with"):
+        {
+            messages.IMU: recording.imu,
+            messages.JOINT_STATE: lambda topic: recording.joints(topic, ["ab", "c"]),
+            messages.CAMERA_INFO: recording.camera_info,
+            messages.COMPRESSED_IMAGE: lambda topic: list(recording.images(topic)),
+            messages.TAG_DETECTIONS: recording.detections,
+        }[kind]("/x")
+
+
+@pytest.mark.parametrize(
+    ("message", "schema", "kind", "shown"),
+    [
+        ("json", "jsonschema", "foxglove.Imu", r"/imu \(foxglove.Imu, json/jsonschema\)"),
+        ("protobuf", "protobuf", "foxglove.Imu", r"/imu \(foxglove.Imu, protobuf/protobuf\)"),
+        ("ros1", "ros1msg", "sensor_msgs/Imu", r"\(a ROS 1 recording\): /imu \(Imu, ros1/ros1msg\)"),
+        ("cdr", "ros2idl", messages.IMU, r"/imu \(Imu, cdr/ros2idl\)"),
+        ("cdr", "", messages.IMU, r"/imu \(Imu, cdr/\)"),
+    ],
+)
+def test_another_encoding_is_named_with_what_is_needed(
+    message: str, schema: str, kind: str, shown: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "x.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros1" if message == "ros1" else "")
+        number = writer.register_schema(kind, schema, b"{}")
+        channel = writer.register_channel("/imu", message, number)
+        writer.add_message(channel, T0, b"{}", T0)
+        writer.finish()  # type: ignore[no-untyped-call]
+    recording = open_recording(path)
+    facts = session_facts(recording, Config())
+    assert [topic.count for topic in facts.topics] == [1]
+    assert not facts.methods
+    with pytest.raises(InputError, match=rf"no usable topics.*{shown}.*needed are ROS 2 messages \(cdr/ros2msg\)"):
+        resolve_method(None, recording, Config())
+    with pytest.raises(InputError, match=r"topic /imu (holds|has the encoding) .*needed is .*cdr/ros2msg"):
+        recording.imu("/imu")

@@ -89,8 +89,8 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
     if able:
         raise InputError(f"{recording.path}: the topics serve {' and '.join(able)}; choose with --method")
     raise InputError(
-        f"{recording.path}: no usable topics for any method; {recording.there()}; "
-        "`alidade info` tells what each method needs, `topics:` in the config can rename"
+        f"{recording.path}: no usable topics for any method; {recording.there()}; needed are ROS 2 messages "
+        f"({ENCODING}): `alidade info` tells which for each method, `topics:` in the config can rename"
     )
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,6 +22,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines import progress
 from pipelines.errors import InputError
 from pipelines.sessions import messages, series
 from pipelines.sessions.clocks import check_clock
@@ -160,7 +162,7 @@ class Recording:
         seen: dict[str, None] = {}
 
         def order(message: Any) -> list[int] | None:
-            seen.update(dict.fromkeys(message.name))
+            seen.update(dict.fromkeys(map(str, message.name)))
             if not set(names) <= set(message.name) or len(message.position) != len(message.name):
                 return None
             return [message.name.index(name) for name in names]
@@ -181,25 +183,28 @@ class Recording:
     def camera_info(self, topic: str) -> series.CameraInfo:
         """The first message of a sensor_msgs/msg/CameraInfo topic."""
         for t_ns, _, message, _ in self._decoded(topic, messages.CAMERA_INFO):
-            k, r, p = (np.array(values, dtype=float) for values in (message.k, message.r, message.p))
-            d = np.array(message.d, dtype=float)
-            return series.CameraInfo(
-                t_ns,
-                int(message.width),
-                int(message.height),
-                message.distortion_model,
-                d,
-                k.reshape(3, 3),
-                r.reshape(3, 3),
-                p.reshape(3, 4),
-                message.header.frame_id,
-            )
+            with self._fields(topic):
+                k, r, p = (np.array(values, dtype=float) for values in (message.k, message.r, message.p))
+                d = np.array(message.d, dtype=float)
+                return series.CameraInfo(
+                    t_ns,
+                    int(message.width),
+                    int(message.height),
+                    message.distortion_model,
+                    d,
+                    k.reshape(3, 3),
+                    r.reshape(3, 3),
+                    p.reshape(3, 4),
+                    message.header.frame_id,
+                )
         raise AssertionError("an empty topic has been refused")
 
     def images(self, topic: str) -> Iterator[tuple[int, bytes]]:
         """(stamp in ns, file) of the pictures on a sensor_msgs/msg/CompressedImage topic, one at a time."""
         for t_ns, _, message, _ in self._decoded(topic, messages.COMPRESSED_IMAGE):
-            yield t_ns, message.data.tobytes()
+            with self._fields(topic):
+                picture = message.data.tobytes()
+            yield t_ns, picture
 
     def detections(self, topic: str) -> series.DetectionSeries:
         """An apriltag_msgs/msg/AprilTagDetectionArray topic, with corners as points or as plain numbers."""
@@ -209,14 +214,15 @@ class Recording:
         for i, (t_ns, from_log, message, definition) in enumerate(self._decoded(topic, messages.TAG_DETECTIONS)):
             stamps.append(t_ns)
             by_log += from_log
-            for found in message.detections:
-                frame.append(i)
-                tag_id.append(int(definition.numbers(found.id)[0]))
-                # (x, y) or (x, y, z) of each
-                corners.append(definition.numbers(found.corners).reshape(4, -1)[:, :2])
-                hamming.append(int(found.hamming))
-                margin.append(float(found.decision_margin))
-                family.append(found.family)
+            with self._fields(topic):
+                for found in message.detections:
+                    frame.append(i)
+                    tag_id.append(int(definition.numbers(found.id)[0]))
+                    # (x, y) or (x, y, z) of each
+                    corners.append(definition.numbers(found.corners).reshape(4, -1)[:, :2])
+                    hamming.append(int(found.hamming))
+                    margin.append(float(found.decision_margin))
+                    family.append(found.family)
         return series.DetectionSeries(
             np.array(stamps, dtype=np.int64),
             np.array(frame, dtype=np.int64),
@@ -267,9 +273,8 @@ class Recording:
         """Raise InputError unless the topic is there, has messages, and one of the types."""
         found = self.topics.get(topic)
         if found is None:
-            named = [f"{name} ({t.type.split('/')[-1]})" for name, t in self.topics.items()]
             raise InputError(
-                f"{self.path}: no topic {topic} ({' or '.join(types)}); {self.there(named)}; "
+                f"{self.path}: no topic {topic} ({' or '.join(types)}); {self.there()}; "
                 "`topics:` in the config can rename"
             )
         if types and found.type not in types:
@@ -283,9 +288,20 @@ class Recording:
         if not found.count:
             raise InputError(f"{self.path}: topic {topic} has no messages")
 
-    def there(self, topics: Sequence[str] | None = None) -> str:
+    @contextmanager
+    def _fields(self, topic: str) -> Iterator[None]:
+        """Turns what comes of fields that are missing, or are something else, into an InputError."""
+        try:
+            yield
+        except (KeyError, AttributeError, TypeError, ValueError) as error:
+            raise InputError(f"{self.path}: topic {topic}: the messages have no usable field ({error})") from error
+
+    def there(self) -> str:
         """A phrase that lists the topics of the recording, and what is lost of it."""
-        named = list(self.topics if topics is None else topics)
+        named = [
+            f"{name} ({t.type.split('/')[-1]}{f', {t.encoding}' if t.encoding != ENCODING else ''})"
+            for name, t in self.topics.items()
+        ]
         more = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
         ros1 = " (a ROS 1 recording)" if self.profile == "ros1" else ""
         return "; ".join(
@@ -358,11 +374,10 @@ class Recording:
             for definition, rows in self._rows(topic):
                 if rows.channel not in decoders:
                     decoders[rows.channel] = Decoder(definition, fields)
-                decoders[rows.channel].append(rows, table)
+                with self._fields(topic):
+                    decoders[rows.channel].append(rows, table)
         except MessageError as error:
             raise self._unreadable(topic, error) from error
-        except (KeyError, AttributeError) as error:
-            raise InputError(f"{self.path}: topic {topic}: the messages have no usable field {error}") from error
         self._check_read(topic, table.taken)
 
 
