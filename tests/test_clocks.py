@@ -117,8 +117,14 @@ def stuck(times: Stamps) -> tuple[Stamps, Stamps]:
     return stamps, LOGGED
 
 
+def all_forward(times: Stamps) -> tuple[Stamps, Stamps]:
+    """All clocks set five seconds forward: nothing tells it from a gap, and as one it is read."""
+    return after(700, 5000.0, times), after(700, 5000.0, LOGGED)
+
+
 @pytest.mark.parametrize(
-    "make", [late, stalled, with_gaps, twice, slower, lagging, without_stamps, irregular, in_another_order, stuck]
+    "make",
+    [late, stalled, with_gaps, twice, slower, lagging, without_stamps, irregular, in_another_order, stuck, all_forward],
 )
 def test_what_is_no_step_is_none(make: Callable[[Stamps], tuple[Stamps, Stamps]]) -> None:
     assert find_step(*make(STAMPS)) is None

@@ -239,3 +239,29 @@ class Page(HTMLParser):
             self.code += data
         else:
             self.text += data
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["indexer_nominal", "cube_nominal", "head_mounts", "los_nominal"])
+def test_independent_recordings_damaged_are_calibrated_rightly_or_not_at_all(
+    name: str, shared_data: Path, tmp_path: Path
+) -> None:
+    whole = (shared_data / "contract" / f"{name}.mcap").read_bytes()
+    truth = json.loads((shared_data / "contract" / f"{name}.truth.json").read_text())
+    rng = np.random.default_rng(4)
+    copies = [whole[: int(share * len(whole))] for share in (0.35, 0.6, 0.85)]
+    for number in (1, 1, 1, 3, 6):
+        flipped = bytearray(whole)
+        for at in rng.integers(2000, len(whole), number):
+            flipped[at] ^= 0x5A
+        copies.append(bytes(flipped))
+    for copy in copies:
+        (tmp_path / "x.mcap").write_bytes(copy)
+        try:
+            (calibration,) = calibrate(tmp_path / "x.mcap", ["batch"])
+        except InputError:
+            continue
+        known = [p for p in calibration.parameters if isinstance(truth.get(p.name), float) and p.sigma > 0.0]
+        assert known
+        errors = [abs(p.value - truth[p.name]) / p.sigma for p in known]
+        assert calibration.assessment.status != "calibrated" or max(errors) < 4.0
