@@ -52,7 +52,7 @@ def los_rates() -> tuple[Model, Array]:
     H = rate_matrix(rng.uniform(-0.5, 0.5, (n, 2)), rng.normal(scale=0.2, size=(n, 3)))
     sigma = rng.uniform(1e-3, 2e-3, n)
     noise = sigma[:, None] * rng.standard_normal((n, 2))
-    return LosRateFactor(np.arange(n), H @ np.array([8e-3, -9e-3, 7e-3, 5e-3]) + noise, H, sigma), np.zeros(4)
+    return LosRateFactor(np.arange(float(n)), H @ np.array([8e-3, -9e-3, 7e-3, 5e-3]) + noise, H, sigma), np.zeros(4)
 
 
 def accelerometer() -> tuple[Model, Array]:
@@ -64,7 +64,9 @@ def accelerometer() -> tuple[Model, Array]:
     A = np.eye(3) + rng.normal(scale=1e-2, size=(3, 3))
     sigma = rng.uniform(1e-3, 2e-3, n)
     raw = up @ A.T + 0.1 + sigma[:, None] * rng.standard_normal((n, 3))
-    return AtKnownAttitudes(AccelFactor(np.arange(n), raw, sigma, GRAVITY), nRb), np.append(np.eye(3), np.zeros(3))
+    return AtKnownAttitudes(AccelFactor(np.arange(float(n)), raw, sigma, GRAVITY), nRb), np.append(
+        np.eye(3), np.zeros(3)
+    )
 
 
 def ours(model: Model, start: Array) -> Array:

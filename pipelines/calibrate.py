@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from pipelines import progress
 from pipelines.consistency import Halves, find_causes, held_out, mostly_rejected, split_halves
 from pipelines.errors import InputError
-from pipelines.methods.base import Estimate, Problem
+from pipelines.methods.base import Estimate, Problem, Step
 from pipelines.observability import Cause, assess
 from pipelines.registry import Method, method
 from pipelines.reports.result import Calibration
@@ -45,9 +47,11 @@ def calibrate(
         IndeterminateError: states other than the parameters are not determined.
     """
     start = time.perf_counter()
-    session = Session.read(open_recording(path, strict), method_name, config_file)
+    with progress.doing("reading"):
+        session = Session.read(open_recording(path, strict), method_name, config_file)
     read = time.perf_counter() - start
-    solved = (_solve(solver, session.method, session.data, session.config, window) for solver in solvers)
+    duration = session.recording.duration_s
+    solved = (_solve(solver, session.method, session.data, session.config, window, duration) for solver in solvers)
     return calibrations(session, solved, {"read": read})
 
 
@@ -92,7 +96,8 @@ def calibrations(
         if ours and not estimate.converged:
             assessment = assessment.unsolved(estimate.message)
         elif ours and (assessment.status == "inconsistent" or mostly_rejected(estimate)):
-            causes = find_causes(chosen, data, config, estimate) if causes is None else causes
+            with progress.doing("looking for causes"):
+                causes = find_causes(chosen, data, config, estimate) if causes is None else causes
             assessment = assessment.explained(causes)
         found.append(
             Calibration(
@@ -121,17 +126,27 @@ def self_agreement(
     return split_halves(session.method, session.data, session.config), held_out(session.problem())
 
 
-def _solve(solver: str, chosen: Method, data: object, config: Config, window: float | None) -> tuple[Estimate, Problem]:
+def _solve(
+    solver: str, chosen: Method, data: object, config: Config, window: float | None, duration: float
+) -> tuple[Estimate, Problem]:
     problem = chosen.problem(data, config)
     if solver == "published":
         return chosen.published(data, config, problem), problem
     if solver == "incremental":
         from pipelines.solvers.incremental import solve_incremental
 
-        return solve_incremental(problem, window), problem
+        return solve_incremental(replace(problem, steps=partial(_shown, problem, duration)), window), problem
     from pipelines.solvers.batch import solve_batch
 
-    return solve_batch(problem), problem
+    with progress.doing("solving"):
+        return solve_batch(problem), problem
+
+
+def _shown(problem: Problem, duration: float, chunk: int) -> Iterator[Step]:
+    """The problem's steps; those fed one by one are shown as they are taken, by time in the recording."""
+    if chunk > 1:
+        return problem.steps(chunk)
+    return progress.track(problem.steps(chunk), "step by step", duration, lambda step: step.time)
 
 
 def _published(chosen: Method, data: object, config: Config) -> Estimate | None:

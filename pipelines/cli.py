@@ -33,6 +33,8 @@ _MethodName = Annotated[str | None, typer.Option("--method", help="los, indexer,
 _ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML that overrides the recording's own config.")]
 _Scheduler = Annotated[str | None, typer.Option(help="Of a dask cluster, tcp://host:8786; default: this machine.")]
 _Jobs = Annotated[int | None, typer.Option(help="Local worker processes; default: one a core.")]
+_PictureJobs = Annotated[int | None, typer.Option("--jobs", help="Processes for many pictures; default: one a core.")]
+_Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars.")]
 _Strict = Annotated[bool, typer.Option("--strict", help="Refuse a recording of which anything is lost.")]
 _Window = Annotated[str, typer.Option(help="Of the incremental solver: seconds kept, or 'all'.")]
 
@@ -46,15 +48,20 @@ def calibrate(
     window: _Window = "1",
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: SESSION-SOLVER.")] = None,
     strict: _Strict = False,
+    jobs: _PictureJobs = None,
+    quiet: _Quiet = False,
 ) -> None:
     """Calibrate a recording. Exit code 0 calibrated, 2 unusable input, 3 weak or unobservable, 4 inconsistent."""
-    from pipelines import terminal
+    from pipelines import progress, terminal
     from pipelines.calibrate import calibrate as run
     from pipelines.reports.write import write_results
+    from pipelines.vision import parallel
 
-    (calibration,) = run(session, [solver.value], method, config, _seconds(window), strict)
     folder = out or session.with_name(f"{session.stem}-{solver.value}")
-    written = write_results(folder, calibration)
+    with progress.shown(quiet), parallel.processes(jobs):
+        (calibration,) = run(session, [solver.value], method, config, _seconds(window), strict)
+        with progress.doing("writing"):
+            written = write_results(folder, calibration)
     terminal.show([calibration])
     terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
     raise typer.Exit(exit_codes.OF_STATUS[calibration.assessment.status])
@@ -68,14 +75,16 @@ def compare(
     window: _Window = "1",
     out: Annotated[Path | None, typer.Option(help="Folder for compare.html, which also splits the recording.")] = None,
     strict: _Strict = False,
+    quiet: _Quiet = False,
 ) -> None:
     """The published, batch and incremental solvers side by side, with errors where the truth is known."""
-    from pipelines import terminal
+    from pipelines import progress, terminal
     from pipelines.calibrate import calibrate as run
     from pipelines.calibrate import self_agreement
     from pipelines.reports.compare import write_compare
 
-    calibrations = run(session, ["published", "batch", "incremental"], method, config, _seconds(window), strict)
+    with progress.shown(quiet):
+        calibrations = run(session, ["published", "batch", "incremental"], method, config, _seconds(window), strict)
     terminal.show(calibrations)
     if out is not None:
         written = write_compare(out, calibrations, *self_agreement(session, method, config))

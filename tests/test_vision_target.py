@@ -10,7 +10,7 @@ from factors import so3
 from pipelines.errors import InputError
 from pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
 from pipelines.vision.camera import Camera
-from pipelines.vision.head import UNREADABLE
+from pipelines.vision.parallel import UNREADABLE
 from pipelines.vision.target import LOST, los_errors
 
 FOCAL = 2000.0

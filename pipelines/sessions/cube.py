@@ -393,22 +393,21 @@ def _pictures(
     recording: Recording, config: Config, epoch_ns: int, camera: Camera, rests: Array, dropped: dict[str, int]
 ) -> Sightings:
     """Tags found in the pictures taken at rest; the others are not looked at."""
-    from pipelines.vision.head import UNREADABLE, decode
-    from pipelines.vision.tags import detect
+    from pipelines.vision.parallel import UNREADABLE, detections
 
     topic = config.topic("image")
     stamps: list[int] = []
     frame: list[int] = []
     parts = []
-    for t_ns, encoded in recording.images(topic):
-        at = (t_ns - epoch_ns) / 1e9
-        if not ((rests[:, 0] <= at) & (at <= rests[:, 1])).any():
-            continue
-        picture = decode(encoded)
-        if picture is None:
+    at_rest = (
+        (t_ns, encoded)
+        for t_ns, encoded in recording.images(topic)
+        if ((rests[:, 0] <= (t_ns - epoch_ns) / 1e9) & ((t_ns - epoch_ns) / 1e9 <= rests[:, 1])).any()
+    )
+    for t_ns, seen in detections(at_rest, config.cube.tag_family, camera):
+        if seen is None:
             count(dropped, f"{topic}: {UNREADABLE}", 1)
             continue
-        seen = detect(picture, config.cube.tag_family, camera)
         sharp = np.isfinite(seen.covariance).all(axis=(1, 2, 3))
         count(dropped, f"{topic}: tag with an edge that cannot be measured", int((~sharp).sum()))
         frame += [len(stamps)] * int(sharp.sum())

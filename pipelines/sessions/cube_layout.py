@@ -28,11 +28,10 @@ def cube_layout(recording: Recording, config: Config) -> Layout:
     camera = read_camera(recording, config)
     topic = config.topic("image")
     if topic in recording.topics:
-        from pipelines.vision.head import decode
-        from pipelines.vision.tags import detect
+        from pipelines.vision.parallel import detections
 
-        pictures = (decode(encoded) for _, encoded in recording.images(topic))
-        found = [detect(picture, config.cube.tag_family, camera) for picture in pictures if picture is not None]
+        seen = detections(recording.images(topic), config.cube.tag_family, camera)
+        found = [tags for _, tags in seen if tags is not None]
     else:
         found = _detections(recording, config)
     if not any(len(tags) for tags in found):

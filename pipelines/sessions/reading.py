@@ -201,7 +201,9 @@ class Recording:
 
     def images(self, topic: str) -> Iterator[tuple[int, bytes]]:
         """(stamp in ns, file) of the pictures on a sensor_msgs/msg/CompressedImage topic, one at a time."""
-        for t_ns, _, message, _ in self._decoded(topic, messages.COMPRESSED_IMAGE):
+        self._require(topic, messages.COMPRESSED_IMAGE)
+        decoded = self._decoded(topic, messages.COMPRESSED_IMAGE)
+        for t_ns, _, message, _ in progress.track(decoded, "pictures", self.topics[topic].count):
             with self._fields(topic):
                 picture = message.data.tobytes()
             yield t_ns, picture

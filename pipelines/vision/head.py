@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from pipelines.errors import InputError
 from pipelines.vision.camera import Camera
+from pipelines.vision.parallel import UNREADABLE, detections
 from pipelines.vision.pose import BodyPose, TagBody, estimate_pose
-from pipelines.vision.tags import Detections, Picture, detect
+from pipelines.vision.tags import Detections
 
 Array = NDArray[np.float64]
 
@@ -22,7 +23,6 @@ _FRESH_NS = 200_000_000
 # share of a tag's side (a layout made by hand is good to half a per cent; a tag in another's place is not).
 _MISFIT_SIGMAS, _MISFIT_PX, _MISFIT_SHARE = 5.0, 0.5, 0.03
 
-UNREADABLE = "picture does not decode"
 UNSEEN = "no tag of the body seen well"
 AMBIGUOUS = "planar flip could not be told"
 MISFIT = "tags do not fit the layout"
@@ -67,27 +67,16 @@ def body_poses(
         sigma_px: as in `estimate_pose`.
     """
     last_t, last_cRb = 0, None
-    for t_ns, encoded in images:
-        picture = decode(encoded)
-        if picture is None:
+    for t_ns, found in detections(images, body.family, camera):
+        if found is None:
             yield Sight(t_ns, np.zeros(0, dtype=np.int64), None, UNREADABLE)
             continue
-        found = detect(picture, body.family, camera)
         fresh = last_cRb is not None and 0 <= t_ns - last_t <= _FRESH_NS
         pose = estimate_pose(camera, body, found, sigma_px, expected=last_cRb if fresh else None)
         problem = _problem(pose, found, sigma_px)
         if pose is not None and problem is None and pose.decided:
             last_t, last_cRb = t_ns, pose.cRb
         yield Sight(t_ns, found.ids, pose, problem)
-
-
-def decode(encoded: bytes) -> Picture | None:
-    """The grey picture in a PNG, JPEG, ... file; None when it does not decode."""
-    import cv2
-
-    data = np.frombuffer(encoded, dtype=np.uint8)
-    picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
-    return None if picture is None else np.asarray(picture)
 
 
 def _problem(pose: BodyPose | None, found: Detections, sigma_px: float | None) -> str | None:

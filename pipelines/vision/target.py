@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from factors import so3
 from pipelines.errors import InputError
 from pipelines.vision.camera import Camera
-from pipelines.vision.head import UNREADABLE, decode
+from pipelines.vision.parallel import UNREADABLE, decode
 from pipelines.vision.tags import Picture, detect
 
 Array = NDArray[np.float64]
