@@ -1,0 +1,83 @@
+"""The runner of the benchmarks and its gate."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import __main__ as runner
+from benchmarks.measure import Ratio, costs, growth, worse
+
+SLOW = """
+from benchmarks.measure import Ratio, costs
+
+def run():
+    a, b = costs([lambda: sum(range(100_000)), lambda: sum(range(300_000))])
+    yield Ratio("toy.sum", "short over long sum", a.seconds / b.seconds, tolerance=0.5, ours=a, theirs=b)
+"""
+
+
+@pytest.fixture
+def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A benchmark of its own among the others, and a folder."""
+    import benchmarks
+
+    (tmp_path / "toy.py").write_text(SLOW)
+    monkeypatch.setattr(benchmarks, "__path__", [*benchmarks.__path__, str(tmp_path)])
+    # Processes the runner starts find it beside the real ones.
+    (tmp_path / "sitecustomize.py").write_text(
+        f"import sys; sys.path.insert(0, {str(Path(runner.__file__).parents[1])!r})\n"
+        f"import benchmarks; benchmarks.__path__.append({str(tmp_path)!r})\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    return tmp_path
+
+
+def test_gate_passes_its_own_baseline_and_fails_a_ratio_made_worse(
+    toy: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    baseline, report = toy / "baseline.json", toy / "report.json"
+    common = ["toy", "--baseline", str(baseline)]
+    assert runner.main([*common, "--save", "--json", str(report)], ("toy",)) == 0
+    (measured,) = json.loads(report.read_text())
+    assert measured["ours"][0] < measured["theirs"][0]
+    assert measured["ours"][1] > 1.0  # MiB
+    assert runner.main([*common, "--gate"], ("toy",)) == 0
+    baseline.write_text(json.dumps({"toy.sum": measured["value"] / 10.0}))
+    capfd.readouterr()
+    assert runner.main([*common, "--gate"], ("toy",)) == 1
+    assert "toy.sum" in capfd.readouterr().err
+
+
+def test_unknown_names_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert runner.main(["nothing"], ("toy",)) == 2
+    assert "no benchmark nothing" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("better", "good", "bad"), [("lower", 1.2, 1.4), ("higher", 0.8, 0.7)])
+def test_worse_is_beyond_the_tolerance_in_its_direction(better: str, good: float, bad: float) -> None:
+    ratio = Ratio("a", "b", good, "lower" if better == "lower" else "higher", 0.3)
+    assert worse([ratio], {"a": 1.0}) == []
+    assert len(worse([replace(ratio, value=bad)], {"a": 1.0})) == 1
+    assert worse([replace(ratio, value=bad)], {}) == []
+
+
+def test_growth_is_the_exponent() -> None:
+    assert growth([1e3, 1e4, 1e5], [2e-3, 2e-2 * 10**0.1, 0.2 * 10**0.2]) == pytest.approx(1.1)
+
+
+def test_peak_memory_is_that_of_the_work() -> None:
+    small, large = costs([lambda: np.zeros(10), lambda: np.ones(8_000_000)], rounds=1, warm=False)
+    assert large.peak_mib is not None
+    assert small.peak_mib is not None
+    assert 50.0 < large.peak_mib - small.peak_mib < 75.0
+
+
+def test_committed_baseline_names_what_is_measured() -> None:
+    baseline = json.loads(runner.BASELINE.read_text())
+    assert {name.split(".")[0] for name in baseline} <= set(runner.SUITE)
+    assert all(value > 0.0 for value in baseline.values())
