@@ -6,7 +6,7 @@ import json
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +111,7 @@ def calibrations(
                 truth=truth,
                 seconds=seconds,
                 plots=chosen.plots(data) if chosen.plots else None,
-                beside=_published(chosen, data, config) if incremental else None,
+                beside=cache(partial(_published, chosen, data, config)) if incremental else None,
                 findings=chosen.findings(data, config, estimate) if chosen.findings else {},
             )
         )

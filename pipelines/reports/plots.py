@@ -190,7 +190,7 @@ _OTHERS = (
 
 def _others(out: go.Figure, calibration: Calibration, name: str, factor: float, color: str) -> set[str]:
     """Draws what else is known of a parameter over time; returns which of _OTHERS that was."""
-    estimate, beside = calibration.estimate, calibration.beside
+    estimate, beside = calibration.estimate, calibration.beside() if calibration.beside else None
     published, smooth, truth = _OTHERS
     shown = set()
     if beside is not None and beside.history is not None and name in beside.names:

@@ -71,7 +71,8 @@ class Calibration:
         software: package -> version.
         seconds: phase -> wall time, beside those of the estimate.
         plots: makes the method's own figures and tables.
-        beside: the published solver's estimate of the same recording, where the report shows it too.
+        beside: tells the published solver's estimate of the same recording, where the report shows it too; None when
+            that solver cannot serve the recording.
         findings: what the method found beside its parameters.
     """
 
@@ -86,7 +87,7 @@ class Calibration:
     software: Mapping[str, str] = field(default_factory=lambda: software_versions())
     seconds: Mapping[str, float] = field(default_factory=dict)
     plots: Callable[[Calibration], Sequence[Plot | Table]] | None = None
-    beside: Estimate | None = None
+    beside: Callable[[], Estimate | None] | None = None
     findings: Findings = field(default_factory=dict)
 
     @property
