@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from enum import StrEnum
 from pathlib import Path
@@ -350,6 +351,8 @@ def main() -> None:
     """Run the command; known trouble is one line on stderr."""
     from pipelines.errors import InputError
 
+    # The matrices are small: threads that wait for each other cost more than they bring, most on a busy machine.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         app()
     except InputError as error:
