@@ -16,6 +16,7 @@ from factors import so3
 from pipelines.errors import InputError
 from pipelines.methods.base import Estimate, Problem
 from pipelines.methods.cube import problem
+from pipelines.methods.cube_findings import findings
 from pipelines.methods.cube_validation import validate
 from pipelines.methods.validation import rms
 from pipelines.observability import Assessment, assess
@@ -279,7 +280,8 @@ def test_real_counts_of_an_xsens_without_camera(shared_data: Path) -> None:
     config = load_config(imu_tk_xsens.CONFIG.encode())
     assert config.latitude_deg is not None
     data = imu_tk_xsens.to_session(shared_data / "imu_tk_xsens")
-    _, estimate, judged = _solved(replace(data, latitude=float(np.deg2rad(config.latitude_deg))), config)
+    data = replace(data, latitude=float(np.deg2rad(config.latitude_deg)))
+    _, estimate, judged = _solved(data, config)
     assert judged.status == "calibrated", judged.headline
     accel, gyro = imu_tk_xsens.as_on_sheet(dict(zip(estimate.names, estimate.values, strict=True)))
     for found, sheet in ((accel, imu_tk_xsens.ACCEL_SHEET), (gyro, imu_tk_xsens.GYRO_SHEET)):
@@ -288,6 +290,9 @@ def test_real_counts_of_an_xsens_without_camera(shared_data: Path) -> None:
     assert accel.offset is not None
     assert imu_tk_xsens.ACCEL_SHEET.offset is not None
     np.testing.assert_allclose(accel.offset, imu_tk_xsens.ACCEL_SHEET.offset, atol=10.0)
+    noise = {row["sensor"]: row["density"] for row in findings(data, config, estimate)["noise"]}
+    for name, density in (("accel", 8e-4), ("gyro", 5.7e-4)):
+        np.testing.assert_allclose(np.array(noise[name]), density, rtol=0.2)
 
 
 def _normalized_error(estimate: Estimate, truth: dict[str, float]) -> float:
