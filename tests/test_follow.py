@@ -181,7 +181,7 @@ def test_a_recording_that_stops_growing_unfinished_gives_what_is_there(whole: Pa
     session = _unfinished(raw, tmp_path / "s.mcap", 0.4)
     calibration, views, said = _follow(Settings(session, patience=1.5))
     assert said[-1] == "nothing new for 1.5 s: the recording is not finished, the result is that of what is there"
-    assert 20.0 < calibration.facts.duration_s < 26.0
+    assert 16.0 < calibration.facts.duration_s < 24.0
     assert views[-1].values is not None
     assert views[-1].time > views[0].time
 
