@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from io import StringIO
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,8 +18,14 @@ if TYPE_CHECKING:
     from pipelines.vision.tags import Detections
 
 
+# Many pictures of one pose tell little more than a few; each is a pose to be found.
+_MOST_PICTURES = 800
+
+
 def cube_layout(recording: Recording, config: Config) -> Layout:
     """Where the cube's tags are, seen from all sides; the config gives their ids and sizes.
+
+    Of a long recording pictures are taken at even distances, a few hundred.
 
     Raises InputError when there are no pictures or detections, or none that ties the tags together.
     """
@@ -30,7 +37,8 @@ def cube_layout(recording: Recording, config: Config) -> Layout:
     if topic in recording.topics:
         from pipelines.vision.parallel import detections
 
-        seen = detections(recording.images(topic), config.cube.tag_family, camera)
+        pictures = islice(recording.images(topic), None, None, _every(recording.topics[topic].count))
+        seen = detections(pictures, config.cube.tag_family, camera)
         found = [tags for _, tags in seen if tags is not None]
     else:
         found = _detections(recording, config)
@@ -39,13 +47,18 @@ def cube_layout(recording: Recording, config: Config) -> Layout:
     return estimate_layout(camera, TagBody.from_board(config.cube), found)
 
 
+def _every(pictures: int) -> int:
+    """Take every so many of them."""
+    return -(-pictures // _MOST_PICTURES)
+
+
 def _detections(recording: Recording, config: Config) -> list[Detections]:
     from pipelines.vision.tags import Detections
 
     seen = recording.detections(config.topic("tag_detections"))
     sigma = first_given(config.noise.corner_px, DEFAULT_NOISE.corner_px)
     found = []
-    for frame in range(len(seen)):
+    for frame in range(0, len(seen), _every(len(seen))):
         rows = np.flatnonzero(seen.frame == frame)
         covariance = np.tile(sigma**2 * np.eye(2), (len(rows), 4, 1, 1))
         found.append(Detections(seen.tag_id[rows], seen.corners[rows], covariance))
