@@ -44,6 +44,8 @@ _MOST_NAMED = 3
 _FEWEST_MEASUREMENTS, _FEWEST_USED = 10, 0.6
 # Iterations of a first look at a change, and how far the typical residual has to fall for a second.
 _GLANCE = 5
+# A model that is right needs no more damping than this; one that needs more is not looked at any longer.
+_GLANCE_DAMPING = 1e-4
 _PROMISING = 0.97
 
 # A half tells a parameter when its sigma is below this share of the prior's; one chunk in so many is held out.
@@ -357,7 +359,7 @@ def _glance(method: Method, data: Any, config: Config) -> float:
         values.insert(step.initial)
         stand_ins.update(step.stand_ins)
     shared = [stand_ins.get(p.key, p.key) for p in problem.parameters]
-    values = optimize(factors, values, shared, None, _GLANCE).values
+    values = optimize(factors, values, shared, None, _GLANCE, _GLANCE_DAMPING).values
     measured = np.concatenate([np.abs(r.whitened).ravel() for r in residuals_of(factors, values).values()])
     processes = [f.factor for f in factors if f.measurement is None and f.family not in ("prior", "definition")]
     sizes = [np.sqrt(2.0 * f.error(values) / f.dim()) for f in processes]

@@ -22,6 +22,8 @@ from pipelines.solvers.marginals import chi_square, joint_covariance, ordering_o
 # Frames in one vectorised factor: past this the Jacobians' zeros cost more than the Python calls they save.
 CHUNK = 20
 _MOST_ITERATIONS = 60
+# Damping in units of an unknown's own information, beyond which no step is left to be made.
+_MOST_DAMPING = 1e8
 # An error (unit: half a squared sigma) less than this above the minimum has nothing more than 0.005 sigma off. What a
 # linearisation foresaw wrongly of its step is about what is left for the next one.
 _ERROR_TOLERANCE = 1e-5
@@ -158,11 +160,12 @@ def optimize(
     shared: Sequence[int],
     loss: TruncatedLoss | None,
     most: int = _MOST_ITERATIONS,
+    most_damping: float = _MOST_DAMPING,
 ) -> Solution:
     """Minimise; with a loss: plain least squares first, and the graduated relaxation only if it leaves outliers."""
     system = System(factors, shared)
     if loss is None:
-        return _minimize(system, values, most=most)
+        return _minimize(system, values, most=most, most_damping=most_damping)
     loss.mu = 0.0
     measurements = sum(len(f.measurement.model.time) for f in factors if f.measurement is not None)
     plain = _minimize(system, values, _ROUGH_TOLERANCE * measurements)
@@ -185,7 +188,11 @@ def optimize(
 
 
 def _minimize(
-    system: System, values: gtsam.Values, tolerance: float = _ERROR_TOLERANCE, most: int = _MOST_ITERATIONS
+    system: System,
+    values: gtsam.Values,
+    tolerance: float = _ERROR_TOLERANCE,
+    most: int = _MOST_ITERATIONS,
+    most_damping: float = _MOST_DAMPING,
 ) -> Solution:
     """Gauss-Newton steps, damped (Levenberg-Marquardt) only when a full step fails."""
     error = system.error(values)
@@ -200,7 +207,7 @@ def _minimize(
             if new_error <= error + _ERROR_TOLERANCE:
                 break
             damping = max(10.0 * damping, 1e-6)
-            if damping > 1e8:
+            if damping > most_damping:
                 return Solution(system, values, False, f"no step lowers the error of {error:.6g}", iteration)
         assert candidate is not None
         fall, rounding = error - new_error, 1e-13 * error + 1e-10 * new_error
