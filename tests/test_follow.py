@@ -93,19 +93,24 @@ def _alidade(*arguments: str) -> list[str]:
 
 async def _received(url: str, topic: str, seconds: float) -> dict[str, Any]:
     """The first message on a topic of a Foxglove server, as any client gets it."""
-    protocols = ["foxglove.sdk.v1", "foxglove.websocket.v1"]
     until = time.monotonic() + seconds
-    while True:
+    while time.monotonic() < until:
         try:
-            connection = await websocket_connect(url, subprotocols=protocols)
-            break
+            found = await _first(url, topic, until)
         except OSError:
-            assert time.monotonic() < until, "no server"
-            await asyncio.sleep(0.1)
+            found = None
+        if found is not None:
+            return found
+        # No server yet, or one too busy to keep this client.
+        await asyncio.sleep(0.1)
+    raise AssertionError(f"nothing on {topic}")
+
+
+async def _first(url: str, topic: str, until: float) -> dict[str, Any] | None:
+    """The first message on a topic; None when the server hangs up."""
+    connection = await websocket_connect(url, subprotocols=["foxglove.sdk.v1", "foxglove.websocket.v1"])
     try:
-        while True:
-            message = await asyncio.wait_for(connection.read_message(), until - time.monotonic())
-            assert message is not None, "the server has gone"
+        while (message := await asyncio.wait_for(connection.read_message(), until - time.monotonic())) is not None:
             if isinstance(message, bytes):
                 if message[0] == 1:  # message data: subscription, time, payload
                     struct.unpack_from("<BIQ", message)
@@ -116,6 +121,7 @@ async def _received(url: str, topic: str, seconds: float) -> dict[str, Any]:
                 if channel["topic"] == topic:
                     wanted = [{"id": 7, "channelId": channel["id"]}]
                     await connection.write_message(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+        return None
     finally:
         connection.close()
 
