@@ -56,6 +56,7 @@ def test_chi_square_fits_the_stated_noise(scored: dict[str, tuple[Calibration, S
         assert calibration.assessment.status == "calibrated", calibration.assessment.headline
 
 
+@pytest.mark.slow
 def test_wrong_noise_is_said_plainly(
     scored: dict[str, tuple[Calibration, Score]], tmp_path: Path, shared_data: Path
 ) -> None:

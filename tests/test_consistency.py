@@ -73,6 +73,7 @@ def test_what_fits_has_no_cause(head: Case) -> None:
     assert find_causes(*head) == ()
 
 
+@pytest.mark.slow
 def test_noise_stated_five_times_too_small_is_named_with_its_factor(head: Case) -> None:
     find, data, config = head
     wrong = replace(data, vision_cov=data.vision_cov / 25.0)
@@ -105,6 +106,7 @@ def test_delay_of_20_ms_with_the_time_offset_fixed(head: Case) -> None:
     assert float(label.split()[4]) == pytest.approx(20.0, abs=3.0)
 
 
+@pytest.mark.slow
 def test_delay_of_20_ms_of_the_los_pictures() -> None:
     """In sway slow enough the mounting angles take the delay up; this one is not."""
     sway = {
@@ -118,7 +120,7 @@ def test_delay_of_20_ms_of_the_los_pictures() -> None:
     assert float(label.split()[4]) == pytest.approx(20.0, abs=2.0)
 
 
-@pytest.mark.parametrize("key", ["los_error", "gyro_density"])
+@pytest.mark.parametrize("key", [pytest.param("los_error", marks=pytest.mark.slow), "gyro_density"])
 def test_the_noise_that_is_too_small_is_told_from_the_others(los: Case, key: str) -> None:
     find, data, config = los
     assert first_cause((find, data, with_noise(config, **{key: 0.2}))).startswith(f"the noise {key} is stated ")

@@ -18,7 +18,13 @@ _BLOCK = re.compile(r"^```(sh|yaml file=(\S+))\n(.*?)^```", re.MULTILINE | re.DO
 _LINK = re.compile(r"\]\((?!https?://)([^)#]+)")
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+# Their commands are those of other tests, on longer recordings.
+_LONG = ("fleet.md", "trust.md")
+
+
+@pytest.mark.parametrize(
+    "page", [pytest.param(p, marks=[pytest.mark.slow] * (p.name in _LONG), id=p.name) for p in PAGES]
+)
 def test_commands_work(page: Path, tmp_path: Path) -> None:
     for kind, file, text in _BLOCK.findall(page.read_text(encoding="utf-8")):
         if kind != "sh":

@@ -122,8 +122,13 @@ def cases() -> dict[str, Case]:
     }
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-@pytest.mark.parametrize("name", ["los", "head"])
+@pytest.mark.parametrize(
+    ("name", "fault"),
+    [
+        *(("los", fault) for fault in FAULTS),
+        *(pytest.param("head", f, marks=[pytest.mark.slow] * (f not in (_frozen, _gappy))) for f in FAULTS),
+    ],
+)
 def test_a_faulty_gyro_moves_no_parameter(name: str, fault: Fault, tmp_path: Path, cases: dict[str, Case]) -> None:
     case = cases[name]
     fields = case.gyro

@@ -20,7 +20,9 @@ SCENARIOS = {
 
 
 @needs_browser
-@pytest.mark.parametrize("name", SCENARIOS)
+@pytest.mark.parametrize(
+    "name", ["los", "cube", *(pytest.param(name, marks=pytest.mark.slow) for name in ("indexer", "head"))]
+)
 def test_a_browser_draws_the_report_at_the_width_of_a_desktop_and_of_a_phone(name: str, tmp_path: Path) -> None:
     (tmp_path / "scenario.yaml").write_text(SCENARIOS[name])
     method(name).simulate(str(tmp_path / "scenario.yaml"), 1, tmp_path / "s.mcap", False)

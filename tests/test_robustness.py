@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from factors import so3
 from pipelines.calibrate import calibrate
-from pipelines.methods import cube, head, indexer, los
+from pipelines.methods import cube, indexer, los
 from pipelines.methods.base import Estimate, Problem
 from pipelines.methods.cube_parameters import triad_names
 from pipelines.observability import assess
 from pipelines.sessions.config import load_config
 from pipelines.sessions.los import write_los
 from pipelines.simulation.cube import CubeScenario, cube_config, simulate_cube
-from pipelines.simulation.head import HeadScenario, head_config, simulate_head
 from pipelines.simulation.indexer import IndexerScenario, indexer_config, simulate_indexer
 from pipelines.simulation.los import LosAngles, LosScenario, los_config, simulate_los
 from pipelines.simulation.motion import EulerMotion, Swing
@@ -33,9 +32,6 @@ SWAY = EulerMotion(
     roll=[Swing(amplitude_deg=12, frequency_hz=0.21)],
 )
 LOS = LosScenario(duration_s=20.0, carrier=SWAY, image_rate_hz=20.0, gyro_rate_hz=200.0, gimbal_rate_hz=100.0)
-HEAD = HeadScenario(
-    duration_s=20.0, platform=SWAY, gyro_rate_hz=100.0, platform_gyro_rate_hz=100.0, vision_rate_hz=20.0
-)
 INDEXER = IndexerScenario(gyro_rate_hz=50.0, encoder_rate_hz=50.0)
 CUBE = CubeScenario(poses=14)
 
@@ -47,13 +43,6 @@ def _far_los() -> Made:
     scenario = LOS.model_copy(update={"angles_deg": angles})
     data, truth = simulate_los(scenario, 1)
     return los.problem(data, load_config(los_config(scenario).encode())), truth
-
-
-def _far_head() -> Made:
-    mounts = {"helmet_mount_deg": (30.0, -30.0, 30.0), "camera_mount_deg": (30.0, 30.0, -30.0)}
-    scenario = HEAD.model_copy(update=mounts)
-    data, truth = simulate_head(scenario, 1)
-    return head.problem(data, load_config(head_config(scenario).encode())), truth
 
 
 def _far_indexer() -> Made:
@@ -81,7 +70,7 @@ def _worst(estimate: Estimate, truth: dict[str, float]) -> float:
     return float(np.abs(error[free] / estimate.sigmas[free]).max())
 
 
-@pytest.mark.parametrize("make", [_far_los, _far_head, _far_indexer, _far_cube])
+@pytest.mark.parametrize("make", [_far_los, _far_indexer, _far_cube])
 @pytest.mark.parametrize("solve", [solve_batch, solve_incremental])
 def test_mounts_30_degrees_off_are_found(make: Callable[[], Made], solve: Callable[[Problem], Estimate]) -> None:
     problem, truth = make()
