@@ -9,7 +9,7 @@ demo: $(VENV)/installed
 	$(BIN)/alidade demo
 
 test: $(VENV)/installed
-	$(BIN)/python -m pytest -q -n auto
+	$(BIN)/python -m pytest -q -n auto --dist worksteal
 
 slow: $(VENV)/installed
 	$(BIN)/python -m pytest -q -n auto -m slow

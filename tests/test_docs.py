@@ -19,7 +19,7 @@ _LINK = re.compile(r"\]\((?!https?://)([^)#]+)")
 
 
 # Their commands are those of other tests, on longer recordings.
-_LONG = ("fleet.md", "trust.md")
+_LONG = ("cube.md", "fleet.md", "trust.md")
 
 
 @pytest.mark.parametrize(
