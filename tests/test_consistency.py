@@ -152,6 +152,7 @@ def test_a_gyro_in_degrees_that_is_too_slow_to_be_refused(los: Case) -> None:
     assert first_cause((find, replace(data, gyro=np.rad2deg(data.gyro)), config)) == "the gyro is in deg/s, not rad/s"
 
 
+@pytest.mark.slow
 def test_late_encoders(indexer: Case) -> None:
     find, data, config = indexer
     label = first_cause((find, replace(data, encoder_t=data.encoder_t + 0.02), config))

@@ -125,6 +125,7 @@ def test_errors_agree_with_the_covariance(runs: int, name: str) -> None:
     assert quantile(0.005, dof) < np.sum(nees) < quantile(0.995, dof)
 
 
+@pytest.mark.slow
 def test_an_hour_of_attitude_is_within_a_millidegree_after_compensation() -> None:
     scenario = _scenario("hour")
     data, truth = simulate_indexer(scenario, 1)
