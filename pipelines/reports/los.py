@@ -37,8 +37,10 @@ def los_plots(data: LosData, calibration: Calibration) -> list[Plot]:
     time, measured = data.image_t[rows], data.error[rows]
     chains = np.split(np.arange(len(rows)), np.flatnonzero(starts)[1:])
     bias_alone = {name: value for name, value in values.items() if name not in ANGLES}
+    gyro = GyroPath(data.gyro_t, data.gyro, [values.get(f"gyro_bias_{axis}", 0.0) for axis in "xyz"])
+    gimbal = GimbalPath(data.gimbal_t, data.gimbal)
     with_angles, without = (
-        np.concatenate([_predicted(data, time[chain], measured[chain], v) for chain in chains])
+        np.concatenate([_predicted(gyro, gimbal, time[chain], measured[chain], v) for chain in chains])
         for v in (values, bias_alone)
     )
     return [
@@ -47,13 +49,12 @@ def los_plots(data: LosData, calibration: Calibration) -> list[Plot]:
     ]
 
 
-def _predicted(data: LosData, time: Array, measured: Array, values: Mapping[str, float]) -> Array:
+def _predicted(gyro: GyroPath, gimbal: GimbalPath, time: Array, measured: Array, values: Mapping[str, float]) -> Array:
     """phx, phz (n, 2) of one target's pictures as carried on from the first, rad."""
     names = tuple(name for name in ANGLES if name in values)
-    bias = np.array([values.get(f"gyro_bias_{axis}", 0.0) for axis in "xyz"])
-    at = np.clip(time + values.get("time_offset", 0.0), data.gyro_t[0], data.gyro_t[-1])
-    cRm = camera(GimbalPath(data.gimbal_t, data.gimbal).at(at), np.array([values[name] for name in names]), names)
-    return carried_errors(at, cRm, measured, GyroPath(data.gyro_t, data.gyro, bias))
+    at = np.clip(time + values.get("time_offset", 0.0), gyro.t[0], gyro.t[-1])
+    cRm = camera(gimbal.at(at), np.array([values[name] for name in names]), names)
+    return carried_errors(at, cRm, measured, gyro)
 
 
 def _measured_and_predicted(time: Array, measured: Array, predicted: Array) -> Plot:
