@@ -87,13 +87,10 @@ def solve_batch(problem: Problem) -> Estimate:
     values = gtsam.Values()
     stand_ins: dict[int, int] = {}
     marks: list[Mark] = []
-    held: list[tuple[float, dict[int, int]]] = []
     keyframes: list[int] = []
     for step in problem.steps(CHUNK):
         factors.extend(step.factors)
         values.insert(step.initial)
-        if not held or step.stand_ins:
-            held.append((step.time, {**stand_ins, **step.stand_ins}))
         stand_ins.update(step.stand_ins)
         marks.append(Mark(step.time, len(factors), dict(stand_ins)))
         keyframes.extend(step.keyframes)
@@ -108,6 +105,7 @@ def solve_batch(problem: Problem) -> Estimate:
     residuals = system.residuals(values)
     with system.measurements.at(values):
         summary = chi_square(problem, factors, linear, ordering, values, marginal)
+    held = [(m.time, m.stand_ins) for i, m in enumerate(marks) if i == 0 or m.stand_ins != marks[i - 1].stand_ins]
     # The last stand-ins are what the session reports; those before them held the parameters over time.
     smooth = smoothed(problem, linear, ordering, values, held[:-1], marginal) if len(held) > 2 else None
     history = growth(problem, linear, ordering, values, marks)
