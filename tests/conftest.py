@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 # As the command has it, and before anything imports numpy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
+
+from pipelines import cli
+from tests.command import Command, Run
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -19,3 +23,21 @@ def shared_data() -> Path:
     if not _SHARED.is_dir():
         pytest.skip("needs the recordings in ../shared/data, which are not part of the project")
     return _SHARED
+
+
+@pytest.fixture
+def alidade(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Runs the command in this process (imports paid once)."""
+
+    def run(*arguments: str | Path) -> Run:
+        monkeypatch.setattr(sys, "argv", ["alidade", *map(str, arguments)])
+        capsys.readouterr()
+        try:
+            cli.main()
+            code: int | str | None = 0
+        except SystemExit as stop:
+            code = stop.code
+        captured = capsys.readouterr()
+        return Run(int(code or 0), captured.out, captured.err)
+
+    return run

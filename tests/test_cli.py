@@ -6,44 +6,16 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pipelines import cli
 from pipelines.sessions.head import HeadData, write_head
 from pipelines.simulation.head import HeadScenario, head_config, simulate_head
 from pipelines.simulation.scenario import load_scenario
-
-
-@dataclass
-class Run:
-    code: int
-    out: str
-    err: str
-
-
-Command = Callable[..., Run]
-
-
-@pytest.fixture
-def alidade(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Runs the command in this process (imports paid once)."""
-
-    def run(*arguments: str | Path) -> Run:
-        monkeypatch.setattr(sys, "argv", ["alidade", *map(str, arguments)])
-        capsys.readouterr()
-        try:
-            cli.main()
-            code: int | str | None = 0
-        except SystemExit as stop:
-            code = stop.code
-        captured = capsys.readouterr()
-        return Run(int(code or 0), captured.out, captured.err)
-
-    return run
+from tests.command import Command, Run
 
 
 @pytest.fixture(scope="module")

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -14,7 +11,6 @@ import numpy as np
 import pytest
 from mcap.opcode import Opcode
 
-from pipelines import cli
 from pipelines.calibrate import calibrate
 from pipelines.errors import InputError
 from pipelines.reports.result import truth_errors
@@ -22,6 +18,7 @@ from pipelines.sessions import writing
 from pipelines.sessions.los import write_los
 from pipelines.simulation.los import LosScenario, los_config, simulate_los
 from pipelines.simulation.motion import EulerMotion, Swing
+from tests.command import Command
 from tests.damage import boundaries, cuts, flips, rewrite, spoilt
 
 LOS = LosScenario(
@@ -35,34 +32,6 @@ LOS = LosScenario(
     gyro_rate_hz=200.0,
     gimbal_rate_hz=100.0,
 )
-
-
-@dataclass
-class Run:
-    code: int
-    out: str
-    err: str
-
-
-Command = Callable[..., Run]
-
-
-@pytest.fixture
-def alidade(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Runs the command in this process."""
-
-    def run(*arguments: str | Path) -> Run:
-        monkeypatch.setattr(sys, "argv", ["alidade", *map(str, arguments)])
-        capsys.readouterr()
-        code: int | str | None = 0
-        try:
-            cli.main()
-        except SystemExit as stop:
-            code = stop.code
-        captured = capsys.readouterr()
-        return Run(int(code or 0), captured.out, captured.err)
-
-    return run
 
 
 @pytest.fixture(scope="module")
