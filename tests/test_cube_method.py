@@ -28,9 +28,10 @@ from pipelines.simulation.cube import CubeScenario, cube_config, simulate_cube, 
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.incremental import solve_incremental
 
-# The default field prior leaves the magnetometer's scale at one per cent; here the field is known better.
+# The default field prior leaves the magnetometer's scale at one per cent; here the field is known better, and is so.
 FIELD = {"field_e": 1e-8, "field_n": 1e-8, "field_u": 1e-8}
-
+NEAR_MODEL = {"field_direction": 1e-8, "field_strength": 1e-8}
+ONE_DEGREE = {"reference_heading_deg": 1.0, "reference_heading_error_deg": 0.0}
 
 # Enough for everything to be calibrated; a third as long as the nominal scenario.
 NOMINAL: dict[str, Any] = {"poses": 24, "static_s": 4.0, "turn_rad_s": 0.8, "camera_rate_hz": 10.0}
@@ -53,7 +54,7 @@ def _solved(data: CubeData, config: Config) -> tuple[Problem, Estimate, Assessme
 @cache
 def _with_known_field(seed: int) -> tuple[CubeData, dict[str, float], Config, Problem, Estimate, Assessment]:
     """A whole session and its solution, shared by the tests that only look at it."""
-    data, truth, config = _simulated(seed)
+    data, truth, config = _simulated(seed, **NEAR_MODEL)
     config = config.model_copy(update={"priors": FIELD})
     return data, truth, config, *_solved(data, config)
 
@@ -67,7 +68,7 @@ def _sigmas_off(estimate: Estimate, truth: dict[str, float], names: str = "") ->
 @pytest.mark.parametrize("missing", [[], ["magnetometer"], ["reference"], ["reference", "magnetometer"]], ids=str)
 def test_every_mode_with_a_camera(missing: list[str]) -> None:
     if missing:
-        data, truth, config = _simulated(4, **dict.fromkeys(missing, False))
+        data, truth, config = _simulated(4, **NEAR_MODEL, **dict.fromkeys(missing, False))
         priors = {} if "magnetometer" in missing else FIELD
         built, estimate, judged = _solved(data, config.model_copy(update={"priors": priors}))
     else:
@@ -124,7 +125,7 @@ def test_axes_never_turned_are_named() -> None:
 
 
 def test_a_face_never_seen_is_known_by_its_prior_alone() -> None:
-    data, _, config = _simulated(9, faces_hidden=(19,))
+    data, _, config = _simulated(9, **NEAR_MODEL, faces_hidden=(19,))
     _, _, judged = _solved(data, config.model_copy(update={"priors": FIELD}))
     assert judged.verdicts["tag_19_x"] == "prior"
     assert "tag_19_x" in judged.headline
@@ -133,7 +134,7 @@ def test_a_face_never_seen_is_known_by_its_prior_alone() -> None:
 def test_wrong_heading_is_found_from_the_magnetometer() -> None:
     """With mount and field known well the heading is all that is left: 1 degree is found within 3 sigma."""
     priors = FIELD | dict.fromkeys(("camera_mount_x", "camera_mount_y", "camera_mount_z"), 1e-3)
-    data, truth, config = _simulated(10, reference_heading_deg=1.0, camera_mount=1e-3)
+    data, truth, config = _simulated(10, **NEAR_MODEL, **ONE_DEGREE, camera_mount=1e-3)
     _, estimate, judged = _solved(data, config.model_copy(update={"priors": priors | {"reference_heading": 0.1}}))
     heading = estimate.names.index("reference_heading")
     assert truth["reference_heading"] == pytest.approx(np.deg2rad(1.0))
@@ -145,7 +146,7 @@ def test_wrong_heading_is_found_from_the_magnetometer() -> None:
 
 def test_wrong_heading_is_absorbed_and_reported() -> None:
     """The usual priors allow the field as much: heading, mount and field share it, and the sigmas say so."""
-    data, truth, config = _simulated(10, reference_heading_deg=1.0)
+    data, truth, config = _simulated(10, **ONE_DEGREE)
     _, estimate, judged = _solved(data, config)
     assert max(_sigmas_off(estimate, truth).values()) < 4.0
     sigmas = dict(zip(estimate.names, estimate.sigmas, strict=True))

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from factors import so3
-from factors.earth import earth_rate, gravity
+from factors.earth import earth_rate, gravity, magnetic_field
 from pipelines.errors import InputError
 from pipelines.sessions.config import load_config
 from pipelines.sessions.cube import read_cube, rests
 from pipelines.sessions.cube_poses import static_poses
 from pipelines.sessions.reading import open_recording
-from pipelines.simulation.cube import CubeNoise, CubeScenario, cube_config, simulate_cube, write_simulation
+from pipelines.simulation.cube import YEAR, CubeNoise, CubeScenario, cube_config, simulate_cube, write_simulation
 from pipelines.simulation.cube_faces import Resting
 from pipelines.simulation.scenario import load_scenario
 
@@ -27,6 +27,9 @@ EXACT = CubeScenario(
     reference_heading_noise_deg=1e-9,
     camera_mount=0.0,
     tag_mount=0.0,
+    field_direction=0.0,
+    field_strength=0.0,
+    reference_heading_error_deg=0.0,
     occluded=0.0,
     camera_rate_hz=5.0,
 )
@@ -94,6 +97,21 @@ def test_noise_is_as_stated() -> None:
     assert data.accel.std(axis=0) == pytest.approx(noise.accel_density * 10.0, rel=0.05)
     assert data.mag is not None
     assert data.mag.std(axis=0) == pytest.approx(noise.mag_density * np.sqrt(50.0), rel=0.05)
+
+
+def test_field_and_heading_are_drawn_as_their_priors_have_them() -> None:
+    """Sigmas over seeds: 500 nT each way across the model's field, 133 nT along it, 10 mrad of heading."""
+    truths = [simulate_cube(CubeScenario(poses=1, static_s=0.5), seed)[1] for seed in range(60)]
+    field = np.array([[truth[f"field_{axis}"] for axis in "enu"] for truth in truths])
+    place = CubeScenario()
+    model = magnetic_field(*np.deg2rad([place.latitude_deg, place.longitude_deg]), place.height, YEAR)
+    along = (field - model) @ model / np.linalg.norm(model)
+    # A sigma of n draws is known to 1 / sqrt(2 n) of itself.
+    assert np.sqrt(np.mean(along**2)) == pytest.approx(1.33e-7, rel=3.0 / np.sqrt(2 * 60))
+    across = np.sqrt((((field - model) ** 2).sum(axis=1) - along**2).mean() / 2.0)
+    assert across == pytest.approx(5e-7, rel=3.0 / np.sqrt(2 * 120))
+    heading = np.array([truth["reference_heading"] for truth in truths])
+    assert np.sqrt(np.mean(heading**2)) == pytest.approx(1e-2, rel=3.0 / np.sqrt(2 * 60))
 
 
 def test_same_seed_same_session_and_another_one_differs() -> None:

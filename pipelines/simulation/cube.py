@@ -74,9 +74,12 @@ class CubeScenario(BaseModel):
     accel_bias: NotNegative = 0.3  # m/s^2
     gyro_bias: NotNegative = 0.01  # rad/s
     mag_bias: NotNegative = 1e-5  # T
-    camera_mount: NotNegative = 3e-3  # rad
+    camera_mount: NotNegative = 5e-3  # rad
     tag_mount: NotNegative = 3e-3  # rad
-    reference_heading_deg: float = 0.0  # correction that the reference's heading needs
+    field_direction: NotNegative = 5e-7  # T, each way across the model's field
+    field_strength: NotNegative = 1.33e-7  # T, along it
+    reference_heading_deg: float = 0.0  # correction that the reference's heading needs, and the sigma about it
+    reference_heading_error_deg: NotNegative = 0.573
     reference_level_deg: Positive = 0.02  # noise of roll and pitch, of a message
     reference_heading_noise_deg: Positive = 0.05
     magnetometer: bool = True
@@ -228,7 +231,7 @@ class _World:
         self.rng = np.random.default_rng(seed)
         self.place_rad = np.deg2rad([scenario.latitude_deg, scenario.longitude_deg])
         latitude, longitude = self.place_rad
-        self.field = magnetic_field(latitude, longitude, scenario.height, YEAR)
+        self.field, self.heading = self._surroundings(magnetic_field(latitude, longitude, scenario.height, YEAR))
         self.camera = Camera(
             1280,
             960,
@@ -256,6 +259,20 @@ class _World:
         self.motion = self._motion()
         self.duration = float(self.motion.stop[-1])
         self.truth: dict[str, float] = {}
+
+    def _surroundings(self, model: Array) -> tuple[Array, float]:
+        """Field (3,), T, and the correction of the reference's heading, rad.
+
+        The model errs more in the field's direction, by the iron of the building, than in its strength. The draws have
+        a generator of their own: what else happens in a seed's session does not depend on them.
+        """
+        s, (rng,) = self.scenario, self.rng.spawn(1)
+        along = model / np.linalg.norm(model)
+        error = s.field_direction * rng.standard_normal(3)
+        error += along * (s.field_strength * rng.standard_normal() - along @ error)
+        return model + error, float(
+            np.deg2rad(s.reference_heading_deg + s.reference_heading_error_deg * rng.standard_normal())
+        )
 
     def _motion(self) -> Motion:
         s, rng = self.scenario, self.rng
@@ -334,7 +351,7 @@ class _World:
         s = self.scenario
         t = sample_times(self.duration, s.reference_rate_hz, 0.4)
         sigma = np.deg2rad([s.reference_level_deg, s.reference_level_deg, s.reference_heading_noise_deg])
-        heading = so3.exp([0.0, 0.0, -np.deg2rad(s.reference_heading_deg)])
+        heading = so3.exp([0.0, 0.0, -self.heading])
         wxyz = so3.compose(so3.exp(sigma * self.rng.standard_normal((len(t), 3))), heading, self.nRB)
         return t, wxyz, np.tile(np.diag(sigma**2), (len(t), 1, 1))
 
@@ -405,7 +422,7 @@ class _World:
             vectors = {f"tag_{i}": vector for i, vector in self.tags.items()}
             if self.scenario.reference:
                 vectors["camera_mount"] = self.mount
-                truth["reference_heading"] = float(np.deg2rad(self.scenario.reference_heading_deg))
+                truth["reference_heading"] = float(self.heading)
             truth |= {
                 f"{name}_{axis}": float(x)
                 for name, vector in vectors.items()
