@@ -350,7 +350,7 @@ class Run:
             measurements = [
                 f for f in step.factors if f.measurement and self._agrees(f, f.measurement, processes, values, new)
             ]
-            if not self._anchors and self.window is not None and self.rejected_in_a_row == 0:
+            if self.window is not None and self.rejected_in_a_row == 0:
                 measurements = [_linear(f, values) for f in measurements]
             smoother.update(processes + measurements, new, step.timestamps)
         except (RuntimeError, np.linalg.LinAlgError):
