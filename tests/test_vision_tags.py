@@ -119,6 +119,32 @@ def test_tags_whose_white_margin_nearly_touches_the_border_are_found() -> None:
         assert detect(expose(light, 0.6, 1.0, np.random.default_rng(0)), camera=pinhole).ids.tolist() == [5]
 
 
+@pytest.mark.parametrize(
+    ("side", "blur", "light"),
+    [(22.0, 0.7, 1.0), (30.0, 0.7, 0.25), (60.0, 1.5, 0.2), (60.0, 3.0, 1.0), (150.0, 3.0, 0.3)],
+    ids=["small", "small, dark", "dark, blurred", "very blurred", "dark, very blurred"],
+)
+def test_small_dark_and_blurred_tags_are_found_once(side: float, blur: float, light: float) -> None:
+    """Six tags before clutter; two of them have the same number."""
+    pinhole = Camera(640, 480, np.array([[600.0, 0, 320], [0, 600.0, 240], [0, 0, 1]]))
+    places, numbers = [(x, y) for y in (-120.0, 120.0) for x in (-210.0, 0.0, 210.0)], [1, 2, 3, 4, 5, 1]
+    found = 0
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        z = 600.0 * SIZE / side
+        turns = so3.compose(so3.exp(np.append(rng.normal(scale=0.2, size=(6, 2)), np.zeros((6, 1)), axis=1)), FACING)
+        quads = [
+            tag_quad(number, SIZE, cRt, np.array([x / 600.0 * z, y / 600.0 * z, z]))
+            for number, cRt, (x, y) in zip(numbers, turns, places, strict=True)
+        ]
+        clutter = cv2.GaussianBlur(rng.normal(scale=100.0, size=(480, 640)), (0, 0), 4.0) + 90.0
+        seen = detect(expose(Renderer(pinhole).radiance(quads, clutter) * light, blur, 2.0 * light, rng), camera=pinhole)
+        assert not set(seen.ids.tolist()) - set(numbers)
+        assert np.bincount(seen.ids, minlength=6).max() <= 2
+        found += len(seen)
+    assert found >= 16, "of 18"
+
+
 def test_empty_pictures_and_wrong_questions() -> None:
     blank = np.full((480, 640), 90, dtype=np.uint8)
     assert len(detect(blank)) == 0

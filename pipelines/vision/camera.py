@@ -99,7 +99,7 @@ class Camera:
 
     def _distort(self, u: Array) -> tuple[Array, Array]:
         """Distorted z = 1 coordinates of undistorted ones, shape (..., 2), and the Jacobian, shape (..., 2, 2)."""
-        k1, k2, p1, p2, k3, k4, k5, k6 = np.pad(self.coefficients, (0, 8 - len(self.coefficients)))
+        k1, k2, p1, p2, k3, k4, k5, k6 = [*self.coefficients.tolist(), 0.0, 0.0, 0.0][:8]
         x, y = u[..., 0], u[..., 1]
         r2 = x * x + y * y
         over, under = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
@@ -129,7 +129,8 @@ class Camera:
                 det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
                 u[..., 0] -= (J[..., 1, 1] * miss[..., 0] - J[..., 0, 1] * miss[..., 1]) / det
                 u[..., 1] -= (J[..., 0, 0] * miss[..., 1] - J[..., 1, 0] * miss[..., 0]) / det
-            out, J = self._distort(u)
+            else:
+                out, J = self._distort(u)
             # Beyond the radius where a polynomial turns back, a point has no image or a mirrored one.
             good = (np.abs(out - flat) * self.focal < _PIXEL_TOLERANCE).all(axis=-1)
             good &= (J[..., 0, 0] + J[..., 1, 1] > 0) & (J[..., 0, 0] * J[..., 1, 1] > J[..., 0, 1] * J[..., 1, 0])

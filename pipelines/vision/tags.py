@@ -25,12 +25,18 @@ Picture = NDArray[np.uint8]
 # official bottom right, bottom left, top left, top right. This order makes them the library's.
 _OFFICIAL = [1, 0, 3, 2]
 
+# OpenCV's adaptive threshold, px: a narrow window shows small tags; a wide one, in the picture made smaller, those that
+# are blurred or dark. One detector for each: a detector with three windows, its default, takes twice as long, and loses
+# a tag when it takes the outline of the white margin that one window shows for the same quad as the tag of another.
+_NARROW = 5
+_WIDE, _SMALLER, _LEAST_SIDE = 11, 0.7, 16
 _CUTS = 48  # profiles across an edge
 _SAMPLES = 25  # grey values in a profile
 _CELLS = 8  # a tag's black square is this many cells wide
 _REACH_CELLS = 0.45  # profiles end half way to the next cell's edge, whose blur must stay outside
 _REACH_PX = 6.0
-_ROUNDS = 4
+_ROUNDS = 6  # at most
+_SETTLED_PX = 0.01  # moves of the corners that end the rounds; the next would be a quarter of it or less
 _CONTRAST = 8.0  # least difference of white and black, grey levels
 _CORRELATION_PX = 1.5  # cuts closer than this share their noise (bilinear sampling of white noise)
 # Systematic error of a line, px, when the profile is just as long as the blurred step; where it is cut short, levels
@@ -74,18 +80,46 @@ def detect(picture: Picture, family: str = "36h11", camera: Camera | None = None
         camera = Camera(width, height, np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]]))
     elif (camera.width, camera.height) != (width, height):
         raise InputError(f"pictures are {width}x{height}, camera_info says {camera.width}x{camera.height}")
-    found, ids, _ = _detector().detectMarkers(picture)
-    if ids is None or not len(ids):
-        return Detections(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)))
-    corners = np.concatenate(found).astype(float)[:, _OFFICIAL]
-    return Detections(np.asarray(ids, dtype=np.int64).ravel(), *_refine(picture, corners, camera))
+    ids, corners = _read(picture)
+    if not len(ids):
+        return Detections(ids, corners, np.zeros((0, 4, 2, 2)))
+    return Detections(ids, *_refine(picture, corners, camera))
+
+
+def _read(picture: Picture) -> tuple[NDArray[np.int64], Array]:
+    """Ids (n,) and rough corners (n, 4, 2) of all tags; one that both detectors see counts once."""
+    ids, corners = np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2))
+    for detector in _detectors(max(picture.shape)):
+        found, numbers, _ = detector.detectMarkers(picture)
+        if numbers is None or not len(numbers):
+            continue
+        more, at = numbers.astype(np.int64).ravel(), np.concatenate(found).astype(float)[:, _OFFICIAL]
+        apart = np.linalg.norm(at.mean(axis=1)[:, None] - corners.mean(axis=1), axis=-1)
+        side = np.linalg.norm(at[:, 0] - at[:, 1], axis=-1)
+        new = ~((more[:, None] == ids) & (apart < side[:, None])).any(axis=1)
+        ids, corners = np.concatenate([ids, more[new]]), np.concatenate([corners, at[new]])
+    return ids, corners
 
 
 @cache
-def _detector() -> Any:
+def _detectors(width: int) -> tuple[Any, Any]:
+    """For pictures so wide, px: with the narrow window, and with the wide one."""
+    import cv2
+
+    tags = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    narrow, wide = _parameters(_NARROW), _parameters(_WIDE)
+    # OpenCV looks for quads in the picture times side / (side + width ratio), and reads their bits at full size.
+    wide.useAruco3Detection = True
+    wide.minSideLengthCanonicalImg = _LEAST_SIDE
+    wide.minMarkerLengthRatioOriginalImg = _LEAST_SIDE * (1.0 / _SMALLER - 1.0) / width
+    return cv2.aruco.ArucoDetector(tags, narrow), cv2.aruco.ArucoDetector(tags, wide)
+
+
+def _parameters(window: int) -> Any:
     import cv2
 
     parameters = cv2.aruco.DetectorParameters()
+    parameters.adaptiveThreshWinSizeMin = parameters.adaptiveThreshWinSizeMax = window
     # Small tags: more pixels a cell when the bits are read, and 4 of 36 bits may be wrong (36h11 tells 5 wrong ones).
     parameters.perspectiveRemovePixelPerCell = 8
     parameters.errorCorrectionRate = 0.8
@@ -93,7 +127,7 @@ def _detector() -> Any:
     # taken for one, and the tag is lost when the outline comes near the picture's border.
     parameters.minMarkerDistanceRate = 0.03
     parameters.minDistanceToBorder = 0
-    return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11), parameters)
+    return parameters
 
 
 def _refine(picture: Picture, plain: Array, camera: Camera) -> tuple[Array, Array]:
@@ -111,10 +145,12 @@ def _refine(picture: Picture, plain: Array, camera: Camera) -> tuple[Array, Arra
         # Corner k lies on edge k (at its start) and on edge k - 1 (at its end).
         meet = np.cross(np.roll(line, 1, axis=1), line)
         with np.errstate(all="ignore"):
-            corners = camera.project(meet * np.sign(meet[..., 2:]))
-        lost = ~(np.linalg.norm(corners - plain, axis=-1) < _limit(plain))
+            met = camera.project(meet * np.sign(meet[..., 2:]))
+        lost = ~(np.linalg.norm(met - plain, axis=-1) < _limit(plain))
         lost |= ~np.isfinite(variance[..., 0] + np.roll(variance[..., 1], 1, axis=1))
-        corners = np.where(lost[..., None], plain, corners)
+        before, corners = corners, np.where(lost[..., None], plain, met)
+        if np.abs(corners - before).max() < _SETTLED_PX:
+            break
     covariance = _corner_covariance(cuts.normal.reshape(n, 4, 2), variance)
     covariance[lost] = np.inf * np.ones((2, 2))
     return corners, covariance
@@ -172,8 +208,8 @@ def _cut(picture: Picture, start: Array, end: Array, centre: Array, blur: Array)
     # The step with its blur lies within `near`; beyond it are the levels.
     near = np.minimum(_needed(blur), reach)
     beyond = np.abs(unit) >= (near / reach)[:, None] * (1 - 1e-9)
-    black, black_noise = _level(grey, beyond & (unit < 0), s)
-    white, white_noise = _level(grey, beyond & (unit > 0), s)
+    beside = np.stack([beyond & (unit < 0), beyond & (unit > 0)])
+    (black, white), noise = _levels(grey, beside, s)
     contrast = white - black
     weights *= contrast > _CONTRAST
     share = np.where(beyond[:, None], unit < 0, (white[..., None] - grey) / np.maximum(contrast, _CONTRAST)[..., None])
@@ -187,7 +223,7 @@ def _cut(picture: Picture, start: Array, end: Array, centre: Array, blur: Array)
     about = (slope * middle_t).sum(axis=1)
     sigma = np.sqrt(np.maximum((slope * middle_t**2).sum(axis=1) - about**2, 0.1))
     level = np.median(np.maximum(contrast, _CONTRAST), axis=1)
-    level_variance = (near / level) ** 2 * (black_noise**2 + white_noise**2)
+    level_variance = (near / level) ** 2 * (noise**2).sum(axis=0)
     return _Cuts(
         points, weights, normal, (length - 2 * inset) / (_CUTS - 1), _needed(sigma) / reach, sigma, level_variance
     )
@@ -213,18 +249,18 @@ def _sample(picture: Picture, where: Array) -> tuple[Array, NDArray[np.bool_]]:
     return upper + (lower - upper) * down, inside
 
 
-def _level(grey: Array, where: NDArray[np.bool_], s: Array) -> tuple[Array, Array]:
-    """Grey level beside each cut, (e, c), smoothed along the edge by a straight line, and its scatter from cut to cut.
+def _levels(grey: Array, where: NDArray[np.bool_], s: Array) -> tuple[Array, Array]:
+    """Grey levels beside each cut, (k, e, c), smoothed along the edge by a straight line, and their scatter, (k, e).
 
-    The mean of the samples `where`, (e, samples). The line goes through medians, so that dirt does not pull it.
+    Means of the samples `where`, (k, e, samples). The line goes through medians, so that dirt does not pull it.
     """
-    beside = (grey * where[:, None]).sum(axis=2) / where.sum(axis=1)[:, None]
+    beside = np.einsum("ecs,kes->kec", grey, where / where.sum(axis=2, keepdims=True))
     third = len(s) // 3
-    first, last = np.median(beside[:, :third], axis=1), np.median(beside[:, -third:], axis=1)
+    first, last = np.median(beside[..., :third], axis=-1), np.median(beside[..., -third:], axis=-1)
     slope = (last - first) / (s[-third:].mean() - s[:third].mean())
-    level = np.median(beside - slope[:, None] * s, axis=1)[:, None] + slope[:, None] * s
-    noise = 1.4826 * np.median(np.abs(beside - level), axis=1)
-    return level, noise
+    line = slope[..., None] * s
+    level = np.median(beside - line, axis=-1)[..., None] + line
+    return level, 1.4826 * np.median(np.abs(beside - level), axis=-1)
 
 
 def _fit(camera: Camera, cuts: _Cuts, start: Array, end: Array) -> tuple[Array, Array]:
