@@ -138,7 +138,9 @@ def test_small_dark_and_blurred_tags_are_found_once(side: float, blur: float, li
             for number, cRt, (x, y) in zip(numbers, turns, places, strict=True)
         ]
         clutter = cv2.GaussianBlur(rng.normal(scale=100.0, size=(480, 640)), (0, 0), 4.0) + 90.0
-        seen = detect(expose(Renderer(pinhole).radiance(quads, clutter) * light, blur, 2.0 * light, rng), camera=pinhole)
+        seen = detect(
+            expose(Renderer(pinhole).radiance(quads, clutter) * light, blur, 2.0 * light, rng), camera=pinhole
+        )
         assert not set(seen.ids.tolist()) - set(numbers)
         assert np.bincount(seen.ids, minlength=6).max() <= 2
         found += len(seen)
