@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+_NUMBERS = ("imu", "mag", "reference_imu", "reference_fix")
+
 # Norms at rest that no accelerometer in m/s^2 and no magnetometer in T shows, and what they are likely to be.
 _ACCEL_RANGE, _MAG_RANGE = (3.0, 30.0), (1e-6, 1e-3)
 _ACCEL_UNITS = {"g": (0.5, 2.0), "mg": (500.0, 2000.0), "raw counts": (2000.0, np.inf)}
@@ -168,6 +170,7 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
     """
     dropped: dict[str, int] = {}
     epoch = recording.epoch_ns
+    recording.read_together(dict.fromkeys(map(config.topic, _NUMBERS), ()))
     name = config.topic("imu")
     imu = recording.imu(name)
     count(dropped, f"{name}: stamped by log time (kept)", imu.stamped_by_log)

@@ -16,6 +16,9 @@ from pipelines.sessions.records import windows
 # Which numbers of a field, as indexes, given the message; None if the message has not got them.
 Order = Callable[[Any], Sequence[int] | None]
 
+# Stamps and log times, ns, in the file's order.
+Times = tuple[NDArray[np.int64], NDArray[np.int64]]
+
 # What every message with a header starts with: CDR encapsulation, then the stamp.
 _STAMP = {
     order: np.dtype([("kind", "u1", 2), ("options", "u1", 2), ("sec", f"{order}i4"), ("nanosec", f"{order}u4")])
@@ -60,12 +63,11 @@ class Table:
         """Messages taken up so far: rows beyond them are those of damaged chunks."""
         return self._next
 
-    def times(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Stamps, log times where there are none, and log times of the rows that were filled, in the file's order."""
-        t_ns = self._t_ns if self._t_ns.all() else np.where(self._t_ns == 0, self._log_ns, self._t_ns)
-        if self.filled.all():
-            return t_ns, self._log_ns
-        return t_ns[self.filled], self._log_ns[self.filled]
+    def times(self, filled: bool = True) -> Times:
+        """Stamps, log times where there are none, and log times of the rows that were filled, or of all taken up."""
+        rows: Any = self.filled if filled and not self.filled.all() else slice(self._next)
+        t_ns, log_ns = self._t_ns[rows], self._log_ns[rows]
+        return (t_ns if t_ns.all() else np.where(t_ns == 0, log_ns, t_ns)), log_ns
 
     def sorted(self) -> tuple[NDArray[np.int64], int, dict[str, Any]]:
         """Stamps, how many of them are log times, and the columns, of the rows that were filled, by log time."""

@@ -28,6 +28,7 @@ from pipelines.sessions.writing import write_session
 
 Array = NDArray[np.float64]
 
+_NUMBERS = ("head_imu", "platform_imu", "vision_attitude", "truth_attitude")
 _ROTATION = slice(3, 6)  # of the 6x6 covariance of a pose
 
 
@@ -65,6 +66,7 @@ def read_head(recording: Recording, config: Config) -> HeadData:
     """
     dropped: dict[str, int] = {}
     epoch = recording.epoch_ns
+    recording.read_together(dict.fromkeys(map(config.topic, _NUMBERS), ()))
     name = config.topic("head_imu")
     head_t, head_gyro, density = read_gyro(recording, name, epoch, dropped)
     spans = {name: head_t}

@@ -68,6 +68,7 @@ def read_los(recording: Recording, config: Config) -> LosData:
     epoch = recording.epoch_ns
     gyro_name, gimbal_name, error_name = (config.topic(key) for key in ("imu", "gimbal", "los_error"))
     from_pictures = error_name not in recording.topics and config.topic("image") in recording.topics
+    recording.read_together({gyro_name: (), gimbal_name: JOINTS, error_name: ()})
     gyro_t, gyro, density = read_gyro(recording, gyro_name, epoch, dropped)
     gimbal_t, gimbal = _gimbal(recording, gimbal_name, epoch, dropped)
     covariance = None

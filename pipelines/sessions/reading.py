@@ -12,7 +12,7 @@ damaged is left out, see `Recording.notes`.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
@@ -27,9 +27,10 @@ from pipelines.errors import InputError
 from pipelines.sessions import messages, series
 from pipelines.sessions.clocks import check_clock
 from pipelines.sessions.container import McapFile, Rows
-from pipelines.sessions.decoding import Decoder, Order, Table, header_stamps, logged_at
+from pipelines.sessions.decoding import Decoder, Times, header_stamps, logged_at
 from pipelines.sessions.losses import Loss
 from pipelines.sessions.messages import Definition, MessageError
+from pipelines.sessions.taking import NUMBERS, Taking
 
 AnySeries = TypeVar("AnySeries", bound=series.Series)
 
@@ -65,12 +66,14 @@ def open_recording(path: Path | str, strict: bool = False) -> Recording:
 
 
 class Recording:
-    """An MCAP recording of ROS 2 messages. Holds positions in the file, not the messages."""
+    """An MCAP recording of ROS 2 messages. Holds positions in the file and stamps, not the messages."""
 
     def __init__(self, path: Path, strict: bool = False) -> None:
         self.path = path
         self._file = McapFile(path, strict)
         self.topics = self._list_topics()
+        self._at_hand: dict[tuple[str, tuple[str, ...]], Taking] = {}
+        self._times: dict[str, Times] = {}
 
     def sha256(self) -> str:
         """SHA-256 of the file, hexadecimal."""
@@ -129,6 +132,22 @@ class Recording:
         """Time from the first message to the last, by their log times, s."""
         return (self._span[1] - self._span[0]) * 1e-9
 
+    def read_together(self, topics: Mapping[str, Sequence[str]]) -> None:
+        """Decode topics in one pass over the file, to have them at hand when the methods below ask for them.
+
+        A topic that has no numbers, or cannot be read, is left to the method, which says why.
+
+        Args:
+            topics: names, each with the joints wanted if it is a sensor_msgs/msg/JointState.
+        """
+        takings = {}
+        for name in topics.keys() & self.topics.keys():
+            topic = self.topics[name]
+            if topic.type in NUMBERS and topic.encoding == ENCODING and topic.count:
+                takings[name] = Taking(topic.type, topic.count, topics[name])
+        failed = self._fill(takings)
+        self._at_hand |= {(name, tuple(topics[name])): t for name, t in takings.items() if name not in failed}
+
     def imu(self, topic: str) -> series.ImuSeries:
         """A sensor_msgs/msg/Imu topic."""
         return self._series(series.ImuSeries, topic)
@@ -159,21 +178,13 @@ class Recording:
 
     def joints(self, topic: str, names: Sequence[str]) -> series.JointSeries:
         """Positions of the named joints on a sensor_msgs/msg/JointState topic, whatever order the messages have."""
-        seen: dict[str, None] = {}
-
-        def order(message: Any) -> list[int] | None:
-            seen.update(dict.fromkeys(map(str, message.name)))
-            if not set(names) <= set(message.name) or len(message.position) != len(message.name):
-                return None
-            return [message.name.index(name) for name in names]
-
         self._require(topic, messages.JOINT_STATE)
-        table = Table(self.topics[topic].count, {"position": (len(names),)})
-        self._fill(table, topic, {"position": ("position", order)})
+        taking = self._taking(topic, tuple(names))
+        table = taking.table
         if not table.filled.any():
             raise InputError(
                 f"{self.path}: topic {topic} has no message with positions of the joints {', '.join(names)}; "
-                f"its joints: {', '.join(seen) or 'none'}"
+                f"its joints: {', '.join(taking.joints) or 'none'}"
             )
         check_clock(topic, *table.times(), self.epoch_ns)
         t_ns, by_log, columns = table.sorted()
@@ -236,17 +247,14 @@ class Recording:
             by_log,
         )
 
-    @cached_property
-    def times(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """Topic -> stamps (log times where there is no header to be read) and log times, ns, in the file's order."""
-        found: dict[str, list[tuple[NDArray[np.int64], NDArray[np.int64]]]] = {name: [] for name in self.topics}
-        for rows in self._file.rows(set(self._file.channels)):
+    @property
+    def times(self) -> Mapping[str, Times]:
+        """Topic -> stamps (log times where there is no header to be read) and log times."""
+        found: dict[str, list[Times]] = {name: [] for name in self.topics if name not in self._times}
+        for _, rows in self._blocks(found):
             found[self._file.channels[rows.channel].topic].append((self._stamps(rows), rows.log_ns))
-        none = [(np.empty(0, np.int64), np.empty(0, np.int64))]
-        return {
-            name: (np.concatenate([t for t, _ in parts]), np.concatenate([log for _, log in parts]))
-            for name, parts in ((name, parts or none) for name, parts in found.items())
-        }
+        self._times |= {name: _joined(parts) for name, parts in found.items()}
+        return self._times
 
     # -- behind the methods above
 
@@ -310,18 +318,21 @@ class Recording:
             [f"topics there{ros1}: {', '.join(named[:_MOST_NAMED]) or 'none'}{more}", *self._file.notes(None)]
         )
 
-    def _channels(self, topic: str) -> set[int]:
-        return {number for number, channel in self._file.channels.items() if channel.topic == topic}
+    def _blocks(self, topics: Iterable[str]) -> Iterator[tuple[str, Rows]]:
+        """Topic and messages, block by block in the file's order."""
+        wanted = set(topics)
+        channels = {number for number, channel in self._file.channels.items() if channel.topic in wanted}
+        for rows in self._file.rows(channels) if channels else ():
+            yield self._file.channels[rows.channel].topic, rows
 
-    def _rows(self, topic: str) -> Iterator[tuple[Definition, Rows]]:
-        for rows in self._file.rows(self._channels(topic)):
-            schema = self._file.schemas[self._file.channels[rows.channel].schema_id]
-            try:
-                found = messages.definition(schema.name, schema.data.decode(errors="replace"))
-                found.check()
-            except MessageError as error:
-                raise self._unreadable(topic, error) from error
-            yield found, rows
+    def _definition(self, topic: str, rows: Rows) -> Definition:
+        schema = self._file.schemas[self._file.channels[rows.channel].schema_id]
+        try:
+            found = messages.definition(schema.name, schema.data.decode(errors="replace"))
+            found.check()
+        except MessageError as error:
+            raise self._unreadable(topic, error) from error
+        return found
 
     def _stamps(self, rows: Rows) -> NDArray[np.int64]:
         """Header stamps, ns; log times where there are none."""
@@ -340,7 +351,8 @@ class Recording:
         """(stamp, whether it is the log time, message, its definition) one by one, in file order."""
         self._require(topic, *types)
         times = []
-        for definition, rows in self._rows(topic):
+        for _, rows in self._blocks([topic]):
+            definition = self._definition(topic, rows)
             stamps = header_stamps(definition.has_header, rows)
             times.append((self._stamps(rows), rows.log_ns))
             for i, (t_ns, log_ns) in enumerate(zip(stamps.tolist(), rows.log_ns.tolist(), strict=True)):
@@ -350,10 +362,10 @@ class Recording:
                 except MessageError as error:
                     raise self._unreadable(topic, error) from error
                 yield t_ns or log_ns, not t_ns, message, definition
-        self._check_read(topic, sum(len(t_ns) for t_ns, _ in times))
+        self._times[topic] = _joined(times)
+        self._check_read(topic, len(self._times[topic][0]))
         if self.topics[topic].type in _TIMED:
-            t_ns, log_ns = (np.concatenate(part) for part in zip(*times, strict=True))
-            check_clock(topic, t_ns, log_ns, self.epoch_ns)
+            check_clock(topic, *self._times[topic], self.epoch_ns)
 
     def _check_read(self, topic: str, number: int) -> None:
         """Raise InputError if no message of the topic is left."""
@@ -363,25 +375,44 @@ class Recording:
 
     def _series(self, kind: type[AnySeries], topic: str) -> AnySeries:
         self._require(topic, kind.TYPE)
-        table = Table(self.topics[topic].count, {name: column.shape for name, column in kind.COLUMNS.items()})
-        self._fill(table, topic, {name: (column.path, _always(column.order)) for name, column in kind.COLUMNS.items()})
+        table = self._taking(topic).table
         if kind.TYPE in _TIMED:
             check_clock(topic, *table.times(), self.epoch_ns)
         t_ns, by_log, columns = table.sorted()
         return kind(t_ns, stamped_by_log=by_log, **columns)
 
-    def _fill(self, table: Table, topic: str, fields: Mapping[str, tuple[str, Order | None]]) -> None:
+    def _taking(self, topic: str, joints: tuple[str, ...] = ()) -> Taking:
+        """What is at hand of a topic, or is read now."""
+        taking = self._at_hand.pop((topic, joints), None)
+        if taking is None:
+            taking = Taking(self.topics[topic].type, self.topics[topic].count, joints)
+            for error in self._fill({topic: taking}).values():
+                raise error
+        self._check_read(topic, taking.table.taken)
+        return taking
+
+    def _fill(self, takings: Mapping[str, Taking]) -> dict[str, InputError]:
+        """Read topics in one pass; returns those that cannot be read, with the reason."""
         decoders: dict[int, Decoder] = {}
-        try:
-            for definition, rows in self._rows(topic):
+        failed: dict[str, InputError] = {}
+        for topic, rows in self._blocks(takings):
+            if topic in failed:
+                continue
+            try:
                 if rows.channel not in decoders:
-                    decoders[rows.channel] = Decoder(definition, fields)
+                    decoders[rows.channel] = Decoder(self._definition(topic, rows), takings[topic].fields)
                 with self._fields(topic):
-                    decoders[rows.channel].append(rows, table)
-        except MessageError as error:
-            raise self._unreadable(topic, error) from error
-        self._check_read(topic, table.taken)
+                    decoders[rows.channel].append(rows, takings[topic].table)
+            except MessageError as error:
+                failed[topic] = self._unreadable(topic, error)
+            except InputError as error:
+                failed[topic] = error
+            if len(failed) == len(takings):
+                break
+        self._times |= {topic: t.table.times(filled=False) for topic, t in takings.items() if topic not in failed}
+        return failed
 
 
-def _always(order: tuple[int, ...] | None) -> Order | None:
-    return (lambda _: order) if order else None
+def _joined(parts: Sequence[Times]) -> Times:
+    none = np.empty(0, np.int64)
+    return np.concatenate([none, *(t_ns for t_ns, _ in parts)]), np.concatenate([none, *(log for _, log in parts)])
