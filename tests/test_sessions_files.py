@@ -14,6 +14,7 @@ from rosbags.highlevel import AnyReader
 
 from pipelines.errors import InputError
 from pipelines.sessions import messages, records, series
+from pipelines.sessions.container import McapFile
 from pipelines.sessions.reading import open_recording
 from pipelines.sessions.writing import write_session
 
@@ -187,6 +188,42 @@ def test_backward_stamps_stay_in_the_order_they_were_logged(tmp_path: Path) -> N
     write_session(tmp_path / "s.mcap", {"/v": series.VectorSeries(t, np.arange(15.0).reshape(5, 3))})
     found = open_recording(tmp_path / "s.mcap").vector("/v")
     np.testing.assert_array_equal(found.t_ns, t)
+
+
+def test_topics_read_together_take_one_pass_and_are_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "s.mcap"
+    write_session(path, session())
+    joints = ("elevation", "azimuth")
+    alone = open_recording(path)
+    expected = alone.imu("/imu"), alone.joints("/joints", joints), alone.fixes("/fix")
+    times = {name: alone.times[name] for name in ("/imu", "/image")}
+    together = open_recording(path)
+    assert together.epoch_ns == T0
+    loads: list[Any] = []
+    load = McapFile._load
+    monkeypatch.setattr(McapFile, "_load", lambda *args: [loads.append(args), load(*args)][1])
+    together.read_together({"/imu": (), "/joints": joints, "/fix": (), "/image": (), "/nothing": ()})
+    once = len(loads)
+    found = together.imu("/imu"), together.joints("/joints", joints), together.fixes("/fix")
+    assert len(loads) == once == len({block.start for _, _, block in loads})
+    for a, b in zip(found, expected, strict=True):
+        for name, value in vars(b).items():
+            np.testing.assert_array_equal(getattr(a, name), value)
+    # Stamps of what was decoded are known; the pictures' are not yet.
+    for name, (t_ns, log_ns) in times.items():
+        np.testing.assert_array_equal(together.times[name][0], t_ns)
+        np.testing.assert_array_equal(together.times[name][1], log_ns)
+
+
+def test_a_topic_that_cannot_be_read_together_is_told_when_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "s.mcap"
+    topics = session()
+    write_session(path, topics)
+    recording = open_recording(path)
+    recording.read_together({"/imu": (), "/joints": ("azimuth", "roll")})
+    assert len(recording.imu("/imu")) == len(topics["/imu"])
+    with pytest.raises(InputError, match="no message with positions of the joints azimuth, roll"):
+        recording.joints("/joints", ("azimuth", "roll"))
 
 
 def test_a_failed_write_leaves_nothing(tmp_path: Path) -> None:
