@@ -58,8 +58,8 @@ def initial_attitudes(
     toward = so3.rotate(so3.inverse(cRm), los_direction(measured))
     for chain in chains:
         first = chain[:1]
-        increments = gyro.increments(np.repeat(time[first], len(chain)), time[chain])
-        carried = so3.multiply(seen(cRm[first], measured[first]), increments.wxyz)
+        turned = gyro.attitude(time[chain])
+        carried = so3.compose(seen(cRm[first], measured[first]), so3.inverse(turned[:1]), turned)
         expected = so3.rotate(so3.inverse(carried), [0.0, 1.0, 0.0])
         out[chain] = so3.multiply(carried, _shortest(toward[chain], expected))
     return out

@@ -101,14 +101,14 @@ def solve_batch(problem: Problem) -> Estimate:
     values = solution.values
     system, ordering = solution.system, solution.system.ordering
     linear = system.linearize(values)
-    marginal = joint_covariance(problem, linear, ordering, values, stand_ins)
+    grown = growth(problem, linear, ordering, values, marks)
+    marginal = grown[1] if grown else joint_covariance(problem, linear, ordering, values, stand_ins)
     residuals = system.residuals(values)
     with system.measurements.at(values):
         summary = chi_square(problem, factors, linear, ordering, values, marginal)
     held = [(m.time, m.stand_ins) for i, m in enumerate(marks) if i == 0 or m.stand_ins != marks[i - 1].stand_ins]
     # The last stand-ins are what the session reports; those before them held the parameters over time.
     smooth = smoothed(problem, linear, ordering, values, held[:-1], marginal) if len(held) > 2 else None
-    history = growth(problem, linear, ordering, values, marks)
     done = time.perf_counter()
     return Estimate(
         solver="batch",
@@ -119,7 +119,7 @@ def solve_batch(problem: Problem) -> Estimate:
         message=solution.message,
         residuals=residuals,
         chi_square=summary,
-        history=history,
+        history=grown[0] if grown else None,
         smoothed=smooth,
         attitudes=problem.attitudes(keyframes, values) if problem.attitudes else None,
         rejected={family: int((~r.used).sum()) for family, r in residuals.items()},

@@ -34,8 +34,8 @@ def growth(
     ordering: gtsam.Ordering,
     values: gtsam.Values,
     marks: Sequence[Mark],
-) -> History | None:
-    """Values and sigmas from what was recorded until some of the marks.
+) -> tuple[History, Array] | None:
+    """Values and sigmas from what was recorded until some of the marks, and the joint covariance (n, n) at the last.
 
     Args:
         problem: the graph's.
@@ -65,9 +65,10 @@ def growth(
             now = _without(carried, sorted(set(_keys(carried)) - set(held), key=place.__getitem__))
         except RuntimeError:
             return None
-        rows.append((mark.time, *_solved(problem, now, values, mark.stand_ins, held)))
-    times, numbers, sigmas = (np.array(column) for column in zip(*rows, strict=True))
-    return History(times, numbers, sigmas)
+        numbers, covariance = _solved(problem, now, values, mark.stand_ins, held)
+        rows.append((mark.time, numbers, np.sqrt(np.diag(covariance))))
+    history = History(*(np.array(column) for column in zip(*rows, strict=True)))
+    return history, covariance
 
 
 def _moments(marks: Sequence[Mark]) -> list[Mark]:
@@ -94,10 +95,10 @@ def _solved(
     stand_ins: Mapping[int, int],
     held: Sequence[int],
 ) -> tuple[Array, Array]:
-    """Reported numbers and their sigmas from a graph of nothing but the parameters."""
+    """Reported numbers and their covariance from a graph of nothing but the parameters."""
     information, slope = graph.hessian(ordering_of(held))
     covariance = reported_covariance(problem.parameters, information, values, held)
     inverse = coordinate_inverse(problem.parameters, values, held)
     extra = np.array([0.0 if q.prior_sigma == 0.0 else q.extra_sigma**2 for q in problem.quantities])
     move = (covariance - np.diag(extra)) @ inverse.T @ slope
-    return reported(problem, values, stand_ins) + move, np.sqrt(np.diag(covariance))
+    return reported(problem, values, stand_ins) + move, covariance
