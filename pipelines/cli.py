@@ -86,9 +86,10 @@ def compare(
 
     with progress.shown(quiet):
         calibrations = run(session, ["published", "batch", "incremental"], method, config, _seconds(window), strict)
+        with progress.doing("solving parts of the recording"):
+            written = out and write_compare(out, calibrations, *self_agreement(session, method, config))
     terminal.show(calibrations)
-    if out is not None:
-        written = write_compare(out, calibrations, *self_agreement(session, method, config))
+    if written is not None:
         terminal.say(f"Comparison in {written}")
 
 
@@ -127,14 +128,16 @@ def validate(
     config: _ConfigFile = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the page; default: SESSION-validation.")] = None,
     strict: _Strict = False,
+    quiet: _Quiet = False,
 ) -> None:
     """Errors of a recording before and after compensation with a calibration made on another one."""
-    from pipelines import terminal
+    from pipelines import progress, terminal
     from pipelines.validate import table, write_validation
     from pipelines.validate import validate as run
 
-    validated = run(session, calibration, method, config, strict)
-    written = write_validation(out or session.with_name(f"{session.stem}-validation"), validated)
+    with progress.shown(quiet), progress.doing("validating"):
+        validated = run(session, calibration, method, config, strict)
+        written = write_validation(out or session.with_name(f"{session.stem}-validation"), validated)
     for line in table(validated):
         terminal.say(line)
     for note in validated.notes:
@@ -149,12 +152,14 @@ def simulate(
     scenario: Annotated[str | None, typer.Option(help="YAML file or the name of one in datasets/scenarios.")] = None,
     seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
     images: Annotated[bool, typer.Option("--images", help="Pictures instead of what is measured in them.")] = False,
+    quiet: _Quiet = False,
 ) -> None:
     """Simulate a recording with its truth."""
-    from pipelines import terminal
+    from pipelines import progress, terminal
     from pipelines.registry import method as find
 
-    find(method).simulate(scenario, seed, out, images)
+    with progress.shown(quiet), progress.doing("simulating"):
+        find(method).simulate(scenario, seed, out, images)
     terminal.say(f"Wrote {out}")
 
 
@@ -167,12 +172,14 @@ def plan(
     config: _ConfigFile = None,
     require: Annotated[list[str] | None, typer.Option(help="NAME=SIGMA wanted, SI; may be repeated.")] = None,
     out: Annotated[Path | None, typer.Option(help="File for the better motion, as a scenario.")] = None,
+    quiet: _Quiet = False,
 ) -> None:
     """How well a planned motion would tell each parameter, and a better one. Exit code 3 if less than required."""
-    from pipelines import terminal
+    from pipelines import progress, terminal
     from pipelines.planning import make_plan, requirements, write_scenario
 
-    planned = make_plan(method, scenario, config, requirements(require or []))
+    with progress.shown(quiet):
+        planned = make_plan(method, scenario, config, requirements(require or []))
     terminal.show_plan(planned)
     if out is not None:
         write_scenario(out, planned)
@@ -181,35 +188,39 @@ def plan(
 
 
 @app.command()
-def info(session: _Session, config: _ConfigFile = None, strict: _Strict = False) -> None:
+def info(session: _Session, config: _ConfigFile = None, strict: _Strict = False, quiet: _Quiet = False) -> None:
     """What is in a recording: topics, rates, gaps, and the methods it can serve."""
-    from pipelines import terminal
+    from pipelines import progress, terminal
     from pipelines.sessions.config import ATTACHMENT, load_config
     from pipelines.sessions.info import session_facts
     from pipelines.sessions.reading import open_recording
 
-    recording = open_recording(session, strict)
-    settings = load_config(recording.attachment(ATTACHMENT, needed=config is None), config)
-    facts = session_facts(recording, settings)
+    with progress.shown(quiet), progress.doing("reading"):
+        recording = open_recording(session, strict)
+        settings = load_config(recording.attachment(ATTACHMENT, needed=config is None), config)
+        facts = session_facts(recording, settings)
     terminal.show_facts(session.name, facts)
 
 
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the recording and its results.")] = Path("alidade-demo"),
+    quiet: _Quiet = False,
 ) -> None:
     """Simulate a helmet on a manoeuvring platform, calibrate it with all three solvers, say where the report is."""
-    from pipelines import terminal
+    from pipelines import progress, terminal
     from pipelines.calibrate import calibrate as run
     from pipelines.registry import method
     from pipelines.reports.write import write_results
 
     out.mkdir(parents=True, exist_ok=True)
     session = out / "head_mounts.mcap"
-    method("head").simulate("head_mounts", 1, session, False)
-    calibrations = run(session, ["published", "batch", "incremental"])
-    for calibration in calibrations:
-        write_results(out / calibration.estimate.solver, calibration)
+    with progress.shown(quiet):
+        with progress.doing("simulating"):
+            method("head").simulate("head_mounts", 1, session, False)
+        calibrations = run(session, ["published", "batch", "incremental"])
+        for calibration in progress.track(calibrations, "writing", len(calibrations)):
+            write_results(out / calibration.estimate.solver, calibration)
     terminal.show(calibrations)
     terminal.say(f"Report: {(out / 'batch' / 'report.html').resolve()}")
 
@@ -225,16 +236,18 @@ def montecarlo(
     scheduler: _Scheduler = None,
     jobs: _Jobs = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: METHOD-montecarlo.")] = None,
+    quiet: _Quiet = False,
 ) -> None:
     """Simulate and solve many recordings: are the sigmas true? The same command goes on after an interruption."""
-    from pipelines import terminal
+    from pipelines import progress, terminal
     from pipelines.fleet.montecarlo import SOLVERS, run_study
     from pipelines.fleet.write import write_study
 
     folder = out or Path(f"{method}-montecarlo")
     chosen = SOLVERS if solvers == "all" else tuple(solvers.split(","))
     seeds = range(seed, seed + runs)
-    study = run_study(method, scenario, seeds, chosen, folder, scheduler, jobs, _seconds(window))
+    with progress.shown(quiet):
+        study = run_study(method, scenario, seeds, chosen, folder, scheduler, jobs, _seconds(window))
     written = write_study(folder, study)
     for line in study.summary:
         terminal.say(line)
@@ -254,16 +267,18 @@ def fleet(
     scheduler: _Scheduler = None,
     jobs: _Jobs = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("alidade-fleet"),
+    quiet: _Quiet = False,
 ) -> None:
     """Calibrate many recordings and compare units and dates. The same command goes on after an interruption."""
-    from pipelines import terminal
+    from pipelines import progress, terminal
     from pipelines.fleet.analysis import populations
     from pipelines.fleet.fleet import Settings, calibrate_fleet
     from pipelines.fleet.recordings import find
     from pipelines.fleet.write import write_fleet
 
     settings = Settings.of(method, config, solver.value, _seconds(window))
-    outcome = calibrate_fleet(find(recordings), settings, out, scheduler, jobs, names)
+    with progress.shown(quiet):
+        outcome = calibrate_fleet(find(recordings), settings, out, scheduler, jobs, names)
     written = write_fleet(out, outcome, populations(outcome.results))
     for line in outcome.summary:
         terminal.say(line)
@@ -296,16 +311,18 @@ def cube_layout(
     session: _Session,
     out: Annotated[Path, typer.Option(help="The config to write, with where the tags are.")],
     config: _ConfigFile = None,
+    quiet: _Quiet = False,
 ) -> None:
     """Where the tags are on a cube, from pictures of it on all sides; the config gives their ids and sizes."""
-    from pipelines import terminal
+    from pipelines import progress, terminal
     from pipelines.sessions.config import ATTACHMENT, load_config
     from pipelines.sessions.cube_layout import cube_layout as estimate
     from pipelines.sessions.cube_layout import layout_yaml
     from pipelines.sessions.reading import open_recording
 
-    recording = open_recording(session)
-    layout = estimate(recording, load_config(recording.attachment(ATTACHMENT), config))
+    with progress.shown(quiet), progress.doing("finding where the tags are"):
+        recording = open_recording(session)
+        layout = estimate(recording, load_config(recording.attachment(ATTACHMENT), config))
     _write(out, layout_yaml(layout))
     terminal.say(f"Wrote {out}")
 
@@ -347,6 +364,13 @@ def _seconds(window: str) -> float | None:
     return seconds
 
 
+def _interrupted(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is behind an error, as it is behind the ImportError of a module that it met half loaded."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
 def main() -> None:
     """Run the command; known trouble is one line on stderr."""
     from pipelines.errors import InputError
@@ -358,7 +382,9 @@ def main() -> None:
     except InputError as error:
         print(f"alidade: {error}", file=sys.stderr)
         sys.exit(2)
-    except Exception as error:
+    except BaseException as error:
+        if _interrupted(error):
+            sys.exit(exit_codes.INTERRUPTED)
         # Not to be imported before it is needed: gtsam takes a quarter of a second.
         if type(error).__name__ != "IndeterminateError":
             raise

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipelines import progress
 from pipelines.errors import InputError
 from pipelines.methods.base import Quantity
 from pipelines.observability import Assessment, assess
@@ -125,11 +126,12 @@ def make_plan(
     wanted = dict(require or {})
     model = _model(method_name)
     settings = load_scenario(model, scenario or f"{method_name}_nominal").model_dump()
-    now = predict(method_name, settings, config_file, wanted)
+    with progress.doing("predicting"):
+        now = predict(method_name, settings, config_file, wanted)
     steps: list[Step] = []
     best = now
     while best.missing and len(steps) < most_steps:
-        found = list(_candidates(method_name, best, config_file, wanted))
+        found = list(progress.track(_candidates(method_name, best, config_file, wanted), "trying other motions"))
         if not found:
             break
         step = max(found, key=lambda each: each.gain)

@@ -193,6 +193,22 @@ def test_bad_options_are_refused(alidade: Command, session: Path, tmp_path: Path
     _refused(alidade("simulate", "spoon", "--out", tmp_path / "x"), tmp_path / "x", ("head",))
 
 
+@pytest.mark.parametrize("where", ["reading", "importing", "writing"])
+def test_ctrl_c_is_silent_and_leaves_nothing(
+    alidade: Command, session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        if where == "importing":
+            raise ImportError("initialization failed") from KeyboardInterrupt()  # as gtsam's module does
+        raise KeyboardInterrupt
+
+    target = "pipelines.reports.write.report_html" if where == "writing" else "pipelines.calibrate.open_recording"
+    monkeypatch.setattr(target, interrupted)
+    run = alidade("calibrate", session, "--out", tmp_path / "out")
+    assert (run.code, run.out, run.err) == (130, "", "")
+    assert [p.name for p in tmp_path.iterdir()] == ["s.mcap"]
+
+
 def test_help_imports_nothing_heavy() -> None:
     code = (
         "import sys; import pipelines.cli; print([m for m in ('gtsam', 'cv2', 'numpy', 'plotly') if m in sys.modules])"

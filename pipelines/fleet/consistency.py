@@ -12,6 +12,7 @@ from typing import Annotated
 
 import typer
 
+from pipelines import progress
 from pipelines.errors import InputError
 from pipelines.fleet import statistics
 from pipelines.fleet.montecarlo import SOLVERS, Study, run_study
@@ -49,7 +50,8 @@ def main(
     interrupted = False
     for method, solvers, stop in _plan(methods.split(","), runs):
         folder = work / method / "-".join(solvers)
-        study = run_study(method, None, range(stop), solvers, folder, scheduler, jobs)
+        with progress.shown():
+            study = run_study(method, None, range(stop), solvers, folder, scheduler, jobs)
         studies |= {(method, solver): study for solver in solvers}
         interrupted = study.interrupted
         if interrupted:

@@ -14,11 +14,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from pipelines import exit_codes
+from pipelines import exit_codes, progress
 from pipelines.errors import InputError
 from pipelines.fleet.attempt import attempt, failure, set_aside
 from pipelines.fleet.engine import Killed, cluster, completed, source_version
-from pipelines.fleet.progress import progress
 from pipelines.fleet.recordings import as_date, from_metadata, from_name, local
 from pipelines.fleet.store import Result, Store, settings_key
 from pipelines.sessions.config import load_config
@@ -113,9 +112,10 @@ def calibrate_fleet(
     tasks = {name: (file, settings, store.results.get(name, {}).get("sha256")) for name, file in recordings.items()}
     fresh: dict[str, Result] = {}
     kept, interrupted = [], False
-    with cluster(scheduler, jobs) as client, progress("calibrating", len(tasks)) as advance:
+    with cluster(scheduler, jobs) as client:
+        done = completed(client, calibrate_recording, tasks)
         try:
-            for name, result in completed(client, calibrate_recording, tasks):
+            for name, result in progress.track(done, "calibrating", len(tasks)):
                 if isinstance(result, Killed):
                     fresh[name] = set_aside()
                 elif result is None:
@@ -124,7 +124,6 @@ def calibrate_fleet(
                     store.add(name, result)
                 else:
                     fresh[name] = result
-                advance()
         except KeyboardInterrupt:
             interrupted = True
     known = {**{name: store.results[name] for name in recordings if name in store.results}, **fresh}

@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipelines import progress
 from pipelines.errors import InputError
 from pipelines.fleet import require_extra, statistics
 from pipelines.fleet.attempt import attempt, set_aside
 from pipelines.fleet.engine import Killed, cluster, completed, source_version
-from pipelines.fleet.progress import progress
 from pipelines.fleet.store import Result, Store, settings_key
 from pipelines.fleet.tables import Cell, Row
 
@@ -156,14 +156,14 @@ def run_study(
     kept, interrupted = len(seeds) - len(tasks), False
     killed: dict[str, Result] = {}
     if tasks:
-        with cluster(scheduler, jobs) as client, progress("simulating and solving", len(tasks)) as advance:
+        with cluster(scheduler, jobs) as client:
+            done = completed(client, simulate_and_solve, tasks)
             try:
-                for name, result in completed(client, simulate_and_solve, tasks):
+                for name, result in progress.track(done, "simulating and solving", len(tasks)):
                     if isinstance(result, Killed):
                         killed[name] = dict.fromkeys(solvers, set_aside())
                     else:
                         store.add(name, result)
-                    advance()
             except KeyboardInterrupt:
                 interrupted = True
     known = {**store.results, **killed}

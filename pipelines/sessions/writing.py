@@ -34,6 +34,7 @@ from mcap.records import (
 )
 from numpy.typing import NDArray
 
+from pipelines import progress
 from pipelines.sessions import messages, series
 from pipelines.sessions.messages import Array, Definition, known
 from pipelines.sessions.records import MAGIC, MESSAGE_HEAD, windows
@@ -124,7 +125,9 @@ class _File:
         widths = np.array([MESSAGE_HEAD.itemsize + source.size for source in sources], dtype=np.int64)
         filled = np.cumsum(widths[owner])
         cuts = np.flatnonzero(np.diff(filled // _CHUNK)) + 1
-        for start, end in zip([0, *cuts], [*cuts, len(order)], strict=True):
+        pieces = list(zip([0, *cuts], [*cuts, len(order)], strict=True))
+        # Pictures are drawn as they are written.
+        for start, end in progress.track(pieces, "writing", len(pieces)):
             if end > start:
                 self._write_chunk(sources, owner[start:end], log_ns[start:end])
 
