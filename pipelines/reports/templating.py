@@ -9,9 +9,13 @@ if TYPE_CHECKING:
 
 
 def environment(package: str) -> Environment:
-    """Templates of a package: every string escaped, a name that is not given is an error."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
+    """Templates of a package on top of the base of all: every string escaped, a name that is not given is an error."""
+    from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
     return Environment(
-        loader=PackageLoader(package), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=ChoiceLoader([PackageLoader(package), PackageLoader("pipelines.reports")]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
