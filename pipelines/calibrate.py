@@ -17,7 +17,7 @@ from pipelines.methods.base import Estimate, Problem, Step
 from pipelines.observability import Cause, assess
 from pipelines.registry import Method, method
 from pipelines.reports.result import Calibration
-from pipelines.sessions.config import ATTACHMENT, Config, load_config
+from pipelines.sessions.config import ATTACHMENT, TRUTH, Config, load_config
 from pipelines.sessions.info import resolve_method, session_facts
 from pipelines.sessions.reading import Recording, open_recording
 
@@ -158,10 +158,10 @@ def _published(chosen: Method, data: object, config: Config) -> Estimate | None:
 
 
 def _truth(recording: Recording) -> dict[str, object] | None:
-    attachment = recording.attachment("truth.json", needed=False)
+    attachment = recording.attachment(TRUTH, needed=False)
     try:
         return None if attachment is None else dict(json.loads(attachment, parse_int=float))
     except (ValueError, TypeError, RecursionError) as error:
         raise InputError(
-            f"{recording.path}: the attachment truth.json is no JSON object of parameters and their values"
+            f"{recording.path}: the attachment {TRUTH} is no JSON object of parameters and their values"
         ) from error

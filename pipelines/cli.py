@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
 from pipelines import exit_codes
+
+if TYPE_CHECKING:
+    from pipelines.reports.result import Calibration
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -53,7 +57,7 @@ def calibrate(
     quiet: _Quiet = False,
 ) -> None:
     """Calibrate a recording. Exit code 0 calibrated, 2 unusable input, 3 weak or unobservable, 4 inconsistent."""
-    from pipelines import progress, terminal
+    from pipelines import progress
     from pipelines.calibrate import calibrate as run
     from pipelines.reports.write import write_results
     from pipelines.vision import parallel
@@ -63,9 +67,7 @@ def calibrate(
         (calibration,) = run(session, [solver.value], method, config, _seconds(window), strict)
         with progress.doing("writing"):
             written = write_results(folder, calibration)
-    terminal.show([calibration])
-    terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
-    raise typer.Exit(exit_codes.OF_STATUS[calibration.assessment.status])
+    _tell(calibration, folder, written)
 
 
 @app.command()
@@ -106,7 +108,6 @@ def follow(
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: SESSION-incremental.")] = None,
 ) -> None:
     """Calibrate a recording while it is being written, and say what is still missing. Ctrl-C ends it."""
-    from pipelines import terminal
     from pipelines.follow.follow import follow as run
     from pipelines.follow.follower import Settings
     from pipelines.reports.write import write_results
@@ -115,9 +116,7 @@ def follow(
     calibration = run(settings, port if serve else None)
     folder = out or session.with_name(f"{session.stem}-incremental")
     written = write_results(folder, calibration)
-    terminal.show([calibration])
-    terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
-    raise typer.Exit(exit_codes.OF_STATUS[calibration.assessment.status])
+    _tell(calibration, folder, written)
 
 
 @app.command()
@@ -339,6 +338,15 @@ def cube_print(
 
     print_cube(out, edge, first_id)
     terminal.say(f"Wrote {out}: print at 100 % and check the ruler")
+
+
+def _tell(calibration: Calibration, folder: Path, written: Sequence[Path]) -> NoReturn:
+    """Show a calibration and where its results are; its status is the exit code."""
+    from pipelines import terminal
+
+    terminal.show([calibration])
+    terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
+    raise typer.Exit(exit_codes.OF_STATUS[calibration.assessment.status])
 
 
 def _write(path: Path, text: str) -> None:

@@ -21,6 +21,7 @@ from pipelines.errors import InputError
 from pipelines.sessions.topics import TOPICS, topic_name
 
 ATTACHMENT = "alidade.yaml"
+TRUTH = "truth.json"
 _UNIT_TOLERANCE = 1e-3
 _LONGEST = 1 << 20
 

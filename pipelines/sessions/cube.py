@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,11 +24,11 @@ from pipelines.sessions.checks import (
     nanoseconds,
     unit_quaternions,
 )
-from pipelines.sessions.config import ATTACHMENT, DEFAULT_NOISE, Config, RawConversion, first_given
+from pipelines.sessions.config import DEFAULT_NOISE, Config, RawConversion, first_given
 from pipelines.sessions.cube_rests import find_rests
 from pipelines.sessions.reading import Recording
 from pipelines.sessions.topics import TOPICS
-from pipelines.sessions.writing import write_session
+from pipelines.sessions.writing import attached, write_session
 
 if TYPE_CHECKING:
     from pipelines.vision.camera import Camera
@@ -276,12 +275,7 @@ def write_cube(
     if data.camera is not None and data.sightings is not None:
         topics[TOPICS["camera_info"].name] = _info_message(data.camera, epoch)
         topics |= _pictures_or_tags(data.sightings, epoch, pictures)
-    attachments = {}
-    if config_yaml is not None:
-        attachments[ATTACHMENT] = config_yaml.encode()
-    if truth is not None:
-        attachments["truth.json"] = json.dumps(dict(truth), indent=1).encode()
-    write_session(path, topics, attachments)
+    write_session(path, topics, attached(truth, config_yaml))
 
 
 def _info_message(camera: Camera, epoch_ns: int) -> series.CameraInfo:

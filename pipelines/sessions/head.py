@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,11 +19,11 @@ from pipelines.sessions.checks import (
     nanoseconds,
     unit_quaternions,
 )
-from pipelines.sessions.config import ATTACHMENT, Config
+from pipelines.sessions.config import Config
 from pipelines.sessions.gyro import read_gyro
 from pipelines.sessions.reading import Recording
 from pipelines.sessions.topics import TOPICS
-from pipelines.sessions.writing import write_session
+from pipelines.sessions.writing import attached, write_session
 
 Array = NDArray[np.float64]
 
@@ -140,12 +139,7 @@ def write_head(
     if data.truth_t is not None and data.truth_wxyz is not None:
         t_ns = nanoseconds(data.truth_t, data.epoch_ns)
         topics[TOPICS["truth_attitude"].name] = series.QuaternionSeries(t_ns, data.truth_wxyz, frame_id="platform")
-    attachments = {}
-    if config_yaml is not None:
-        attachments[ATTACHMENT] = config_yaml.encode()
-    if truth is not None:
-        attachments["truth.json"] = json.dumps(dict(truth), indent=1).encode()
-    write_session(path, topics, attachments)
+    write_session(path, topics, attached(truth, config_yaml))
 
 
 def _wanted(recording: Recording, config: Config, key: str) -> bool:

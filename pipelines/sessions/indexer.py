@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,11 +20,11 @@ from pipelines.sessions.checks import (
     nanoseconds,
     unit_quaternions,
 )
-from pipelines.sessions.config import ATTACHMENT, Config
+from pipelines.sessions.config import Config
 from pipelines.sessions.gyro import usable
 from pipelines.sessions.reading import Recording
 from pipelines.sessions.topics import TOPICS
-from pipelines.sessions.writing import write_session
+from pipelines.sessions.writing import attached, write_session
 
 Array = NDArray[np.float64]
 
@@ -111,12 +110,7 @@ def write_indexer(
         start = np.array([data.epoch_ns])
         fix = series.FixSeries(start, np.array([data.latitude_deg]), np.zeros(1), frame_id="gnss")
         topics[TOPICS["fix"].name] = fix
-    attachments = {}
-    if config_yaml is not None:
-        attachments[ATTACHMENT] = config_yaml.encode()
-    if truth is not None:
-        attachments["truth.json"] = json.dumps(dict(truth), indent=1).encode()
-    write_session(path, topics, attachments)
+    write_session(path, topics, attached(truth, config_yaml))
 
 
 def _latitude(recording: Recording, config: Config) -> float | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise, product
@@ -15,11 +14,11 @@ from pipelines.errors import InputError
 from pipelines.sessions import series
 from pipelines.sessions.camera import camera_of
 from pipelines.sessions.checks import check_overlap, clean, count, nanoseconds
-from pipelines.sessions.config import ATTACHMENT, Config
+from pipelines.sessions.config import Config
 from pipelines.sessions.gyro import read_gyro
 from pipelines.sessions.reading import Recording
 from pipelines.sessions.topics import TOPICS
-from pipelines.sessions.writing import write_session
+from pipelines.sessions.writing import attached, write_session
 
 Array = NDArray[np.float64]
 
@@ -110,12 +109,7 @@ def write_los(
         topics[TOPICS["los_error"].name] = series.VectorSeries(ns(data.image_t), vector, frame_id="los")
     else:
         topics[TOPICS["camera_info"].name], topics[TOPICS["image"].name] = pictures
-    attachments = {}
-    if config_yaml is not None:
-        attachments[ATTACHMENT] = config_yaml.encode()
-    if truth is not None:
-        attachments["truth.json"] = json.dumps(dict(truth), indent=1).encode()
-    write_session(path, topics, attachments)
+    write_session(path, topics, attached(truth, config_yaml))
 
 
 def check_gimbal(topic: str, data: LosData) -> None:

@@ -6,6 +6,7 @@ and whole chunks are put together from them; the records around the chunks are t
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import struct
@@ -36,6 +37,7 @@ from numpy.typing import NDArray
 
 from pipelines import progress
 from pipelines.sessions import messages, series
+from pipelines.sessions.config import ATTACHMENT, TRUTH
 from pipelines.sessions.messages import Array, Definition, known
 from pipelines.sessions.records import MAGIC, MESSAGE_HEAD, windows
 
@@ -45,6 +47,16 @@ _MEDIA = {".yaml": "application/yaml", ".json": "application/json"}
 
 _PICTURE = 1 << 16  # expected size of a message of no fixed size; only chunk sizes depend on it
 _SEC_NS = 1_000_000_000
+
+
+def attached(truth: Mapping[str, float] | None, config_yaml: str | None) -> dict[str, bytes]:
+    """A session's attachments: its config and the true values of its parameters, as far as there are any."""
+    attachments = {}
+    if config_yaml is not None:
+        attachments[ATTACHMENT] = config_yaml.encode()
+    if truth is not None:
+        attachments[TRUTH] = json.dumps(dict(truth), indent=1).encode()
+    return attachments
 
 
 def write_session(
