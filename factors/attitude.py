@@ -140,7 +140,7 @@ class VisionAttitudeFactor:
             growth = np.einsum("nij,nj->ni", so3.hat(step.rate) @ step.bias_jacobian + np.eye(3), -bias_error)
             rate = so3.rotate(so3.exp(-correction), step.rate) + np.einsum("nij,nj->ni", by_correction, growth)
             if self.platform is not None:
-                rate = rate - np.einsum("nij,nj->ni", vRb, self.platform.increments(at, at).rate)
+                rate = rate - np.einsum("nij,nj->ni", vRb, self.platform.rate(at))
             return (
                 weight @ hRv @ so3.matrix(so3.inverse(dV)),
                 weight @ hRv @ by_correction @ step.bias_jacobian,

@@ -82,14 +82,19 @@ class GyroPath:
         i, s = self._place(np.asarray(at, dtype=float))
         return so3.multiply(self._attitude[i], so3.exp(_arc(self._rate[i], self._slope[i], s)))
 
+    def rate(self, at: ArrayLike) -> Array:
+        """Rate (n, 3) at the times, bias_hat taken off, rad/s."""
+        i, s = self._place(np.asarray(at, dtype=float))
+        return _rate(self._rate[i], self._slope[i], s)
+
     def increments(self, start: ArrayLike, stop: ArrayLike) -> Increments:
         """Rotations over the windows [start, stop], (n,) each, s; a window may be empty or run backwards.
 
         Beyond the first and the last stamp the outermost rates are continued; callers keep windows inside.
         """
         start, stop = np.asarray(start, dtype=float), np.asarray(stop, dtype=float)
-        q0, c0, _ = self._at(start)
-        q1, c1, rate = self._at(stop)
+        # Both ends in one call: what a few windows cost is calls.
+        (q0, q1), (c0, c1), (_, rate) = (np.split(each, 2) for each in self._at(np.concatenate([start, stop])))
         jacobian = -so3.matrix(so3.inverse(q1)) @ (c1 - c0)
         unseen = np.abs(np.interp(stop, self.t, self._unseen) - np.interp(start, self.t, self._unseen))
         return Increments(stop - start, so3.multiply(so3.inverse(q0), q1), jacobian, rate, unseen)
@@ -101,9 +106,7 @@ class GyroPath:
         arc = _arc(w0, a, s)
         turn = so3.exp(arc)
         integral = self._integral[i] + so3.matrix(self._attitude[i]) @ (s[..., None] * so3.right_jacobian(-arc))
-        speed = w0 + a * s + so3.cross(w0, a) * s**2 / 4.0
-        rate = np.einsum("nij,nj->ni", so3.right_jacobian(arc), speed)
-        return so3.multiply(self._attitude[i], turn), integral, rate
+        return so3.multiply(self._attitude[i], turn), integral, _rate(w0, a, s)
 
     def _place(self, at: Array) -> tuple[NDArray[np.intp], Array]:
         """The sample intervals that hold the times, (n,), and the time since their start, (n, 1), s."""
@@ -145,6 +148,12 @@ def _gap_variance(t: Array, mean: Array) -> Array:
 def _arc(w0: Array, a: Array, s: Array) -> Array:
     """Rotation vectors after the times s of rates w0 + a s."""
     return w0 * s + a * (0.5 * s**2) + so3.cross(w0, a) * (s**3 / 12.0)
+
+
+def _rate(w0: Array, a: Array, s: Array) -> Array:
+    """Rates of the attitude Exp(arc) after the times s, in the turned frame."""
+    speed = w0 + a * s + so3.cross(w0, a) * s**2 / 4.0
+    return np.einsum("nij,nj->ni", so3.right_jacobian(_arc(w0, a, s)), speed)
 
 
 def _running_product(q: Array) -> Array:

@@ -237,7 +237,7 @@ class WeightedSumFactor:
 def _turn_by_triad(path: GyroPath, rate: Array, K: Array) -> Array:
     """Jacobian (3, 12) of a turn's rotation, perturbed on the right, by the triad; dw = -K (dA w + dc)."""
     # The rates that the path takes as linear in between; at its last stamp that is the sample itself.
-    points = path.increments(path.t, path.t).rate
+    points = path.rate(path.t)
     points[-1] = rate[-1]
     dt = np.diff(path.t)[:, None, None]
     w0, w1 = points[:-1], points[1:]
