@@ -44,6 +44,20 @@ _Strict = Annotated[bool, typer.Option("--strict", help="Refuse a recording of w
 _Window = Annotated[str, typer.Option(help="Of the incremental solver: seconds kept, or 'all'.")]
 
 
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(version("alidade"))
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print it.")] = False,
+) -> None: ...
+
+
 @app.command()
 def calibrate(
     session: _Session,

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -207,6 +208,10 @@ def test_ctrl_c_is_silent_and_leaves_nothing(
     run = alidade("calibrate", session, "--out", tmp_path / "out")
     assert (run.code, run.out, run.err) == (130, "", "")
     assert [p.name for p in tmp_path.iterdir()] == ["s.mcap"]
+
+
+def test_version(alidade: Command) -> None:
+    assert alidade("--version").out == f"{version('alidade')}\n"
 
 
 def test_help_imports_nothing_heavy() -> None:
