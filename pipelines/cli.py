@@ -46,9 +46,9 @@ _Window = Annotated[str, typer.Option(help="Of the incremental solver: seconds k
 
 def _version(wanted: bool) -> None:
     if wanted:
-        from importlib.metadata import version
+        from pipelines.reports.result import software_versions
 
-        typer.echo(version("alidade"))
+        typer.echo(software_versions()["alidade"])
         raise typer.Exit
 
 
@@ -102,10 +102,10 @@ def compare(
 
     with progress.shown(quiet):
         calibrations = run(session, ["published", "batch", "incremental"], method, config, _seconds(window), strict)
-        with progress.doing("solving parts of the recording"):
-            written = out and write_compare(out, calibrations, *self_agreement(session, method, config))
     terminal.show(calibrations)
-    if written is not None:
+    if out is not None:
+        with progress.shown(quiet), progress.doing("solving parts of the recording"):
+            written = write_compare(out, calibrations, *self_agreement(session, method, config))
         terminal.say(f"Comparison in {written}")
 
 
@@ -401,17 +401,15 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         app()
-    except InputError as error:
-        print(f"alidade: {error}", file=sys.stderr)
-        sys.exit(2)
     except BaseException as error:
         if _interrupted(error):
             sys.exit(exit_codes.INTERRUPTED)
-        # Not to be imported before it is needed: gtsam takes a quarter of a second.
-        if type(error).__name__ != "IndeterminateError":
+        # IndeterminateError is not to be imported before it is needed: gtsam takes a quarter of a second.
+        unusable = isinstance(error, InputError)
+        if not unusable and type(error).__name__ != "IndeterminateError":
             raise
         print(f"alidade: {error}", file=sys.stderr)
-        sys.exit(3)
+        sys.exit(exit_codes.BAD_INPUT if unusable else exit_codes.UNDETERMINED)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from pipelines.methods.priors import vector_prior
 from pipelines.observability import assess
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.incremental import solve_incremental
-from pipelines.solvers.marginals import IndeterminateError
+from pipelines.solvers.marginals import IndeterminateError, reported_covariance
 
 PARAMETER = int(gtsam.symbol("p", 0))
 WALK, START, NOISE, PRIOR = 0.3, 0.5, 0.2, 2.0
@@ -262,3 +262,18 @@ def test_nothing_is_known_but_the_prior() -> None:
     assert_same(estimate, np.zeros(2), PRIOR**2 * np.eye(2))
     assert estimate.chi_square is not None
     assert estimate.chi_square.dof == pytest.approx(20.0, abs=1e-6)
+
+
+def test_fixed_quantities_cost_the_others_no_digits() -> None:
+    """A pinned number has some 1e16 times the information of a weak one; the others' covariance stays exact."""
+    rng = np.random.default_rng(3)
+    A = rng.normal(size=(8, 4)) * [1.0, 1e-4, 1e8, 1.0]
+    quantities = [Quantity(f"q{i}", "", 0.0 if i == 2 else 1.0, 1.0, 0.1) for i in range(4)]
+    values = gtsam.Values()
+    values.insert(0, np.zeros(4))
+    covariance = reported_covariance([Parameter(0, tuple(quantities))], A.T @ A, values, [0])
+    free = [0, 1, 3]
+    expected = np.linalg.inv(A[:, free].T @ A[:, free])
+    np.testing.assert_allclose(covariance[np.ix_(free, free)], expected, rtol=1e-6)
+    assert not covariance[2].any()
+    assert not covariance[:, 2].any()

@@ -113,9 +113,10 @@ def calibrate_fleet(
     fresh: dict[str, Result] = {}
     kept, interrupted = [], False
     with cluster(scheduler, jobs) as client:
-        done = completed(client, calibrate_recording, tasks)
         try:
-            for name, result in progress.track(done, "calibrating", len(tasks)):
+            for name, result in progress.track(
+                completed(client, calibrate_recording, tasks), "calibrating", len(tasks)
+            ):
                 if isinstance(result, Killed):
                     fresh[name] = set_aside()
                 elif result is None:

@@ -157,9 +157,10 @@ def run_study(
     killed: dict[str, Result] = {}
     if tasks:
         with cluster(scheduler, jobs) as client:
-            done = completed(client, simulate_and_solve, tasks)
             try:
-                for name, result in progress.track(done, "simulating and solving", len(tasks)):
+                for name, result in progress.track(
+                    completed(client, simulate_and_solve, tasks), "simulating and solving", len(tasks)
+                ):
                     if isinstance(result, Killed):
                         killed[name] = dict.fromkeys(solvers, set_aside())
                     else:

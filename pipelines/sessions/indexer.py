@@ -62,7 +62,7 @@ def read_indexer(recording: Recording, config: Config) -> IndexerData:
     dropped: dict[str, int] = {}
     epoch = recording.epoch_ns
     imu_topic, encoder_topic = config.topic("imu"), config.topic("indexer")
-    recording.read_together({imu_topic: (), encoder_topic: JOINTS})
+    recording.read_together({imu_topic: (), encoder_topic: JOINTS, config.topic("fix"): ()})
     imu = recording.imu(imu_topic)
     gyro_t, keep = usable(imu_topic, imu, epoch, dropped, least=3)
     gyro = imu.gyro[keep]

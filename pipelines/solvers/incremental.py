@@ -455,7 +455,8 @@ def _linear(factor: Factor, values: gtsam.Values) -> Factor:
     """The factor as it is about the values, for good.
 
     iSAM2 would not move the point either unless a variable moved by _RELINEARIZE, but ask a Python factor for the same
-    numbers again at every update.
+    numbers again at every update. What moves farther in the first moments is made good at the next anchor, which solves
+    the steps' own factors.
     """
     return Factor(factor.family, gtsam.LinearContainerFactor(factor.factor.linearize(values), values))
 

@@ -108,14 +108,16 @@ def reported_covariance(
     """Covariance of the reported numbers from the information matrix of the variables' tangents, in this order."""
     quantities = [q for p in parameters for q in p.quantities]
     scale = np.array([q.prior_scale for q in quantities])
+    extra = np.diag([q.extra_sigma**2 for q in quantities])
+    # Fixed numbers are left out: their huge information would cost the others their digits.
+    free = np.ix_(*2 * [np.flatnonzero([q.prior_sigma != 0.0 for q in quantities])])
     # Information in units of the prior scales, so that one threshold serves angles, rates and seconds.
     unit = coordinate_inverse(parameters, values, keys) * scale
-    eigenvalues, vectors = np.linalg.eigh(unit.T @ information @ unit)
+    eigenvalues, vectors = np.linalg.eigh((unit.T @ information @ unit)[free])
     variance = 1.0 / np.maximum(eigenvalues, _UNKNOWN**-2)
-    covariance = (vectors * variance) @ vectors.T * np.outer(scale, scale)
-    covariance += np.diag([q.extra_sigma**2 for q in quantities])
-    known = np.array([q.prior_sigma != 0.0 for q in quantities])
-    return np.where(np.outer(known, known), covariance, 0.0)
+    covariance = np.zeros_like(extra)
+    covariance[free] = (vectors * variance) @ vectors.T * np.outer(scale, scale)[free] + extra[free]
+    return covariance
 
 
 def coordinate_inverse(parameters: Sequence[Parameter], values: gtsam.Values, keys: Sequence[int]) -> Array:

@@ -108,7 +108,8 @@ def _detectors(width: int) -> tuple[Any, Any]:
 
     tags = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     narrow, wide = _parameters(_NARROW), _parameters(_WIDE)
-    # OpenCV looks for quads in the picture times side / (side + width ratio), and reads their bits at full size.
+    # OpenCV looks for quads in the picture times side / (side + width ratio), and reads their bits in that of its
+    # smaller copies in which they are still some `side` px wide.
     wide.useAruco3Detection = True
     wide.minSideLengthCanonicalImg = _LEAST_SIDE
     wide.minMarkerLengthRatioOriginalImg = _LEAST_SIDE * (1.0 / _SMALLER - 1.0) / width
@@ -136,7 +137,7 @@ def _refine(picture: Picture, plain: Array, camera: Camera) -> tuple[Array, Arra
     corners = plain
     centre = np.repeat(plain.mean(axis=1), 4, axis=0)
     blur = np.full(4 * n, np.inf)
-    for _ in range(_ROUNDS):
+    for round_ in range(_ROUNDS):
         start, end = corners.reshape(-1, 2), np.roll(corners, -1, axis=1).reshape(-1, 2)
         cuts = _cut(picture, start, end, centre, blur)
         blur = cuts.blur
@@ -149,7 +150,7 @@ def _refine(picture: Picture, plain: Array, camera: Camera) -> tuple[Array, Arra
         lost = ~(np.linalg.norm(met - plain, axis=-1) < _limit(plain))
         lost |= ~np.isfinite(variance[..., 0] + np.roll(variance[..., 1], 1, axis=1))
         before, corners = corners, np.where(lost[..., None], plain, met)
-        if np.abs(corners - before).max() < _SETTLED_PX:
+        if round_ and np.abs(corners - before).max() < _SETTLED_PX:  # the first knows no blur
             break
     covariance = _corner_covariance(cuts.normal.reshape(n, 4, 2), variance)
     covariance[lost] = np.inf * np.ones((2, 2))
