@@ -36,7 +36,7 @@ _OFFSET_PRIOR = 0.05
 _NOISE_STEPS = 5
 _NOISE_ACCURACY = 0.02
 # Stamps are moved by this much first, s, and tags scaled by this much; then so many times to the bottom of a parabola.
-_FIRST_SHIFT, _FIRST_SCALING, _PARABOLAS = 0.01, 0.01, 3
+_FIRST_SHIFT, _FIRST_SCALING, _PARABOLAS = 0.01, 0.01, 4
 # A recording with more than this share rejected does not fit.
 _OUTLIERS = 0.1
 _MOST_NAMED = 3
@@ -465,16 +465,24 @@ def _tag_sizes(method: Method, data: Any, config: Config) -> Iterator[_Trial]:
 
 
 def _lowest(cost: Callable[[float], float], step: float) -> float | None:
-    """The size of a change that costs least, by parabolas through three trials; None when there is none."""
-    best = 0.0
+    """The size of a change that costs least; None when there is none.
+
+    From the best so far a step to either side, and to the bottom of the parabola through the three.
+    """
+    known, best = {0.0: cost(0.0)}, 0.0
     for _ in range(_PARABOLAS):
-        left, middle, right = (cost(best + move) for move in (-step, 0.0, step))
+        sides = best - step, best + step
+        known |= {size: cost(size) for size in sides if size not in known}
+        left, middle, right = known[sides[0]], known[best], known[sides[1]]
         bend = left - 2.0 * middle + right
         if not np.isfinite(bend):
             return None
-        downhill = np.sign(left - right) * step
-        best += float(np.clip(0.5 * step * (left - right) / bend, -5.0 * step, 5.0 * step)) if bend > 0.0 else downhill
-        step *= 0.2 if bend > 0.0 else 1.0
+        if bend > 0.0:
+            bottom = best + float(np.clip(0.5 * step * (left - right) / bend, -5.0 * step, 5.0 * step))
+            known[bottom] = cost(bottom)
+        best = min(known, key=known.__getitem__)
+        if best not in sides:
+            step *= 0.2
     return best
 
 

@@ -160,9 +160,10 @@ def test_late_encoders(indexer: Case) -> None:
 
 
 @pytest.mark.slow
-def test_size_of_the_cubes_tags() -> None:
+@pytest.mark.parametrize("seed", [1, 4])
+def test_size_of_the_cubes_tags(seed: int) -> None:
     scenario = CubeScenario(poses=8, static_s=2, imu_rate_hz=50, camera_rate_hz=5)
-    data, _ = simulate_cube(scenario, 1)
+    data, _ = simulate_cube(scenario, seed)
     config = load_config(cube_config(scenario).encode())
     tags = {i: tag.model_copy(update={"size": 1.03 * tag.size}) for i, tag in config.cube.tags.items()}
     wrong = config.model_copy(update={"cube": config.cube.model_copy(update={"tags": tags})})
