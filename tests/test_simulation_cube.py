@@ -104,7 +104,8 @@ def test_field_and_heading_are_drawn_as_their_priors_have_them() -> None:
     truths = [simulate_cube(CubeScenario(poses=1, static_s=0.5), seed)[1] for seed in range(60)]
     field = np.array([[truth[f"field_{axis}"] for axis in "enu"] for truth in truths])
     place = CubeScenario()
-    model = magnetic_field(*np.deg2rad([place.latitude_deg, place.longitude_deg]), place.height, YEAR)
+    latitude, longitude = np.deg2rad([place.latitude_deg, place.longitude_deg])
+    model = magnetic_field(latitude, longitude, place.height, YEAR)
     along = (field - model) @ model / np.linalg.norm(model)
     # A sigma of n draws is known to 1 / sqrt(2 n) of itself.
     assert np.sqrt(np.mean(along**2)) == pytest.approx(1.33e-7, rel=3.0 / np.sqrt(2 * 60))
