@@ -16,6 +16,9 @@ from pipelines import exit_codes
 if TYPE_CHECKING:
     from pipelines.reports.result import Calibration
 
+# Errors that are told in one line, by name: to import the second takes gtsam's quarter of a second.
+_TROUBLE = {"InputError": exit_codes.BAD_INPUT, "IndeterminateError": exit_codes.UNDETERMINED}
+
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
@@ -395,8 +398,6 @@ def _interrupted(error: BaseException | None) -> bool:
 
 def main() -> None:
     """Run the command; known trouble is one line on stderr."""
-    from pipelines.errors import InputError
-
     # The matrices are small: threads that wait for each other cost more than they bring, most on a busy machine.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
@@ -404,12 +405,11 @@ def main() -> None:
     except BaseException as error:
         if _interrupted(error):
             sys.exit(exit_codes.INTERRUPTED)
-        # IndeterminateError is not to be imported before it is needed: gtsam takes a quarter of a second.
-        unusable = isinstance(error, InputError)
-        if not unusable and type(error).__name__ != "IndeterminateError":
+        code = _TROUBLE.get(type(error).__name__)
+        if code is None:
             raise
         print(f"alidade: {error}", file=sys.stderr)
-        sys.exit(exit_codes.BAD_INPUT if unusable else exit_codes.UNDETERMINED)
+        sys.exit(code)
 
 
 if __name__ == "__main__":
