@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator
-from itertools import count
 
 import numpy as np
 
@@ -27,17 +26,14 @@ def run() -> Iterator[Ratio]:
     problem = los_problem(round(MINUTES * 60.0 * IMAGES_PER_S))
     solver = Run(problem, DEFAULT_WINDOW)
     seconds, memory = [], []
-    steps = problem.steps(1)
-    for number in count(1):
-        begun = time.process_time()
-        step = next(steps, None)
-        if step is None:
-            break
+    begun = time.process_time()
+    for step in problem.steps(1):
         made = time.process_time()
         solver.take(step)
         seconds.append((step.time, made - begun, time.process_time() - made))
-        if number % 500 == 0:
+        if len(seconds) % 500 == 0:
             memory.append((step.time, _resident_mib()))
+        begun = time.process_time()
     t, making, cost = np.array(seconds).T
     first, last = (t >= _FILLED) & (t < _FILLED + 60.0), t >= t[-1] - 60.0
     # Within an hour a machine gets faster and slower: making a step's factors, always the same work, tells how much.

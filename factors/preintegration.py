@@ -85,7 +85,8 @@ class GyroPath:
     def rate(self, at: ArrayLike) -> Array:
         """Rate (n, 3) at the times, bias_hat taken off, rad/s."""
         i, s = self._place(np.asarray(at, dtype=float))
-        return _rate(self._rate[i], self._slope[i], s)
+        w0, a = self._rate[i], self._slope[i]
+        return _rate(w0, a, s, _arc(w0, a, s))
 
     def increments(self, start: ArrayLike, stop: ArrayLike) -> Increments:
         """Rotations over the windows [start, stop], (n,) each, s; a window may be empty or run backwards.
@@ -106,7 +107,7 @@ class GyroPath:
         arc = _arc(w0, a, s)
         turn = so3.exp(arc)
         integral = self._integral[i] + so3.matrix(self._attitude[i]) @ (s[..., None] * so3.right_jacobian(-arc))
-        return so3.multiply(self._attitude[i], turn), integral, _rate(w0, a, s)
+        return so3.multiply(self._attitude[i], turn), integral, _rate(w0, a, s, arc)
 
     def _place(self, at: Array) -> tuple[NDArray[np.intp], Array]:
         """The sample intervals that hold the times, (n,), and the time since their start, (n, 1), s."""
@@ -150,10 +151,10 @@ def _arc(w0: Array, a: Array, s: Array) -> Array:
     return w0 * s + a * (0.5 * s**2) + so3.cross(w0, a) * (s**3 / 12.0)
 
 
-def _rate(w0: Array, a: Array, s: Array) -> Array:
+def _rate(w0: Array, a: Array, s: Array, arc: Array) -> Array:
     """Rates of the attitude Exp(arc) after the times s, in the turned frame."""
     speed = w0 + a * s + so3.cross(w0, a) * s**2 / 4.0
-    return np.einsum("nij,nj->ni", so3.right_jacobian(_arc(w0, a, s)), speed)
+    return np.einsum("nij,nj->ni", so3.right_jacobian(arc), speed)
 
 
 def _running_product(q: Array) -> Array:

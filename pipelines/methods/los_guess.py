@@ -57,18 +57,21 @@ def initial_attitudes(
     out = np.empty((len(time), 4))
     toward = so3.rotate(so3.inverse(cRm), los_direction(measured))
     for chain in chains:
-        first = chain[:1]
-        turned = gyro.attitude(time[chain])
-        carried = so3.compose(seen(cRm[first], measured[first]), so3.inverse(turned[:1]), turned)
+        carried = _carried(time[chain], cRm[chain], measured[chain], gyro)
         expected = so3.rotate(so3.inverse(carried), [0.0, 1.0, 0.0])
         out[chain] = so3.multiply(carried, _shortest(toward[chain], expected))
     return out
 
 
+def _carried(time: Array, cRm: Array, measured: Array, gyro: GyroPath) -> Array:
+    """tRm (n, 4) at one target's pictures: where the first of them shows it, carried on by the gyro."""
+    turned = gyro.attitude(time)
+    return so3.compose(seen(cRm[:1], measured[:1]), so3.inverse(turned[:1]), turned)
+
+
 def carried_errors(time: Array, cRm: Array, measured: Array, gyro: GyroPath) -> Array:
     """phx, phz (n, 2), rad, that one target's pictures would show if the gyro told all since the first of them."""
-    turned = gyro.attitude(time)
-    tRm = so3.compose(seen(cRm[:1], measured[:1]), so3.inverse(turned[:1]), turned)
+    tRm = _carried(time, cRm, measured, gyro)
     return los_error(so3.rotate(so3.multiply(cRm, so3.inverse(tRm)), [0.0, 1.0, 0.0]))
 
 

@@ -251,8 +251,8 @@ class Recording:
     def times(self) -> Mapping[str, Times]:
         """Topic -> stamps (log times where there is no header to be read) and log times."""
         found: dict[str, list[Times]] = {name: [] for name in self.topics if name not in self._times}
-        for _, rows in self._blocks(found):
-            found[self._file.channels[rows.channel].topic].append((self._stamps(rows), rows.log_ns))
+        for name, rows in self._blocks(found):
+            found[name].append((self._stamps(rows), rows.log_ns))
         self._times |= {name: _joined(parts) for name, parts in found.items()}
         return self._times
 

@@ -422,7 +422,7 @@ class _World:
             vectors = {f"tag_{i}": vector for i, vector in self.tags.items()}
             if self.scenario.reference:
                 vectors["camera_mount"] = self.mount
-                truth["reference_heading"] = float(self.heading)
+                truth["reference_heading"] = self.heading
             truth |= {
                 f"{name}_{axis}": float(x)
                 for name, vector in vectors.items()

@@ -107,16 +107,15 @@ def reported_covariance(
 ) -> Array:
     """Covariance of the reported numbers from the information matrix of the variables' tangents, in this order."""
     quantities = [q for p in parameters for q in p.quantities]
-    scale = np.array([q.prior_scale for q in quantities])
-    extra = np.diag([q.extra_sigma**2 for q in quantities])
     # Fixed numbers are left out: their huge information would cost the others their digits.
-    free = np.ix_(*2 * [np.flatnonzero([q.prior_sigma != 0.0 for q in quantities])])
+    free = np.flatnonzero([q.prior_sigma != 0.0 for q in quantities])
+    scale, extra = np.array([(q.prior_scale, q.extra_sigma) for q in quantities])[free].T
     # Information in units of the prior scales, so that one threshold serves angles, rates and seconds.
-    unit = coordinate_inverse(parameters, values, keys) * scale
-    eigenvalues, vectors = np.linalg.eigh((unit.T @ information @ unit)[free])
+    unit = coordinate_inverse(parameters, values, keys)[:, free] * scale
+    eigenvalues, vectors = np.linalg.eigh(unit.T @ information @ unit)
     variance = 1.0 / np.maximum(eigenvalues, _UNKNOWN**-2)
-    covariance = np.zeros_like(extra)
-    covariance[free] = (vectors * variance) @ vectors.T * np.outer(scale, scale)[free] + extra[free]
+    covariance = np.zeros((len(quantities), len(quantities)))
+    covariance[np.ix_(free, free)] = (vectors * variance) @ vectors.T * np.outer(scale, scale) + np.diag(extra**2)
     return covariance
 
 
