@@ -9,11 +9,12 @@ import gtsam
 import numpy as np
 
 from benchmarks.measure import Ratio, costs, growth
-from pipelines.methods import head, los
-from pipelines.methods.base import Factor, Problem
-from pipelines.sessions.config import load_config
-from pipelines.simulation.head import HeadScenario, head_config, simulate_head
-from pipelines.simulation.los import LosScenario, los_config, simulate_los
+from pipelines.config import load_config
+from pipelines.graph.problem import Factor, Problem
+from pipelines.methods.head import graph as head
+from pipelines.methods.los import graph as los
+from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.solvers.batch import CHUNK, Solution, optimize
 

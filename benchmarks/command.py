@@ -13,10 +13,10 @@ import numpy as np
 
 from benchmarks.batch import native, solve
 from benchmarks.measure import Cost, Ratio, costs
-from pipelines.methods import los
-from pipelines.sessions.config import load_config
-from pipelines.sessions.los import write_los
-from pipelines.simulation.los import LosScenario, los_config, simulate_los
+from pipelines.config import load_config
+from pipelines.methods.los import graph as los
+from pipelines.methods.los.recording import write_los
+from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 
 MINUTES = LosScenario(duration_s=600.0, gyro_rate_hz=1000.0, gimbal_rate_hz=1000.0, image_rate_hz=50.0)
 _ALIDADE = (sys.executable, "-m", "pipelines.cli")

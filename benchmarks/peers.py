@@ -22,11 +22,11 @@ from factors import so3
 from factors.attitude import RelativeAttitudeFactor
 from factors.preintegration import GyroPath
 from factors.vectorized import Model
-from pipelines.methods import los
-from pipelines.methods.base import Problem
-from pipelines.sessions.config import load_config
-from pipelines.sessions.los import LosData
-from pipelines.simulation.los import LosNoise, LosScenario, los_config, simulate_los
+from pipelines.config import load_config
+from pipelines.graph.problem import Problem
+from pipelines.methods.los import graph as los
+from pipelines.methods.los.recording import LosData
+from pipelines.methods.los.simulation import LosNoise, LosScenario, los_config, simulate_los
 from pipelines.solvers.batch import CHUNK
 
 Array = NDArray[np.float64]

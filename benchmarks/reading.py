@@ -13,10 +13,10 @@ from mcap_ros2.reader import read_ros2_messages
 from rosbags.highlevel import AnyReader
 
 from benchmarks.measure import Ratio, costs
-from pipelines.sessions import series
-from pipelines.sessions.container import McapFile
-from pipelines.sessions.reading import open_recording
-from pipelines.sessions.writing import write_session
+from pipelines.recording import series
+from pipelines.recording.container import McapFile
+from pipelines.recording.reading import open_recording
+from pipelines.recording.writing import write_session
 
 TOPIC = "/imu"
 HOUR = 3_600_000  # messages of an hour at 1 kHz

@@ -18,7 +18,7 @@ from factors import so3
 from factors.los import LosRateFactor, rate_matrix
 from factors.triad import AccelFactor
 from factors.vectorized import Model, VectorizedFactor
-from pipelines.methods.base import Factor
+from pipelines.graph.problem import Factor
 from pipelines.solvers.batch import optimize
 
 Array = NDArray[np.float64]

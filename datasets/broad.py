@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from factors import so3
 from pipelines.errors import InputError
-from pipelines.sessions.head import HeadData, write_head
+from pipelines.methods.head.recording import HeadData, write_head
 
 Array = NDArray[np.float64]
 

@@ -26,7 +26,7 @@ from factors.attitude import ahrs_factors
 from factors.chi_square import gate
 from factors.preintegration import GyroPath
 from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
-from pipelines.methods.base import Estimate, Factor, Parameter, Problem, Quantity, Step, rotation_vector_coordinates
+from pipelines.graph.problem import Estimate, Factor, Parameter, Problem, Quantity, Step, rotation_vector_coordinates
 from pipelines.solvers.batch import solve_batch
 
 Array = NDArray[np.float64]

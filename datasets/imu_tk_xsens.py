@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import InputError
-from pipelines.sessions.cube import CubeData, write_cube
+from pipelines.methods.cube.recording import CubeData, write_cube
 
 Array = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import InputError
-from pipelines.sessions.indexer import IndexerData, write_indexer
+from pipelines.methods.indexer.recording import IndexerData, write_indexer
 
 Array = NDArray[np.float64]
 

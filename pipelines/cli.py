@@ -75,8 +75,8 @@ def calibrate(
 ) -> None:
     """Calibrate a recording. Exit code 0 calibrated, 2 unusable input, 3 weak or unobservable, 4 inconsistent."""
     from pipelines import progress
-    from pipelines.calibrate import calibrate as run
     from pipelines.reports.write import write_results
+    from pipelines.session import calibrate as run
     from pipelines.vision import parallel
 
     folder = out or session.with_name(f"{session.stem}-{solver.value}")
@@ -99,9 +99,9 @@ def compare(
 ) -> None:
     """The published, batch and incremental solvers side by side, with errors where the truth is known."""
     from pipelines import progress, terminal
-    from pipelines.calibrate import calibrate as run
-    from pipelines.calibrate import self_agreement
     from pipelines.reports.compare import write_compare
+    from pipelines.session import calibrate as run
+    from pipelines.session import self_agreement
 
     with progress.shown(quiet):
         calibrations = run(session, ["published", "batch", "incremental"], method, config, _seconds(window), strict)
@@ -207,9 +207,9 @@ def plan(
 def info(session: _Session, config: _ConfigFile = None, strict: _Strict = False, quiet: _Quiet = False) -> None:
     """What is in a recording: topics, rates, gaps, and the methods it can serve."""
     from pipelines import progress, terminal
-    from pipelines.sessions.config import ATTACHMENT, load_config
-    from pipelines.sessions.info import session_facts
-    from pipelines.sessions.reading import open_recording
+    from pipelines.config import ATTACHMENT, load_config
+    from pipelines.recording.info import session_facts
+    from pipelines.recording.reading import open_recording
 
     with progress.shown(quiet), progress.doing("reading"):
         recording = open_recording(session, strict)
@@ -225,9 +225,9 @@ def demo(
 ) -> None:
     """Simulate a helmet on a manoeuvring platform, calibrate it with all three solvers, say where the report is."""
     from pipelines import progress, terminal
-    from pipelines.calibrate import calibrate as run
     from pipelines.registry import method
     from pipelines.reports.write import write_results
+    from pipelines.session import calibrate as run
 
     out.mkdir(parents=True, exist_ok=True)
     session = out / "head_mounts.mcap"
@@ -311,8 +311,8 @@ def export(
 ) -> None:
     """A cube calibration as the parameters of another program, in its own conventions."""
     from pipelines import terminal
+    from pipelines.methods.cube.export import exported
     from pipelines.reports.calibration import load_calibration
-    from pipelines.reports.export import exported
 
     text = exported(load_calibration(calibration), form)
     if out is None:
@@ -331,10 +331,10 @@ def cube_layout(
 ) -> None:
     """Where the tags are on a cube, from pictures of it on all sides; the config gives their ids and sizes."""
     from pipelines import progress, terminal
-    from pipelines.sessions.config import ATTACHMENT, load_config
-    from pipelines.sessions.cube_layout import cube_layout as estimate
-    from pipelines.sessions.cube_layout import layout_yaml
-    from pipelines.sessions.reading import open_recording
+    from pipelines.config import ATTACHMENT, load_config
+    from pipelines.methods.cube.layout import cube_layout as estimate
+    from pipelines.methods.cube.layout import layout_yaml
+    from pipelines.recording.reading import open_recording
 
     with progress.shown(quiet), progress.doing("finding where the tags are"):
         recording = open_recording(session)
@@ -351,7 +351,7 @@ def cube_print(
 ) -> None:
     """Sheets with the six faces of a tag cube, true to scale."""
     from pipelines import terminal
-    from pipelines.reports.printing import print_cube
+    from pipelines.methods.cube.printing import print_cube
 
     print_cube(out, edge, first_id)
     terminal.say(f"Wrote {out}: print at 100 % and check the ruler")

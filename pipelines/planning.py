@@ -19,8 +19,8 @@ import numpy as np
 
 from pipelines import progress
 from pipelines.errors import InputError
-from pipelines.methods.base import Quantity
-from pipelines.observability import Assessment, assess
+from pipelines.graph.problem import Quantity
+from pipelines.judgement.observability import Assessment, assess
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -144,10 +144,10 @@ def make_plan(
 
 def predict(method_name: str, scenario: Scenario, config_file: Path | None, require: Mapping[str, float]) -> Prediction:
     """The sigmas that a recording of this motion would end with. Raises InputError when it would be unusable."""
+    from pipelines.config import ATTACHMENT, load_config
+    from pipelines.recording.info import session_facts
+    from pipelines.recording.reading import open_recording
     from pipelines.registry import method
-    from pipelines.sessions.config import ATTACHMENT, load_config
-    from pipelines.sessions.info import session_facts
-    from pipelines.sessions.reading import open_recording
     from pipelines.solvers.batch import solve_batch
     from pipelines.solvers.marginals import IndeterminateError
 
@@ -208,19 +208,19 @@ def scenario_yaml(scenario: Scenario) -> str:
 
 def _model(method_name: str) -> type[BaseModel]:
     if method_name == "los":
-        from pipelines.simulation.los import LosScenario
+        from pipelines.methods.los.simulation import LosScenario
 
         return LosScenario
     if method_name == "head":
-        from pipelines.simulation.head import HeadScenario
+        from pipelines.methods.head.simulation import HeadScenario
 
         return HeadScenario
     if method_name == "indexer":
-        from pipelines.simulation.indexer import IndexerScenario
+        from pipelines.methods.indexer.simulation import IndexerScenario
 
         return IndexerScenario
     if method_name == "cube":
-        from pipelines.simulation.cube import CubeScenario
+        from pipelines.methods.cube.simulation import CubeScenario
 
         return CubeScenario
     raise InputError(f"no method {method_name}; there are {', '.join(_CHANGES)}")
@@ -290,8 +290,8 @@ def _indexer_changes(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
 
 
 def _cube_changes(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
-    from pipelines.next_poses import next_poses
-    from pipelines.simulation.cube import CubeScenario
+    from pipelines.methods.cube.next_poses import next_poses
+    from pipelines.methods.cube.simulation import CubeScenario
 
     single, series = next_poses(CubeScenario.model_validate(scenario), _SEED, _SERIES)
     for poses in (*([pose] for pose in single), series):

@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 from pipelines.errors import InputError
 
 if TYPE_CHECKING:
-    from pipelines.methods.base import Estimate, Findings, Problem
+    from pipelines.config import Config
+    from pipelines.graph.problem import Estimate, Findings, Problem
+    from pipelines.judgement.validation import Validation
     from pipelines.methods.collected import Collected
-    from pipelines.methods.validation import Validation
+    from pipelines.recording.reading import Recording
     from pipelines.reports.result import Calibration, Plot, Table
-    from pipelines.sessions.config import Config
-    from pipelines.sessions.reading import Recording
 
 
 @dataclass(frozen=True)
@@ -57,12 +57,12 @@ def _head() -> Method:
     from functools import partial
 
     from pipelines.methods.collected import collected_head
-    from pipelines.methods.head import problem
-    from pipelines.methods.head_validation import validate
-    from pipelines.published.head import published_estimate
-    from pipelines.reports.head import head_plots
-    from pipelines.sessions.head import read_head
-    from pipelines.simulation.head import write_simulation
+    from pipelines.methods.head.figures import head_plots
+    from pipelines.methods.head.graph import problem
+    from pipelines.methods.head.published import published_estimate
+    from pipelines.methods.head.recording import read_head
+    from pipelines.methods.head.simulation import write_simulation
+    from pipelines.methods.head.validation import validate
 
     return Method(
         read_head,
@@ -79,12 +79,12 @@ def _los() -> Method:
     from functools import partial
 
     from pipelines.methods.collected import collected_los
-    from pipelines.methods.los import problem
-    from pipelines.methods.los_validation import validate
-    from pipelines.published.los import published_estimate
-    from pipelines.reports.los import los_plots
-    from pipelines.sessions.los import read_los
-    from pipelines.simulation.los import write_simulation
+    from pipelines.methods.los.figures import los_plots
+    from pipelines.methods.los.graph import problem
+    from pipelines.methods.los.published import published_estimate
+    from pipelines.methods.los.recording import read_los
+    from pipelines.methods.los.simulation import write_simulation
+    from pipelines.methods.los.validation import validate
 
     return Method(
         read_los,
@@ -101,11 +101,11 @@ def _indexer() -> Method:
     from functools import partial
 
     from pipelines.methods.collected import collected_indexer
-    from pipelines.methods.indexer import problem, validate
-    from pipelines.published.indexer import published_estimate
-    from pipelines.reports.indexer import indexer_plots
-    from pipelines.sessions.indexer import read_indexer
-    from pipelines.simulation.indexer import write_simulation
+    from pipelines.methods.indexer.figures import indexer_plots
+    from pipelines.methods.indexer.graph import problem, validate
+    from pipelines.methods.indexer.published import published_estimate
+    from pipelines.methods.indexer.recording import read_indexer
+    from pipelines.methods.indexer.simulation import write_simulation
 
     return Method(
         read_indexer,
@@ -122,13 +122,13 @@ def _cube() -> Method:
     from functools import partial
 
     from pipelines.methods.collected import collected_cube
-    from pipelines.methods.cube import problem
-    from pipelines.methods.cube_findings import findings
-    from pipelines.methods.cube_validation import validate
-    from pipelines.published.cube import published_estimate
-    from pipelines.reports.cube import cube_plots
-    from pipelines.sessions.cube import read_cube
-    from pipelines.simulation.cube import write_simulation
+    from pipelines.methods.cube.figures import cube_plots
+    from pipelines.methods.cube.findings import findings
+    from pipelines.methods.cube.graph import problem
+    from pipelines.methods.cube.published import published_estimate
+    from pipelines.methods.cube.recording import read_cube
+    from pipelines.methods.cube.simulation import write_simulation
+    from pipelines.methods.cube.validation import validate
 
     return Method(
         read_cube,

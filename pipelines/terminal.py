@@ -14,8 +14,8 @@ from pipelines.errors import printable
 
 if TYPE_CHECKING:
     from pipelines.planning import Plan
+    from pipelines.recording.info import SessionFacts
     from pipelines.reports.result import Calibration, ParameterResult
-    from pipelines.sessions.info import SessionFacts
 
 console = Console(highlight=False)
 _LONGEST = 10_000

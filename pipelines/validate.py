@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipelines.config import ATTACHMENT, load_config
 from pipelines.errors import InputError
-from pipelines.methods.validation import Validation
+from pipelines.judgement.validation import Validation
+from pipelines.recording.info import resolve_method
+from pipelines.recording.reading import open_recording
 from pipelines.registry import method
 from pipelines.reports.calibration import SavedCalibration, load_calibration
 from pipelines.reports.validation import validation_html, validation_rows
-from pipelines.sessions.config import ATTACHMENT, load_config
-from pipelines.sessions.info import resolve_method
-from pipelines.sessions.reading import open_recording
 
 FILE = "validation.html"
 

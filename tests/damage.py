@@ -12,10 +12,10 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from pipelines.errors import InputError
-from pipelines.sessions import series
-from pipelines.sessions.reading import Recording, open_recording
-from pipelines.sessions.records import HEAD, MAGIC
-from pipelines.sessions.writing import write_session
+from pipelines.recording import series
+from pipelines.recording.reading import Recording, open_recording
+from pipelines.recording.records import HEAD, MAGIC
+from pipelines.recording.writing import write_session
 
 T0 = 1_700_000_000_123_456_789
 CONFIG = b"method: head\n"

@@ -12,10 +12,10 @@ from scipy.io import savemat
 
 from datasets.broad import VISION_SIGMA, Trial, config_yaml, gyro_bias_at_rest, read_trial, to_session
 from factors import so3
+from pipelines.config import load_config
 from pipelines.errors import InputError
-from pipelines.sessions.config import load_config
-from pipelines.sessions.head import HeadData, read_head
-from pipelines.sessions.reading import Recording
+from pipelines.methods.head.recording import HeadData, read_head
+from pipelines.recording.reading import Recording
 
 RATE_HZ = 2000.0 / 7.0
 BIAS = np.array([1e-3, -2e-3, 3e-3])

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from datasets.broad import Score, read_trial, score_results
-from pipelines.calibrate import calibrate
 from pipelines.reports.result import Calibration
 from pipelines.reports.write import write_results
+from pipelines.session import calibrate
 from tests.test_broad import TRIALS, converted
 
 

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipelines.config import load_config
 from pipelines.errors import InputError
-from pipelines.methods.base import Estimate, Problem
-from pipelines.methods.los import problem
-from pipelines.sessions.config import load_config
-from pipelines.sessions.los import read_los, write_los
-from pipelines.sessions.reading import open_recording
-from pipelines.simulation.los import LosScenario, los_config, simulate_los
+from pipelines.graph.problem import Estimate, Problem
+from pipelines.methods.los.graph import problem
+from pipelines.methods.los.recording import read_los, write_los
+from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from pipelines.recording.reading import open_recording
 from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
@@ -35,10 +35,10 @@ IDENTITY = {"recording": "first", "config": "{}"}
 RESUME = """
 import json, sys
 from pathlib import Path
-from pipelines.methods.los import problem
-from pipelines.sessions.config import load_config
-from pipelines.sessions.los import read_los
-from pipelines.sessions.reading import open_recording
+from pipelines.methods.los.graph import problem
+from pipelines.config import load_config
+from pipelines.methods.los.recording import read_los
+from pipelines.recording.reading import open_recording
 from pipelines.solvers.checkpoint import load_checkpoint
 recording = open_recording(Path(sys.argv[1]))
 config = load_config(recording.attachment("alidade.yaml"))

@@ -11,7 +11,7 @@ import pytest
 
 from factors.vectorized import VectorizedFactor
 from pipelines.errors import InputError
-from pipelines.methods.base import Array, Factor, Problem, Step
+from pipelines.graph.problem import Array, Factor, Problem, Step
 from pipelines.solvers.incremental import solve_incremental
 from tests.test_solvers import PARAMETER, Walk, state
 

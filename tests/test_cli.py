@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.sessions.head import HeadData, write_head
-from pipelines.simulation.head import HeadScenario, head_config, simulate_head
+from pipelines.methods.head.recording import HeadData, write_head
+from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from pipelines.simulation.scenario import load_scenario
 from tests.command import Command, Run
 
@@ -203,7 +203,7 @@ def test_ctrl_c_is_silent_and_leaves_nothing(
             raise ImportError("initialization failed") from KeyboardInterrupt()  # as gtsam's module does
         raise KeyboardInterrupt
 
-    target = "pipelines.reports.write.report_html" if where == "writing" else "pipelines.calibrate.open_recording"
+    target = "pipelines.reports.write.report_html" if where == "writing" else "pipelines.session.open_recording"
     monkeypatch.setattr(target, interrupted)
     run = alidade("calibrate", session, "--out", tmp_path / "out")
     assert (run.code, run.out, run.err) == (130, "", "")

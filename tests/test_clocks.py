@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from pipelines.errors import InputError
-from pipelines.sessions import messages
-from pipelines.sessions.clocks import find_step
-from pipelines.sessions.reading import open_recording
+from pipelines.recording import messages
+from pipelines.recording.clocks import find_step
+from pipelines.recording.reading import open_recording
 from tests.test_sessions_messages import STORE, T0, random_message, write_raw
 
 Stamps = NDArray[np.int64]

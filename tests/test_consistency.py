@@ -12,15 +12,15 @@ import pytest
 from typer.testing import CliRunner
 
 from pipelines.cli import app
-from pipelines.consistency import cut, find_causes, held_out, mostly_rejected, split_halves
-from pipelines.methods.base import Estimate, Residuals
+from pipelines.config import Config, load_config
+from pipelines.graph.problem import Estimate, Residuals
+from pipelines.judgement.consistency import cut, find_causes, held_out, mostly_rejected, split_halves
+from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.head.recording import write_head
+from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
+from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from pipelines.registry import Method, method
-from pipelines.sessions.config import Config, load_config
-from pipelines.sessions.head import write_head
-from pipelines.simulation.cube import CubeScenario, cube_config, simulate_cube
-from pipelines.simulation.head import HeadScenario, head_config, simulate_head
-from pipelines.simulation.indexer import IndexerScenario, indexer_config, simulate_indexer
-from pipelines.simulation.los import LosScenario, los_config, simulate_los
 from pipelines.simulation.motion import EulerMotion, Swing
 
 Case = tuple[Method, Any, Config]

@@ -13,18 +13,18 @@ import pytest
 
 from datasets import imu_tk_xsens
 from factors import so3
+from pipelines.config import Config, Raw, RawConversion, load_config
 from pipelines.errors import InputError
-from pipelines.methods.base import Estimate, Problem
-from pipelines.methods.cube import problem
-from pipelines.methods.cube_findings import findings
-from pipelines.methods.cube_validation import validate
-from pipelines.methods.validation import rms
-from pipelines.observability import Assessment, assess
-from pipelines.published.cube import published_estimate
-from pipelines.sessions.config import Config, Raw, RawConversion, load_config
-from pipelines.sessions.cube import CubeData, read_cube, rests
-from pipelines.sessions.reading import open_recording
-from pipelines.simulation.cube import CubeScenario, cube_config, simulate_cube, write_simulation
+from pipelines.graph.problem import Estimate, Problem
+from pipelines.judgement.observability import Assessment, assess
+from pipelines.judgement.validation import rms
+from pipelines.methods.cube.findings import findings
+from pipelines.methods.cube.graph import problem
+from pipelines.methods.cube.published import published_estimate
+from pipelines.methods.cube.recording import CubeData, read_cube, rests
+from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube, write_simulation
+from pipelines.methods.cube.validation import validate
+from pipelines.recording.reading import open_recording
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.incremental import solve_incremental
 

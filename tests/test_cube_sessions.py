@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from factors import so3
+from pipelines.config import Config, load_config
 from pipelines.errors import InputError
-from pipelines.sessions.config import Config, load_config
-from pipelines.sessions.cube import CubeData, Sightings, local_field, read_cube, rests, write_cube
-from pipelines.sessions.cube_poses import static_poses
-from pipelines.sessions.reading import open_recording
-from pipelines.simulation.cube import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.poses import static_poses
+from pipelines.methods.cube.recording import CubeData, Sightings, local_field, read_cube, rests, write_cube
+from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.recording.reading import open_recording
 from pipelines.vision.camera import Camera
 
 SCENARIO = CubeScenario(poses=4, static_s=2.0, camera_rate_hz=5.0)

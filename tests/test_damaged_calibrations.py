@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from mcap.opcode import Opcode
 
-from pipelines.calibrate import calibrate
 from pipelines.errors import InputError
+from pipelines.methods.los.recording import write_los
+from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from pipelines.recording import writing
 from pipelines.reports.result import truth_errors
-from pipelines.sessions import writing
-from pipelines.sessions.los import write_los
-from pipelines.simulation.los import LosScenario, los_config, simulate_los
+from pipelines.session import calibrate
 from pipelines.simulation.motion import EulerMotion, Swing
 from tests.command import Command
 from tests.damage import boundaries, cuts, flips, rewrite, spoilt

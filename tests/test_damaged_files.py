@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from mcap.opcode import Opcode
 
+from pipelines.config import Config
 from pipelines.errors import InputError
-from pipelines.sessions import writing
-from pipelines.sessions.config import Config
-from pipelines.sessions.info import session_facts
-from pipelines.sessions.reading import open_recording
+from pipelines.recording import writing
+from pipelines.recording.info import session_facts
+from pipelines.recording.reading import open_recording
 from tests.damage import (
     CONFIG,
     FORMS,

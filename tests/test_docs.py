@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.sessions.config import load_config
+from pipelines.config import load_config
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -16,7 +16,7 @@ from factors import so3
 from factors.attitude import ahrs_factors
 from factors.preintegration import GyroPath
 from factors.vectorized import Array, VectorizedFactor
-from pipelines.methods.base import Factor, Parameter, Problem, Quantity, Step, rotation_vector_coordinates
+from pipelines.graph.problem import Factor, Parameter, Problem, Quantity, Step, rotation_vector_coordinates
 from pipelines.solvers.batch import solve_batch
 from tests.numerics import assert_jacobians_match
 

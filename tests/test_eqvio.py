@@ -8,7 +8,7 @@ import pytest
 from datasets import eqvio
 from factors import so3
 from factors.vectorized import Array, Kind
-from pipelines.methods.base import Estimate
+from pipelines.graph.problem import Estimate
 from pipelines.solvers.batch import solve_batch
 from tests.numerics import assert_jacobians_match
 

@@ -11,17 +11,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipelines.config import Config, load_config
 from pipelines.errors import InputError
-from pipelines.methods import head, los
-from pipelines.methods.base import Array, Estimate, Problem
-from pipelines.observability import assess
-from pipelines.sessions.config import Config, load_config
-from pipelines.sessions.faults import drop_faults
-from pipelines.sessions.head import read_head, write_head
-from pipelines.sessions.los import read_los, write_los
-from pipelines.sessions.reading import Recording, open_recording
-from pipelines.simulation.head import HeadScenario, head_config, simulate_head
-from pipelines.simulation.los import LosScenario, los_config, simulate_los
+from pipelines.graph.problem import Array, Estimate, Problem
+from pipelines.judgement.observability import assess
+from pipelines.methods.head import graph as head
+from pipelines.methods.los import graph as los
+from pipelines.methods.head.recording import read_head, write_head
+from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from pipelines.methods.los.recording import read_los, write_los
+from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from pipelines.recording.faults import drop_faults
+from pipelines.recording.reading import Recording, open_recording
 from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.solvers.batch import solve_batch
 

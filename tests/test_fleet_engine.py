@@ -21,8 +21,8 @@ from pipelines.fleet import engine, fleet
 from pipelines.fleet.engine import cluster, completed, source_version
 from pipelines.fleet.fleet import Settings, calibrate_fleet
 from pipelines.fleet.recordings import find
-from pipelines.sessions.head import write_head
-from pipelines.simulation.head import HeadScenario, head_config, simulate_head
+from pipelines.methods.head.recording import write_head
+from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 
 pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
 pytest.importorskip("arro3.io", reason="needs the extra alidade[fleet]")

@@ -11,7 +11,7 @@ import pytest
 
 from pipelines.fleet import consistency
 from pipelines.fleet.montecarlo import SOLVERS, run_study, simulate_and_solve
-from pipelines.sessions.topics import METHODS
+from pipelines.recording.topics import METHODS
 from tests.test_fleet_recordings import alidade
 
 distributed = pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")

@@ -17,8 +17,8 @@ from pipelines import cli
 from pipelines.fleet import engine
 from pipelines.fleet.fleet import Settings, calibrate_recording
 from pipelines.fleet.recordings import find
-from pipelines.sessions.head import write_head
-from pipelines.simulation.head import HeadScenario, head_config, simulate_head
+from pipelines.methods.head.recording import write_head
+from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 
 distributed = pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
 pytest.importorskip("arro3.io", reason="needs the extra alidade[fleet]")

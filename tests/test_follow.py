@@ -18,14 +18,14 @@ from typing import Any
 import pytest
 from tornado.websocket import websocket_connect
 
-from pipelines.calibrate import calibrate
 from pipelines.errors import InputError
 from pipelines.follow.follower import Follower, Settings
 from pipelines.follow.guidance import View
 from pipelines.follow.serve import LiveServer
+from pipelines.methods.los.recording import write_los
+from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from pipelines.reports.result import Calibration
-from pipelines.sessions.los import write_los
-from pipelines.simulation.los import LosScenario, los_config, simulate_los
+from pipelines.session import calibrate
 from pipelines.simulation.motion import EulerMotion, Swing
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from pipelines.config import Config, load_config
 from pipelines.follow.guidance import View
 from pipelines.follow.screen import Screen
-from pipelines.methods.base import Quantity
+from pipelines.graph.problem import Quantity
+from pipelines.judgement.observability import assess
 from pipelines.methods.collected import (
     Collected,
     collected_cube,
@@ -19,12 +21,10 @@ from pipelines.methods.collected import (
     collected_los,
     next_pose,
 )
-from pipelines.observability import assess
-from pipelines.sessions.config import Config, load_config
-from pipelines.simulation.cube import CubeScenario, cube_config, simulate_cube
-from pipelines.simulation.head import HeadScenario, simulate_head
-from pipelines.simulation.indexer import IndexerScenario, simulate_indexer
-from pipelines.simulation.los import LosScenario, simulate_los
+from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.head.simulation import HeadScenario, simulate_head
+from pipelines.methods.indexer.simulation import IndexerScenario, simulate_indexer
+from pipelines.methods.los.simulation import LosScenario, simulate_los
 from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.simulation.scenario import load_scenario
 

@@ -14,12 +14,12 @@ from typer.testing import CliRunner
 
 from factors import so3
 from pipelines.cli import app
-from pipelines.methods.base import Array, Estimate, Problem
-from pipelines.methods.head import problem
-from pipelines.observability import Assessment, assess
-from pipelines.sessions.config import load_config
-from pipelines.sessions.head import write_head
-from pipelines.simulation.head import HeadScenario, head_config, simulate_head
+from pipelines.config import load_config
+from pipelines.graph.problem import Array, Estimate, Problem
+from pipelines.judgement.observability import Assessment, assess
+from pipelines.methods.head.graph import problem
+from pipelines.methods.head.recording import write_head
+from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from pipelines.simulation.scenario import load_scenario
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.incremental import solve_incremental

@@ -11,15 +11,15 @@ import pytest
 from typer.testing import CliRunner
 
 from factors import so3
-from pipelines.calibrate import calibrate
 from pipelines.cli import app
+from pipelines.config import Config, load_config
 from pipelines.errors import InputError
-from pipelines.methods.head import problem
-from pipelines.methods.head_validation import validate
-from pipelines.methods.validation import peak, rms
-from pipelines.sessions.config import Config, load_config
-from pipelines.sessions.head import HeadData, write_head
-from pipelines.simulation.head import HeadScenario, head_config, simulate_head
+from pipelines.judgement.validation import peak, rms
+from pipelines.methods.head.graph import problem
+from pipelines.methods.head.recording import HeadData, write_head
+from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from pipelines.methods.head.validation import validate
+from pipelines.session import calibrate
 from pipelines.simulation.scenario import load_scenario
 
 QUIET = {"gyro_density": 0.0, "gyro_bias_walk": 0.0, "platform_gyro_density": 0.0, "vision_attitude": 0.0}

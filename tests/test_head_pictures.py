@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from factors import so3
-from pipelines.calibrate import calibrate
+from pipelines.config import load_config
 from pipelines.errors import InputError
-from pipelines.sessions.config import load_config
-from pipelines.sessions.head import HeadData, read_head, write_head
-from pipelines.sessions.reading import open_recording
-from pipelines.simulation.head import HeadScenario, head_config, simulate_head, simulate_pictures
+from pipelines.methods.head.recording import HeadData, read_head, write_head
+from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head, simulate_pictures
+from pipelines.recording.reading import open_recording
+from pipelines.session import calibrate
 from pipelines.simulation.scenario import load_scenario
 
 

@@ -17,12 +17,12 @@ import pytest
 import zstandard
 from mcap.opcode import Opcode
 
+from pipelines.config import load_config
 from pipelines.errors import InputError, printable
-from pipelines.sessions import messages
-from pipelines.sessions.config import load_config
-from pipelines.sessions.info import resolve_method, session_facts
-from pipelines.sessions.reading import open_recording
-from pipelines.sessions.records import HEAD, MAGIC
+from pipelines.recording import messages
+from pipelines.recording.info import resolve_method, session_facts
+from pipelines.recording.reading import open_recording
+from pipelines.recording.records import HEAD, MAGIC
 from tests.test_sessions_messages import STORE, T0, random_message
 
 MIB = 1 << 20

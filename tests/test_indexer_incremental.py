@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.methods.base import Estimate, Problem
-from pipelines.methods.indexer import problem
-from pipelines.sessions.config import load_config
-from pipelines.sessions.indexer import read_indexer
-from pipelines.sessions.reading import open_recording
-from pipelines.simulation.indexer import ARCSEC, IndexerScenario, indexer_config, simulate_indexer
+from pipelines.config import load_config
+from pipelines.graph.problem import Estimate, Problem
+from pipelines.methods.indexer.graph import problem
+from pipelines.methods.indexer.recording import read_indexer
+from pipelines.methods.indexer.simulation import ARCSEC, IndexerScenario, indexer_config, simulate_indexer
+from pipelines.recording.reading import open_recording
 from pipelines.simulation.scenario import load_scenario
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.incremental import solve_incremental

@@ -7,12 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipelines.config import Config, load_config
 from pipelines.errors import InputError
-from pipelines.methods.indexer import problem, validate
-from pipelines.sessions.config import Config, load_config
-from pipelines.sessions.indexer import IndexerData
-from pipelines.sessions.indexer_runs import axis_motion
-from pipelines.simulation.indexer import IndexerNoise, IndexerScenario, Position, indexer_config, simulate_indexer
+from pipelines.methods.indexer.graph import problem, validate
+from pipelines.methods.indexer.recording import IndexerData
+from pipelines.methods.indexer.runs import axis_motion
+from pipelines.methods.indexer.simulation import (
+    IndexerNoise,
+    IndexerScenario,
+    Position,
+    indexer_config,
+    simulate_indexer,
+)
 from pipelines.solvers.batch import solve_batch
 
 SCENARIO = IndexerScenario(

@@ -12,14 +12,14 @@ from datasets.imucal import CONFIG, COUNTS, read_parts, to_session
 from factors import so3
 from factors.chi_square import quantile
 from factors.indexer import mounting
-from pipelines.methods.base import Estimate
-from pipelines.methods.indexer import problem, validate
-from pipelines.methods.validation import rms
-from pipelines.published.indexer import published_estimate, thin_shell
-from pipelines.sessions.config import load_config
-from pipelines.sessions.indexer import read_indexer
-from pipelines.sessions.reading import open_recording
-from pipelines.simulation.indexer import ARCSEC, IndexerScenario, indexer_config, simulate_indexer
+from pipelines.config import load_config
+from pipelines.graph.problem import Estimate
+from pipelines.judgement.validation import rms
+from pipelines.methods.indexer.graph import problem, validate
+from pipelines.methods.indexer.published import published_estimate, thin_shell
+from pipelines.methods.indexer.recording import read_indexer
+from pipelines.methods.indexer.simulation import ARCSEC, IndexerScenario, indexer_config, simulate_indexer
+from pipelines.recording.reading import open_recording
 from pipelines.simulation.scenario import load_scenario
 from pipelines.solvers.batch import solve_batch
 

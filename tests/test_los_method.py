@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from factors.chi_square import quantile
+from pipelines.config import Config, Noise, load_config
 from pipelines.errors import InputError
-from pipelines.methods.base import Array, Estimate
-from pipelines.methods.los import problem
-from pipelines.observability import Assessment, assess
-from pipelines.published.los import recursive_least_squares
-from pipelines.sessions.config import Config, Noise, load_config
-from pipelines.sessions.los import LosData, read_los
-from pipelines.sessions.reading import open_recording
-from pipelines.simulation.los import LosAngles, LosScenario, los_config, simulate_los
+from pipelines.graph.problem import Array, Estimate
+from pipelines.judgement.observability import Assessment, assess
+from pipelines.methods.los.graph import problem
+from pipelines.methods.los.published import recursive_least_squares
+from pipelines.methods.los.recording import LosData, read_los
+from pipelines.methods.los.simulation import LosAngles, LosScenario, los_config, simulate_los
+from pipelines.recording.reading import open_recording
 from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.simulation.scenario import load_scenario
 from pipelines.solvers.batch import solve_batch

@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipelines.config import Config, load_config
 from pipelines.errors import InputError
-from pipelines.sessions.config import Config, load_config
-from pipelines.sessions.los import LosData, read_los, write_los
-from pipelines.sessions.reading import open_recording
-from pipelines.simulation.los import (
+from pipelines.methods.los.recording import LosData, read_los, write_los
+from pipelines.methods.los.simulation import (
     LosCamera,
     LosScenario,
     los_config,
@@ -21,6 +20,7 @@ from pipelines.simulation.los import (
     simulate_pictures,
     write_simulation,
 )
+from pipelines.recording.reading import open_recording
 from pipelines.simulation.scenario import load_scenario
 
 DATA, TRUTH = simulate_los(LosScenario(duration_s=12.0, measures_roll=True), 1)

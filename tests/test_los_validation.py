@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.methods.los import problem
-from pipelines.methods.los_validation import validate
-from pipelines.methods.validation import peak, rms
-from pipelines.sessions.config import Config, load_config
-from pipelines.simulation.los import LosNoise, LosScenario, los_config, simulate_los
+from pipelines.config import Config, load_config
+from pipelines.judgement.validation import peak, rms
+from pipelines.methods.los.graph import problem
+from pipelines.methods.los.simulation import LosNoise, LosScenario, los_config, simulate_los
+from pipelines.methods.los.validation import validate
 from pipelines.simulation.scenario import load_scenario
 from pipelines.solvers.batch import solve_batch
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.calibrate import calibrate
-from pipelines.sessions.los import write_los
-from pipelines.simulation.los import LosScenario, los_config, simulate_los
+from pipelines.methods.los.recording import write_los
+from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from pipelines.session import calibrate
 from tests.test_reports_files import make_calibration
 
 

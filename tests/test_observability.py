@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pipelines.methods.base import ChiSquare, History, Quantity, Residuals
-from pipelines.observability import Assessment, Cause, Innovations, assess, learning
+from pipelines.graph.problem import ChiSquare, History, Quantity, Residuals
+from pipelines.judgement.observability import Assessment, Cause, Innovations, assess, learning
 
 GOOD_FIT = ChiSquare(1000.0, 1000.0, {"vision": (1000.0, 1000.0)})
 

@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
+from pipelines.methods.cube.simulation import CubeScenario
+from pipelines.methods.head.simulation import HeadScenario
+from pipelines.methods.indexer.simulation import IndexerScenario, Position
+from pipelines.methods.los.simulation import LosScenario
 from pipelines.planning import Prediction, predict
-from pipelines.simulation.cube import CubeScenario
-from pipelines.simulation.head import HeadScenario
-from pipelines.simulation.indexer import IndexerScenario, Position
-from pipelines.simulation.los import LosScenario
 from pipelines.simulation.motion import EulerMotion, Swing
 
 _Scenario = LosScenario | HeadScenario | IndexerScenario | CubeScenario

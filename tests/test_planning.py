@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipelines.config import load_config
 from pipelines.errors import InputError
-from pipelines.next_poses import next_poses
+from pipelines.methods.cube.faces import Resting, Side
+from pipelines.methods.cube.next_poses import next_poses
+from pipelines.methods.cube.simulation import CubeScenario
+from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from pipelines.planning import Prediction, make_plan, predict, requirements, write_scenario
 from pipelines.registry import method
-from pipelines.sessions.config import load_config
-from pipelines.simulation.cube import CubeScenario
-from pipelines.simulation.cube_faces import Resting, Side
-from pipelines.simulation.head import HeadScenario, head_config, simulate_head
-from pipelines.simulation.los import LosScenario, los_config, simulate_los
 from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.simulation.scenario import load_scenario
 from pipelines.solvers.batch import solve_batch

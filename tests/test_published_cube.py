@@ -9,12 +9,12 @@ import pytest
 
 from factors import so3
 from factors.earth import EARTH_RATE, earth_rate, gravity
+from pipelines.config import load_config
 from pipelines.errors import InputError
-from pipelines.methods.cube import problem
-from pipelines.published.cube import nominal_vectors, published_estimate, regression
-from pipelines.sessions.config import load_config
-from pipelines.sessions.cube import CubeData, local_field
-from pipelines.simulation.cube import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.graph import problem
+from pipelines.methods.cube.published import nominal_vectors, published_estimate, regression
+from pipelines.methods.cube.recording import CubeData, local_field
+from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
 
 RNG = np.random.default_rng(1)
 K = np.eye(3) + 0.05 * RNG.normal(size=(3, 3))

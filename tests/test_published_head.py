@@ -9,10 +9,10 @@ import pytest
 
 from factors import so3
 from pipelines.errors import InputError
-from pipelines.published import head as published
-from pipelines.published.head import HeadFilterResult, euler_kalman_filter
-from pipelines.sessions.head import HeadData
-from pipelines.simulation.head import HeadScenario, simulate_head
+from pipelines.methods.head import published
+from pipelines.methods.head.published import HeadFilterResult, euler_kalman_filter
+from pipelines.methods.head.recording import HeadData
+from pipelines.methods.head.simulation import HeadScenario, simulate_head
 from pipelines.simulation.scenario import load_scenario
 
 

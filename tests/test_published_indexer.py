@@ -7,8 +7,8 @@ import pytest
 
 from factors import so3
 from pipelines.errors import InputError
-from pipelines.published.indexer import HalfDifference, cost, half_differences, search, thin_shell
-from pipelines.simulation.indexer import ARCSEC, IndexerNoise, IndexerScenario, Position, simulate_indexer
+from pipelines.methods.indexer.published import HalfDifference, cost, half_differences, search, thin_shell
+from pipelines.methods.indexer.simulation import ARCSEC, IndexerNoise, IndexerScenario, Position, simulate_indexer
 from pipelines.simulation.scenario import load_scenario
 
 RATE = np.deg2rad(10.0)

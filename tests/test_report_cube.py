@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from factors import so3
-from pipelines.methods.base import Estimate, Findings
-from pipelines.methods.cube import problem
-from pipelines.methods.cube_findings import findings, parts_of, white_noise
-from pipelines.reports.cube import cube_plots
-from pipelines.reports.cube_tables import described
+from pipelines.config import Config, load_config
+from pipelines.graph.problem import Estimate, Findings
+from pipelines.methods.cube.figures import cube_plots
+from pipelines.methods.cube.findings import findings, parts_of, white_noise
+from pipelines.methods.cube.graph import problem
+from pipelines.methods.cube.recording import CubeData
+from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.tables import described
 from pipelines.reports.result import Calibration, Plot, Table
-from pipelines.sessions.config import Config, load_config
-from pipelines.sessions.cube import CubeData
-from pipelines.simulation.cube import CubeScenario, cube_config, simulate_cube
 from pipelines.solvers.batch import solve_batch
 
 SCENARIO = CubeScenario(poses=10, static_s=3.0, turn_rad_s=1.2, camera_rate_hz=5.0)

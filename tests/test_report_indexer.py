@@ -7,11 +7,11 @@ from typing import cast
 
 import numpy as np
 
-from pipelines.methods.indexer import problem
-from pipelines.reports.indexer import indexer_plots
+from pipelines.config import load_config
+from pipelines.methods.indexer.figures import indexer_plots
+from pipelines.methods.indexer.graph import problem
+from pipelines.methods.indexer.simulation import IndexerScenario, Position, indexer_config, simulate_indexer
 from pipelines.reports.result import Calibration, Plot
-from pipelines.sessions.config import load_config
-from pipelines.simulation.indexer import IndexerScenario, Position, indexer_config, simulate_indexer
 from pipelines.solvers.batch import solve_batch
 
 

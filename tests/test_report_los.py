@@ -8,11 +8,11 @@ from typing import cast
 import numpy as np
 import pytest
 
-from pipelines.methods.los import problem
-from pipelines.reports.los import los_plots
+from pipelines.config import load_config
+from pipelines.methods.los.figures import los_plots
+from pipelines.methods.los.graph import problem
+from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from pipelines.reports.result import Calibration, Plot
-from pipelines.sessions.config import load_config
-from pipelines.simulation.los import LosScenario, los_config, simulate_los
 from pipelines.solvers.batch import solve_batch
 
 SCENARIO = LosScenario(duration_s=20.0, image_rate_hz=20.0, gyro_rate_hz=200.0, gimbal_rate_hz=100.0)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.calibrate import calibrate
 from pipelines.registry import method
 from pipelines.reports.html import report_html
+from pipelines.session import calibrate
 from tests.browser import drawn, needs_browser
 
 SCENARIOS = {

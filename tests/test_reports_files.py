@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 
 from factors import so3
 from pipelines.errors import InputError
-from pipelines.methods.base import (
+from pipelines.graph.problem import (
     Attitudes,
     ChiSquare,
     Estimate,
@@ -27,14 +27,14 @@ from pipelines.methods.base import (
     Step,
     rotation_vector_coordinates,
 )
-from pipelines.observability import assess
+from pipelines.judgement.observability import assess
+from pipelines.recording.info import SessionFacts, TopicFacts
+from pipelines.recording.messages import definition
 from pipelines.reports import write
 from pipelines.reports.calibration import SavedCalibration, calibration_yaml, load_calibration
 from pipelines.reports.result import Calibration, quantities_of, result_json
 from pipelines.reports.trajectory import tum
 from pipelines.reports.write import write_results
-from pipelines.sessions.info import SessionFacts, TopicFacts
-from pipelines.sessions.messages import definition
 
 EPOCH_NS = 1_795_176_000_123_456_789
 MOUNT = np.array([0.03, -0.02, 0.5])

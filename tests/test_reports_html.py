@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from factors import so3
-from pipelines.methods.base import Attitudes, Quantity, Residuals
-from pipelines.observability import assess
-from pipelines.reports.head import head_plots
+from pipelines.graph.problem import Attitudes, Quantity, Residuals
+from pipelines.judgement.observability import assess
+from pipelines.methods.head.figures import head_plots
+from pipelines.methods.head.recording import HeadData
 from pipelines.reports.html import report_html
 from pipelines.reports.plots import common_plots
 from pipelines.reports.result import Calibration, quantities_of
 from pipelines.reports.units import human_unit, robust_sigma, to_digits_of
-from pipelines.sessions.head import HeadData
 from tests.browser import drawn, needs_browser
 from tests.test_reports_files import make_calibration
 

@@ -11,16 +11,18 @@ import pytest
 from numpy.typing import NDArray
 
 from factors import so3
-from pipelines.calibrate import calibrate
-from pipelines.methods import cube, indexer, los
-from pipelines.methods.base import Estimate, Problem
-from pipelines.methods.cube_parameters import triad_names
-from pipelines.observability import assess
-from pipelines.sessions.config import load_config
-from pipelines.sessions.los import write_los
-from pipelines.simulation.cube import CubeScenario, cube_config, simulate_cube
-from pipelines.simulation.indexer import IndexerScenario, indexer_config, simulate_indexer
-from pipelines.simulation.los import LosAngles, LosScenario, los_config, simulate_los
+from pipelines.config import load_config
+from pipelines.graph.problem import Estimate, Problem
+from pipelines.judgement.observability import assess
+from pipelines.methods.cube import graph as cube
+from pipelines.methods.indexer import graph as indexer
+from pipelines.methods.los import graph as los
+from pipelines.methods.cube.parameters import triad_names
+from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
+from pipelines.methods.los.recording import write_los
+from pipelines.methods.los.simulation import LosAngles, LosScenario, los_config, simulate_los
+from pipelines.session import calibrate
 from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.solvers import batch
 from pipelines.solvers.batch import solve_batch

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from pipelines.config import Tag, check_names, first_given, load_config
 from pipelines.errors import InputError
-from pipelines.sessions.config import Tag, check_names, first_given, load_config
 
 # The example of the file format, with every key.
 FULL = b"""
@@ -141,7 +141,7 @@ def test_config_wins_over_message_over_default() -> None:
 
 
 def test_configs_of_the_independent_recordings(shared_data: Path) -> None:
-    from pipelines.sessions.reading import open_recording
+    from pipelines.recording.reading import open_recording
 
     methods = {}
     for path in (shared_data / "contract").glob("*.mcap"):

@@ -13,10 +13,10 @@ from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.highlevel import AnyReader
 
 from pipelines.errors import InputError
-from pipelines.sessions import messages, records, series
-from pipelines.sessions.container import McapFile
-from pipelines.sessions.reading import open_recording
-from pipelines.sessions.writing import write_session
+from pipelines.recording import messages, records, series
+from pipelines.recording.container import McapFile
+from pipelines.recording.reading import open_recording
+from pipelines.recording.writing import write_session
 
 T0 = 1_700_000_000_123_456_789
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from factors import so3
+from pipelines.config import load_config
 from pipelines.errors import InputError
-from pipelines.sessions import checks, series
-from pipelines.sessions.config import load_config
-from pipelines.sessions.head import HeadData, read_head, write_head
-from pipelines.sessions.reading import open_recording
-from pipelines.sessions.writing import write_session
+from pipelines.methods.head.recording import HeadData, read_head, write_head
+from pipelines.recording import checks, series
+from pipelines.recording.reading import open_recording
+from pipelines.recording.writing import write_session
 
 T0 = 1_800_000_000_000_000_000
 NONE = load_config(None)

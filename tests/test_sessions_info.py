@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipelines.config import load_config
 from pipelines.errors import InputError
-from pipelines.sessions import series
-from pipelines.sessions.config import load_config
-from pipelines.sessions.info import missing_for, resolve_method, session_facts
-from pipelines.sessions.reading import open_recording
-from pipelines.sessions.topics import NEEDED, TOPICS, topic_name
-from pipelines.sessions.writing import write_session
+from pipelines.recording import series
+from pipelines.recording.info import missing_for, resolve_method, session_facts
+from pipelines.recording.reading import open_recording
+from pipelines.recording.topics import NEEDED, TOPICS, topic_name
+from pipelines.recording.writing import write_session
 
 T0 = 1_800_000_000_000_000_000
 NONE = load_config(None)

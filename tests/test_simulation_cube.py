@@ -9,13 +9,20 @@ import pytest
 
 from factors import so3
 from factors.earth import earth_rate, gravity, magnetic_field
+from pipelines.config import load_config
 from pipelines.errors import InputError
-from pipelines.sessions.config import load_config
-from pipelines.sessions.cube import read_cube, rests
-from pipelines.sessions.cube_poses import static_poses
-from pipelines.sessions.reading import open_recording
-from pipelines.simulation.cube import YEAR, CubeNoise, CubeScenario, cube_config, simulate_cube, write_simulation
-from pipelines.simulation.cube_faces import Resting
+from pipelines.methods.cube.faces import Resting
+from pipelines.methods.cube.poses import static_poses
+from pipelines.methods.cube.recording import read_cube, rests
+from pipelines.methods.cube.simulation import (
+    YEAR,
+    CubeNoise,
+    CubeScenario,
+    cube_config,
+    simulate_cube,
+    write_simulation,
+)
+from pipelines.recording.reading import open_recording
 from pipelines.simulation.scenario import load_scenario
 
 QUIET = CubeNoise(gyro_density=1e-12, gyro_bias_walk=0.0, accel_density=1e-12, mag_density=1e-18, corner_px=1e-6)

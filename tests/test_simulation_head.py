@@ -10,11 +10,11 @@ import pytest
 
 from factors import so3
 from factors.earth import earth_rate
+from pipelines.config import load_config
 from pipelines.errors import InputError
-from pipelines.sessions.config import load_config
-from pipelines.sessions.head import read_head, write_head
-from pipelines.sessions.reading import Recording
-from pipelines.simulation.head import HeadNoise, HeadScenario, head_config, simulate_head
+from pipelines.methods.head.recording import read_head, write_head
+from pipelines.methods.head.simulation import HeadNoise, HeadScenario, head_config, simulate_head
+from pipelines.recording.reading import Recording
 from pipelines.simulation.scenario import load_scenario
 
 SCENARIOS = ["head_nominal", "head_mounts", "head_outages", "head_turntable"]

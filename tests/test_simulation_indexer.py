@@ -9,11 +9,10 @@ import pytest
 
 from factors import so3
 from factors.earth import EARTH_RATE
-from pipelines.sessions.config import load_config
-from pipelines.sessions.indexer import read_indexer
-from pipelines.sessions.indexer_runs import axis_motion
-from pipelines.sessions.reading import open_recording
-from pipelines.simulation.indexer import (
+from pipelines.config import load_config
+from pipelines.methods.indexer.recording import read_indexer
+from pipelines.methods.indexer.runs import axis_motion
+from pipelines.methods.indexer.simulation import (
     ARCSEC,
     IndexerNoise,
     IndexerScenario,
@@ -21,6 +20,7 @@ from pipelines.simulation.indexer import (
     simulate_indexer,
     write_simulation,
 )
+from pipelines.recording.reading import open_recording
 from pipelines.simulation.scenario import load_scenario
 
 QUIET = IndexerNoise(gyro_density=0.0)

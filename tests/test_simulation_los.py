@@ -10,7 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 from factors import so3
-from pipelines.simulation.los import (
+from pipelines.methods.los.simulation import (
     LosAngles,
     LosNoise,
     Loss,

@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from factors.vectorized import TruncatedLoss, VectorizedFactor
-from pipelines.methods.base import Array, Estimate, Factor, Parameter, Problem, Quantity, Step
-from pipelines.methods.priors import vector_prior
-from pipelines.observability import assess
+from pipelines.graph.priors import vector_prior
+from pipelines.graph.problem import Array, Estimate, Factor, Parameter, Problem, Quantity, Step
+from pipelines.judgement.observability import assess
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.incremental import solve_incremental
 from pipelines.solvers.marginals import IndeterminateError, reported_covariance

@@ -12,9 +12,9 @@ import pytest
 from factors import so3
 from pipelines.errors import InputError
 from pipelines.simulation.rendering import Renderer, encode, expose, tag_quad
-from pipelines.vision import head
+from pipelines.vision import board as vision
+from pipelines.vision.board import Sight, board_attitudes, body_poses
 from pipelines.vision.camera import Camera
-from pipelines.vision.head import Sight, board_attitudes, body_poses
 from pipelines.vision.parallel import UNREADABLE
 from pipelines.vision.pose import TagBody
 
@@ -80,7 +80,7 @@ def test_bad_pictures_are_counted_by_reason(renderer: Renderer) -> None:
     images = [(0, good), (1, b""), (2, b"\x89PNG not really"), (3, blank), (4, swapped), (5, good[:200])]
     found = board_attitudes(images, CAMERA, BOARD)
     assert found.t_ns.tolist() == [0]
-    assert found.dropped == {UNREADABLE: 3, head.UNSEEN: 1, head.MISFIT: 1}
+    assert found.dropped == {UNREADABLE: 3, vision.UNSEEN: 1, vision.MISFIT: 1}
 
 
 def test_nothing_usable_says_why(renderer: Renderer) -> None:

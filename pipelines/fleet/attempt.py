@@ -24,9 +24,9 @@ def attempt(
 ) -> Result:
     """Status, exit code, reason, seconds of wall time, and what `summarise` takes from the calibration.
 
-    The other arguments are those of `pipelines.calibrate.calibrate`. Never raises.
+    The other arguments are those of `pipelines.session.calibrate`. Never raises.
     """
-    from pipelines.calibrate import calibrate
+    from pipelines.session import calibrate
     from pipelines.solvers.marginals import IndeterminateError
 
     try:

@@ -16,7 +16,7 @@ from pipelines import progress
 from pipelines.errors import InputError
 from pipelines.fleet import statistics
 from pipelines.fleet.montecarlo import SOLVERS, Study, run_study
-from pipelines.sessions.topics import METHODS
+from pipelines.recording.topics import METHODS
 
 # Seeds by which the studies of the incremental solver grow together.
 _BLOCK = 25

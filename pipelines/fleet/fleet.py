@@ -15,13 +15,13 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from pipelines import exit_codes, progress
+from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.fleet.attempt import attempt, failure, set_aside
 from pipelines.fleet.engine import Killed, cluster, completed, source_version
 from pipelines.fleet.recordings import as_date, from_metadata, from_name, local
 from pipelines.fleet.store import Result, Store, settings_key
-from pipelines.sessions.config import load_config
-from pipelines.sessions.topics import METHODS
+from pipelines.recording.topics import METHODS
 
 if TYPE_CHECKING:
     from fsspec.core import OpenFile

@@ -12,7 +12,7 @@ import numpy as np
 
 from pipelines.fleet import analysis, statistics
 from pipelines.fleet.analysis import Change, Population, iso
-from pipelines.methods.base import Array, Quantity
+from pipelines.graph.problem import Array, Quantity
 from pipelines.reports.plots import COLORS, REJECTED, figure, thin
 from pipelines.reports.result import Plot
 from pipelines.reports.templating import environment

@@ -16,14 +16,14 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
-from pipelines.calibrate import Session, calibrations
 from pipelines.errors import InputError
 from pipelines.follow.growing import is_finished, size_of
 from pipelines.follow.guidance import View, view_of
-from pipelines.methods.base import Problem, Step
+from pipelines.graph.problem import Problem, Step
 from pipelines.methods.collected import Collected
+from pipelines.recording.reading import open_recording
 from pipelines.reports.result import Calibration
-from pipelines.sessions.reading import open_recording
+from pipelines.session import Session, calibrations
 from pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
 from pipelines.solvers.incremental import Run
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.methods.base import Array, Quantity
+from pipelines.graph.problem import Array, Quantity
+from pipelines.judgement.observability import Assessment, assess
 from pipelines.methods.collected import Collected
-from pipelines.observability import Assessment, assess
 from pipelines.solvers.incremental import Run
 
 # Parameters a sentence names.

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.methods.base import Array
+from pipelines.graph.problem import Array
 
 if TYPE_CHECKING:
-    from pipelines.sessions.config import Config
-    from pipelines.sessions.cube import CubeData
-    from pipelines.sessions.head import HeadData
-    from pipelines.sessions.indexer import IndexerData
-    from pipelines.sessions.los import LosData
+    from pipelines.config import Config
+    from pipelines.methods.cube.recording import CubeData
+    from pipelines.methods.head.recording import HeadData
+    from pipelines.methods.indexer.recording import IndexerData
+    from pipelines.methods.los.recording import LosData
 
 # A turn within this time, s, counts as motion about an axis ...
 _STRETCH = 5.0
@@ -70,7 +70,7 @@ def collected_head(data: HeadData, _: Config) -> Sequence[Collected]:
 
 def collected_indexer(data: IndexerData, _: Config) -> Sequence[Collected]:
     """Turns forward and back about each axis, by the angle at which the other one stands."""
-    from pipelines.sessions.indexer_runs import axis_motion
+    from pipelines.methods.indexer.runs import axis_motion
 
     turns: dict[tuple[str, int], list[int]] = {}
     for run in axis_motion(data).runs:
@@ -91,7 +91,7 @@ def collected_indexer(data: IndexerData, _: Config) -> Sequence[Collected]:
 
 def collected_cube(data: CubeData, config: Config) -> Sequence[Collected]:
     """Poses and the faces that were up, tags seen, and the next best pose."""
-    from pipelines.sessions.cube_poses import static_poses
+    from pipelines.methods.cube.poses import static_poses
 
     poses = static_poses(data, config)
     up = poses.accel / np.linalg.norm(poses.accel, axis=1, keepdims=True)

@@ -17,8 +17,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from factors import so3
 from pipelines.errors import InputError
-from pipelines.methods.base import rotation_vector_coordinates
-from pipelines.observability import Status, Verdict
+from pipelines.graph.problem import rotation_vector_coordinates
+from pipelines.judgement.observability import Status, Verdict
 from pipelines.reports.formulas import FORMULAS, ROTATIONS
 from pipelines.reports.result import Calibration
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.consistency import Halves
 from pipelines.errors import InputError
-from pipelines.methods.base import Quantity
+from pipelines.graph.problem import Quantity
+from pipelines.judgement.consistency import Halves
 from pipelines.reports.plots import COLORS, add_line, band, figure
 from pipelines.reports.result import Calibration, Plot, truth_errors
 from pipelines.reports.templating import environment
@@ -37,7 +37,7 @@ def compare_html(
 
     Args:
         calibrations: of one recording, by different solvers.
-        halves: of the recording, see pipelines.consistency.
+        halves: of the recording, see pipelines.judgement.consistency.
         predicted: family -> size of the errors of held-out measurements, sigmas.
     """
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.methods.base import Array, History
+from pipelines.graph.problem import Array, History
 from pipelines.reports.result import Calibration
 
 MESSAGE = "alidade_msgs/msg/Estimate"

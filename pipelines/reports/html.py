@@ -9,7 +9,7 @@ from __future__ import annotations
 import datetime
 from dataclasses import dataclass
 
-from pipelines.observability import by_advice
+from pipelines.judgement.observability import by_advice
 from pipelines.reports.formulas import FORMULAS
 from pipelines.reports.plots import common_plots
 from pipelines.reports.result import Calibration, Plot, Table, quantities_of, truth_errors

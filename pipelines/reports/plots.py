@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.methods.base import Array, History, Quantity, Residuals
+from pipelines.graph.problem import Array, History, Quantity, Residuals
 from pipelines.reports.result import Calibration, Plot, quantities_of
 from pipelines.reports.units import human_unit
 

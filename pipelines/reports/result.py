@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from pipelines.methods.base import Estimate, Findings, Problem, Quantity, Residuals
-from pipelines.observability import Assessment, Fit, Innovations, Learning, Status, Verdict, learning
+from pipelines.graph.problem import Estimate, Findings, Problem, Quantity, Residuals
+from pipelines.judgement.observability import Assessment, Fit, Innovations, Learning, Status, Verdict, learning
+from pipelines.recording.info import SessionFacts
 from pipelines.reports.units import robust_sigma
-from pipelines.sessions.info import SessionFacts
 
 if TYPE_CHECKING:
     import plotly.graph_objects

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from pipelines.methods.base import Array, Quantity
+from pipelines.graph.problem import Array, Quantity
 
 # What is wanted to better than this, rad or rad/s, is read in arc seconds or degrees per hour.
 _FINE = 2e-4

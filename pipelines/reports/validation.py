@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipelines.methods.validation import Validation, peak, rms
+from pipelines.judgement.validation import Validation, peak, rms
 from pipelines.reports.calibration import SavedCalibration
 from pipelines.reports.plots import COLORS, add_points, figure
 from pipelines.reports.templating import environment

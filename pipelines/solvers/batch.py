@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 
 from factors.vectorized import Ensemble, TruncatedLoss
-from pipelines.methods.base import Estimate, Factor, Problem, Residuals
+from pipelines.graph.problem import Estimate, Factor, Problem, Residuals
 from pipelines.solvers.growth import Mark, growth
 from pipelines.solvers.marginals import chi_square, joint_covariance, ordering_of, reported, smoothed
 

@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from pipelines.errors import InputError
-from pipelines.methods.base import Problem
+from pipelines.graph.problem import Problem
 from pipelines.solvers.incremental import Run
 from pipelines.solvers.rows import Rows
 from pipelines.solvers.state import State

@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.methods.base import Array, History, Problem
+from pipelines.graph.problem import Array, History, Problem
 from pipelines.solvers.marginals import coordinate_inverse, ordering_of, reported, reported_covariance
 
 # Moments at which the recording is looked back upon.

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from factors.chi_square import gate
 from factors.vectorized import VectorizedFactor
-from pipelines.methods.base import (
+from pipelines.graph.problem import (
     Array,
     Attitudes,
     ChiSquare,

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import gtsam
 import numpy as np
 
-from pipelines.methods.base import Array, ChiSquare, Factor, History, Parameter, Problem
+from pipelines.graph.problem import Array, ChiSquare, Factor, History, Parameter, Problem
 
 # A direction the data and priors say nothing about gets this many times its prior scale as sigma, so that it can be
 # named with the others instead of making the system unsolvable.

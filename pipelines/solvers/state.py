@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 
 from pipelines.errors import InputError
-from pipelines.methods.base import Factor
+from pipelines.graph.problem import Factor
 from pipelines.solvers.marginals import IndeterminateError, explain, ordering_of
 
 

@@ -1,0 +1,169 @@
+"""Figures of the cube method: errors before and after, vectors on their spheres; with its tables and the map."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from factors import so3
+from factors.earth import earth_rate, gravity
+from factors.preintegration import GyroPath
+from pipelines.config import Config
+from pipelines.graph.problem import Array
+from pipelines.methods.cube.coverage import coverage
+from pipelines.methods.cube.findings import calibrated, resting
+from pipelines.methods.cube.poses import StaticPoses, turn
+from pipelines.methods.cube.recording import CubeData, local_field, nominal
+from pipelines.methods.cube.tables import NAMES, cube_tables
+from pipelines.reports.plots import COLORS, add_points, figure, thin
+from pipelines.reports.result import Calibration, Plot, Table
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
+
+# Unit that people read an error in, and what to multiply its SI number by.
+_ERRORS = {"accel": ("mg", 1e3 / 9.80665), "gyro": ("deg", np.rad2deg(1.0)), "mag": ("nT", 1e9)}
+_BEFORE, _AFTER = "#8a949e", COLORS[0]
+
+
+def cube_plots(data: CubeData, calibration: Calibration) -> list[Plot | Table]:
+    """The method's own figures and tables; those that the recording has no data for are left out."""
+    config = Config.model_validate_json(calibration.config_text)
+    values = dict(zip(calibration.estimate.names, calibration.estimate.values.tolist(), strict=True))
+    poses = resting(data, config)
+    found: list[Plot | Table | None] = [*cube_tables(calibration)]
+    found += [_before_and_after(*rows) for rows in _errors(data, config, poses, calibration, values)]
+    for name, strength in _strengths(data, values).items():
+        found.append(_sphere(name, strength, data, config, poses, values))
+    return [each for each in [*found, coverage(calibration)] if each is not None]
+
+
+def _errors(
+    data: CubeData, config: Config, poses: StaticPoses, calibration: Calibration, values: Mapping[str, float]
+) -> list[tuple[str, Array, Array, Array]]:
+    """Sensor, times (n,), and errors (n, 3), SI, before and after calibration, against the estimate's attitudes."""
+    attitudes = calibration.estimate.attitudes
+    if attitudes is None or not len(attitudes.time) or data.latitude is None:
+        return []
+    middle = poses.span.mean(axis=1)
+    k = np.abs(middle[:, None] - attitudes.time).argmin(axis=0)
+    bRn = so3.inverse(attitudes.wxyz)
+    found = []
+    vectors = {"accel": np.array([0.0, 0.0, float(gravity(data.latitude, data.height))])}
+    if "mag_k11" in values:
+        vectors["mag"] = _field(data, config, values)
+    for name, vector in vectors.items():
+        means = {"accel": poses.accel, "mag": poses.mag}[name]
+        if f"{name}_k11" in values and means is not None:
+            good = np.isfinite(means[k]).all(axis=1)
+            expected, raw = so3.rotate(bRn[good], vector), means[k][good]
+            found.append((name, middle[k][good], raw - expected, calibrated(name, raw, config, values) - expected))
+    if "gyro_k11" in values and len(k) > 1:
+        found.insert(1, ("gyro", *_turns(data, config, poses.span[k], attitudes.wxyz, values)))
+    return found
+
+
+def _field(data: CubeData, config: Config, values: Mapping[str, float]) -> Array:
+    names = ("field_e", "field_n", "field_u")
+    return np.array([values[n] for n in names]) if names[0] in values else local_field(data, config)
+
+
+def _turns(
+    data: CubeData, config: Config, span: Array, nRb: Array, values: Mapping[str, float]
+) -> tuple[Array, Array, Array]:
+    """Ends of the turns, and errors (n, 3), rad, of the gyro's rotation over each, before and after calibration."""
+    assert data.latitude is not None
+    rates = nominal(data.gyro, config.cube.raw.gyro)
+    time: list[float] = []
+    before: list[Array] = []
+    after: list[Array] = []
+    for i in range(1, len(span)):
+        samples = turn(data, span[i - 1, 1], span[i, 0])
+        t = data.imu_t[samples]
+        earth = so3.exp(earth_rate(data.latitude) * (t[-1] - t[0]))
+        expected = so3.compose(so3.inverse(nRb[i - 1]), earth, nRb[i])
+        for errors, gyro in ((before, rates[samples]), (after, calibrated("gyro", rates[samples], config, values))):
+            turned = GyroPath(t, gyro).attitude(t[-1:])[0]
+            errors.append(so3.log(so3.multiply(so3.inverse(expected), turned)))
+        time.append(span[i, 0])
+    return np.array(time), np.array(before), np.array(after)
+
+
+def _before_and_after(name: str, time: Array, before: Array, after: Array) -> Plot:
+    unit, factor = _ERRORS[name]
+    lengths = [factor * np.linalg.norm(errors, axis=1) for errors in (before, after)]
+    out = figure(f"error, {unit}")
+    for words, length, color in zip(("uncalibrated", "calibrated"), lengths, (_BEFORE, _AFTER), strict=True):
+        add_points(out, time, np.maximum(length, 1e-12), words, color, 7)
+    out.update_yaxes(type="log", exponentformat="power", dtick=1)
+    rms = [float(np.sqrt((length**2).mean())) for length in lengths]
+    what = "Rotation over each turn, against the attitudes found" if name == "gyro" else "Mean of each static pose"
+    against = "" if name == "gyro" else " against what it should say at the attitude found"
+    return Plot(
+        f"{NAMES[name].capitalize()} before and after",
+        f"{what}{against}: {rms[0]:.3g} {unit} RMS as recorded, {rms[1]:.3g} {unit} calibrated.",
+        out,
+    )
+
+
+def _strengths(data: CubeData, values: Mapping[str, float]) -> dict[str, float]:
+    """Sensor -> the strength that its vectors have at rest, SI."""
+    found = {}
+    if data.latitude is not None and "accel_k11" in values:
+        found["accel"] = float(gravity(data.latitude, data.height))
+    if "mag_k11" in values and "field_e" in values:
+        found["mag"] = float(np.linalg.norm([values[f"field_{axis}"] for axis in "enu"]))
+    return found
+
+
+def _sphere(
+    name: str, strength: float, data: CubeData, config: Config, poses: StaticPoses, values: Mapping[str, float]
+) -> Plot | None:
+    """Vectors at rest on their sphere, seen along two axes, and how far from it they are."""
+    means = poses.accel if name == "accel" else poses.mag
+    assert means is not None
+    good = np.isfinite(means).all(axis=1)
+    vectors = [v / strength for v in (means[good], calibrated(name, means[good], config, values))]
+    out = figure("", height=660)
+    out.set_subplots(2, 2, specs=[[{}, {}], [{"colspan": 2}, None]], row_heights=[0.68, 0.32], vertical_spacing=0.14)
+    angle = np.linspace(0.0, 2.0 * np.pi, 91)
+    for column, (i, j) in enumerate(((0, 1), (0, 2)), start=1):
+        circle = {"mode": "lines", "line": {"color": "#c3ccd4", "width": 1}, "hoverinfo": "skip", "showlegend": False}
+        out.add_scatter(x=np.cos(angle), y=np.sin(angle), row=1, col=column, **circle)
+        if name == "mag" and data.mag is not None:
+            moving = calibrated(name, nominal(data.mag, config.cube.raw.mag), config, values) / strength
+            some = moving[thin(3 * len(moving))]
+            cloud = {"mode": "markers", "marker": {"color": "#9cc3de", "size": 3}, "name": "calibrated, all samples"}
+            out.add_scatter(x=some[:, i], y=some[:, j], row=1, col=column, showlegend=column == 1, **cloud)
+        _add_both(out, [v[:, i] for v in vectors], [v[:, j] for v in vectors], 1, column)
+        square = {"range": [-1.35, 1.35], "dtick": 1, "zeroline": False}
+        out.update_xaxes(title_text="xyz"[i], constrain="domain", row=1, col=column, **square)
+        out.update_yaxes(title_text="xyz"[j], scaleanchor=f"x{column}", row=1, col=column, **square)
+    time = poses.span[good].mean(axis=1)
+    misses = [100.0 * (np.linalg.norm(v, axis=1) - 1.0) for v in vectors]
+    _add_both(out, [time, time], misses, 2, 1, legend=False)
+    out.add_hline(y=0.0, line={"color": "#c3ccd4", "width": 1}, row=2, col=1)
+    out.update_xaxes(title_text="time, s", row=2, col=1)
+    out.update_yaxes(title_text="length, % off", row=2, col=1)
+    rms = [float(np.sqrt((miss**2).mean())) for miss in misses]
+    return Plot(
+        f"Sphere of the {NAMES[name]}",
+        f"Means of the static poses over the strength they should have, seen along z and along y, and below how far "
+        f"their lengths are off: {rms[0]:.2g} % RMS as recorded, {rms[1]:.2g} % calibrated.",
+        out,
+    )
+
+
+def _add_both(out: go.Figure, x: list[Array], y: list[Array], row: int, column: int, legend: bool = True) -> None:
+    """Uncalibrated as rings, calibrated as dots."""
+    looks = (
+        ("uncalibrated", {"color": _BEFORE, "size": 8, "symbol": "circle-open", "line": {"width": 1.5}}),
+        ("calibrated", {"color": _AFTER, "size": 5}),
+    )
+    for (name, marker), across, along in zip(looks, x, y, strict=True):
+        shown = legend and row == column == 1
+        out.add_scatter(
+            x=across, y=along, mode="markers", name=name, marker=marker, showlegend=shown, row=row, col=column
+        )

@@ -1,0 +1,151 @@
+"""What a cube session shows beside its parameters: K taken apart, the sensors' noise at rest, the static poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from factors import so3
+from pipelines.config import DEFAULT_NOISE, Config, first_given
+from pipelines.graph.problem import Array, Estimate, Findings
+from pipelines.methods.cube.parameters import TRIADS, triad_names
+from pipelines.methods.cube.poses import StaticPoses, static_poses
+from pipelines.methods.cube.recording import CubeData, noise_densities, nominal, recorded
+
+# White noise is told from means over this much time, s: shorter ones are what the device's own filter leaves.
+_BLOCK = 0.25
+_UNITS = {"accel": "m/s^2/sqrt(Hz)", "gyro": "rad/s/sqrt(Hz)", "mag": "T/sqrt(Hz)"}
+# Of K's entries, for the derivatives of its parts.
+_STEP = 1e-6
+
+
+def findings(data: CubeData, config: Config, estimate: Estimate) -> Findings:
+    """Rows of `triads`, `noise` and `static_poses`, SI, for the triads that the estimate knows.
+
+    triads: scale of each axis against the nominal one; nonorthogonality, rad, of x and y, x and z, y and z, positive
+    where they are closer than a right angle; mounting, rad, the rotation vector that turns the body's axes into the
+    sensor's; each with its sigmas. None for a K that is no sensor's: singular, or left-handed.
+    noise: white noise density of each axis with K applied, measured over the static poses, beside the one that the
+    solution took; walk of the bias per sqrt(s), stated or an upper bound.
+    static_poses: beginning and end, s, the direction of up in the body, and the kinds of measurement that were used.
+    """
+    values = dict(zip(estimate.names, estimate.values.tolist(), strict=True))
+    poses = resting(data, config)
+    known = [name for name in TRIADS if f"{name}_k11" in values]
+    return {
+        "triads": [row for name in known if (row := _triad(name, config, estimate)) is not None],
+        "noise": [_noise(name, data, config, poses, values) for name in known],
+        "static_poses": _poses(poses, config, estimate, values),
+    }
+
+
+def resting(data: CubeData, config: Config) -> StaticPoses:
+    """The static poses with their means, tags left aside."""
+    return static_poses(replace(data, camera=None, sightings=None), config)
+
+
+def calibrated(name: str, vectors: Array, config: Config, values: Mapping[str, float]) -> Array:
+    """K raw + b of vectors (n, 3) given in nominal units."""
+    numbers = np.array([values[entry] for entry in triad_names(name)])
+    raw = recorded(vectors, getattr(config.cube.raw, name))
+    return np.asarray(raw @ numbers[:9].reshape(3, 3).T + numbers[9:])
+
+
+def parts_of(K: Array) -> Array:
+    """Scales (3), nonorthogonalities (3) and mounting (3) of a triad whose nominal = K raw + b; shape (9,).
+
+    The rows of K^-1 are the sensitive axes in the body, as long as their scales; the mounting is the rotation nearest
+    to the unit axes (polar decomposition). Raises ValueError when K is singular or its axes are left-handed.
+    """
+    if not np.linalg.det(K) > 0.0:
+        raise ValueError("K is singular or left-handed")
+    axes = np.linalg.inv(K)
+    scale = np.linalg.norm(axes, axis=1)
+    axes /= scale[:, None]
+    across = (axes @ axes.T)[[0, 0, 1], [1, 2, 2]]
+    u, _, vt = np.linalg.svd(axes)
+    mounting = so3.log(so3.from_matrix((u @ vt).T))
+    return np.concatenate([scale, np.arcsin(np.clip(across, -1.0, 1.0)), mounting])
+
+
+def _triad(name: str, config: Config, estimate: Estimate) -> dict[str, object] | None:
+    rows = [estimate.names.index(entry) for entry in triad_names(name)[:9]]
+    conversion = getattr(config.cube.raw, name)
+    unit = 1.0 if conversion is None else conversion.scale
+    K = estimate.values[rows] / unit
+    try:
+        found = parts_of(K.reshape(3, 3))
+        steps = _STEP * np.eye(9)
+        columns = [parts_of((K + s).reshape(3, 3)) - parts_of((K - s).reshape(3, 3)) for s in steps]
+    except ValueError:
+        return None
+    J = np.array(columns).T / (2.0 * _STEP)
+    sigma = np.sqrt(np.diag(J @ estimate.covariance[np.ix_(rows, rows)] @ J.T)) / unit
+    kinds = ("scale", "nonorthogonality", "mounting")
+    row: dict[str, object] = {"sensor": name}
+    for kind, part in zip(kinds, (slice(0, 3), slice(3, 6), slice(6, 9)), strict=True):
+        row |= {kind: found[part].tolist(), f"{kind}_sigma": sigma[part].tolist()}
+    return row
+
+
+def _noise(
+    name: str, data: CubeData, config: Config, poses: StaticPoses, values: Mapping[str, float]
+) -> dict[str, object]:
+    t, samples = {
+        "accel": (data.imu_t, data.accel),
+        "gyro": (data.imu_t, data.gyro),
+        "mag": (data.mag_t, data.mag),
+    }[name]
+    assert t is not None
+    assert samples is not None
+    vectors = calibrated(name, nominal(samples, getattr(config.cube.raw, name)), config, values)
+    rate = 1.0 / float(np.median(np.diff(t)))
+    density = white_noise(t, vectors, poses.span, rate)
+    stated = dict(zip(("gyro", "accel", "mag"), noise_densities(data, config), strict=True))[name]
+    row: dict[str, object] = {
+        "sensor": name,
+        "topic": config.topic("mag" if name == "mag" else "imu"),
+        "rate_hz": float(f"{rate:.6g}"),
+        "unit": _UNITS[name],
+        "density": density.tolist(),
+        "stated": stated,
+    }
+    taken = first_given(config.noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk) if name == "gyro" else 0.0
+    # One that adds up to more over the recording than the mean of one rest is good to would have shown.
+    length = float(poses.span[-1, 1] - poses.span[0, 0])
+    bound = float(np.mean(density) / np.sqrt(np.median(poses.duration) * length))
+    return row | ({"walk": taken, "walk_source": "stated"} if taken else {"walk": bound, "walk_source": "upper bound"})
+
+
+def white_noise(t: Array, vectors: Array, spans: Array, rate: float) -> Array:
+    """Density (3,), unit/sqrt(Hz), of the white noise of vectors (n, 3) at t (n,) s within the spans (P, 2) s.
+
+    From the overlapping Allan variance over a quarter of a second (IEEE 1139): half the mean square of the differences
+    of means that follow each other, times that time. Zero where no span is as long as two of them.
+    """
+    size = max(1, round(_BLOCK * rate))
+    squares = []
+    for first, last in np.searchsorted(t, spans):
+        sums = np.cumsum(vectors[first:last] - vectors[first], axis=0)
+        squares.append((sums[2 * size :] - 2.0 * sums[size:-size] + sums[: -2 * size]) ** 2)
+    gathered = np.concatenate(squares)
+    return np.asarray(np.sqrt(0.5 * gathered.mean(axis=0) / (size * rate))) if len(gathered) else np.zeros(3)
+
+
+def _poses(
+    poses: StaticPoses, config: Config, estimate: Estimate, values: Mapping[str, float]
+) -> list[dict[str, object]]:
+    up = calibrated("accel", poses.accel, config, values) if "accel_k11" in values else poses.accel
+    up = up / np.linalg.norm(up, axis=1, keepdims=True)
+    used = {family: r.time[r.used] for family, r in estimate.residuals.items()}
+    return [
+        {
+            "start_s": float(start),
+            "end_s": float(end),
+            "up": np.round(direction, 4).tolist(),
+            "used": [family for family, time in used.items() if ((start <= time) & (time <= end)).any()],
+        }
+        for (start, end), direction in zip(poses.span, up, strict=True)
+    ]

@@ -1,0 +1,89 @@
+"""The layout of a cube's tags from a recording of pictures or detections, and as a config."""
+
+from __future__ import annotations
+
+from io import StringIO
+from itertools import islice
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipelines.config import DEFAULT_NOISE, Config, first_given
+from pipelines.errors import InputError
+from pipelines.methods.cube.recording import read_camera
+from pipelines.recording.reading import Recording
+
+if TYPE_CHECKING:
+    from pipelines.vision.layout import Layout
+    from pipelines.vision.tags import Detections
+
+
+# Many pictures of one pose tell little more than a few; each is a pose to be found.
+_MOST_PICTURES = 800
+
+
+def cube_layout(recording: Recording, config: Config) -> Layout:
+    """Where the cube's tags are, seen from all sides; the config gives their ids and sizes.
+
+    Of a long recording pictures are taken at even distances, a few hundred.
+
+    Raises InputError when there are no pictures or detections, or none that ties the tags together.
+    """
+    from pipelines.vision.layout import estimate_layout
+    from pipelines.vision.pose import TagBody
+
+    camera = read_camera(recording, config)
+    topic = config.topic("image")
+    if topic in recording.topics:
+        from pipelines.vision.parallel import detections
+
+        pictures = islice(recording.images(topic), None, None, _every(recording.topics[topic].count))
+        seen = detections(pictures, config.cube.tag_family, camera)
+        found = [tags for _, tags in seen if tags is not None]
+    else:
+        found = _detections(recording, config)
+    if not any(len(tags) for tags in found):
+        raise InputError(f"no tag in any of {len(found)} pictures; are they blurred, or the tags of another family?")
+    return estimate_layout(camera, TagBody.from_board(config.cube), found)
+
+
+def _every(pictures: int) -> int:
+    """Take every so many of them."""
+    return -(-pictures // _MOST_PICTURES)
+
+
+def _detections(recording: Recording, config: Config) -> list[Detections]:
+    from pipelines.vision.tags import Detections
+
+    seen = recording.detections(config.topic("tag_detections"))
+    sigma = first_given(config.noise.corner_px, DEFAULT_NOISE.corner_px)
+    found = []
+    for frame in range(0, len(seen), _every(len(seen))):
+        rows = np.flatnonzero(seen.frame == frame)
+        covariance = np.tile(sigma**2 * np.eye(2), (len(rows), 4, 1, 1))
+        found.append(Detections(seen.tag_id[rows], seen.corners[rows], covariance))
+    return found
+
+
+def layout_yaml(layout: Layout) -> str:
+    """The layout as a config with `cube.tags`, to be given to `calibrate --config`; sigmas stand in comments."""
+    from ruamel.yaml import YAML
+
+    body = layout.body
+    tags = {
+        int(i): {"size": float(size), "rotation": bRt.tolist(), "position": position.tolist()}
+        for i, size, bRt, position in zip(body.ids, body.size, body.bRt, body.position, strict=True)
+    }
+    text = StringIO()
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = None
+    yaml.dump({"cube": {"tag_family": body.family, "tags": tags}}, text)
+    sigmas = np.sqrt(np.diag(layout.covariance)).reshape(-1, 6)
+    lines = [f"# From {layout.frames} pictures; corners good to {layout.sigma_px:.3f} px. Sigmas:"]
+    lines.append(f"# tag {body.ids[0]}: defines the body frame")
+    lines += [
+        f"# tag {i}: {np.rad2deg(s[:3].max()):.3f} deg, {1e3 * s[3:].max():.3f} mm"
+        for i, s in zip(body.ids[1:], sigmas, strict=True)
+    ]
+    lines += [f"# tag {i}: could not be placed, never seen well with another" for i in layout.unplaced]
+    return "\n".join([*lines, text.getvalue()])

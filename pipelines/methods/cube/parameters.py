@@ -1,0 +1,208 @@
+"""The cube's calibration variables: their priors, first values and the numbers they are reported as."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import gtsam
+import numpy as np
+
+from factors import so3
+from factors.triad import TriadPriorFactor, calibration, triad
+from factors.vectorized import VectorizedFactor
+from pipelines.config import Config, RawConversion, check_names
+from pipelines.graph.priors import prior_sigmas, rotation_prior, vector_prior
+from pipelines.graph.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
+
+TRIADS = ("accel", "gyro", "mag")
+TRIAD_KEYS: dict[str, int] = {name: int(gtsam.symbol(c, 0)) for name, c in zip(TRIADS, "AGM", strict=True)}
+MOUNT_KEY, HEADING_KEY, FIELD_KEY = (int(gtsam.symbol(c, 0)) for c in "CHF")
+
+# Of the total intensity by WMM 2025, T: global error model of its technical report (NOAA/NCEI and BGS, 2024).
+_STRENGTH_SIGMA = 1.38e-7
+
+# Triad -> unit of its nominal value, default prior sigma and accuracy wanted of its bias.
+_BIAS: Mapping[str, tuple[str, float, float]] = {
+    "accel": ("m/s^2", 2.0, 0.02),
+    "gyro": ("rad/s", 0.2, 2e-3),
+    "mag": ("T", 1e-4, 5e-7),
+}
+_GAIN_PRIOR, _GAIN_REQUIRE = 0.2, 5e-3
+# Without a camera these are zero by definition of the body frame.
+_FRAME = ("accel_k21", "accel_k31", "accel_k32")
+
+
+def tag_key(tag: int) -> int:
+    """Variable of the correction of a tag's attitude on the cube, a Rot3."""
+    return int(gtsam.symbol("T", tag))
+
+
+def triad_names(name: str) -> tuple[str, ...]:
+    """Names of a triad's 12 numbers: rows of K, then b."""
+    return tuple(f"{name}_k{i}{j}" for i in "123" for j in "123") + tuple(f"{name}_b{i}" for i in "123")
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """The calibration variables of a recording.
+
+    Attributes:
+        triads: name -> parameter, reported for the raw numbers as recorded.
+        priors: name -> (12,) sigmas of rows of K and of b in nominal units; 0 fixed, inf free.
+        rotations: mount and tags, corrections about the identity; none without a camera.
+        heading: correction of the reference's heading, None without a camera.
+        field: the earth's field in n about the model, None without a magnetometer.
+        field_model: (3,) T.
+    """
+
+    triads: Mapping[str, Parameter]
+    priors: Mapping[str, Array]
+    rotations: tuple[Parameter, ...]
+    heading: Parameter | None
+    field: Parameter | None
+    field_model: Array | None
+
+    @property
+    def all(self) -> tuple[Parameter, ...]:
+        """In reporting order."""
+        rest = [*self.rotations[:1], self.heading, *self.rotations[1:], self.field]
+        return (*self.triads.values(), *(p for p in rest if p is not None))
+
+    def initial(self, gyro_bias: Array) -> gtsam.Values:
+        """First values: nominal sensors but for the gyro's offset (3,), mounts as given, the model's field."""
+        values = gtsam.Values()
+        for name, parameter in self.triads.items():
+            b = -gyro_bias if name == "gyro" else np.zeros(3)
+            values.insert(parameter.key, triad(np.eye(3), b))
+        for parameter in self.rotations:
+            values.insert(parameter.key, so3.to_gtsam(so3.identity()))
+        if self.heading is not None:
+            values.insert(self.heading.key, np.zeros(1))
+        if self.field is not None and self.field_model is not None:
+            values.insert(self.field.key, self.field_model)
+        return values
+
+
+def first_priors(parameters: Parameters) -> list[Factor]:
+    """Priors on all calibration variables."""
+    mean = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
+    factors = []
+    for name, parameter in parameters.triads.items():
+        prior = TriadPriorFactor(np.zeros(1), mean[None], parameters.priors[name][None])
+        factors.append(Factor("prior", VectorizedFactor(prior, [parameter.key], [12]).factor))
+    factors += [rotation_prior(p) for p in parameters.rotations]
+    if parameters.heading is not None:
+        factors.append(vector_prior(parameters.heading, np.zeros(1)))
+    if parameters.field is not None and parameters.field_model is not None:
+        factors.append(vector_prior(parameters.field, parameters.field_model))
+        factors.append(_strength(parameters.field.key, parameters.field_model))
+    return factors
+
+
+def _strength(key: int, model: Array) -> Factor:
+    """The field's strength is as the model says, to the model's own error.
+
+    No motion tells it from the magnetometer's scale, and the priors on the components are made for its direction, which
+    iron nearby turns.
+    """
+    along = (model / np.linalg.norm(model))[None]
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, _STRENGTH_SIGMA)
+    at = gtsam.Values()
+    at.insert(key, model)
+    return Factor("prior", gtsam.LinearContainerFactor(gtsam.JacobianFactor(key, along, np.zeros(1), noise), at))
+
+
+def cube_parameters(config: Config, camera: bool, reference: bool, field: Array | None) -> Parameters:
+    """The parameters of a recording, with the config's priors and requirements.
+
+    Args:
+        config: its priors and `cube`.
+        camera: whether the cube is seen; without, its body frame is the accelerometer's.
+        reference: whether the camera's attitude is measured; without, mount and heading mean nothing and are fixed.
+        field: (3,) T, the field model in n; None without a magnetometer.
+
+    Raises:
+        InputError: the config names a parameter that the method does not know.
+    """
+    tags = sorted(config.cube.tags)
+    _check_names(config, tags)
+
+    def quantity(name: str, unit: str, prior: float, require: float, fixed: bool = False) -> Quantity:
+        sigma = config.priors.get(name, 0.0 if fixed else prior)
+        return Quantity(name, unit, sigma, prior, config.require.get(name, require))
+
+    def rotation(key: int, name: str, prior: float, fixed: bool) -> Parameter:
+        triple = tuple(quantity(f"{name}_{axis}", "rad", prior, 1e-2, fixed) for axis in "xyz")
+        return Parameter(key, triple, rotation_vector_coordinates)
+
+    triads, priors = {}, {}
+    for name in TRIADS if field is not None else TRIADS[:2]:
+        unit, bias_prior, bias_require = _BIAS[name]
+        frame = () if camera else _FRAME
+        plain = [
+            quantity(entry, "1", _GAIN_PRIOR, _GAIN_REQUIRE, entry in frame) for entry in triad_names(name)[:9]
+        ] + [quantity(entry, unit, bias_prior, bias_require) for entry in triad_names(name)[9:]]
+        triads[name] = _triad_parameter(TRIAD_KEYS[name], plain, getattr(config.cube.raw, name))
+        priors[name] = prior_sigmas(Parameter(0, tuple(plain)))
+    rotations: list[Parameter] = []
+    heading = None
+    if camera:
+        rotations.append(rotation(MOUNT_KEY, "camera_mount", 5e-3, not reference))
+        rotations += [rotation(tag_key(tag), f"tag_{tag}", 3e-3, tag == tags[0]) for tag in tags]
+        heading = Parameter(HEADING_KEY, (quantity("reference_heading", "rad", 1e-2, 1e-2, not reference),))
+    field_parameter = None
+    if field is not None:
+        names = ("field_e", "field_n", "field_u")
+        modelled = [
+            replace(quantity(name, "T", 5e-7, 1e-6), prior_mean=float(mean))
+            for name, mean in zip(names, field, strict=True)
+        ]
+        field_parameter = Parameter(FIELD_KEY, tuple(modelled))
+    return Parameters(triads, priors, tuple(rotations), heading, field_parameter, field)
+
+
+def _check_names(config: Config, tags: Sequence[int]) -> None:
+    """Raise InputError for priors or requirements of unknown parameters, whatever the recording holds."""
+    known = [entry for name in TRIADS for entry in triad_names(name)]
+    known += [f"{name}_{axis}" for name in ("camera_mount", *(f"tag_{tag}" for tag in tags)) for axis in "xyz"]
+    known += ["reference_heading", "field_e", "field_n", "field_u"]
+    check_names(config.priors, known, "priors")
+    check_names(config.require, known, "require")
+
+
+def _triad_parameter(key: int, plain: Sequence[Quantity], conversion: RawConversion | None) -> Parameter:
+    """A triad as reported: nominal = K raw + b for the raw numbers as recorded.
+
+    With nominal = K' (raw - offset) scale + b' it is K = K' scale, b = b' - K (offset, offset, offset); the sigmas of
+    priors and the accuracies wanted follow.
+    """
+    means = np.concatenate([np.eye(3).ravel(), np.zeros(3)])
+    if conversion is None:
+        known = tuple(replace(q, prior_mean=float(mean)) for q, mean in zip(plain, means, strict=True))
+        return Parameter(key, known, partial(_coordinates, np.eye(12)))
+    scale, offset = conversion.scale, conversion.offset
+    linear = np.diag([scale] * 9 + [1.0] * 3)
+    for i in range(3):
+        linear[9 + i, 3 * i : 3 * i + 3] = -offset * scale
+
+    def through(sigmas: Sequence[float]) -> list[float]:
+        return [float(s) for s in np.sqrt(linear**2 @ np.square(sigmas))]
+
+    scales, requires = through([q.prior_scale for q in plain]), through([q.require for q in plain])
+    sigmas = through([q.prior_scale if q.prior_sigma is None else q.prior_sigma for q in plain])
+    reported = []
+    for i, q in enumerate(plain):
+        on = plain[3 * (i - 9) : 3 * (i - 9) + 3] if i >= 9 else []
+        free = any(p.prior_sigma is None for p in (q, *on))
+        unit = f"{plain[9].unit}/count" if i < 9 else q.unit
+        sigma = None if free else sigmas[i]
+        reported.append(Quantity(q.name, unit, sigma, scales[i], requires[i], prior_mean=float(linear[i] @ means)))
+    return Parameter(key, tuple(reported), partial(_coordinates, linear))
+
+
+def _coordinates(linear: Array, values: gtsam.Values, key: int) -> tuple[Array, Array]:
+    """The reported numbers of a triad, a linear function (12, 12) of rows of K and of b, and their Jacobian."""
+    numbers, J = calibration(np.asarray(values.atVector(key), dtype=float))
+    return linear @ numbers, linear @ J

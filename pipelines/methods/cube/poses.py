@@ -1,0 +1,210 @@
+"""What each static pose of a cube session says: means of the sensors, and of the tags' corners with their pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import so3
+from factors.preintegration import GyroPath
+from pipelines.config import DEFAULT_NOISE, Config, first_given
+from pipelines.errors import InputError
+from pipelines.methods.cube.recording import CubeData, nominal, rests
+from pipelines.recording.checks import count
+
+if TYPE_CHECKING:
+    from pipelines.vision.pose import BodyPose, TagBody
+
+Array = NDArray[np.float64]
+
+# Corners this many sigmas from the median of their pose are left out of its mean.
+_FAR = 6.0
+# What stays of a corner's error when pictures of a tag at rest are averaged, px.
+_CORNER_BIAS = 0.01
+# A tag misses the layout when its corners miss the pose by this share of its side (one made by hand is good to half
+# a per cent).
+_MISFIT_SHARE = 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class SeenTags:
+    """The cube's tags as seen in one pose.
+
+    Attributes:
+        ids: (k,), ascending.
+        corners: (k, 4, 2) px, means over the pictures.
+        covariance: (k, 4, 2, 2) px^2, of the means.
+        pose: of the cube in the camera, with the layout as given.
+    """
+
+    ids: NDArray[np.int64]
+    corners: Array
+    covariance: Array
+    pose: BodyPose
+
+
+@dataclass(frozen=True, eq=False)
+class StaticPoses:
+    """The static poses of a session. Means are in nominal SI units.
+
+    Attributes:
+        span: (P, 2) s, beginning and end.
+        gyro, accel: (P, 3) rad/s, m/s^2.
+        duration: (P,) s, time that gyro and accelerometer are averaged over.
+        mag: (P, 3) T, NaN for a pose without samples, or None.
+        mag_duration: (P,) s.
+        tags: one a pose, None where no tag of the cube is seen well.
+        dropped: reason -> number of tags or poses.
+    """
+
+    span: Array
+    gyro: Array
+    accel: Array
+    duration: Array
+    mag: Array | None
+    mag_duration: Array
+    tags: tuple[SeenTags | None, ...]
+    dropped: dict[str, int]
+
+    def __len__(self) -> int:
+        return len(self.span)
+
+
+def static_poses(data: CubeData, config: Config) -> StaticPoses:
+    """Find the static poses and average over them.
+
+    Raises:
+        InputError: there is no static pose, no tag is seen in any though there is a camera, or a tag does not fit the
+            others.
+    """
+    span = rests(data, config)
+    raw = config.cube.raw
+    gyro, duration = _means(data.imu_t, nominal(data.gyro, raw.gyro), span)
+    accel, _ = _means(data.imu_t, nominal(data.accel, raw.accel), span)
+    mag, mag_duration = None, np.zeros(len(span))
+    if data.mag_t is not None and data.mag is not None:
+        mag, mag_duration = _means(data.mag_t, nominal(data.mag, raw.mag), span)
+    dropped: dict[str, int] = {}
+    tags: tuple[SeenTags | None, ...] = (None,) * len(span)
+    if data.camera is not None:
+        tags = _seen_tags(data, config, span, gyro, dropped)
+    return StaticPoses(span, gyro, accel, duration, mag, mag_duration, tags, dropped)
+
+
+def turn(data: CubeData, start: float, stop: float) -> slice:
+    """The device's samples from one stamp to another, both included."""
+    return slice(int(np.searchsorted(data.imu_t, start)), int(np.searchsorted(data.imu_t, stop, side="right")))
+
+
+def _means(t: Array, values: Array, span: Array) -> tuple[Array, Array]:
+    """Means (P, 3) over the spans, NaN over empty ones, and the time they are taken over (P,), s."""
+    first, last = np.searchsorted(t, span[:, 0]), np.searchsorted(t, span[:, 1], side="right")
+    number = last - first
+    # About the whole mean, so that cumulative sums of counts keep their digits.
+    centre = values.mean(axis=0)
+    sums = np.concatenate([np.zeros((1, 3)), np.cumsum(values - centre, axis=0)])
+    means: Array = (sums[last] - sums[first]) / np.maximum(number, 1)[:, None] + centre
+    means[number == 0] = np.nan
+    return means, np.asarray(number * np.median(np.diff(t)))
+
+
+def _seen_tags(
+    data: CubeData, config: Config, span: Array, gyro: Array, dropped: dict[str, int]
+) -> tuple[SeenTags | None, ...]:
+    from pipelines.vision.pose import TagBody
+
+    assert data.sightings is not None
+    body = TagBody.from_board(config.cube)
+    # The rates' median over the rests is the bias, near enough for what a pose is expected to be.
+    path = GyroPath(data.imu_t, nominal(data.gyro, config.cube.raw.gyro), np.median(gyro, axis=0))
+    found: list[SeenTags | None] = []
+    last: tuple[float, Array] | None = None
+    wrong: dict[int, int] = {}
+    for start, stop in span:
+        expected = None
+        if last is not None:
+            expected = so3.multiply(last[1], path.increments(np.array([last[0]]), np.array([start])).wxyz[0])
+        seen = _seen_in(data, config, body, start, stop, expected, wrong, dropped)
+        found.append(seen)
+        if seen is not None:
+            last = float(stop), seen.pose.cRb
+    _check_rigid(wrong, found)
+    if not any(found):
+        reasons = ", ".join(f"{reason} ({n})" for reason, n in dropped.items()) or "no tag in sight"
+        raise InputError(f"no tag of the cube is seen well in any of {len(span)} static poses: {reasons}")
+    return tuple(found)
+
+
+def _seen_in(
+    data: CubeData,
+    config: Config,
+    body: TagBody,
+    start: float,
+    stop: float,
+    expected: Array | None,
+    wrong: dict[int, int],
+    dropped: dict[str, int],
+) -> SeenTags | None:
+    """The tags in the pictures taken from start to stop; counts those that do not fit in `wrong`."""
+    from pipelines.vision.pose import estimate_pose
+    from pipelines.vision.tags import Detections
+
+    seen, camera = data.sightings, data.camera
+    assert seen is not None
+    assert camera is not None
+    rows = np.flatnonzero((seen.t[seen.frame] >= start) & (seen.t[seen.frame] <= stop))
+    ids = np.unique(seen.ids[rows])
+    if not len(ids):
+        count(dropped, "static pose without a tag in sight", 1)
+        return None
+    averages = [_mean_corners(data, config, rows[seen.ids[rows] == tag]) for tag in ids]
+    corners, covariance = (np.array(column) for column in zip(*averages, strict=True))
+    pose = estimate_pose(camera, body, Detections(ids, corners, covariance), None, expected)
+    if pose is None or pose.ambiguous:
+        count(dropped, "static pose with its tags' planar flip not told" if pose else "static pose not solved", 1)
+        return None
+    side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean()
+    misfit = bool((pose.tag_rms_px > _MISFIT_SHARE * side).any())
+    # Of two tags that disagree either may be the wrong one.
+    for tag in [*pose.rejected, *(pose.ids.tolist() if misfit else [])]:
+        wrong[tag] = wrong.get(tag, 0) + 1
+    if misfit:
+        count(dropped, "static pose whose tags do not fit the layout", 1)
+        return None
+    keep = np.isin(ids, pose.ids)
+    return SeenTags(ids[keep], corners[keep], covariance[keep], pose)
+
+
+def _mean_corners(data: CubeData, config: Config, rows: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Mean (4, 2) px of one tag's corners over its pictures, and the mean's covariance (4, 2, 2) px^2."""
+    seen = data.sightings
+    assert seen is not None
+    corners = seen.corners[rows]
+    given = config.noise.corner_px
+    if given is None and seen.covariance is not None:
+        covariance = seen.covariance[rows].mean(axis=0)
+    else:
+        covariance = np.tile(first_given(given, DEFAULT_NOISE.corner_px) ** 2 * np.eye(2), (4, 1, 1))
+    away = np.abs(corners - np.median(corners, axis=0)).max(axis=(1, 2))
+    sigma = float(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).max()))
+    good = away <= _FAR * max(sigma, float(np.median(away)))
+    bias = 0.0 if seen.covariance is None else _CORNER_BIAS
+    return corners[good].mean(axis=0), covariance / int(good.sum()) + bias**2 * np.eye(2)
+
+
+def _check_rigid(wrong: dict[int, int], found: list[SeenTags | None]) -> None:
+    """Raise InputError if a tag disagrees with others more often than it agrees with others."""
+    agrees = {tag: sum(len(seen.ids) > 1 and tag in seen.ids for seen in found if seen is not None) for tag in wrong}
+    often = {tag: times for tag, times in wrong.items() if times > agrees[tag]}
+    if not often:
+        return
+    worst = sorted(tag for tag, times in often.items() if times == max(often.values()))
+    names = " or ".join(str(tag) for tag in worst)
+    raise InputError(
+        f"cube not rigid: tag {names} disagrees with others in {often[worst[0]]} of "
+        f"{often[worst[0]] + agrees[worst[0]]} static poses; check size, rotation and position in the config "
+        f"(cube.tags.{worst[0]}) and that it is glued down"
+    )

@@ -1,0 +1,431 @@
+"""Simulator of the `cube` method: a device in a cube of tags, moved by hand through static poses before a camera.
+
+Frames: n level East-North-Up, i which does not turn and is n at t = 0, b the cube, B the reference, C its camera
+(optical), T a tag. Attitude and place of the cube are closed-form functions of time. A sample of gyro, accelerometer or
+magnetometer is the mean over its interval of the exact quantity: of the rate the sum of the rotations over eight parts
+of the interval, of force and field the mean over their middles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from io import StringIO
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import numpy as np
+from numpy.polynomial import Polynomial
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from factors import so3
+from factors.earth import earth_rate, gravity, magnetic_field
+from pipelines.methods.cube.faces import FACES, Resting
+from pipelines.methods.cube.recording import CubeData, Sightings, write_cube
+from pipelines.simulation.motion import sample_times
+from pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
+from pipelines.simulation.scenario import load_scenario
+from pipelines.vision.camera import Camera
+
+Array = NDArray[np.float64]
+
+# 2026-11-20 12:00 UTC, and the year of that day for the field model.
+EPOCH_NS, YEAR = 1_795_176_000_000_000_000, 2026.8849315068493
+Positive = Annotated[float, Field(gt=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+
+_PARTS = 8
+# From 0 to 1, and from 0 to 1 and back, over [0, 1], at rest with two derivatives at both ends.
+_STEP = Polynomial([0, 0, 0, 10, -15, 6])
+_BUMP = 64.0 * Polynomial([0, 0, 0, 1]) * Polynomial([1, -1]) ** 3
+_SQUARE = 0.5 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+# A tag is read when the cosine between its normal and the way to the camera is more than this.
+_LEAST_COSINE = 0.3
+_FORWARD = (-0.5, 0.5, -0.5, 0.5)  # BRC of a camera that looks along x of the reference, z up
+
+
+class CubeNoise(BaseModel):
+    """Noise of the sensors, under the names the recording's config gives them."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    gyro_density: Positive = 1.2e-4  # rad/s/sqrt(Hz)
+    gyro_bias_walk: NotNegative = 2e-6  # rad/s/sqrt(s)
+    accel_density: Positive = 1.5e-3  # m/s^2/sqrt(Hz)
+    mag_density: Positive = 5e-8  # T/sqrt(Hz)
+    corner_px: Positive = 0.2  # of the detections; pictures have their own
+
+
+class CubeScenario(BaseModel):
+    """What the `cube` simulator is asked for; every key has a default."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    poses: Annotated[int, Field(ge=0)] = 24  # in random attitudes
+    attitudes: list[Resting] = []  # of more poses, after those
+    static_s: Positive = 4.0
+    turn_rad_s: Positive = 0.8  # mean rate of the turns between poses
+    turn_axes: list[tuple[float, float, float]] = []  # in b; turns about these only, in turn; none: any attitude
+    noise: CubeNoise = CubeNoise()
+    # Sigmas of what is to be found: K - 1, and b of accelerometer, gyro and magnetometer.
+    gain_error: NotNegative = 0.02
+    accel_bias: NotNegative = 0.3  # m/s^2
+    gyro_bias: NotNegative = 0.01  # rad/s
+    mag_bias: NotNegative = 1e-5  # T
+    camera_mount: NotNegative = 5e-3  # rad
+    tag_mount: NotNegative = 3e-3  # rad
+    field_direction: NotNegative = 5e-7  # T, each way across the model's field
+    field_strength: NotNegative = 1.33e-7  # T, along it
+    reference_heading_deg: float = 0.0  # correction that the reference's heading needs, and the sigma about it
+    reference_heading_error_deg: NotNegative = 0.573
+    reference_level_deg: Positive = 0.02  # noise of roll and pitch, of a message
+    reference_heading_noise_deg: Positive = 0.05
+    magnetometer: bool = True
+    reference: bool = True
+    camera: bool = True
+    faces_hidden: list[int] = []  # ids of tags that are never seen
+    occluded: Share = 0.05  # of the tags in a picture, by a finger
+    disturbed: Share = 0.0  # of the poses stand near iron
+    disturbance: NotNegative = 2e-6  # T, sigma per axis
+    latitude_deg: float = 40.0
+    longitude_deg: float = 116.3
+    height: float = 50.0
+    imu_rate_hz: Positive = 100.0
+    mag_rate_hz: Positive = 50.0
+    camera_rate_hz: Positive = 20.0
+    picture_rate_hz: Positive = 5.0
+    reference_rate_hz: Positive = 10.0
+    fix_rate_hz: Positive = 1.0
+    edge: Positive = 0.16  # m
+    tag_size: Positive = 0.12  # m
+    distance: Positive = 0.7  # m
+    distortion: list[float] = [-0.12, 0.05, 4e-4, -3e-4, 0.0]
+    blur_px: NotNegative = 0.7  # of pictures
+    grey_noise: NotNegative = 2.0
+    exposure_s: Positive = 4e-3
+    priors: dict[str, float | None] = {}  # passed on to the recording's config
+
+    @model_validator(mode="after")
+    def _some(self) -> Self:
+        if not self.poses + len(self.attitudes):
+            raise ValueError("poses or attitudes are needed")
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """The cube's way: attitudes nRb (P, 4) and places (P, 3), m in C, of the poses, and the hand's detours between.
+
+    start (P,), stop (P,): of the static poses, s. wobble (P - 1, 3) rad in b, detour (P - 1, 3) m.
+    """
+
+    start: Array
+    stop: Array
+    nRb: Array
+    place: Array
+    wobble: Array
+    detour: Array
+
+    def _phase(self, t: Array) -> tuple[NDArray[np.intp], Array, Array]:
+        """The pose that a moment comes after, how far the turn from it has gone (0 to 1), and the turn's duration."""
+        k = np.clip(np.searchsorted(self.start, t, side="right") - 1, 0, len(self.start) - 1)
+        following = np.minimum(k + 1, len(self.start) - 1)
+        duration = np.where(following > k, self.start[following] - self.stop[k], 1.0)
+        return k, np.where(following > k, np.clip((t - self.stop[k]) / duration, 0.0, 1.0), 0.0), duration
+
+    def attitude(self, t: Array) -> Array:
+        """nRb (N, 4) at the times."""
+        k, u, _ = self._phase(t)
+        if len(self.start) == 1:
+            return np.broadcast_to(self.nRb[0], (len(t), 4))
+        turn = np.append(so3.log(so3.multiply(so3.inverse(self.nRb[:-1]), self.nRb[1:])), np.zeros((1, 3)), axis=0)
+        wobble = np.append(self.wobble, np.zeros((1, 3)), axis=0)
+        return so3.compose(self.nRb[k], so3.exp(turn[k] * _STEP(u)[:, None]), so3.exp(wobble[k] * _BUMP(u)[:, None]))
+
+    def position(self, t: Array, derivative: int = 0) -> Array:
+        """Place (N, 3) of the cube in C, m, or a derivative of it by time."""
+        k, u, duration = self._phase(t)
+        step, bump = (f.deriv(derivative) if derivative else f for f in (_STEP, _BUMP))
+        after = np.append(self.place[1:], self.place[-1:], axis=0)
+        detour = np.append(self.detour, np.zeros((1, 3)), axis=0)
+        moved = (after[k] - self.place[k]) * step(u)[:, None] + detour[k] * bump(u)[:, None]
+        return moved / duration[:, None] ** derivative + (0.0 if derivative else self.place[k])
+
+
+def simulate_cube(scenario: CubeScenario, seed: int) -> tuple[CubeData, dict[str, float]]:
+    """A session with tag detections and the true values of its parameters; a bias that walks is its mean."""
+    world = _World(scenario, seed)
+    return world.data(), world.truth
+
+
+def write_simulation(scenario: str | None, seed: int, out: Path, images: bool) -> None:
+    """Simulate a scenario (by name or file, None is cube_nominal) and write it as a session with its truth.
+
+    Raises:
+        InputError: no such scenario, or it cannot be written.
+    """
+    settings = load_scenario(CubeScenario, scenario or "cube_nominal")
+    if not images:
+        data, truth = simulate_cube(settings, seed)
+        write_cube(out, data, truth, cube_config(settings))
+        return
+    world = _World(settings, seed)
+    t = sample_times(world.duration, settings.picture_rate_hz, 0.5)
+    nothing = Sightings(t, *(np.zeros(0, dtype=np.int64),) * 2, np.zeros((0, 4, 2)), None)
+    write_cube(
+        out, replace(world.data(), sightings=nothing), world.truth, cube_config(settings, True), world.pictures(t)
+    )
+
+
+def cube_config(scenario: CubeScenario, images: bool = False) -> str:
+    """The recording's config (YAML): the cube as built to the drawing, the noise simulated, the scenario's priors."""
+    from ruamel.yaml import YAML
+
+    noise = scenario.noise.model_dump()
+    if images:
+        del noise["corner_px"]  # the tracker's own
+    config: dict[str, Any] = {"method": "cube", "noise": noise, "priors": scenario.priors, "date": "2026-11-20"}
+    if scenario.camera:
+        tags = {
+            i: {
+                "size": scenario.tag_size,
+                "rotation": list(wxyz),
+                "position": [0.5 * scenario.edge * x for x in normal],
+            }
+            for i, (wxyz, normal) in FACES.items()
+        }
+        config["cube"] = {"tag_family": "36h11", "tags": tags, "camera_rotation": list(_FORWARD)}
+    text = StringIO()
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = None
+    yaml.dump(config, text)
+    return text.getvalue()
+
+
+def attitudes(scenario: CubeScenario, seed: int) -> Array:
+    """nRb (P, 4) of the poses of a scenario's session."""
+    return _World(scenario, seed).motion.nRb
+
+
+def _attitudes(scenario: CubeScenario, rng: np.random.Generator) -> Array:
+    """nRb (P, 4): the random ones, then those given."""
+    n = scenario.poses
+    given = np.array([each.nRb for each in scenario.attitudes]).reshape(-1, 4)
+    if not (n and scenario.turn_axes):
+        return np.vstack([so3.normalize(rng.standard_normal((n, 4))), given])
+    axes = np.array([scenario.turn_axes[k % len(scenario.turn_axes)] for k in range(n - 1)]).reshape(-1, 3)
+    angle = rng.uniform(0.8, 2.4, n - 1) * rng.choice([-1.0, 1.0], n - 1)
+    found = [so3.normalize(rng.standard_normal(4))]
+    for axis, a in zip(axes, angle, strict=True):
+        found.append(so3.multiply(found[-1], so3.exp(a * axis / np.linalg.norm(axis))))
+    return np.vstack([np.array(found), given])
+
+
+class _World:
+    """One simulated session: everything that is true, drawn from the seed, and the sensors in it."""
+
+    def __init__(self, scenario: CubeScenario, seed: int) -> None:
+        self.scenario = scenario
+        self.rng = np.random.default_rng(seed)
+        self.place_rad = np.deg2rad([scenario.latitude_deg, scenario.longitude_deg])
+        latitude, longitude = self.place_rad
+        self.field, self.heading = self._surroundings(magnetic_field(latitude, longitude, scenario.height, YEAR))
+        self.camera = Camera(
+            1280,
+            960,
+            np.array([[1150.0, 0, 641.3], [0, 1150.0, 477.8], [0, 0, 1.0]]),
+            "plumb_bob",
+            np.array(scenario.distortion),
+        )
+        self.nRB = so3.compose(
+            so3.exp([0.0, 0.0, self.rng.uniform(-np.pi, np.pi)]), so3.exp(0.02 * self.rng.standard_normal(3))
+        )
+        self.mount = scenario.camera_mount * self.rng.standard_normal(3)
+        self.nRC = so3.compose(self.nRB, _FORWARD, so3.exp(self.mount))
+        # The lowest id defines the body frame.
+        self.tags = {i: scenario.tag_mount * self.rng.standard_normal(3) * (i != min(FACES)) for i in FACES}
+        self.K = {
+            name: np.eye(3) + scenario.gain_error * self.rng.standard_normal((3, 3))
+            for name in ("accel", "gyro", "mag")
+        }
+        if not scenario.camera:
+            # The accelerometer's own axes define the body frame: its K is upper triangular.
+            upper = np.linalg.qr(self.K["accel"])[1]
+            self.K["accel"] = np.sign(np.diag(upper))[:, None] * upper
+        sigmas = {"accel": scenario.accel_bias, "gyro": scenario.gyro_bias, "mag": scenario.mag_bias}
+        self.b = {name: sigma * self.rng.standard_normal(3) for name, sigma in sigmas.items()}
+        self.motion = self._motion()
+        self.duration = float(self.motion.stop[-1])
+        self.truth: dict[str, float] = {}
+
+    def _surroundings(self, model: Array) -> tuple[Array, float]:
+        """Field (3,), T, and the correction of the reference's heading, rad.
+
+        The model errs more in the field's direction, by the iron of the building, than in its strength. The draws have
+        a generator of their own: what else happens in a seed's session does not depend on them.
+        """
+        s, (rng,) = self.scenario, self.rng.spawn(1)
+        along = model / np.linalg.norm(model)
+        error = s.field_direction * rng.standard_normal(3)
+        error += along * (s.field_strength * rng.standard_normal() - along @ error)
+        return model + error, float(
+            np.deg2rad(s.reference_heading_deg + s.reference_heading_error_deg * rng.standard_normal())
+        )
+
+    def _motion(self) -> Motion:
+        s, rng = self.scenario, self.rng
+        nRb = _attitudes(s, rng)
+        n = len(nRb)
+        place = np.array([0.0, 0.0, s.distance]) + [0.04, 0.03, 0.05] * rng.uniform(-1, 1, (n, 3))
+        angles = np.linalg.norm(so3.log(so3.multiply(so3.inverse(nRb[:-1]), nRb[1:])), axis=1)
+        turning = np.maximum(angles, 0.5) / s.turn_rad_s
+        start = np.concatenate([[0.0], np.cumsum(s.static_s + turning)])
+        wobble = (0.0 if s.turn_axes else 0.15) * rng.standard_normal((n - 1, 3))
+        return Motion(start, start + s.static_s, nRb, place, wobble, 0.05 * rng.standard_normal((n - 1, 3)))
+
+    def data(self) -> CubeData:
+        """Everything recorded; sets the truth."""
+        s = self.scenario
+        imu_t, gyro, accel = self._imu()
+        data = CubeData(
+            EPOCH_NS,
+            imu_t,
+            gyro,
+            accel,
+            latitude=float(self.place_rad[0]),
+            longitude=float(self.place_rad[1]),
+            height=s.height,
+            gyro_density=s.noise.gyro_density,
+            accel_density=s.noise.accel_density,
+        )
+        if s.magnetometer:
+            mag_t, mag = self._mag()
+            data = replace(data, mag_t=mag_t, mag=mag, mag_density=s.noise.mag_density)
+        if s.camera:
+            data = replace(data, camera=self.camera, sightings=self._sightings())
+        if s.reference:
+            t, wxyz, covariance = self._reference()
+            data = replace(data, reference_t=t, reference_wxyz=wxyz, reference_cov=covariance)
+        self.truth = self._truth()
+        return data
+
+    def _moments(self, t: Array, rate_hz: float) -> Array:
+        """Middles of the parts of the samples' intervals, (N * parts,)."""
+        offsets = ((np.arange(_PARTS) + 0.5) / _PARTS - 0.5) / rate_hz
+        return np.asarray((t[:, None] + offsets).ravel())
+
+    def _raw(self, name: str, nominal: Array, density: float, rate_hz: float, walk: Array | float = 0.0) -> Array:
+        noise = density * np.sqrt(rate_hz) * self.rng.standard_normal(nominal.shape)
+        return (nominal - self.b[name]) @ np.linalg.inv(self.K[name]).T + walk + noise
+
+    def _imu(self) -> tuple[Array, Array, Array]:
+        s, rate = self.scenario, self.scenario.imu_rate_hz
+        t = sample_times(self.duration, rate)
+        edges = np.append(t[:1] - 0.5 / rate, (t[:, None] + (np.arange(1, _PARTS + 1) / _PARTS - 0.5) / rate).ravel())
+        iRn = so3.exp(edges[:, None] * earth_rate(self.place_rad[0]))
+        iRb = so3.multiply(iRn, self.motion.attitude(edges))
+        arcs = so3.log(so3.multiply(so3.inverse(iRb[:-1]), iRb[1:]))
+        rates = arcs.reshape(-1, _PARTS, 3).sum(axis=1) * rate
+        moments = self._moments(t, rate)
+        force = so3.rotate(self.nRC, self.motion.position(moments, 2))
+        force = force + [0.0, 0.0, float(gravity(self.place_rad[0], s.height))]
+        accel = so3.rotate(so3.inverse(self.motion.attitude(moments)), force).reshape(-1, _PARTS, 3).mean(axis=1)
+        walk = np.cumsum(s.noise.gyro_bias_walk / np.sqrt(rate) * self.rng.standard_normal(rates.shape), axis=0)
+        gyro = self._raw("gyro", rates, s.noise.gyro_density, rate, walk)
+        self.b["gyro"] = self.b["gyro"] - self.K["gyro"] @ walk.mean(axis=0)
+        return t, gyro, self._raw("accel", accel, s.noise.accel_density, rate)
+
+    def _mag(self) -> tuple[Array, Array]:
+        s, rate = self.scenario, self.scenario.mag_rate_hz
+        t = sample_times(self.duration, rate, 0.25)
+        moments = self._moments(t, rate)
+        iron = s.disturbance * self.rng.standard_normal((len(self.motion.start), 3))
+        iron *= self.rng.random((len(self.motion.start), 1)) < s.disturbed
+        nearest = np.argmin(np.abs(moments[:, None] - 0.5 * (self.motion.start + self.motion.stop)), axis=1)
+        field = so3.rotate(so3.inverse(self.motion.attitude(moments)), self.field + iron[nearest])
+        return t, self._raw("mag", field.reshape(-1, _PARTS, 3).mean(axis=1), s.noise.mag_density, rate)
+
+    def _reference(self) -> tuple[Array, Array, Array]:
+        s = self.scenario
+        t = sample_times(self.duration, s.reference_rate_hz, 0.4)
+        sigma = np.deg2rad([s.reference_level_deg, s.reference_level_deg, s.reference_heading_noise_deg])
+        heading = so3.exp([0.0, 0.0, -self.heading])
+        wxyz = so3.compose(so3.exp(sigma * self.rng.standard_normal((len(t), 3))), heading, self.nRB)
+        return t, wxyz, np.tile(np.diag(sigma**2), (len(t), 1, 1))
+
+    def _tag(self, tag: int, t: Array) -> tuple[Array, Array, Array]:
+        """Attitudes cRt (N, 4), places (N, 3) m, and the cosines (N,) between the normal and the way to the camera."""
+        wxyz, normal = FACES[tag]
+        cRb = so3.multiply(so3.inverse(self.nRC), self.motion.attitude(t))
+        cRt = so3.compose(cRb, wxyz, so3.exp(self.tags[tag]))
+        centre = self.motion.position(t) + so3.rotate(cRb, 0.5 * self.scenario.edge * np.array(normal))
+        facing = -(so3.rotate(cRt, [0.0, 0.0, 1.0]) * centre).sum(axis=1) / np.linalg.norm(centre, axis=1)
+        return cRt, centre, facing
+
+    def _shown(self) -> list[int]:
+        return [i for i in FACES if i not in self.scenario.faces_hidden]
+
+    def _sightings(self) -> Sightings:
+        s, size = self.scenario, np.array([self.camera.width, self.camera.height])
+        times = sample_times(self.duration, s.camera_rate_hz, 0.3)
+        frames, ids, corners = [], [], []
+        for i in self._shown():
+            cRt, centre, facing = self._tag(i, times)
+            rows = np.flatnonzero((facing > _LEAST_COSINE) & (self.rng.random(len(times)) >= s.occluded))
+            seen = self.camera.project(centre[rows, None] + so3.rotate(cRt[rows, None], s.tag_size * _SQUARE))
+            inside = ((seen > 5.0) & (seen < size - 6.0)).all(axis=(1, 2))
+            frames.append(rows[inside])
+            ids.append(np.full(int(inside.sum()), i))
+            corners.append(seen[inside] + s.noise.corner_px * self.rng.standard_normal((int(inside.sum()), 4, 2)))
+        frame = np.concatenate(frames)
+        order = np.argsort(frame, kind="stable")
+        return Sightings(times, frame[order], np.concatenate(ids)[order], np.concatenate(corners)[order], None)
+
+    def pictures(self, times: Array) -> Iterator[bytes]:
+        """JPEG files of what the camera sees at the times, blurred by the motion while the shutter is open."""
+        s, renderer = self.scenario, Renderer(self.camera)
+        for t in times:
+            finger = self._finger(float(t))
+            still = bool(((self.motion.start <= t) & (t <= self.motion.stop)).any())
+            moments = [t] if still else t + s.exposure_s * np.array([-0.25, 0.25])
+            light = np.mean([renderer.radiance(self._quads(float(m), finger)) for m in moments], axis=0)
+            yield encode(expose(light, s.blur_px, s.grey_noise, self.rng), "jpeg", 95)
+
+    def _tags_at(self, t: float) -> dict[int, tuple[Array, Array]]:
+        """Attitude cRt and place (3,) m of the tags that face the camera."""
+        found = {i: self._tag(i, np.array([t])) for i in self._shown()}
+        return {i: (cRt[0], centre[0]) for i, (cRt, centre, facing) in found.items() if facing[0] > 0.0}
+
+    def _quads(self, t: float, others: list[Quad]) -> list[Quad]:
+        tags = self._tags_at(t).items()
+        return [*others, *(tag_quad(i, self.scenario.tag_size, cRt, centre) for i, (cRt, centre) in tags)]
+
+    def _finger(self, t: float) -> list[Quad]:
+        """At times a finger lies on the edge of a tag."""
+        tags = list(self._tags_at(t).values())
+        if not tags or self.rng.random() > self.scenario.occluded * len(tags):
+            return []
+        cRt, centre = tags[self.rng.integers(len(tags))]
+        on_edge = so3.rotate(cRt, self.scenario.tag_size * np.array([0.5, self.rng.uniform(-0.4, 0.4), 0.02]))
+        return [Quad(np.full((1, 1), 120.0), (0.05, 0.018), cRt, (centre + on_edge) * 0.99)]
+
+    def _truth(self) -> dict[str, float]:
+        truth: dict[str, float] = {}
+        for name in ("accel", "gyro", *(("mag",) if self.scenario.magnetometer else ())):
+            truth |= {f"{name}_k{i + 1}{j + 1}": float(self.K[name][i, j]) for i in range(3) for j in range(3)}
+            truth |= {f"{name}_b{i + 1}": float(self.b[name][i]) for i in range(3)}
+        if self.scenario.magnetometer:
+            truth |= {f"field_{axis}": float(x) for axis, x in zip("enu", self.field, strict=True)}
+        if self.scenario.camera:
+            vectors = {f"tag_{i}": vector for i, vector in self.tags.items()}
+            if self.scenario.reference:
+                vectors["camera_mount"] = self.mount
+                truth["reference_heading"] = self.heading
+            truth |= {
+                f"{name}_{axis}": float(x)
+                for name, vector in vectors.items()
+                for axis, x in zip("xyz", vector, strict=True)
+            }
+        return truth

@@ -1,0 +1,381 @@
+"""The head method: helmet attitude, gyro bias, mounts and time offset from a helmet MIMU, platform IMU and vision.
+
+The graph's states are iRv = iRb bRv at the vision frames, i the platform's frame at the start: with the platform's
+rotation iRb integrated from its own gyro, gtsam's native AHRSFactor joins them. Methods page, section 3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import so3
+from factors.attitude import VisionAttitudeFactor, ahrs_factors
+from factors.chi_square import gate
+from factors.earth import EARTH_RATE
+from factors.preintegration import GyroPath, Increments
+from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
+from pipelines.config import DEFAULT_NOISE, Config, check_names, first_given
+from pipelines.errors import InputError
+from pipelines.graph.priors import rotation_prior, vector_prior
+from pipelines.graph.problem import (
+    Array,
+    Attitudes,
+    Factor,
+    Parameter,
+    Problem,
+    Quantity,
+    Step,
+    rotation_vector_coordinates,
+)
+from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
+from pipelines.graph.walking_bias import WalkingBias
+from pipelines.methods.head.recording import HeadData
+
+# Without vision for longer than this, s, a keyframe is set in between: gtsam corrects an increment for the bias to
+# first order only.
+_LONGEST_INCREMENT = 1.0
+# Rates for the first guess are taken over this time, s: long against vision noise, short against turns.
+_GUESS_SPAN = 0.3
+_FEWEST_FRAMES = 10
+
+_BIAS, _HELMET, _CAMERA, _OFFSET = "gyro_bias", "helmet_mount", "camera_mount", "time_offset"
+_HELMET_KEY, _CAMERA_KEY, _OFFSET_KEY = (int(gtsam.symbol(c, 0)) for c in "HCT")
+
+
+@dataclass(frozen=True)
+class _Model:
+    """The recording prepared for the graph: what every step needs."""
+
+    time: Array  # (K,) keyframes
+    vision: NDArray[np.intp]  # (K,) index into the vision frames, -1 where a keyframe only bridges a gap
+    initial: Array  # (K, 4) iRv from vision
+    measured: Array  # (frames, 4) cRh
+    sqrt_information: Array  # (frames, 3, 3)
+    helmet: GyroPath
+    turns: Increments  # (K - 1,) of the helmet from keyframe to keyframe
+    platform: GyroPath | None
+    variance_rate: float  # rad^2 / s of an increment, both gyros
+    scale_error: float  # sigma of an increment per angle turned
+    bias: WalkingBias
+    bias_hat: Array
+    loss: TruncatedLoss
+    parameters: tuple[Parameter, ...]
+    helmet_guess: Array  # vRh
+
+
+def problem(data: HeadData, config: Config) -> Problem:
+    """The graph of a head recording.
+
+    Raises:
+        InputError: fewer than ten vision frames lie within the helmet gyro's record.
+    """
+    model = _prepare(data, config)
+    return Problem(
+        method="head",
+        parameters=model.parameters,
+        steps=partial(_steps, model),
+        steps_after=partial(_steps, model, 1),
+        loss=model.loss,
+        attitudes=partial(_attitudes, model),
+        attitude_name="bRv",
+        advice=_advice,
+        dropped=data.dropped,
+    )
+
+
+def _prepare(data: HeadData, config: Config) -> _Model:
+    inside = (data.vision_t >= data.head_t[0]) & (data.vision_t <= data.head_t[-1])
+    if data.platform_t is not None:
+        inside &= (data.vision_t >= data.platform_t[0]) & (data.vision_t <= data.platform_t[-1])
+    if inside.sum() < _FEWEST_FRAMES:
+        raise InputError(
+            f"vision: only {int(inside.sum())} of {len(inside)} frames lie within the gyros' record; "
+            f"at least {_FEWEST_FRAMES} are needed: check the topics and their clocks"
+        )
+    vision_t, measured = data.vision_t[inside], data.vision_wxyz[inside]
+    density = first_given(config.noise.gyro_density, data.gyro_density, DEFAULT_NOISE.gyro_density)
+    platform_density = 0.0
+    platform = None
+    if data.platform_t is not None and data.platform_gyro is not None:
+        platform = GyroPath(data.platform_t, data.platform_gyro)
+        platform_density = first_given(
+            config.noise.platform_gyro_density, data.platform_gyro_density, DEFAULT_NOISE.platform_gyro_density
+        )
+    sqrt_information = _sqrt_information(data.vision_cov, inside, config)
+
+    bRi = so3.identity(len(vision_t)) if platform is None else so3.inverse(platform.attitude(vision_t))
+    iRh = so3.multiply(so3.inverse(bRi), measured)
+    sigma = float(1.0 / np.median(np.linalg.norm(sqrt_information, axis=(1, 2)) / np.sqrt(3.0)))
+    bias_hat, vRh = _guess(data, vision_t, iRh, sigma)
+    time, vision = _keyframes(vision_t)
+    walk = first_given(config.noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk)
+    helmet = GyroPath(data.head_t, data.head_gyro, bias_hat)
+    return _Model(
+        time=time,
+        vision=vision,
+        initial=so3.interpolate(vision_t, so3.multiply(iRh, so3.inverse(vRh)), time),
+        measured=measured,
+        sqrt_information=sqrt_information,
+        helmet=helmet,
+        turns=helmet.increments(time[:-1], time[1:]),
+        platform=platform,
+        variance_rate=density**2 + platform_density**2,
+        scale_error=first_given(config.noise.gyro_scale, DEFAULT_NOISE.gyro_scale),
+        bias=WalkingBias.over(time[0], time[-1], walk, density),
+        bias_hat=bias_hat,
+        loss=TruncatedLoss(gate(3)),
+        parameters=_parameters(config, platform is not None),
+        helmet_guess=vRh,
+    )
+
+
+def _sqrt_information(covariance: Array | None, inside: NDArray[np.bool_], config: Config) -> Array:
+    """(n, 3, 3): from the config, else from the messages, else the default."""
+    if covariance is None or config.noise.vision_attitude is not None:
+        sigma = first_given(config.noise.vision_attitude, DEFAULT_NOISE.vision_attitude)
+        return np.broadcast_to(np.eye(3) / sigma, (int(inside.sum()), 3, 3))
+    root: Array = np.linalg.cholesky(np.linalg.inv(covariance[inside]))
+    return np.swapaxes(root, 1, 2)
+
+
+def _keyframes(vision_t: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Vision frames and, in gaps, keyframes that bridge them."""
+    bridges = [
+        np.linspace(a, b, int(np.ceil((b - a) / _LONGEST_INCREMENT)) + 1)[1:-1]
+        for a, b in pairwise(vision_t)
+        if b - a > _LONGEST_INCREMENT
+    ]
+    time = np.concatenate([vision_t, *bridges])
+    vision = np.full(len(time), -1)
+    vision[: len(vision_t)] = np.arange(len(vision_t))
+    order = np.argsort(time, kind="stable")
+    return time[order], vision[order]
+
+
+def _guess(data: HeadData, vision_t: Array, iRh: Array, sigma: float) -> tuple[Array, Array]:
+    """First guess of the gyro bias (3,) and vRh (4,) from rates: w_v = vRh w_h + bias over short windows.
+
+    Rates seen by vision beyond what the gyro's length allows are outliers. The mount is taken from the singular value
+    decomposition (Kabsch) when the motion is about more than one axis, else as the identity.
+    """
+    stride = max(1, round(_GUESS_SPAN / max(float(np.median(np.diff(vision_t))), 1e-3)))
+    if len(vision_t) <= stride:
+        return np.zeros(3), so3.identity()
+    start, stop = vision_t[:-stride], vision_t[stride:]
+    span = (stop - start)[:, None]
+    gyro = so3.log(GyroPath(data.head_t, data.head_gyro).increments(start, stop).wxyz) / span
+    seen = so3.log(so3.multiply(so3.inverse(iRh[:-stride]), iRh[stride:])) / span
+    mismatch = np.abs(np.linalg.norm(gyro, axis=1) - np.linalg.norm(seen, axis=1))
+    good = (span[:, 0] < 2.0 * _GUESS_SPAN) & (mismatch < 0.05 + 5.0 * sigma / span[:, 0])
+    if good.sum() < _FEWEST_FRAMES:
+        return np.zeros(3), so3.identity()
+    gyro, seen = gyro[good], seen[good]
+    u, s, vt = np.linalg.svd((gyro - gyro.mean(axis=0)).T @ (seen - seen.mean(axis=0)))
+    noise = 2.0 * (sigma / _GUESS_SPAN) ** 2 * len(gyro)
+    vRh = np.eye(3)
+    if s[1] > 3.0 * noise / np.sqrt(len(gyro)) and s[1] > 0.01 * s[0]:
+        vRh = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return np.median(gyro - seen @ vRh.T, axis=0), so3.from_matrix(vRh)
+
+
+def _parameters(config: Config, platform: bool) -> tuple[Parameter, ...]:
+    """The method's parameters with their priors; without a platform topic the camera mount is fixed by default."""
+
+    def quantity(
+        name: str, unit: str, scale: float, require: float, fixed: bool = False, extra: float = 0.0
+    ) -> Quantity:
+        prior = config.priors.get(name, 0.0 if fixed else scale)
+        return Quantity(name, unit, prior, scale, config.require.get(name, require), extra)
+
+    def triple(
+        name: str, unit: str, scale: float, require: float, fixed: bool = False, extra: float = 0.0
+    ) -> tuple[Quantity, ...]:
+        return tuple(quantity(f"{name}_{axis}", unit, scale, require, fixed, extra) for axis in "xyz")
+
+    parameters = (
+        Parameter(FIRST_BIAS, triple(_BIAS, "rad/s", 0.05, 2e-3, extra=0.0 if platform else EARTH_RATE)),
+        Parameter(_HELMET_KEY, triple(_HELMET, "rad", 0.35, 1e-2), rotation_vector_coordinates),
+        Parameter(_CAMERA_KEY, triple(_CAMERA, "rad", 0.35, 1e-2, fixed=not platform), rotation_vector_coordinates),
+        Parameter(_OFFSET_KEY, (quantity(_OFFSET, "s", 0.05, 5e-3),)),
+    )
+    names = [q.name for p in parameters for q in p.quantities]
+    check_names(config.priors, names, "priors")
+    check_names(config.require, names, "require")
+    return parameters
+
+
+def _state(keyframe: int) -> int:
+    return int(gtsam.symbol("x", keyframe))
+
+
+def _steps(model: _Model, chunk: int, after: float = -np.inf) -> Iterator[Step]:
+    """The first keyframe with the calibration variables and their priors, then `chunk` keyframes at a time."""
+    taken = int(np.searchsorted(model.time, after, side="right"))
+    if taken == 0:
+        yield _first_step(model)
+    for begin in range(max(taken, 1), len(model.time), chunk):
+        yield _step(model, range(begin, min(begin + chunk, len(model.time))))
+
+
+def _first_step(model: _Model) -> Step:
+    initial = gtsam.Values()
+    initial.insert(_state(0), so3.to_gtsam(model.initial[0]))
+    initial.insert(model.bias.key(0), model.bias_hat)
+    initial.insert(_HELMET_KEY, so3.to_gtsam(model.helmet_guess))
+    initial.insert(_CAMERA_KEY, so3.to_gtsam(so3.identity()))
+    initial.insert(_OFFSET_KEY, np.zeros(1))
+    bias, helmet, camera, offset = model.parameters
+    priors = [
+        vector_prior(bias, np.zeros(3)),
+        rotation_prior(helmet),
+        rotation_prior(camera),
+        vector_prior(offset, np.zeros(1)),
+    ]
+    vision = _vision_factor(model, range(1))
+    return Step(
+        time=float(model.time[0]),
+        initial=initial,
+        factors=[*priors, *vision],
+        timestamps=_timestamps(model, range(1)),
+        keyframes=range(1),
+    )
+
+
+def _step(model: _Model, keyframes: range) -> Step:
+    initial = gtsam.Values()
+    for k in keyframes:
+        initial.insert(_state(k), so3.to_gtsam(model.initial[k]))
+    before = np.array([k - 1 for k in keyframes])
+    after = np.array(keyframes)
+    nodes = model.bias.node_at(0.5 * (model.time[before] + model.time[after]))
+    factors: list[Factor] = []
+    stand_ins: dict[int, int] = {}
+    last_node = int(_node(model, keyframes.start - 1))
+    for node in range(last_node + 1, int(nodes[-1]) + 1):
+        initial.insert(model.bias.key(node), model.bias_hat)
+        factors.append(model.bias.walk_factor(node))
+        if node >= 2:
+            initial.insert(model.bias.mean_key(node - 1), model.bias_hat)
+            factors.append(model.bias.mean_factor(node - 1))
+        stand_ins[model.bias.key(0)] = model.bias.key(node)
+    if keyframes.stop == len(model.time) and model.bias.nodes > 1:
+        end = model.bias.nodes - 1
+        initial.insert(model.bias.mean_key(end), model.bias_hat)
+        factors.append(model.bias.mean_factor(end))
+        stand_ins[model.bias.key(0)] = model.bias.mean_key(end)
+    increments = model.turns[before]
+    turned = model.scale_error * np.linalg.norm(so3.log(increments.wxyz), axis=1)
+    gyro = ahrs_factors(
+        [_state(k) for k in before],
+        [_state(k) for k in after],
+        [model.bias.key(int(n)) for n in nodes],
+        increments,
+        model.bias_hat,
+        model.variance_rate * increments.duration + turned**2 + increments.unseen,
+    )
+    return Step(
+        time=float(model.time[keyframes[-1]]),
+        initial=initial,
+        factors=[*factors, *(Factor("gyro", f) for f in gyro), *_vision_factor(model, keyframes)],
+        predict=partial(_predict, model, keyframes, initial),
+        timestamps=_timestamps(model, keyframes),
+        stand_ins=stand_ins,
+        keyframes=keyframes,
+    )
+
+
+def _node(model: _Model, keyframe: int) -> int:
+    """The bias node of the increment that ends at a keyframe; the first keyframe's is the first node."""
+    if keyframe == 0:
+        return 0
+    return int(model.bias.node_at(0.5 * (model.time[keyframe - 1] + model.time[keyframe])))
+
+
+def _vision_factor(model: _Model, keyframes: range) -> list[Factor]:
+    seen = [k for k in keyframes if model.vision[k] >= 0]
+    if not seen:
+        return []
+    rows = model.vision[seen]
+    rows_model = VisionAttitudeFactor(
+        model.time[seen], model.measured[rows], model.sqrt_information[rows], model.helmet, model.platform
+    )
+    columns: list[int | list[int]] = [
+        [_state(k) for k in seen],
+        [model.bias.key(_node(model, k)) for k in seen],
+        _CAMERA_KEY,
+        _HELMET_KEY,
+        _OFFSET_KEY,
+    ]
+    kinds: list[Kind] = ["rotation", 3, "rotation", "rotation", 1]
+    return [Factor.of("vision", VectorizedFactor(rows_model, columns, kinds, model.loss))]
+
+
+def _timestamps(model: _Model, keyframes: range) -> dict[int, float]:
+    """States age; the bias in force and the mean so far stay alive until the next stretch."""
+    stamps = {_state(k): float(model.time[k]) for k in keyframes}
+    if model.bias.nodes == 1:
+        return stamps
+    now = float(model.time[keyframes[-1]])
+    first, last = _node(model, keyframes.start), _node(model, keyframes[-1])
+    for node in range(first, last + 1):
+        stamps[model.bias.key(node)] = now
+        if node >= 1:
+            stamps[model.bias.mean_key(node - 1)] = now
+    if keyframes.stop == len(model.time):
+        stamps[model.bias.mean_key(model.bias.nodes - 1)] = now
+    return stamps
+
+
+def _predict(model: _Model, keyframes: range, initial: gtsam.Values, current: gtsam.Values) -> gtsam.Values:
+    """The new variables from the current estimate: attitudes carried by the gyro, biases carried over."""
+    out = gtsam.Values()
+    previous = _node(model, keyframes.start - 1)
+    bias = current.atVector(model.bias.key(previous))
+    for key in initial.keys():
+        if gtsam.Symbol(key).chr() in (ord("b"), ord("m")):
+            out.insert(key, bias)
+    attitude = so3.from_gtsam([current.atRot3(_state(keyframes.start - 1))])[0]
+    for k in keyframes:
+        step = model.turns[k - 1]
+        correction = step.bias_jacobian @ (bias - model.bias_hat)
+        attitude = so3.compose(attitude, step.wxyz, so3.exp(correction))
+        out.insert(_state(k), so3.to_gtsam(attitude))
+    return out
+
+
+def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) -> Attitudes:
+    """bRv at the vision frames' true times, stamp + time offset, on the gyro's clock."""
+    seen = [k for k in keyframes if model.vision[k] >= 0]
+    if not seen:
+        return Attitudes(np.empty(0), np.empty((0, 4)))
+    stamps = model.time[seen]
+    at = stamps + float(values.atVector(_OFFSET_KEY)[0])
+    iRv = so3.from_gtsam([values.atRot3(_state(k)) for k in seen])
+    bias = np.array([values.atVector(model.bias.key(_node(model, k))) for k in seen])
+    step = model.helmet.increments(stamps, at)
+    correction = np.einsum("nij,nj->ni", step.bias_jacobian, bias - model.bias_hat)
+    iRv_at = so3.compose(iRv, step.wxyz, so3.exp(correction))
+    if model.platform is None:
+        return Attitudes(at, iRv_at)
+    return Attitudes(at, so3.multiply(so3.inverse(model.platform.attitude(at)), iRv_at))
+
+
+def _advice(weights: Mapping[str, float]) -> str:
+    """The motion that would make a weak direction observable."""
+    strongest = {name.rsplit("_", 1)[0] if name != _OFFSET else name for name, w in weights.items() if abs(w) > 0.3}
+    if {_CAMERA, _HELMET} <= strongest:
+        return "camera and helmet mounts trade against each other: turn the platform about two axes while recording"
+    if _CAMERA in strongest:
+        return "the camera mount needs platform motion: turn the platform about two axes while recording"
+    if _HELMET in strongest:
+        return "the helmet mount needs head motion about two axes: nod and shake the head"
+    if _OFFSET in strongest:
+        return "the time offset needs faster head motion: turn the head back and forth within a second"
+    return "the gyro bias needs a longer recording with vision"

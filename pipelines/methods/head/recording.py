@@ -1,0 +1,194 @@
+"""A recording of the head method as arrays, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.config import Config
+from pipelines.errors import InputError
+from pipelines.recording import series
+from pipelines.recording.checks import (
+    check_overlap,
+    clean,
+    count,
+    nanoseconds,
+    unit_quaternions,
+)
+from pipelines.recording.gyro import read_gyro
+from pipelines.recording.reading import Recording
+from pipelines.recording.topics import TOPICS
+from pipelines.recording.writing import attached, write_session
+from pipelines.vision.recorded import camera_of
+
+Array = NDArray[np.float64]
+
+_NUMBERS = ("head_imu", "platform_imu", "vision_attitude", "truth_attitude")
+_ROTATION = slice(3, 6)  # of the 6x6 covariance of a pose
+
+
+@dataclass(frozen=True, eq=False)
+class HeadData:
+    """What a head session measured. Times are s from epoch_ns (Unix ns), strictly increasing.
+
+    head_t (N,), head_gyro (N, 3) rad/s: helmet gyro w_iv in v. platform_t (M,), platform_gyro (M, 3) rad/s: platform
+    gyro w_ib in b; both None when there is no platform topic. vision_t (K,), vision_wxyz (K, 4): measured cRh, unit.
+    vision_cov (K, 3, 3) rad^2: covariance of delta in R*Exp(delta), delta in h; None if unknown. truth_t (T,),
+    truth_wxyz (T, 4): bRv, for scoring only, or None. gyro_density, platform_gyro_density, rad/s/sqrt(Hz): from the
+    covariances of the messages, None if they say nothing. dropped: reason -> messages.
+    """
+
+    epoch_ns: int
+    head_t: Array
+    head_gyro: Array
+    platform_t: Array | None
+    platform_gyro: Array | None
+    vision_t: Array
+    vision_wxyz: Array
+    vision_cov: Array | None
+    truth_t: Array | None = None
+    truth_wxyz: Array | None = None
+    gyro_density: float | None = None
+    platform_gyro_density: float | None = None
+    dropped: dict[str, int] = field(default_factory=dict)
+
+
+def read_head(recording: Recording, config: Config) -> HeadData:
+    """Read and check a head session; without vision attitudes they are taken from the pictures of the tag board.
+
+    Raises InputError when a topic is missing or unusable, see pipelines.recording.checks, and when the topics have no
+    time in common.
+    """
+    dropped: dict[str, int] = {}
+    epoch = recording.epoch_ns
+    recording.read_together(dict.fromkeys(map(config.topic, _NUMBERS), ()))
+    name = config.topic("head_imu")
+    head_t, head_gyro, density = read_gyro(recording, name, epoch, dropped)
+    spans = {name: head_t}
+
+    platform_t = platform_gyro = platform_density = None
+    name = config.topic("platform_imu")
+    if _wanted(recording, config, "platform_imu"):
+        platform_t, platform_gyro, platform_density = read_gyro(recording, name, epoch, dropped)
+        spans[name] = platform_t
+
+    name = config.topic("vision_attitude")
+    vision_cov: Array | None
+    if name in recording.topics or not _has_pictures(recording, config):
+        vision_t, vision_wxyz, vision_cov = _vision(recording, name, epoch, dropped)
+    else:
+        name = config.topic("image")
+        vision_t, vision_wxyz, vision_cov = _from_pictures(recording, config, epoch, dropped)
+    check_overlap({**spans, name: vision_t})
+
+    truth_t = truth_wxyz = None
+    if _wanted(recording, config, "truth_attitude"):
+        truth_t, truth_wxyz, _ = _vision(recording, config.topic("truth_attitude"), epoch, dropped)
+    return HeadData(
+        epoch,
+        head_t,
+        head_gyro,
+        platform_t,
+        platform_gyro,
+        vision_t,
+        vision_wxyz,
+        vision_cov,
+        truth_t,
+        truth_wxyz,
+        density,
+        platform_density,
+        dropped,
+    )
+
+
+def write_head(
+    path: Path | str,
+    data: HeadData,
+    truth: Mapping[str, float] | None = None,
+    config_yaml: str | None = None,
+    pictures: tuple[series.CameraInfo, series.ImageSeries] | None = None,
+) -> None:
+    """Write a head session under the default topic names, with its truth and config as attachments.
+
+    Given pictures, they take the place of vision's attitudes. Stamps are rounded to ns. read_head gives the same data
+    back if the first sample is the one at t = 0.
+    """
+
+    def imu(t: Array, gyro: Array, density: float | None) -> series.ImuSeries:
+        variance = 0.0 if density is None else density**2 / np.median(np.diff(t))
+        t_ns = nanoseconds(t, data.epoch_ns)
+        return series.ImuSeries(t_ns, gyro, gyro_cov=variance * np.eye(3), frame_id="imu")
+
+    topics: dict[str, series.Topic] = {
+        TOPICS["head_imu"].name: imu(data.head_t, data.head_gyro, data.gyro_density),
+    }
+    if data.platform_t is not None and data.platform_gyro is not None:
+        topics[TOPICS["platform_imu"].name] = imu(data.platform_t, data.platform_gyro, data.platform_gyro_density)
+    if pictures is None:
+        cov = np.zeros((len(data.vision_t), 6, 6))
+        if data.vision_cov is not None:
+            cov[:, _ROTATION, _ROTATION] = data.vision_cov
+        t_ns = nanoseconds(data.vision_t, data.epoch_ns)
+        topics[TOPICS["vision_attitude"].name] = series.PoseSeries(t_ns, data.vision_wxyz, cov=cov, frame_id="camera")
+    else:
+        topics[TOPICS["camera_info"].name], topics[TOPICS["image"].name] = pictures
+    if data.truth_t is not None and data.truth_wxyz is not None:
+        t_ns = nanoseconds(data.truth_t, data.epoch_ns)
+        topics[TOPICS["truth_attitude"].name] = series.QuaternionSeries(t_ns, data.truth_wxyz, frame_id="platform")
+    write_session(path, topics, attached(truth, config_yaml))
+
+
+def _wanted(recording: Recording, config: Config, key: str) -> bool:
+    """Whether an optional topic is there, or the config asks for it by name."""
+    return config.topic(key) in recording.topics or key in config.topics
+
+
+def _has_pictures(recording: Recording, config: Config) -> bool:
+    return config.topic("image") in recording.topics and "vision_attitude" not in config.topics
+
+
+def _from_pictures(
+    recording: Recording, config: Config, epoch_ns: int, dropped: dict[str, int]
+) -> tuple[Array, Array, Array]:
+    """Attitudes of the helmet's tag board, seen in the pictures."""
+    from pipelines.vision.board import board_attitudes
+    from pipelines.vision.pose import TagBody
+
+    topic = config.topic("image")
+    if config.head.board is None or not config.head.board.tags:
+        raise InputError(
+            f"topic {topic}: the pictures need the tags on the helmet: give them in the config as head.board"
+        )
+    camera = camera_of(recording, config)
+    board = TagBody.from_board(config.head.board)
+    seen = board_attitudes(recording.images(topic), camera, board, config.noise.corner_px)
+    for reason, number in seen.dropped.items():
+        count(dropped, f"{topic}: {reason}", number)
+    t, keep = clean(topic, seen.t_ns, epoch_ns, seen.cRh, dropped)
+    return t, seen.cRh[keep], seen.covariance[keep]
+
+
+def _vision(
+    recording: Recording, topic: str, epoch_ns: int, dropped: dict[str, int]
+) -> tuple[Array, Array, Array | None]:
+    poses = recording.poses(topic)
+    count(dropped, f"{topic}: stamped by log time (kept)", poses.stamped_by_log)
+    t, keep = clean(topic, poses.t_ns, epoch_ns, poses.wxyz, dropped)
+    wxyz = unit_quaternions(topic, t, poses.wxyz[keep])
+    cov = poses.cov[keep][:, _ROTATION, _ROTATION]
+    known = np.abs(cov).max(axis=(1, 2)) > 0.0
+    if not known.any():
+        return t, wxyz, None
+    count(dropped, f"{topic}: no covariance, unlike the others", int(np.count_nonzero(~known)))
+    t, wxyz, cov = t[known], wxyz[known], cov[known]
+    bad = np.flatnonzero(~(np.linalg.eigvalsh(0.5 * (cov + cov.swapaxes(1, 2)))[:, 0] > 0.0))
+    if len(bad):
+        raise InputError(
+            f"topic {topic}: the covariance of the rotation at {t[bad[0]]:.6f} s is not positive definite "
+            f"(and {len(bad) - 1} more); all zeros would mean that it is unknown"
+        )
+    return t, wxyz, cov

@@ -1,0 +1,236 @@
+"""Simulator of the `head` method: helmet IMU, platform IMU and vision, with exact rotations.
+
+Frames: v helmet IMU, b platform, c camera on the platform, h marker on the helmet, n level East-North-Up, and i, which
+does not turn and is n at t = 0. All attitudes are closed-form functions of time. A gyro sample is Log of the exact
+rotation over its interval, centred on its stamp, divided by the interval: the product of Exp(sample * interval) is the
+true attitude at the end of every interval, with no integration error.
+"""
+
+from __future__ import annotations
+
+from io import StringIO
+from pathlib import Path
+from typing import Annotated, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from factors import so3
+from factors.earth import earth_rate
+from pipelines.errors import InputError
+from pipelines.methods.head.pictures import HeadPictures, draw
+from pipelines.methods.head.recording import HeadData, write_head
+from pipelines.recording import series
+from pipelines.recording.checks import nanoseconds
+from pipelines.simulation.motion import EulerMotion, Swing, sample_times
+from pipelines.simulation.scenario import load_scenario
+
+Array = NDArray[np.float64]
+
+# 2026-11-20 12:00 UTC: simulated sessions start here.
+EPOCH_NS = 1_795_176_000_000_000_000
+Positive = Annotated[float, Field(gt=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+Fraction = Annotated[float, Field(ge=0.0, lt=1.0)]
+Vector = tuple[float, float, float]
+
+
+class HeadNoise(BaseModel):
+    """Noise of the sensors, under the names the recording's config gives them."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    gyro_density: NotNegative = 1e-4  # rad/s/sqrt(Hz)
+    gyro_bias_walk: NotNegative = 1e-6  # rad/s/sqrt(s)
+    platform_gyro_density: NotNegative = 1e-5  # rad/s/sqrt(Hz)
+    vision_attitude: NotNegative = 8.7e-3  # rad per axis of frame h
+
+
+class HeadScenario(BaseModel):
+    """What the `head` simulator is asked for; every key has a default."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    duration_s: Positive = 60.0
+    head: EulerMotion = EulerMotion(
+        yaw=[Swing(amplitude_deg=40, frequency_hz=0.13), Swing(amplitude_deg=10, frequency_hz=0.47)],
+        pitch=[Swing(amplitude_deg=20, frequency_hz=0.19), Swing(amplitude_deg=8, frequency_hz=0.53)],
+        roll=[Swing(amplitude_deg=15, frequency_hz=0.23), Swing(amplitude_deg=6, frequency_hz=0.61)],
+    )  # bRv
+    platform: EulerMotion | None = None  # nRb; null: at rest, and no platform topic
+    latitude_deg: float | None = 40.0  # of the earth's turning; null: the earth stands still
+    noise: HeadNoise = HeadNoise()
+    gyro_turn_on_bias_deg_s: NotNegative = 0.3  # sigma per axis of the bias at the start
+    helmet_mount_deg: Vector = (0.0, 0.0, 0.0)  # rotation vector of vRh
+    camera_mount_deg: Vector = (0.0, 0.0, 0.0)  # rotation vector of cRb
+    time_offset_s: float = 0.0  # positive: the picture was taken later than its stamp says
+    gyro_rate_hz: Positive = 400.0
+    gyro_phase: Fraction = 0.0  # of the first stamp, in sample intervals; likewise below
+    platform_gyro_rate_hz: Positive = 200.0
+    platform_gyro_phase: Fraction = 0.3
+    vision_rate_hz: Positive = 30.0
+    vision_phase: Fraction = 0.6
+    truth_rate_hz: Positive = 100.0
+    vision_outages_s: list[tuple[float, float]] = []  # [start, end) of each gap
+    outlier_fraction: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    outlier_deg: NotNegative = 20.0  # an outlier is turned this far about a random axis
+    pictures: HeadPictures = HeadPictures()  # when pictures are asked for: they take the place of vision's attitudes
+    priors: dict[str, float | None] = {}  # passed on to the recording's config
+
+    @model_validator(mode="after")
+    def _outages_are_ordered(self) -> Self:
+        if any(end <= start for start, end in self.vision_outages_s):
+            raise ValueError("vision_outages_s: each gap is [start, end] with start before end")
+        return self
+
+
+def simulate_head(scenario: HeadScenario, seed: int) -> tuple[HeadData, dict[str, float]]:
+    """A session and the true values of its parameters (rad/s, rad, s; the bias is its mean over the session)."""
+    rng = np.random.default_rng(seed)
+    noise = scenario.noise
+    head_t, head_rate = _gyro(scenario, scenario.gyro_rate_hz, scenario.gyro_phase, helmet=True)
+    bias = _walking_bias(scenario, len(head_t), rng)
+    head_gyro = head_rate + bias + _white(noise.gyro_density, scenario.gyro_rate_hz, len(head_t), rng)
+    platform_t = platform_gyro = None
+    if scenario.platform is not None:
+        rate_hz = scenario.platform_gyro_rate_hz
+        platform_t, platform_gyro = _gyro(scenario, rate_hz, scenario.platform_gyro_phase, helmet=False)
+        platform_gyro = platform_gyro + _white(noise.platform_gyro_density, rate_hz, len(platform_t), rng)
+    vision_t, vision_wxyz = _vision(scenario, rng)
+    truth_t = sample_times(scenario.duration_s, scenario.truth_rate_hz)
+    variance = noise.vision_attitude**2
+    data = HeadData(
+        epoch_ns=EPOCH_NS,
+        head_t=head_t,
+        head_gyro=head_gyro,
+        platform_t=platform_t,
+        platform_gyro=platform_gyro,
+        vision_t=vision_t,
+        vision_wxyz=vision_wxyz,
+        vision_cov=np.tile(variance * np.eye(3), (len(vision_t), 1, 1)) if variance > 0.0 else None,
+        truth_t=truth_t,
+        truth_wxyz=scenario.head.attitude(truth_t),
+        dropped={},
+        gyro_density=noise.gyro_density or None,
+        platform_gyro_density=(noise.platform_gyro_density or None) if scenario.platform else None,
+    )
+    return data, _truth(scenario, bias)
+
+
+def simulate_pictures(scenario: HeadScenario, seed: int) -> tuple[series.CameraInfo, series.ImageSeries]:
+    """The pictures from which the attitudes of such a session can be measured; drawn one by one as they are taken.
+
+    Raises:
+        InputError: the scenario has outliers, which are made of attitudes, or impossible distortion.
+    """
+    if scenario.outlier_fraction > 0.0:
+        raise InputError("outlier_fraction: pictures are simulated without outliers; leave out --images")
+    t, cRh = _sights(scenario)
+    rng = np.random.default_rng(seed)
+    return draw(scenario.pictures, t + scenario.time_offset_s, nanoseconds(t, EPOCH_NS), cRh, rng)
+
+
+def head_config(scenario: HeadScenario, images: bool = False) -> str:
+    """The recording's config (YAML): the noise that was simulated, the scenario's priors and, of pictures, the board.
+
+    Attitudes from pictures bring their own covariance.
+    """
+    from ruamel.yaml import YAML
+
+    noise = scenario.noise.model_dump()
+    if scenario.platform is None:
+        del noise["platform_gyro_density"]
+    config = {"method": "head", "noise": noise, "priors": scenario.priors}
+    if images:
+        del noise["vision_attitude"]
+        config["head"] = {"board": scenario.pictures.board.model_dump()}
+    text = StringIO()
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = False
+    yaml.dump(config, text)
+    return text.getvalue()
+
+
+def _platform_attitude(scenario: HeadScenario, t: Array) -> Array:
+    """iRb, shape (N, 4)."""
+    if scenario.latitude_deg is None:
+        iRn = so3.identity(len(t))
+    else:
+        iRn = so3.exp(t[:, None] * earth_rate(np.deg2rad(scenario.latitude_deg)))
+    return iRn if scenario.platform is None else so3.multiply(iRn, scenario.platform.attitude(t))
+
+
+def _gyro(scenario: HeadScenario, rate_hz: float, phase: float, helmet: bool) -> tuple[Array, Array]:
+    """Stamps and error-free samples of the helmet's gyro (in v) or the platform's (in b), rad/s."""
+    t = sample_times(scenario.duration_s, rate_hz, phase)
+    edges: Array = (np.arange(len(t) + 1, dtype=float) + (phase - 0.5)) / rate_hz
+    attitude = _platform_attitude(scenario, edges)
+    if helmet:
+        attitude = so3.multiply(attitude, scenario.head.attitude(edges))
+    return t, so3.log(so3.multiply(so3.inverse(attitude[:-1]), attitude[1:])) * rate_hz
+
+
+def _white(density: float, rate_hz: float, n: int, rng: np.random.Generator) -> Array:
+    return density * np.sqrt(rate_hz) * rng.standard_normal((n, 3))
+
+
+def _walking_bias(scenario: HeadScenario, n: int, rng: np.random.Generator) -> Array:
+    start = np.deg2rad(scenario.gyro_turn_on_bias_deg_s) * rng.standard_normal(3)
+    steps = scenario.noise.gyro_bias_walk / np.sqrt(scenario.gyro_rate_hz) * rng.standard_normal((n, 3))
+    return np.asarray(start + np.cumsum(steps, axis=0))
+
+
+def _sights(scenario: HeadScenario) -> tuple[Array, Array]:
+    """Stamps of what vision sees and exact cRh, shape (K, 4)."""
+    t = sample_times(scenario.duration_s, scenario.vision_rate_hz, scenario.vision_phase)
+    seen = np.ones(len(t), dtype=bool)
+    for start, end in scenario.vision_outages_s:
+        seen &= (t < start) | (t >= end)
+    t = t[seen]
+    cRb, vRh = _mount(scenario.camera_mount_deg), _mount(scenario.helmet_mount_deg)
+    return t, so3.compose(cRb, scenario.head.attitude(t + scenario.time_offset_s), vRh)
+
+
+def _vision(scenario: HeadScenario, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Stamps and measured cRh, shape (K, 4)."""
+    t, cRh = _sights(scenario)
+    n = len(t)
+    error = so3.exp(scenario.noise.vision_attitude * rng.standard_normal((n, 3)))
+    axis = rng.standard_normal((n, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    is_outlier = rng.random(n) < scenario.outlier_fraction
+    jump = so3.exp(axis * (np.deg2rad(scenario.outlier_deg) * is_outlier)[:, None])
+    return t, so3.compose(cRh, error, jump)
+
+
+def _mount(rotation_vector_deg: Vector) -> Array:
+    return so3.exp(np.deg2rad(rotation_vector_deg))
+
+
+def _truth(scenario: HeadScenario, bias: Array) -> dict[str, float]:
+    vectors = {
+        "gyro_bias": bias.mean(axis=0),
+        "helmet_mount": np.deg2rad(scenario.helmet_mount_deg),
+        "camera_mount": np.deg2rad(scenario.camera_mount_deg),
+    }
+    truth = {
+        f"{name}_{axis}": float(value)
+        for name, vector in vectors.items()
+        for axis, value in zip("xyz", vector, strict=True)
+    }
+    return truth | {"time_offset": scenario.time_offset_s}
+
+
+def write_simulation(scenario: str | None, seed: int, out: Path, images: bool) -> None:
+    """Simulate a scenario and write it as a session with its truth.
+
+    By name or file; None is head_nominal, or head_pictures with images.
+
+    Raises:
+        InputError: no such scenario, or it cannot be drawn or written.
+    """
+    settings = load_scenario(HeadScenario, scenario or ("head_pictures" if images else "head_nominal"))
+    data, truth = simulate_head(settings, seed)
+    pictures = simulate_pictures(settings, seed) if images else None
+    write_head(out, data, truth, head_config(settings, images), pictures)

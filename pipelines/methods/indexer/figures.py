@@ -1,0 +1,118 @@
+"""Figures of the indexer method: half differences, misfit by turn, what each position says, attitude output."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from factors import so3
+from factors.indexer import IndexerAverageFactor, mounting
+from pipelines.config import Config, load_config
+from pipelines.errors import InputError
+from pipelines.graph.problem import Array
+from pipelines.methods.indexer.graph import BIAS, THETA, Group, groups_of, misfit, validate
+from pipelines.methods.indexer.published import half_differences
+from pipelines.methods.indexer.recording import IndexerData
+from pipelines.methods.indexer.runs import axis_motion
+from pipelines.reports.plots import COLORS, add_line, add_points, figure
+from pipelines.reports.result import Calibration, Plot
+
+_ARCSEC = np.rad2deg(1.0) * 3600.0
+_AXES = "xyz"
+
+
+def indexer_plots(data: IndexerData, calibration: Calibration) -> list[Plot]:
+    """The method's own figures; those that the recording has no data for are left out."""
+    config = load_config(calibration.config_text.encode())
+    values = dict(zip(calibration.estimate.names, calibration.estimate.values.tolist(), strict=True))
+    turning = [g for g in groups_of(data, config, axis_motion(data)) if g.position is not None]
+    plots = [_misfit(turning, values), _contributions(turning, values)]
+    half = _half_differences(data, values)
+    if half is not None:
+        plots.insert(0, half)
+    if data.attitude is not None:
+        plots.insert(0, _attitude(data, config, values))
+    return plots
+
+
+def _angles(values: dict[str, float]) -> Array:
+    return np.array([values.get(name, 0.0) for name in THETA])
+
+
+def _half_differences(data: IndexerData, values: dict[str, float]) -> Plot | None:
+    """Direction of each position's half difference across its axis, before and after turning it by theta."""
+    try:
+        found = half_differences(data)
+    except InputError:
+        return None
+    out = figure("across the axis, arcsec", x_title="position")
+    rows = []
+    for name, theta, color in (
+        ("as measured", np.zeros(3), COLORS[6]),
+        ("compensated", _angles(values), COLORS[0]),
+    ):
+        labels, across = [], []
+        for half in found:
+            in_t = so3.rotate(mounting(theta), half.rate) / np.linalg.norm(half.rate) * _ARCSEC
+            for axis in (1, 2) if half.axis == "outer" else (0, 1):
+                labels.append(f"{half.position} {_AXES[axis]}t")
+                across.append(float(in_t[axis]))
+        out.add_bar(x=labels, y=across, name=name, marker_color=color)
+        rows.append(across)
+    return Plot(
+        "Half differences",
+        "Half the difference of the forward and the backward mean rate: components across the axis in the platform's "
+        f"frame. After compensation the largest is {np.abs(rows[1]).max():.3g} arcsec.",
+        out,
+    )
+
+
+def _misfit(turning: list[Group], values: dict[str, float]) -> Plot:
+    """Mean gyro less prediction over each turn or move, as an angle of the axis."""
+    out = figure("gyro less encoders, arcsec")
+    time, error = misfit(turning, values)
+    for i, axis in enumerate(_AXES):
+        add_points(out, time, error[:, i] * _ARCSEC, f"{axis}t", COLORS[i], 6)
+    return Plot(
+        "Misfit by turn",
+        "Mean rate of each turn or move less what encoders, earth and calibration say, over the rate: the angle by "
+        "which the axis seems to be off.",
+        out,
+    )
+
+
+def _contributions(turning: list[Group], values: dict[str, float]) -> Plot:
+    """Share of each position in what is known of the angles."""
+    information: dict[str, Array] = {}
+    for group in turning:
+        n = len(group.gyro)
+        factor = IndexerAverageFactor.of(group.gyro, group.rates, 1.0, 0.0)
+        bias = [values.get(name, 0.0) for name in BIAS]
+        by_theta = factor(*(np.tile(block, (n, 1)) for block in (_angles(values), bias)))[1]()[0].reshape(-1, 3)
+        position = f"{group.run.axis}, other at {round(np.rad2deg(group.run.other)) % 360} deg"
+        information[position] = information.get(position, np.zeros(3)) + (by_theta**2).sum(axis=0)
+    total = np.sum(list(information.values()), axis=0)
+    out = figure("share, %", x_title="")
+    for (position, own), color in zip(information.items(), [*COLORS] * len(information), strict=False):
+        out.add_bar(x=list(THETA), y=100.0 * own / np.maximum(total, 1e-300), name=position, marker_color=color)
+    out.update_layout(barmode="stack")
+    return Plot(
+        "What each position says",
+        "Share of the turns and moves about each axis, the other axis standing at an angle, in the information on the "
+        "mounting angles by gyro noise alone.",
+        out,
+    )
+
+
+def _attitude(data: IndexerData, config: Config, values: dict[str, float]) -> Plot:
+    """Error of the carrier's attitude put out, before and after compensation."""
+    found = validate(data, config, values)[0]
+    out = figure("attitude error, deg")
+    said = []
+    for name, error, color in (("before", found.before, COLORS[6]), ("after", found.after, COLORS[0])):
+        angle = np.rad2deg(np.linalg.norm(error, axis=1))
+        add_line(out, found.time, angle, name, color)
+        rms = float(np.sqrt((angle**2).mean()))
+        said.append(f"{name} compensation {rms:.4g} deg ({3600.0 * rms:.3g} arcsec) RMS")
+    out.add_hline(y=0.005, line_dash="dash", annotation_text="published claim")
+    out.update_yaxes(type="log")
+    return Plot("Attitude output", "Angle between nRb put out and the base's attitude: " + ", ".join(said) + ".", out)

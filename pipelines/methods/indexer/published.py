@@ -1,0 +1,263 @@
+"""The published calibration of a two-axis indexer: half differences of whole turns, and the thin-shell search.
+
+CN115265591B: in each of four positions the platform turns uniformly forward and back. Half the difference of the two
+mean gyro rates is free of bias and of the earth's rate, and turned into the platform's frame t its components across
+the axis vanish: Yt and Zt in positions 1 and 2 (outer axis), Xt and Yt in positions 3 and 4 (inner axis). The cost is
+the sum of squares of those eight. Angles and passive matrices as published, C_t^m = Rx(theta_x) Ry(theta_y)
+Rz(theta_z). Methods page, section 2; the formulas of the eight equations were lost and are given there as they must
+have been.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from factors import so3
+from pipelines.config import DEFAULT_NOISE, Config, first_given
+from pipelines.errors import InputError
+from pipelines.graph.problem import Estimate, Problem
+from pipelines.methods.indexer.recording import IndexerData
+from pipelines.methods.indexer.runs import AxisMotion, Run, axis_motion
+
+Array = NDArray[np.float64]
+NAMES = ("theta_x", "theta_y", "theta_z")
+
+# The other axis stands at 0 or at half a turn within this, rad.
+_ANGLE_TOLERANCE = np.deg2rad(5.0)
+# A cost that changes by less than this over the start interval, relatively, does not depend on the angle.
+_FLAT = 1e-9
+
+
+@dataclass(frozen=True)
+class HalfDifference:
+    """Of one position.
+
+    Attributes:
+        position: 1 and 2 outer axis, 3 and 4 inner axis, with the other at 0 and at half a turn.
+        axis: the one that turns.
+        rate: (3,) half the forward mean less the backward mean, in m, rad/s.
+        duration: s, of all the whole turns together.
+    """
+
+    position: int
+    axis: Literal["outer", "inner"]
+    rate: Array
+    duration: float
+
+
+@dataclass(frozen=True)
+class ThinShell:
+    """What the search found.
+
+    Attributes:
+        theta: (3,) rad.
+        cost: sum of squares at theta, (rad/s)^2.
+        half_differences: what the cost was made of.
+        sweeps: theta (sweeps, 3) after each sweep.
+        fourth_cases: how often each angle's search met s_min < s_mean > s_max, which the publication does not name: the
+            half with the lower end was kept.
+        flat: for each angle, whether the cost did not depend on it: it then stays at the middle of its interval.
+        at_edge: for each angle, whether it ended at an edge of its start interval: it may lie outside.
+    """
+
+    theta: Array
+    cost: float
+    half_differences: tuple[HalfDifference, ...]
+    sweeps: Array
+    fourth_cases: tuple[int, int, int]
+    flat: tuple[bool, bool, bool]
+    at_edge: tuple[bool, bool, bool]
+
+
+def thin_shell(
+    data: IndexerData, half_width: float = np.deg2rad(2.0), iterations: int = 28, sweeps: int = 1
+) -> ThinShell:
+    """Calibrate from a session.
+
+    Args:
+        data: the session; the base is level and points north, as the schedule of the publication asks.
+        half_width: of the start interval about zero, rad.
+        iterations: limit for each angle.
+        sweeps: how often the three angles are gone through; published is one.
+
+    Raises:
+        InputError: no position has whole turns forward and back.
+    """
+    return search(half_differences(data), half_width, iterations, sweeps)
+
+
+def published_estimate(data: IndexerData, config: Config, problem: Problem) -> Estimate:
+    """One sweep of the search as a solver of the problem: it knows the angles theta.
+
+    The publication gives no accuracy; the covariance is what gyro noise alone does to the eight components.
+    """
+    start = time.perf_counter()
+    found = thin_shell(data)
+    density = first_given(config.noise.gyro_density, data.gyro_density, DEFAULT_NOISE.gyro_density)
+    known = {q.name for q in problem.quantities}
+    notes = [f"{name} has no influence on the cost" for name, flat in zip(NAMES, found.flat, strict=True) if flat]
+    notes += [f"{name} at the edge of +-2 deg" for name, edge in zip(NAMES, found.at_edge, strict=True) if edge]
+    if any(found.fourth_cases):
+        notes.append(f"fourth case met {sum(found.fourth_cases)} times")
+    return Estimate(
+        solver="published",
+        names=tuple(name for name in NAMES if name in known),
+        values=found.theta,
+        covariance=_covariance(found, density),
+        converged=not any(found.flat) and not any(found.at_edge),
+        message="; ".join(notes) or "one sweep",
+        seconds={"solve": time.perf_counter() - start},
+    )
+
+
+def _covariance(found: ThinShell, density: float) -> Array:
+    """(3, 3) rad^2: white gyro noise through the eight components; an angle without influence gets 1 rad."""
+    step = 1e-6
+    information = np.eye(3)
+    for i, half in enumerate(found.half_differences):
+        sides = [[_across(found.theta + s * d, found.half_differences)[i] for d in step * np.eye(3)] for s in (1, -1)]
+        jacobian = (np.array(sides[0]) - np.array(sides[1])).T / (2.0 * step)
+        # Half the difference of two means over half of the time each.
+        information += jacobian.T @ jacobian * half.duration / density**2
+    return np.asarray(np.linalg.inv(information))
+
+
+def half_differences(data: IndexerData) -> tuple[HalfDifference, ...]:
+    """Of the positions that the recording has, in their order; several visits of a position are averaged.
+
+    Raises:
+        InputError: no position has whole turns forward and back.
+    """
+    motion = axis_motion(data)
+    means: dict[int, dict[int, list[Array]]] = {p: {1: [], -1: []} for p in (1, 2, 3, 4)}
+    duration = dict.fromkeys(means, 0.0)
+    for run in motion.runs:
+        position = _position(run)
+        if position is not None and run.whole_turns:
+            mean, length = _mean_over_whole_turns(data, motion, run)
+            means[position][run.direction].append(mean)
+            duration[position] += length
+    found = tuple(
+        HalfDifference(
+            position,
+            "outer" if position <= 2 else "inner",
+            np.asarray(0.5 * (np.mean(both[1], axis=0) - np.mean(both[-1], axis=0))),
+            duration[position],
+        )
+        for position, both in means.items()
+        if both[1] and both[-1]
+    )
+    if not found:
+        raise InputError(
+            "indexer: the published search needs whole turns forward and back about an axis while the other stands at "
+            "0 or 180 degrees; the graph solvers do without"
+        )
+    return found
+
+
+def cost(theta: ArrayLike, measured: Sequence[HalfDifference]) -> float:
+    """Sum of squares of the components across the axis in t, (rad/s)^2, at theta (3,), rad."""
+    return sum(float(row @ row) for row in _across(theta, measured))
+
+
+def _across(theta: ArrayLike, measured: Sequence[HalfDifference]) -> list[Array]:
+    """Components (2,) across the axis in t of each half difference, rad/s."""
+    x, y, z = np.asarray(theta, dtype=float)
+    ex, ey, ez = np.eye(3)
+    C_m_t = so3.compose(so3.exp(z * ez), so3.exp(y * ey), so3.exp(x * ex))
+    in_t = [so3.rotate(C_m_t, half.rate) for half in measured]
+    return [rate[1:] if half.axis == "outer" else rate[:2] for rate, half in zip(in_t, measured, strict=True)]
+
+
+def search(measured: tuple[HalfDifference, ...], half_width: float, iterations: int = 28, sweeps: int = 1) -> ThinShell:
+    """The thin-shell search over theta_x, then theta_y, then theta_z, each with the others where they are."""
+    theta = np.zeros(3)
+    after: list[Array] = []
+    tally = _Tally()
+    for _ in range(sweeps):
+        tally = _Tally()
+        for axis in range(3):
+            theta[axis] = _shell(theta, axis, measured, half_width, iterations, tally)
+        after.append(theta.copy())
+    at_edge = tuple(bool(half_width - abs(angle) < 1e-6 * half_width) for angle in theta)
+    return ThinShell(
+        theta=theta,
+        cost=cost(theta, measured),
+        half_differences=measured,
+        sweeps=np.array(after),
+        fourth_cases=(tally.fourth[0], tally.fourth[1], tally.fourth[2]),
+        flat=(tally.flat[0], tally.flat[1], tally.flat[2]),
+        at_edge=(at_edge[0], at_edge[1], at_edge[2]),
+    )
+
+
+@dataclass
+class _Tally:
+    """What a sweep met, by angle."""
+
+    fourth: list[int] = field(default_factory=lambda: [0, 0, 0])
+    flat: list[bool] = field(default_factory=lambda: [False, False, False])
+
+
+def _shell(
+    theta: Array, axis: int, measured: Sequence[HalfDifference], half_width: float, iterations: int, tally: _Tally
+) -> float:
+    """The angle of one axis."""
+
+    def at(angle: float) -> float:
+        trial = theta.copy()
+        trial[axis] = angle
+        return cost(trial, measured)
+
+    low, high = -half_width, half_width
+    for iteration in range(iterations):
+        middle = 0.5 * (low + high)
+        s_low, s_middle, s_high = at(low), at(middle), at(high)
+        if iteration == 0 and max(s_low, s_high) - min(s_low, s_middle, s_high) <= _FLAT * s_middle:
+            tally.flat[axis] = True
+            break
+        if s_low > s_middle < s_high:
+            low, high = 0.5 * (middle + low), 0.5 * (middle + high)
+        elif s_low <= s_middle <= s_high:
+            high = middle
+        elif s_low >= s_middle >= s_high:
+            low = middle
+        else:
+            tally.fourth[axis] += 1
+            low, high = (low, middle) if s_low <= s_high else (middle, high)
+    return 0.5 * (low + high)
+
+
+def _position(run: Run) -> int | None:
+    """Number of the published position a run belongs to, None for another."""
+    if run.axis not in ("outer", "inner"):
+        return None
+    off_zero = abs((run.other + np.pi) % (2.0 * np.pi) - np.pi)
+    first = 1 if run.axis == "outer" else 3
+    if off_zero < _ANGLE_TOLERANCE:
+        return first
+    return first + 1 if np.pi - off_zero < _ANGLE_TOLERANCE else None
+
+
+def _mean_over_whole_turns(data: IndexerData, motion: AxisMotion, run: Run) -> tuple[Array, float]:
+    """Mean gyro rate (3,) from the time a run has turned a little to whole turns later, by the encoder, and how long.
+
+    The turns start behind the ramp, since the publication averages uniform turning; a run without turns to spare is
+    taken from its start.
+    """
+    first, last = np.searchsorted(motion.t, [run.start, run.stop])
+    t = motion.t[first : last + 1]
+    angle = motion.angles[first : last + 1, 0 if run.axis == "outer" else 1]
+    path = np.maximum.accumulate(np.abs(angle - angle[0]))
+    spare = max(path[-1] - 2.0 * np.pi * run.whole_turns, 0.0)
+    begin, end = np.interp([0.5 * spare, path[-1] - 0.5 * spare], path + 1e-12 * np.arange(len(path)), t)
+    # A sample is the mean over the interval about its stamp; those at the ends count with the part inside.
+    edges = np.concatenate([[-np.inf], 0.5 * (data.gyro_t[1:] + data.gyro_t[:-1]), [np.inf]])
+    inside = np.clip(np.minimum(edges[1:], end) - np.maximum(edges[:-1], begin), 0.0, None)
+    return np.asarray(inside @ data.gyro / inside.sum()), float(inside.sum())

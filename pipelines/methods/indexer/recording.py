@@ -1,0 +1,130 @@
+"""A recording of the indexer method as arrays, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.config import Config
+from pipelines.errors import InputError
+from pipelines.recording import series
+from pipelines.recording.checks import (
+    check_overlap,
+    clean,
+    count,
+    gyro_density,
+    nanoseconds,
+    unit_quaternions,
+)
+from pipelines.recording.gyro import usable
+from pipelines.recording.reading import Recording
+from pipelines.recording.topics import TOPICS
+from pipelines.recording.writing import attached, write_session
+
+Array = NDArray[np.float64]
+
+JOINTS = ("outer_x", "inner_z")
+
+
+@dataclass(frozen=True)
+class IndexerData:
+    """What an indexer session has measured. Times are s from epoch_ns (Unix ns), strictly increasing.
+
+    gyro_t (N,), gyro (N, 3) rad/s: rate w_im of the IMU on the indexer, in m. encoder_t (M,), outer (M,), inner (M,)
+    rad: axis angles as recorded, wrapped or continuous. latitude_deg: from /fix or the config, None if unknown.
+    attitude (N, 4): nRm as the INS puts it out with each gyro sample, unit, or None. gyro_density, rad/s/sqrt(Hz): from
+    the covariances of the messages, None if they say nothing. dropped: reason -> messages.
+    """
+
+    epoch_ns: int
+    gyro_t: Array
+    gyro: Array
+    encoder_t: Array
+    outer: Array
+    inner: Array
+    latitude_deg: float | None
+    attitude: Array | None = None
+    gyro_density: float | None = None
+    dropped: dict[str, int] = field(default_factory=dict)
+
+
+def read_indexer(recording: Recording, config: Config) -> IndexerData:
+    """Read and check an indexer session.
+
+    Raises InputError when a topic is missing or unusable, see pipelines.recording.checks, and when gyro and encoders
+    have no time in common. A missing latitude is left to the method, which knows whether it is needed.
+    """
+    dropped: dict[str, int] = {}
+    epoch = recording.epoch_ns
+    imu_topic, encoder_topic = config.topic("imu"), config.topic("indexer")
+    recording.read_together({imu_topic: (), encoder_topic: JOINTS, config.topic("fix"): ()})
+    imu = recording.imu(imu_topic)
+    gyro_t, keep = usable(imu_topic, imu, epoch, dropped, least=3)
+    gyro = imu.gyro[keep]
+    attitude = None
+    if (imu.wxyz_cov[keep, 0, 0] >= 0.0).all() and np.ptp(imu.wxyz[keep], axis=0).any():
+        attitude = unit_quaternions(imu_topic, gyro_t, imu.wxyz[keep])
+
+    joints = recording.joints(encoder_topic, JOINTS)
+    count(dropped, f"{encoder_topic}: stamped by log time (kept)", joints.stamped_by_log)
+    count(dropped, f"{encoder_topic}: without both joints", joints.without)
+    encoder_t, used = clean(encoder_topic, joints.t_ns, epoch, joints.position, dropped, least=3)
+    outer, inner = joints.position[used].T
+    check_overlap({imu_topic: gyro_t, encoder_topic: encoder_t})
+    return IndexerData(
+        epoch,
+        gyro_t,
+        gyro,
+        encoder_t,
+        outer,
+        inner,
+        _latitude(recording, config),
+        attitude,
+        gyro_density(gyro_t, imu.gyro_cov),
+        dropped,
+    )
+
+
+def write_indexer(
+    path: Path | str, data: IndexerData, truth: Mapping[str, float] | None = None, config_yaml: str | None = None
+) -> None:
+    """Write an indexer session under the default topic names, with its truth and config as attachments.
+
+    Stamps are rounded to ns. read_indexer gives the same data back if the first sample is the one at t = 0.
+    """
+    gyro_ns, encoder_ns = nanoseconds(data.gyro_t, data.epoch_ns), nanoseconds(data.encoder_t, data.epoch_ns)
+    variance = 0.0 if data.gyro_density is None else data.gyro_density**2 / np.median(np.diff(data.gyro_t))
+    orientation: dict[str, Any] = {} if data.attitude is None else {"wxyz": data.attitude, "wxyz_cov": np.zeros((3, 3))}
+    imu = series.ImuSeries(gyro_ns, data.gyro, gyro_cov=variance * np.eye(3), frame_id="imu", **orientation)
+    angles = np.column_stack([data.outer, data.inner])
+    topics: dict[str, series.Topic] = {
+        TOPICS["imu"].name: imu,
+        TOPICS["indexer"].name: series.JointSeries(encoder_ns, angles, JOINTS, frame_id="indexer"),
+    }
+    if data.latitude_deg is not None:
+        start = np.array([data.epoch_ns])
+        fix = series.FixSeries(start, np.array([data.latitude_deg]), np.zeros(1), frame_id="gnss")
+        topics[TOPICS["fix"].name] = fix
+    write_session(path, topics, attached(truth, config_yaml))
+
+
+def _latitude(recording: Recording, config: Config) -> float | None:
+    """Degrees: from the config, else the median of the fixes, else None."""
+    topic = config.topic("fix")
+    if config.latitude_deg is not None:
+        return config.latitude_deg
+    if topic not in recording.topics and "fix" not in config.topics:
+        return None
+    fixes = recording.fixes(topic)
+    good = fixes.latitude_deg[(fixes.status >= 0) & np.isfinite(fixes.latitude_deg)]
+    if not len(good):
+        return None
+    latitude = float(np.median(good))
+    if abs(latitude) > 90.0:
+        raise InputError(f"topic {topic}: latitude of {latitude:g}, beyond 90 degrees; NavSatFix is in degrees")
+    return latitude

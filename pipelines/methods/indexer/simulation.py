@@ -1,0 +1,282 @@
+"""Simulator of the `indexer` method: an IMU turned by two axes on the earth, with exact rotations.
+
+Frames as in methods.md section 2: n level East-North-Up, base the indexer's fixed part, t its platform, m the IMU. All
+angles are closed-form functions of time. A gyro sample is Log of the exact rotation against inertial space over its
+interval, centred on its stamp, divided by the interval.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from io import StringIO
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from factors import so3
+from factors.earth import earth_rate
+from pipelines.errors import InputError
+from pipelines.methods.indexer.recording import IndexerData, write_indexer
+from pipelines.simulation.motion import sample_times
+from pipelines.simulation.scenario import load_scenario
+
+Array = NDArray[np.float64]
+
+# 2026-11-20 12:00 UTC: simulated sessions start here.
+EPOCH_NS = 1_795_176_000_000_000_000
+ARCSEC = np.deg2rad(1.0 / 3600.0)
+
+Positive = Annotated[float, Field(gt=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+Vector = tuple[float, float, float]
+
+
+class Position(BaseModel):
+    """Turns about one axis, forward and back, the other axis standing at an angle."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    axis: Literal["outer", "inner"]
+    other_deg: float
+    turns: Positive = 3.0
+
+
+_SCHEDULE = [
+    Position(axis="outer", other_deg=0.0),
+    Position(axis="outer", other_deg=180.0),
+    Position(axis="inner", other_deg=0.0),
+    Position(axis="inner", other_deg=180.0),
+]
+
+
+class IndexerNoise(BaseModel):
+    """Noise of the sensors, under the names the recording's config gives them; `encoder` is white, rad."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    gyro_density: NotNegative = 5.8e-7  # rad/s/sqrt(Hz); 0.002 deg/sqrt(h)
+    gyro_bias_walk: NotNegative = 0.0  # rad/s/sqrt(s)
+    encoder: NotNegative = 0.0  # rad
+
+
+class IndexerScenario(BaseModel):
+    """What the `indexer` simulator is asked for; every key has a default."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    positions: list[Position] = _SCHEDULE
+    cycles: Annotated[int, Field(ge=1)] = 1  # how many times the positions are gone through
+    record_moves: bool = True  # False: nothing is recorded between positions
+    rate_deg_s: Positive = 10.0
+    acceleration_deg_s2: Positive = 20.0
+    dwell_s: Positive = 5.0  # before and after every run
+    latitude_deg: float = 40.0
+    base_attitude: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)  # nRbase: w, x, y, z
+    noise: IndexerNoise = IndexerNoise()
+    mounting_deg: Vector = (0.5, -0.3, 0.4)  # theta_x, theta_y, theta_z
+    gyro_bias_deg_h: NotNegative = 5.0  # sigma per axis
+    gyro_scale: Vector = (0.0, 0.0, 0.0)
+    axis_nonperpendicularity_arcsec: float = 0.0
+    ripple: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0  # of the rate while turning, relative
+    ripple_per_turn: Annotated[int, Field(ge=1)] = 24
+    wobble_arcsec: NotNegative = 0.0  # of the axis in its bearing
+    wobble_per_turn: Annotated[int, Field(ge=1)] = 2  # once a turn is no wobble but a tilt of what it carries
+    encoder_harmonics_arcsec: list[NotNegative] = []  # amplitudes of the errors once, twice, ... a turn; random phases
+    encoder_bits: Annotated[int, Field(ge=8, le=40)] = 32
+    encoder_wrapped: bool = False  # angles in [-pi, pi)
+    gyro_rate_hz: Positive = 200.0
+    encoder_rate_hz: Positive = 100.0
+    encoder_phase: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0  # of the first stamp, in sample intervals
+    attitude_noise_arcsec: NotNegative | None = None  # of the attitude the INS puts out; null: it puts out none
+    priors: dict[str, float | None] = {}  # passed on to the recording's config
+
+
+@dataclass(frozen=True)
+class _Drive:
+    """One uniform motion of one axis with ramps at its ends."""
+
+    axis: int  # 0 outer, 1 inner
+    start: float
+    angle: float  # rad, signed
+    speed: float
+    acceleration: float
+    is_move: bool
+
+    @property
+    def duration(self) -> float:
+        return abs(self.angle) / self.speed + self.speed / self.acceleration
+
+    def turned(self, t: Array) -> Array:
+        """Angle turned by the time t, rad: the rate is a trapezoid."""
+        ramp, s = self.speed / self.acceleration, t - self.start
+        corners = [(0.0, 1.0), (ramp, -1.0), (self.duration - ramp, -1.0), (self.duration, 1.0)]
+        path = sum(sign * np.maximum(s - corner, 0.0) ** 2 for corner, sign in corners)
+        return np.asarray(np.sign(self.angle) * 0.5 * self.acceleration * path)
+
+
+def simulate_indexer(scenario: IndexerScenario, seed: int) -> tuple[IndexerData, dict[str, float]]:
+    """A session and the true values of its parameters (rad, rad/s; the bias is its mean over the session)."""
+    rng = np.random.default_rng(seed)
+    drives, duration = _program(scenario)
+    phases = rng.uniform(0.0, 2.0 * np.pi, size=(2, 1 + len(scenario.encoder_harmonics_arcsec)))
+    gyro_t = _recorded(sample_times(duration, scenario.gyro_rate_hz), drives, scenario)
+    half = 0.5 / scenario.gyro_rate_hz
+    before, after = (_attitude(scenario, drives, phases, gyro_t + side) for side in (-half, half))
+    turned = so3.exp(np.array([2.0 * half]) * earth_rate(np.deg2rad(scenario.latitude_deg)))
+    rate = so3.log(so3.compose(so3.inverse(before), turned, after)) / (2.0 * half)
+    noise = scenario.noise
+    bias = np.deg2rad(scenario.gyro_bias_deg_h / 3600.0) * rng.standard_normal(3) + np.cumsum(
+        noise.gyro_bias_walk / np.sqrt(scenario.gyro_rate_hz) * rng.standard_normal((len(gyro_t), 3)), axis=0
+    )
+    white = noise.gyro_density * np.sqrt(scenario.gyro_rate_hz) * rng.standard_normal((len(gyro_t), 3))
+    encoder_t = _recorded(sample_times(duration, scenario.encoder_rate_hz, scenario.encoder_phase), drives, scenario)
+    outer, inner = _encoders(scenario, _commanded(scenario, drives, encoder_t), rng)
+    attitude = None
+    if scenario.attitude_noise_arcsec is not None:
+        error = scenario.attitude_noise_arcsec * ARCSEC * rng.standard_normal((len(gyro_t), 3))
+        attitude = so3.multiply(_attitude(scenario, drives, phases, gyro_t), so3.exp(error))
+    data = IndexerData(
+        EPOCH_NS,
+        gyro_t,
+        (1.0 + np.array(scenario.gyro_scale)) * rate + bias + white,
+        encoder_t,
+        outer,
+        inner,
+        scenario.latitude_deg,
+        attitude,
+        noise.gyro_density or None,
+    )
+    return data, _truth(scenario, bias)
+
+
+def write_simulation(scenario: str | None, seed: int, out: Path, images: bool) -> None:
+    """Simulate a scenario (by name or file, None is indexer_nominal) and write it as a session with its truth.
+
+    Raises:
+        InputError: no such scenario, or it cannot be written, or pictures are asked for.
+    """
+    settings = load_scenario(IndexerScenario, scenario or "indexer_nominal")
+    if images:
+        raise InputError("indexer: there is no camera in this method; leave out --images")
+    data, truth = simulate_indexer(settings, seed)
+    write_indexer(out, data, truth, indexer_config(settings))
+
+
+def indexer_config(scenario: IndexerScenario) -> str:
+    """The recording's config (YAML): the noise that was simulated, the base's attitude and the scenario's priors.
+
+    The encoder's noise takes in all errors of the angles, RMS: white noise, harmonics, the axes' wobble, quantisation.
+    """
+    from ruamel.yaml import YAML
+
+    periodic = [*scenario.encoder_harmonics_arcsec, scenario.wobble_arcsec]
+    variance = scenario.noise.encoder**2 + (2.0 * np.pi / 2**scenario.encoder_bits) ** 2 / 12.0
+    variance += 0.5 * float(np.sum(np.square(periodic))) * ARCSEC**2
+    noise = scenario.noise.model_dump() | {"encoder": float(np.sqrt(variance))}
+    if not noise["gyro_density"]:
+        del noise["gyro_density"]
+    config = {
+        "method": "indexer",
+        "noise": noise,
+        "priors": scenario.priors,
+        "indexer": {"base_attitude": list(scenario.base_attitude)},
+    }
+    text = StringIO()
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = False
+    yaml.dump(config, text)
+    return text.getvalue()
+
+
+def _program(scenario: IndexerScenario) -> tuple[list[_Drive], float]:
+    """All motions in time order and the duration, s."""
+    drives: list[_Drive] = []
+    at = np.zeros(2)
+    now = scenario.dwell_s
+
+    def drive(axis: int, angle: float, is_move: bool) -> None:
+        nonlocal now
+        acceleration = np.deg2rad(scenario.acceleration_deg_s2)
+        speed = min(np.deg2rad(scenario.rate_deg_s), float(np.sqrt(abs(angle) * acceleration)))
+        drives.append(_Drive(axis, now, angle, speed, acceleration, is_move))
+        at[axis] += angle
+        now += drives[-1].duration + scenario.dwell_s
+
+    for position in scenario.positions * scenario.cycles:
+        turning = 0 if position.axis == "outer" else 1
+        target = np.deg2rad([0.0, position.other_deg] if turning == 0 else [position.other_deg, 0.0])
+        for axis in (1, 0):
+            if abs(target[axis] - at[axis]) > 1e-9:
+                drive(axis, float(target[axis] - at[axis]), is_move=True)
+        for sign in (1.0, -1.0):
+            drive(turning, sign * 2.0 * np.pi * position.turns, is_move=False)
+    return drives, now
+
+
+def _recorded(t: Array, drives: list[_Drive], scenario: IndexerScenario) -> Array:
+    """The stamps outside moves that are not recorded."""
+    keep = np.ones(len(t), dtype=bool)
+    for move in drives:
+        if move.is_move and not scenario.record_moves:
+            keep &= (t < move.start) | (t > move.start + move.duration)
+    return t[keep]
+
+
+def _commanded(scenario: IndexerScenario, drives: list[_Drive], t: Array) -> Array:
+    """Axis angles (2, N), rad, that the drives follow. Ripple comes with the angle, as cogging does."""
+    angles = np.zeros((2, len(t)))
+    for drive in drives:
+        moving = slice(int(np.searchsorted(t, drive.start)), None)
+        turned = drive.turned(t[moving])
+        k = scenario.ripple_per_turn
+        angles[drive.axis, moving] += turned + scenario.ripple / k * np.sin(k * turned)
+    return angles
+
+
+def _angles(scenario: IndexerScenario, drives: list[_Drive], phases: Array, t: Array) -> Array:
+    """True axis angles (2, N), rad. The drives follow the encoders, and with them the encoders' harmonics."""
+    commanded = _commanded(scenario, drives, t)
+    angles = commanded.copy()
+    for order, amplitude in enumerate(scenario.encoder_harmonics_arcsec, start=1):
+        angles -= amplitude * ARCSEC * np.sin(order * commanded + phases[:, order, None])
+    return angles
+
+
+def _attitude(scenario: IndexerScenario, drives: list[_Drive], phases: Array, t: Array) -> Array:
+    """nRm, shape (N, 4)."""
+    ex, ey, ez = np.eye(3)
+    outer, inner = _angles(scenario, drives, phases, t)[..., None]
+    k, w = scenario.wobble_per_turn, scenario.wobble_arcsec * ARCSEC
+    a, b = k * outer + phases[0, 0], k * inner + phases[1, 0]
+    outer_axis = so3.exp(w * (np.cos(a) * ey + np.sin(a) * ez))
+    inner_axis = so3.exp(w * (np.cos(b) * ex + np.sin(b) * ey))
+    tilt = so3.exp(scenario.axis_nonperpendicularity_arcsec * ARCSEC * ey)
+    x, y, z = np.deg2rad(scenario.mounting_deg)
+    tRm = so3.compose(so3.exp(z * ez), so3.exp(y * ey), so3.exp(x * ex))
+    baseRt = so3.compose(outer_axis, so3.exp(outer * ex), tilt, inner_axis, so3.exp(inner * ez))
+    return so3.compose(np.array(scenario.base_attitude), baseRt, tRm)
+
+
+def _encoders(scenario: IndexerScenario, commanded: Array, rng: np.random.Generator) -> Array:
+    """Encoder readings (2, M), rad."""
+    read = commanded + scenario.noise.encoder * rng.standard_normal(commanded.shape)
+    step = 2.0 * np.pi / 2**scenario.encoder_bits
+    read = step * np.round(read / step)
+    return (read + np.pi) % (2.0 * np.pi) - np.pi if scenario.encoder_wrapped else read
+
+
+def _truth(scenario: IndexerScenario, bias: Array) -> dict[str, float]:
+    vectors = {
+        "theta": np.deg2rad(scenario.mounting_deg),
+        "gyro_bias": bias.mean(axis=0),
+        "gyro_scale": np.array(scenario.gyro_scale),
+    }
+    truth = {
+        f"{name}_{axis}": float(value)
+        for name, vector in vectors.items()
+        for axis, value in zip("xyz", vector, strict=True)
+    }
+    return truth | {"axis_nonperpendicularity": float(scenario.axis_nonperpendicularity_arcsec * ARCSEC)}

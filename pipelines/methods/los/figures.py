@@ -1,0 +1,92 @@
+"""Figures of the los method: the LOS error as measured and as predicted, and what is left of it.
+
+A prediction starts from the first picture of a target and is carried on by gyro, gimbal and calibration alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from factors.los import SMOOTHING, GimbalPath
+from factors.preintegration import GyroPath
+from pipelines.config import DEFAULT_NOISE, first_given, load_config
+from pipelines.graph.problem import Array
+from pipelines.methods.los.graph import ANGLES, select_pictures
+from pipelines.methods.los.guess import camera, carried_errors
+from pipelines.methods.los.recording import LosData
+from pipelines.reports.plots import COLORS, add_line, add_points, figure
+from pipelines.reports.result import Calibration, Plot
+from pipelines.reports.units import robust_sigma
+
+_AXES = ("phx", "phz")
+_MRAD = 1e3
+_URAD = 1e6
+# What is left is shown out to so many times its usual size; outliers lie beyond.
+_SHOWN = 6.0
+
+
+def los_plots(data: LosData, calibration: Calibration) -> list[Plot]:
+    """LOS error measured and predicted, and their difference with and without the mounting angles."""
+    config = load_config(calibration.config_text.encode())
+    values = dict(zip(calibration.estimate.names, calibration.estimate.values.tolist(), strict=True))
+    sigma = first_given(config.noise.los_error, DEFAULT_NOISE.los_error)
+    margin = SMOOTHING if "time_offset" in values else 0.0
+    rows, starts, _ = select_pictures(data, np.full(len(data.image_t), sigma), margin)
+    time, measured = data.image_t[rows], data.error[rows]
+    chains = np.split(np.arange(len(rows)), np.flatnonzero(starts)[1:])
+    bias_alone = {name: value for name, value in values.items() if name not in ANGLES}
+    gyro = GyroPath(data.gyro_t, data.gyro, [values.get(f"gyro_bias_{axis}", 0.0) for axis in "xyz"])
+    gimbal = GimbalPath(data.gimbal_t, data.gimbal)
+    with_angles, without = (
+        np.concatenate([_predicted(gyro, gimbal, time[chain], measured[chain], v) for chain in chains])
+        for v in (values, bias_alone)
+    )
+    return [
+        _measured_and_predicted(time, measured[:, :2], with_angles),
+        _left(time, measured[:, :2] - without, measured[:, :2] - with_angles),
+    ]
+
+
+def _predicted(gyro: GyroPath, gimbal: GimbalPath, time: Array, measured: Array, values: Mapping[str, float]) -> Array:
+    """phx, phz (n, 2) of one target's pictures as carried on from the first, rad."""
+    names = tuple(name for name in ANGLES if name in values)
+    at = np.clip(time + values.get("time_offset", 0.0), gyro.t[0], gyro.t[-1])
+    cRm = camera(gimbal.at(at), np.array([values[name] for name in names]), names)
+    return carried_errors(at, cRm, measured, gyro)
+
+
+def _measured_and_predicted(time: Array, measured: Array, predicted: Array) -> Plot:
+    out = figure("LOS error, mrad")
+    for i, axis in enumerate(_AXES):
+        add_points(out, time, _MRAD * measured[:, i], f"{axis} measured", COLORS[i], 3)
+        add_line(out, time, _MRAD * predicted[:, i], f"{axis} predicted", COLORS[i])
+    out.update_traces(selector={"mode": "markers"}, opacity=0.45)
+    reach = 1.2 * _MRAD * max(float(np.abs(predicted).max()), _SHOWN * float(robust_sigma(measured - predicted)))
+    middle = _MRAD * float(np.median(measured))
+    out.update_yaxes(range=[middle - reach, middle + reach])
+    return Plot(
+        "LOS error measured and predicted",
+        "Points: where the camera saw the target. Lines: where it should be by gyro, gimbal and calibration alone, "
+        "from the first picture of a target on.",
+        out,
+    )
+
+
+def _left(time: Array, without: Array, compensated: Array) -> Plot:
+    out = figure("measured less predicted, urad")
+    for i, axis in enumerate(_AXES):
+        add_points(out, time, _URAD * without[:, i], f"{axis}, mounting angles zero", COLORS[4 + 2 * i], 3)
+    for i, axis in enumerate(_AXES):
+        add_points(out, time, _URAD * compensated[:, i], f"{axis}, mounting angles found", COLORS[i], 3)
+    spread = [_URAD * robust_sigma(errors) for errors in (without, compensated)]
+    reach = _SHOWN * max(*spread, 1.0)
+    out.update_yaxes(range=[-reach, reach])
+    return Plot(
+        "What gyro, gimbal and calibration leave of the LOS error",
+        f"Per axis {spread[0]:.3g} urad with the mounting angles zero, {spread[1]:.3g} urad with those found (standard "
+        "deviations, from the median). The gyro's noise adds up from a target's first picture on, so what is left may "
+        "wander; it should not follow the sway.",
+        out,
+    )

@@ -1,0 +1,434 @@
+"""The los method: mounting angles of the gyro and the camera of a gyro-stabilised line of sight.
+
+The graph's states are tRm, the gyro's attitude in the frame of the target, at the pictures: gtsam's native AHRSFactor
+joins them, LosDirectionFactor ties them to the picture and the gimbal. Where a target stands is part of its first
+attitude, so a target found anew starts a new chain. Methods page, section 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import so3
+from factors.attitude import ahrs_factors
+from factors.chi_square import gate
+from factors.los import SMOOTHING, GimbalPath, LocalMotion, LosDirectionFactor
+from factors.preintegration import GyroPath, Increments
+from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
+from pipelines.config import DEFAULT_NOISE, Config, check_names, first_given
+from pipelines.errors import InputError
+from pipelines.graph.priors import vector_prior
+from pipelines.graph.problem import Array, Factor, Parameter, Problem, Quantity, Step
+from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
+from pipelines.graph.walking_bias import WalkingBias
+from pipelines.methods.los.guess import camera, guess, initial_attitudes, seen
+from pipelines.methods.los.recording import LosData
+
+_ANGLES = ("delta_px", "delta_gx", "delta_gy")
+_SPLIT = ("delta_pz", "delta_gz")
+_OPTIONS = ("camera_roll", "collimation", "axis_nonperpendicularity")
+_BIAS = ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")
+_OFFSET = "time_offset"
+# Everything but gyro bias and time offset: the angles by which gyro, gimbal axes and camera are mounted.
+ANGLES = (*_ANGLES, "delta_z", *_SPLIT, *_OPTIONS)
+NAMES = (*ANGLES, *_BIAS, _OFFSET)
+
+_ANGLES_KEY, _OFFSET_KEY = int(gtsam.symbol("a", 0)), int(gtsam.symbol("T", 0))
+_PRIOR_ANGLE, _PRIOR_BIAS, _PRIOR_OFFSET = 0.1, 0.02, 0.05
+
+# After a gap longer than this, s, the camera may hold on to another target.
+_LOST = 0.5
+# A gap in gyro or gimbal longer than so many sample intervals is no sampling jitter.
+_GAP = 5.0
+_FEWEST_PICTURES = 10
+# Sigmas, rad, of a chain's first attitude about t's axes: wide where pictures tell. Its turn about the line of sight is
+# free when no picture tells the camera's roll (it only turns t), and held for the sake of the arithmetic.
+_WIDE, _HELD = 0.3, 1e-3
+# Pictures that a target's first one has to agree with.
+_FOLLOWERS = 5
+
+
+@dataclass(frozen=True)
+class _Model:
+    """The recording prepared for the graph: what every step needs."""
+
+    time: Array  # (K,) keyframes: the pictures used
+    starts: NDArray[np.bool_]  # (K,) whether a keyframe is the first of its target
+    mount: Array  # first guess of the mounting angles
+    initial: Array  # (K, 4) tRm
+    measured: Array  # (K, 3) phx, phz, roll
+    sqrt_information: Array  # (K, 3, 3), zero rows for a roll not measured
+    angles: Array  # (K, 2) azimuth, elevation
+    turns: Increments  # (K - 1,) of the gyro from keyframe to keyframe
+    bias_hat: Array  # first guess of the gyro's bias
+    motion: LocalMotion | None  # around the keyframes, when the time offset is a variable
+    variance_rate: float  # rad^2 / s of an increment
+    scale_error: float  # sigma of an increment per angle turned
+    bias: WalkingBias
+    nodes: Array  # (K,) whole numbers: of the bias in force up to each keyframe
+    loss: TruncatedLoss
+    parameters: tuple[Parameter, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The mounting angles that are variables."""
+        return tuple(q.name for q in self.parameters[0].quantities)
+
+
+def problem(data: LosData, config: Config) -> Problem:
+    """The graph of a los recording.
+
+    Raises:
+        InputError: an unknown parameter in the config, only one of delta_pz and delta_gz, or fewer than ten pictures
+            within the records of gyro and gimbal.
+    """
+    model, dropped = _prepare(data, config)
+    return Problem(
+        method="los",
+        parameters=model.parameters,
+        steps=partial(_steps, model),
+        steps_after=partial(_steps, model, 1),
+        loss=model.loss,
+        advice=_advice,
+        dropped=dropped,
+    )
+
+
+def _prepare(data: LosData, config: Config) -> tuple[_Model, dict[str, int]]:
+    parameters = _parameters(config)
+    noise = config.noise
+    density = first_given(noise.gyro_density, data.gyro_density, DEFAULT_NOISE.gyro_density)
+    walk = first_given(noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk)
+    gimbal, gyro = GimbalPath(data.gimbal_t, data.gimbal), GyroPath(data.gyro_t, data.gyro)
+    covariance = _covariance(data, gimbal, config)
+    has_offset = len(parameters) == 3
+    rows, starts, dropped = select_pictures(data, np.sqrt(covariance[:, 0, 0]), SMOOTHING if has_offset else 0.0)
+    time, measured = data.image_t[rows], data.error[rows]
+    angles = gimbal.at(time)
+    chains = np.split(np.arange(len(time)), np.flatnonzero(starts)[1:])
+    sigma = float(np.sqrt(np.median(covariance[rows, 0, 0])))
+    mount, bias_hat = guess(chains, time, angles, measured, gyro, parameters, sigma)
+    names = tuple(q.name for q in parameters[0].quantities)
+    gyro = GyroPath(data.gyro_t, data.gyro, bias_hat)
+    motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal) if has_offset else None
+    bias = WalkingBias.over(time[0], time[-1], walk, density)
+    middle = np.where(starts, time, 0.5 * (time + np.roll(time, 1)))
+    model = _Model(
+        time=time,
+        starts=starts,
+        mount=mount,
+        initial=initial_attitudes(chains, time, camera(angles, mount, names), measured, gyro),
+        measured=measured,
+        sqrt_information=_sqrt_information(covariance[rows]),
+        angles=angles,
+        turns=gyro.increments(time[:-1], time[1:]),
+        bias_hat=bias_hat,
+        motion=motion,
+        variance_rate=density**2,
+        scale_error=first_given(noise.gyro_scale, DEFAULT_NOISE.gyro_scale),
+        bias=bias,
+        nodes=bias.node_at(middle),
+        loss=TruncatedLoss(gate(3 if np.isfinite(measured[:, 2]).any() else 2)),
+        parameters=parameters,
+    )
+    return model, {**data.dropped, **dropped}
+
+
+def _covariance(data: LosData, gimbal: GimbalPath, config: Config) -> Array:
+    """(K, 3, 3) of phx, phz, roll: the tracker's or the config's, and the encoders'; NaN where not measured."""
+    if data.error_cov is None:
+        los = first_given(config.noise.los_error, DEFAULT_NOISE.los_error)
+        roll = first_given(config.noise.los_roll, DEFAULT_NOISE.los_roll)
+        covariance = np.tile(np.diag([los**2, los**2, roll**2]), (len(data.image_t), 1, 1))
+    else:
+        covariance = data.error_cov.copy()
+    covariance[~np.isfinite(data.error[:, 2]), 2, :] = np.nan
+    _, weights = gimbal.weights(data.image_t)
+    elevation = gimbal.at(data.image_t)[:, 1]
+    # Azimuth turns the picture about an axis that is elevated against its own up.
+    by_azimuth = np.stack([np.zeros_like(elevation), np.cos(elevation), np.sin(elevation)], axis=1)
+    encoder = first_given(config.noise.encoder, DEFAULT_NOISE.encoder) ** 2 * (weights**2).sum(axis=1)
+    shape = np.diag([1.0, 0.0, 0.0]) + by_azimuth[:, :, None] * by_azimuth[:, None, :]
+    return covariance + encoder[:, None, None] * shape
+
+
+def _sqrt_information(covariance: Array) -> Array:
+    """(K, 3, 3) upper triangular R with R'R the information; the last row and column are zero without roll."""
+    out = np.zeros_like(covariance)
+    rolls = np.isfinite(covariance[:, 2, 2])
+    for size, mine in ((3, rolls), (2, ~rolls)):
+        root = np.linalg.cholesky(np.linalg.inv(covariance[mine][:, :size, :size]))
+        block = np.zeros((int(mine.sum()), 3, 3))
+        block[:, :size, :size] = np.swapaxes(root, 1, 2)
+        out[mine] = block
+    return out
+
+
+def select_pictures(
+    data: LosData, sigma: Array, margin: float
+) -> tuple[NDArray[np.intp], NDArray[np.bool_], dict[str, int]]:
+    """The pictures used, which of them are the first of their target, and what was left out.
+
+    `margin`, s, is left out on either side of a gap in which the gimbal may have turned to another target.
+    """
+    t = data.image_t
+    outside = (t < max(data.gyro_t[0], data.gimbal_t[0])) | (t > min(data.gyro_t[-1], data.gimbal_t[-1]))
+    blind = ~outside & (_in_gap(data.gimbal_t, t) | _in_gap(data.gyro_t, t))
+    rows = np.flatnonzero(~outside & ~blind)
+    chains = np.split(rows, np.flatnonzero(_first_of_target(data, rows))[1:])
+    close, early, lone = (np.zeros(len(t), dtype=bool) for _ in range(3))
+    starts = np.zeros(len(t), dtype=bool)
+    for i, chain in enumerate(chains):
+        after = t[chain] - t[chain[0]] if i > 0 else np.inf
+        before = t[chain[-1]] - t[chain] if i < len(chains) - 1 else np.inf
+        close[chain] = np.minimum(after, before) < margin
+        left = chain[~close[chain]]
+        wrong = _wrong_before_followers(data.error[left, :2], sigma[left])
+        early[left[:wrong]] = True
+        if len(left) - wrong < 2:
+            lone[left[wrong:]] = True
+        else:
+            starts[left[wrong]] = True
+    keep = rows[~(close | early | lone)[rows]]
+    if len(keep) < _FEWEST_PICTURES:
+        raise InputError(
+            f"only {len(keep)} of {len(t)} LOS errors can be used, at least {_FEWEST_PICTURES} are needed: "
+            f"{int(outside.sum())} lie outside the records of gyro and gimbal, {int(blind.sum())} in their gaps, "
+            f"{int(lone.sum())} stand alone; check the topics and their clocks"
+        )
+    reasons = {
+        "LOS error outside the records of gyro and gimbal": outside,
+        "LOS error in a gap of gyro or gimbal": blind,
+        "LOS error beside a gap, where the time offset cannot be followed": close,
+        "LOS error disagrees with those after it where a target is found": early,
+        "LOS error alone between gaps": lone,
+    }
+    return keep, starts[keep], {reason: int(mask.sum()) for reason, mask in reasons.items() if mask.any()}
+
+
+def _in_gap(t: Array, at: Array) -> NDArray[np.bool_]:
+    """Whether times lie between two samples that are too far apart."""
+    step = np.diff(t)
+    i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(step) - 1)
+    return np.asarray(step[i] > _GAP * np.median(step))
+
+
+def _first_of_target(data: LosData, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Where a chain starts: after a gap in which the target may have changed, and after a gap of the gyro."""
+    starts = np.ones(len(rows), dtype=bool)
+    if len(rows) < 2:
+        return starts
+    step = np.diff(data.image_t[rows])
+    gyro_step = np.diff(data.gyro_t)
+    gaps = data.gyro_t[:-1][gyro_step > _GAP * np.median(gyro_step)]
+    gaps_before = np.searchsorted(gaps, data.image_t[rows])
+    starts[1:] = (step > max(_LOST, _GAP * float(np.median(step)))) | (np.diff(gaps_before) > 0)
+    return starts
+
+
+def _wrong_before_followers(error: Array, sigma: Array) -> int:
+    """How many LOS errors at the start of a chain disagree with the median of those that follow."""
+    for i in range(len(error) - _FOLLOWERS):
+        after = error[i + 1 : i + 1 + _FOLLOWERS]
+        drift = np.median(np.abs(np.diff(after, axis=0)), axis=0)
+        if np.all(np.abs(error[i] - np.median(after, axis=0)) < 6.0 * sigma[i] + _FOLLOWERS * drift):
+            return i
+    return 0
+
+
+def _parameters(config: Config) -> tuple[Parameter, ...]:
+    """The method's parameters with their priors; options only where the config gives them a prior other than 0."""
+    check_names(config.priors, NAMES, "priors")
+    check_names(config.require, NAMES, "require")
+    given = [name for name in _SPLIT if name in config.priors]
+    if len(given) == 1:
+        raise InputError(f"priors: {given[0]} alone; delta_pz and delta_gz are given both, or neither for delta_z")
+
+    def quantity(name: str, unit: str, scale: float) -> Quantity:
+        return Quantity(name, unit, config.priors.get(name, scale), scale, config.require.get(name, 1e-3))
+
+    names = (*_ANGLES, *(_SPLIT if given else ("delta_z",)), *(n for n in _OPTIONS if config.priors.get(n, 0.0) != 0.0))
+    parameters = [
+        Parameter(_ANGLES_KEY, tuple(quantity(name, "rad", _PRIOR_ANGLE) for name in names)),
+        Parameter(FIRST_BIAS, tuple(quantity(name, "rad/s", _PRIOR_BIAS) for name in _BIAS)),
+    ]
+    if config.priors.get(_OFFSET, 0.0) != 0.0:
+        parameters.append(Parameter(_OFFSET_KEY, (quantity(_OFFSET, "s", _PRIOR_OFFSET),)))
+    return tuple(parameters)
+
+
+def _state(keyframe: int) -> int:
+    return int(gtsam.symbol("x", keyframe))
+
+
+def _steps(model: _Model, chunk: int, after: float = -np.inf) -> Iterator[Step]:
+    """`chunk` keyframes at a time; the first step brings the calibration variables and their priors too."""
+    for begin in range(int(np.searchsorted(model.time, after, side="right")), len(model.time), chunk):
+        yield _step(model, range(begin, min(begin + chunk, len(model.time))))
+
+
+def _step(model: _Model, keyframes: range) -> Step:
+    initial = gtsam.Values()
+    factors: list[Factor] = []
+    if keyframes.start == 0:
+        factors += [vector_prior(p, np.zeros(len(p.quantities))) for p in model.parameters]
+        initial.insert(_ANGLES_KEY, model.mount)
+        initial.insert(model.bias.key(0), model.bias_hat)
+        if model.motion is not None:
+            initial.insert(_OFFSET_KEY, np.zeros(1))
+    stand_ins = _bias_step(model, keyframes, initial, factors)
+    for k in keyframes:
+        initial.insert(_state(k), so3.to_gtsam(model.initial[k]))
+    factors += [*_gyro_factors(model, keyframes), *_picture_factors(model, keyframes)]
+    return Step(
+        time=float(model.time[keyframes[-1]]),
+        initial=initial,
+        factors=factors,
+        predict=partial(_predict, model, keyframes, initial),
+        timestamps=_timestamps(model, keyframes),
+        stand_ins=stand_ins,
+        keyframes=keyframes,
+    )
+
+
+def _before(model: _Model, keyframes: range) -> int:
+    """The bias node that was in force before these keyframes."""
+    return int(model.nodes[max(keyframes.start - 1, 0)])
+
+
+def _bias_step(model: _Model, keyframes: range, initial: gtsam.Values, factors: list[Factor]) -> dict[int, int]:
+    """Adds the bias nodes that begin with these keyframes; returns what holds the reported bias from now on."""
+    bias, bias_hat = model.bias, model.bias_hat
+    stand_ins: dict[int, int] = {}
+    for node in range(_before(model, keyframes) + 1, int(model.nodes[keyframes[-1]]) + 1):
+        initial.insert(bias.key(node), bias_hat)
+        factors.append(bias.walk_factor(node))
+        if node >= 2:
+            initial.insert(bias.mean_key(node - 1), bias_hat)
+            factors.append(bias.mean_factor(node - 1))
+        stand_ins[bias.key(0)] = bias.key(node)
+    if keyframes.stop == len(model.time) and bias.nodes > 1:
+        end = bias.nodes - 1
+        initial.insert(bias.mean_key(end), bias_hat)
+        factors.append(bias.mean_factor(end))
+        stand_ins[bias.key(0)] = bias.mean_key(end)
+    return stand_ins
+
+
+def _gyro_factors(model: _Model, keyframes: range) -> list[Factor]:
+    """The gyro between pictures of one target; a wide prior where a target is found."""
+    found = [k for k in keyframes if model.starts[k]]
+    after = np.array([k for k in keyframes if not model.starts[k]], dtype=int)
+    increments = model.turns[after - 1]
+    turned = model.scale_error * np.linalg.norm(so3.log(increments.wxyz), axis=1)
+    native = ahrs_factors(
+        [_state(k) for k in after - 1],
+        [_state(k) for k in after],
+        [model.bias.key(int(model.nodes[k])) for k in after],
+        increments,
+        model.bias_hat,
+        model.variance_rate * increments.duration + turned**2 + increments.unseen,
+    )
+    return [*(_start_factor(model, k) for k in found), *(Factor("gyro", f) for f in native)]
+
+
+def _start_factor(model: _Model, k: int) -> Factor:
+    """Wide prior on the first attitude of a target."""
+    rolls = np.isfinite(model.measured[:, 2]).any()
+    sigmas = np.array([_WIDE, _WIDE if rolls else _HELD, _WIDE])
+    noise = gtsam.noiseModel.Gaussian.SqrtInformation(so3.matrix(model.initial[k]) / sigmas[:, None], False)
+    return Factor("prior", gtsam.PriorFactorRot3(_state(k), so3.to_gtsam(model.initial[k]), noise))
+
+
+def _picture_factors(model: _Model, keyframes: range) -> list[Factor]:
+    """One factor for the pictures with roll, one for those without."""
+    k = np.array(keyframes)
+    rolls = np.isfinite(model.measured[k, 2])
+    return [
+        _picture_factor(model, k[mine], rows, family)
+        for rows, family, mine in ((2, "los", ~rolls), (3, "los with roll", rolls))
+        if mine.any()
+    ]
+
+
+def _picture_factor(model: _Model, k: NDArray[np.intp], rows: int, family: str) -> Factor:
+    rows_model = LosDirectionFactor(
+        model.time[k],
+        model.measured[k, :rows],
+        model.sqrt_information[k, :rows, :rows],
+        model.angles[k],
+        model.names,
+        None if model.motion is None else model.motion[k],
+    )
+    columns: list[int | list[int]] = [[_state(i) for i in k], _ANGLES_KEY]
+    kinds: list[Kind] = ["rotation", len(model.names)]
+    if model.motion is not None:
+        columns += [[model.bias.key(int(n)) for n in model.nodes[k]], _OFFSET_KEY]
+        kinds += [3, 1]
+    return Factor.of(family, VectorizedFactor(rows_model, columns, kinds, model.loss))
+
+
+def _timestamps(model: _Model, keyframes: range) -> dict[int, float]:
+    """States age; the bias in force and the mean so far stay alive until the next stretch."""
+    stamps = {_state(k): float(model.time[k]) for k in keyframes}
+    bias = model.bias
+    if bias.nodes == 1:
+        return stamps
+    now = float(model.time[keyframes[-1]])
+    for node in range(_before(model, keyframes), int(model.nodes[keyframes[-1]]) + 1):
+        stamps[bias.key(node)] = now
+        if node >= 1:
+            stamps[bias.mean_key(node - 1)] = now
+    if keyframes.stop == len(model.time):
+        stamps[bias.mean_key(bias.nodes - 1)] = now
+    return stamps
+
+
+def _predict(model: _Model, keyframes: range, initial: gtsam.Values, current: gtsam.Values) -> gtsam.Values:
+    """The new variables from the current estimate: attitudes carried by the gyro or seen anew, biases carried over."""
+    out = gtsam.Values()
+    bias = current.atVector(model.bias.key(_before(model, keyframes)))
+    for key in initial.keys():
+        if gtsam.Symbol(key).chr() in (ord("b"), ord("m")):
+            out.insert(key, bias)
+    for k in keyframes:
+        if model.starts[k]:
+            cRm = camera(model.angles[k : k + 1], current.atVector(_ANGLES_KEY), model.names)
+            attitude = seen(cRm, model.measured[k : k + 1])[0]
+        else:
+            before = out if out.exists(_state(k - 1)) else current
+            step = model.turns[k - 1]
+            previous = so3.from_gtsam([before.atRot3(_state(k - 1))])[0]
+            attitude = so3.compose(previous, step.wxyz, so3.exp(step.bias_jacobian @ (bias - model.bias_hat)))
+        out.insert(_state(k), so3.to_gtsam(attitude))
+    return out
+
+
+def _advice(weights: Mapping[str, float]) -> str:
+    """What would make a weak direction observable."""
+    strong = {name for name, weight in weights.items() if abs(weight) > 0.3}
+    if set(_SPLIT) <= strong:
+        return (
+            "delta_pz and delta_gz can never be told apart, turning the carrier's frame about the azimuth axis changes "
+            "both alike: ask for delta_z = delta_pz - delta_gz instead"
+        )
+    if _OFFSET in strong:
+        return "the time offset needs faster sway: turn the carrier back and forth within a second or two"
+    if "camera_roll" in strong:
+        return "the camera's roll needs the target to move across the picture: offset the gimbal while recording"
+    if {"collimation", "axis_nonperpendicularity"} & strong:
+        return "errors of the gimbal's axes need changing elevation: record targets at low and at high elevation"
+    if "delta_px" in strong:
+        return (
+            "delta_px trades against delta_gx and delta_gy: sway the carrier in azimuth too, or record targets at "
+            "other azimuths and elevations"
+        )
+    if set(_BIAS) & strong and not strong - set(_BIAS):
+        return "the gyro bias needs a longer recording with the target in sight, and sway across the line of sight"
+    return "the mounting angles need sway of the carrier about all three axes while the target is in sight"

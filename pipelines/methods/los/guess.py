@@ -1,0 +1,141 @@
+"""First guesses for the los method's graph: mounting angles, gyro bias and attitudes.
+
+They come from pictures a second apart. Linearising at zero angles and zero bias is good enough for a minute; over ten
+the camera's roll about its line of sight, which no picture tells, would start too far off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import so3
+from factors.los import LosDirectionFactor
+from factors.preintegration import GyroPath
+from pipelines.graph.priors import prior_sigmas
+from pipelines.graph.problem import Array, Parameter
+
+# Pictures so far apart, s, are compared, long against their noise, and no more than so many pairs of them.
+_SPAN, _MOST_PAIRS = 1.0, 2000
+_PASSES = 5
+_STEP = 1e-6
+
+
+def los_direction(measured: Array) -> Array:
+    """Unit vectors (n, 3) in c towards the target at LOS errors phx, phz, (n, 2 or more)."""
+    ahead = np.stack([np.tan(measured[:, 1]), np.ones(len(measured)), -np.tan(measured[:, 0])], axis=1)
+    return np.asarray(ahead / np.linalg.norm(ahead, axis=1, keepdims=True))
+
+
+def los_error(direction: Array) -> Array:
+    """phx, phz (n, 2), rad, of directions (n, 3) in c."""
+    x, y, z = direction.T
+    return np.stack([-np.arctan2(z, y), np.arctan2(x, y)], axis=1)
+
+
+def camera(gimbal: Array, angles: Array, names: tuple[str, ...]) -> Array:
+    """cRm (n, 4) at gimbal angles (n, 2) and mounting angles (d,), rad."""
+    n = len(gimbal)
+    model = LosDirectionFactor(np.zeros(n), np.zeros((n, 2)), np.zeros((n, 2, 2)), gimbal, names)
+    return model.camera(np.tile(angles, (n, 1)))
+
+
+def seen(cRm: Array, measured: Array) -> Array:
+    """tRm (n, 4) of cameras that see the target at phx, phz, with the roll they measure (n, 3) or, if NaN, none."""
+    y = np.array([0.0, 1.0, 0.0])
+    swing = _shortest(np.broadcast_to(y, (len(cRm), 3)), los_direction(measured))
+    cRt = so3.multiply(swing, so3.exp(-np.nan_to_num(measured[:, 2])[:, None] * y))
+    return so3.multiply(so3.inverse(cRt), cRm)
+
+
+def initial_attitudes(
+    chains: Sequence[NDArray[np.intp]], time: Array, cRm: Array, measured: Array, gyro: GyroPath
+) -> Array:
+    """tRm (n, 4): carried by the gyro from a target's first picture, turned to where each picture shows the target."""
+    out = np.empty((len(time), 4))
+    toward = so3.rotate(so3.inverse(cRm), los_direction(measured))
+    for chain in chains:
+        carried = _carried(time[chain], cRm[chain], measured[chain], gyro)
+        expected = so3.rotate(so3.inverse(carried), [0.0, 1.0, 0.0])
+        out[chain] = so3.multiply(carried, _shortest(toward[chain], expected))
+    return out
+
+
+def _carried(time: Array, cRm: Array, measured: Array, gyro: GyroPath) -> Array:
+    """tRm (n, 4) at one target's pictures: where the first of them shows it, carried on by the gyro."""
+    turned = gyro.attitude(time)
+    return so3.compose(seen(cRm[:1], measured[:1]), so3.inverse(turned[:1]), turned)
+
+
+def carried_errors(time: Array, cRm: Array, measured: Array, gyro: GyroPath) -> Array:
+    """phx, phz (n, 2), rad, that one target's pictures would show if the gyro told all since the first of them."""
+    tRm = _carried(time, cRm, measured, gyro)
+    return los_error(so3.rotate(so3.multiply(cRm, so3.inverse(tRm)), [0.0, 1.0, 0.0]))
+
+
+def guess(
+    chains: Sequence[NDArray[np.intp]],
+    time: Array,
+    gimbal: Array,
+    measured: Array,
+    gyro: GyroPath,
+    parameters: tuple[Parameter, ...],
+    sigma: float,
+) -> tuple[Array, Array]:
+    """Mounting angles and gyro bias (3,) that best carry LOS errors on to those a second later, robustly.
+
+    Args:
+        chains: pictures of one target each, as rows of what follows.
+        time: (n,) of the pictures, s.
+        gimbal: (n, 2) azimuth and elevation there, rad.
+        measured: (n, 3) phx, phz, roll.
+        gyro: integrated without any bias taken off.
+        parameters: mounting angles and bias, with their priors.
+        sigma: of one LOS error, rad.
+    """
+    angles, bias = parameters[:2]
+    names = tuple(q.name for q in angles.quantities)
+    prior = 1.0 / np.concatenate([prior_sigmas(angles), prior_sigmas(bias)])
+    x = np.zeros(len(prior))
+    i, j = _pairs(chains, time)
+    if not len(i):
+        return x[: len(names)], x[len(names) :]
+    increments = gyro.increments(time[i], time[j])
+
+    def miss(x: Array) -> Array:
+        mount, b = x[: len(names)], x[len(names) :]
+        before, after = camera(gimbal[i], mount, names), camera(gimbal[j], mount, names)
+        turn = so3.multiply(increments.wxyz, so3.exp(increments.bias_jacobian @ b))
+        tRm = so3.multiply(seen(before, measured[i]), turn)
+        return los_error(so3.rotate(so3.multiply(after, so3.inverse(tRm)), [0.0, 1.0, 0.0])) - measured[j, :2]
+
+    for _ in range(_PASSES):
+        error = miss(x)
+        size = np.linalg.norm(error, axis=1)
+        scale = max(float(np.median(size)), sigma)
+        weight = 1.0 / (scale * np.sqrt(1.0 + (size / (3.0 * scale)) ** 2))[:, None]
+        steps = _STEP * np.eye(len(x))
+        columns = [(weight * (miss(x + d) - error)).ravel() / _STEP for d in steps]
+        A = np.vstack([np.stack(columns, axis=1), np.diag(prior)])
+        x = x - np.linalg.lstsq(A, np.concatenate([(weight * error).ravel(), prior * x]))[0]
+    return x[: len(names)], x[len(names) :]
+
+
+def _pairs(chains: Sequence[NDArray[np.intp]], time: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Pictures of one target a second apart."""
+    first, second = [], []
+    for chain in chains:
+        later = np.searchsorted(time[chain], time[chain] + _SPAN)
+        inside = later < len(chain)
+        first.append(chain[inside])
+        second.append(chain[later[inside]])
+    i, j = np.concatenate(first), np.concatenate(second)
+    stride = -(-len(i) // _MOST_PAIRS) or 1
+    return i[::stride], j[::stride]
+
+
+def _shortest(a: Array, b: Array) -> Array:
+    """The shortest rotations (n, 4) that turn unit vectors a into b."""
+    return so3.normalize(np.concatenate([1.0 + (a * b).sum(axis=1, keepdims=True), so3.cross(a, b)], axis=1))

@@ -1,0 +1,238 @@
+"""A recording of the los method as arrays, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise, product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.config import Config
+from pipelines.errors import InputError
+from pipelines.recording import series
+from pipelines.recording.checks import check_overlap, clean, count, nanoseconds
+from pipelines.recording.gyro import read_gyro
+from pipelines.recording.reading import Recording
+from pipelines.recording.topics import TOPICS
+from pipelines.recording.writing import attached, write_session
+from pipelines.vision.recorded import camera_of
+
+Array = NDArray[np.float64]
+
+JOINTS = ("azimuth", "elevation")
+
+# Beyond this elevation the azimuth axis would have to turn sec(elevation) > 5.8 times as fast as the sway.
+_STEEPEST = np.deg2rad(80.0)
+# No camera that measures LOS errors looks this far off its axis, rad; in pixels most errors are larger.
+_WIDEST_ERROR = 0.5
+# A gimbal is looked at in stretches this long, s, and counts as moved by the carrier beyond this, rad.
+_STRETCH, _MOVED = 2.0, 0.01
+# Pictures this far apart, s, and at least so many, tell the signs of the gyro's axes.
+_STRIDE, _FEWEST = 0.2, 20
+
+
+@dataclass(frozen=True, eq=False)
+class LosData:
+    """What a los session measured. Times are s from epoch_ns (Unix ns), strictly increasing.
+
+    gyro_t (N,), gyro (N, 3) rad/s: carrier gyro in m. gimbal_t (G,), gimbal (G, 2) rad: azimuth (continuous) and
+    elevation. image_t (K,), error (K, 3) rad: phx, phz and the camera's roll since its target was found, NaN where the
+    roll was not measured. error_cov (K, 3, 3) rad^2: the tracker's covariance, None if unknown. gyro_density,
+    rad/s/sqrt(Hz): from the covariances of the messages, None if they say nothing. dropped: reason -> messages.
+    """
+
+    epoch_ns: int
+    gyro_t: Array
+    gyro: Array
+    gimbal_t: Array
+    gimbal: Array
+    image_t: Array
+    error: Array
+    error_cov: Array | None = None
+    gyro_density: float | None = None
+    dropped: dict[str, int] = field(default_factory=dict)
+
+
+def read_los(recording: Recording, config: Config) -> LosData:
+    """Read and check a los session; without LOS errors they are taken from the pictures.
+
+    Raises InputError when a topic is missing or unusable (see pipelines.recording.checks), when the topics have no time
+    in common, when the target was never found, and when sizes say that an encoder is in degrees, an encoder stands
+    still, a gyro axis has the opposite sign, the elevation is beyond 80 deg, or the LOS error is not in radians.
+    """
+    dropped: dict[str, int] = {}
+    epoch = recording.epoch_ns
+    gyro_name, gimbal_name, error_name = (config.topic(key) for key in ("imu", "gimbal", "los_error"))
+    from_pictures = error_name not in recording.topics and config.topic("image") in recording.topics
+    recording.read_together({gyro_name: (), gimbal_name: JOINTS, error_name: ()})
+    gyro_t, gyro, density = read_gyro(recording, gyro_name, epoch, dropped)
+    gimbal_t, gimbal = _gimbal(recording, gimbal_name, epoch, dropped)
+    covariance = None
+    if from_pictures and "los_error" not in config.topics:
+        error_name = config.topic("image")
+        image_t, error, covariance = _from_pictures(recording, config, epoch, dropped)
+    else:
+        image_t, error = _error(recording, error_name, epoch, dropped)
+    check_overlap({gyro_name: gyro_t, gimbal_name: gimbal_t, error_name: image_t})
+    data = LosData(epoch, gyro_t, gyro, gimbal_t, gimbal, image_t, error, covariance, density, dropped)
+    check_gimbal(gimbal_name, data)
+    check_signs(gyro_name, data)
+    return data
+
+
+def write_los(
+    path: Path | str,
+    data: LosData,
+    truth: Mapping[str, float] | None = None,
+    config_yaml: str | None = None,
+    pictures: tuple[series.CameraInfo, series.ImageSeries] | None = None,
+) -> None:
+    """Write a los session under the default topic names, with its truth and config as attachments.
+
+    Given pictures, they take the place of the LOS errors. Stamps are rounded to ns. read_los gives the same data back
+    if the first sample is the one at t = 0.
+    """
+
+    def ns(t: Array) -> NDArray[np.int64]:
+        return nanoseconds(t, data.epoch_ns)
+
+    variance = 0.0 if data.gyro_density is None else data.gyro_density**2 / np.median(np.diff(data.gyro_t))
+    topics: dict[str, series.Topic] = {
+        TOPICS["imu"].name: series.ImuSeries(ns(data.gyro_t), data.gyro, gyro_cov=variance * np.eye(3), frame_id="imu"),
+        TOPICS["gimbal"].name: series.JointSeries(ns(data.gimbal_t), data.gimbal, JOINTS, frame_id="gimbal"),
+    }
+    if pictures is None:
+        vector = data.error[:, [0, 2, 1]]
+        topics[TOPICS["los_error"].name] = series.VectorSeries(ns(data.image_t), vector, frame_id="los")
+    else:
+        topics[TOPICS["camera_info"].name], topics[TOPICS["image"].name] = pictures
+    write_session(path, topics, attached(truth, config_yaml))
+
+
+def check_gimbal(topic: str, data: LosData) -> None:
+    """Raise InputError if an encoder stands still while the carrier turns and the picture does not move.
+
+    A gimbal locked on purpose is told from a frozen encoder by the LOS error, which then moves with the carrier.
+    """
+    turned = _turned_by_carrier(data).sum(axis=2)
+    for start, stop in pairwise(np.arange(data.gimbal_t[0], data.gimbal_t[-1], _STRETCH)):
+        gimbal, turn, error = (
+            _span(values[slice(*np.searchsorted(t, [start, stop]))])
+            for t, values in (
+                (data.gimbal_t, data.gimbal),
+                (data.gyro_t, turned),
+                (data.image_t, data.error[:, [1, 0]]),
+            )
+        )
+        frozen = (gimbal == 0.0) & (turn > _MOVED) & (error < 0.3 * turn)
+        for name, angle in zip(np.array(JOINTS)[frozen], turn[frozen], strict=True):
+            raise InputError(
+                f"topic {topic}: {name} stands still from {start:.3f} to {stop:.3f} s while the carrier turns by "
+                f"{np.rad2deg(angle):.2f} deg and the target stays in the picture; the encoder is frozen: check its "
+                "cable and its driver"
+            )
+
+
+def check_signs(topic: str, data: LosData) -> None:
+    """Raise InputError if with opposite signs of gyro axes the gimbal holds the picture far better than as they are."""
+    t = data.image_t
+    inside = (t >= max(data.gyro_t[0], data.gimbal_t[0])) & (t <= min(data.gyro_t[-1], data.gimbal_t[-1]))
+    stride = max(1, round(_STRIDE / float(np.median(np.diff(t)))))
+    at, error = t[inside][::stride], data.error[inside][::stride, [1, 0]]
+    if len(at) < _FEWEST:
+        return
+    gimbal = np.stack([np.interp(at, data.gimbal_t, data.gimbal[:, k]) for k in range(2)], axis=1)
+    columns = _turned_by_carrier(data).reshape(len(data.gyro_t), 6).T
+    turned = np.stack([np.interp(at, data.gyro_t, column) for column in columns], axis=1).reshape(-1, 2, 3)
+    # The gimbal's own turn about the camera's z and x, less what the picture shows of it.
+    middle = 0.5 * (gimbal[1:, 1] + gimbal[:-1, 1])
+    held = np.diff(gimbal, axis=0) * np.stack([np.cos(middle), np.ones_like(middle)], axis=1) - np.diff(error, axis=0)
+    miss = {
+        signs: float(np.median(np.linalg.norm(held + np.diff(turned, axis=0) @ np.array(signs), axis=1)))
+        for signs in product((1, -1), repeat=3)
+    }
+    best = min(miss, key=miss.__getitem__)
+    if miss[best] < 0.3 * miss[1, 1, 1]:
+        axes = " and ".join(axis for axis, sign in zip("xyz", best, strict=True) if sign < 0)
+        raise InputError(
+            f"topic {topic}: gimbal and pictures show that the gyro's {axes} has the opposite sign; the "
+            "carrier's axes are x right, y ahead, z up: turn the gyro's axes, or the encoders', the right way"
+        )
+
+
+def _turned_by_carrier(data: LosData) -> Array:
+    """(N, 2, 3) rad: how far each gyro axis has turned the picture about the camera's z and x since the start."""
+    azimuth, elevation = (np.interp(data.gyro_t, data.gimbal_t, data.gimbal[:, k]) for k in range(2))
+    s, c, se, ce = np.sin(azimuth), np.cos(azimuth), np.sin(elevation), np.cos(elevation)
+    wx, wy, wz = data.gyro.T
+    about_z = np.stack([se * s * wx, -se * c * wy, ce * wz], axis=1)
+    about_x = np.stack([c * wx, s * wy, np.zeros_like(wz)], axis=1)
+    return np.cumsum(np.stack([about_z, about_x], axis=1) * np.gradient(data.gyro_t)[:, None, None], axis=0)
+
+
+def _span(values: Array) -> Array:
+    """Largest less smallest of each column; NaN, which compares as False, for fewer than two rows."""
+    return np.asarray(np.ptp(values, axis=0)) if len(values) > 1 else np.full(values.shape[1], np.nan)
+
+
+def _gimbal(recording: Recording, topic: str, epoch_ns: int, dropped: dict[str, int]) -> tuple[Array, Array]:
+    joints = recording.joints(topic, JOINTS)
+    count(dropped, f"{topic}: stamped by log time (kept)", joints.stamped_by_log)
+    t, keep = clean(topic, joints.t_ns, epoch_ns, joints.position, dropped, least=4)
+    gimbal = np.stack([np.unwrap(joints.position[keep, 0]), joints.position[keep, 1]], axis=1)
+    worst = int(np.argmax(np.abs(gimbal[:, 1])))
+    steepest = float(np.abs(gimbal[worst, 1]))
+    if steepest > 0.5 * np.pi:
+        raise InputError(
+            f"topic {topic}: elevation of {gimbal[worst, 1]:.4g} at {t[worst]:.6f} s, beyond pi/2; "
+            "is the encoder in degrees? position has to be in rad"
+        )
+    if steepest > _STEEPEST:
+        raise InputError(
+            f"topic {topic}: elevation of {np.rad2deg(gimbal[worst, 1]):.2f} deg at {t[worst]:.6f} s; beyond 80 deg "
+            "the azimuth axis would have to turn sec(elevation) times as fast as the sway and cannot stabilise: record "
+            "below 80 deg"
+        )
+    return t, gimbal
+
+
+def _error(recording: Recording, topic: str, epoch_ns: int, dropped: dict[str, int]) -> tuple[Array, Array]:
+    """Times and phx, phz, roll; messages without phx or phz (target lost) are dropped."""
+    errors = recording.vector(topic)
+    count(dropped, f"{topic}: stamped by log time (kept)", errors.stamped_by_log)
+    offset = errors.vector[:, [0, 2]]
+    if not np.isfinite(offset).all(axis=1).any():
+        raise InputError(
+            f"topic {topic}: the target was never found, none of the {len(errors)} messages has an LOS error; "
+            "check what the tracker is locked on"
+        )
+    t, keep = clean(topic, errors.t_ns, epoch_ns, offset, dropped)
+    error = errors.vector[keep][:, [0, 2, 1]]
+    size = np.abs(error[:, :2]).max(axis=1)
+    if np.median(size) > _WIDEST_ERROR:
+        raise InputError(
+            f"topic {topic}: LOS errors of {np.median(size):.4g} (median, {size.max():.4g} at most), beyond "
+            f"{_WIDEST_ERROR:g} rad; are they in pixels? divide by the focal length: x and z have to be in rad"
+        )
+    return t, error
+
+
+def _from_pictures(
+    recording: Recording, config: Config, epoch_ns: int, dropped: dict[str, int]
+) -> tuple[Array, Array, Array]:
+    """LOS errors of the target that the first picture shows, with the tracker's covariance."""
+    from pipelines.vision.target import los_errors
+
+    topic = config.topic("image")
+    camera = camera_of(recording, config)
+    found = los_errors(recording.images(topic), camera)
+    for reason, number in found.dropped.items():
+        count(dropped, f"{topic}: {reason}", number)
+    t, keep = clean(topic, found.t_ns, epoch_ns, found.error, dropped)
+    covariance = found.covariance[keep]
+    # The first picture agrees with itself without error, yet where it puts the target is as uncertain as elsewhere.
+    covariance[0] = np.median(covariance, axis=0)
+    return t, found.error[keep], covariance

@@ -1,1 +1,0 @@
-"""The published solvers, as published."""

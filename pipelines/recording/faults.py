@@ -1,0 +1,126 @@
+"""Samples of a noisy sensor that cannot be what it measured: frozen, at the end of its range, or torn out by a spike.
+
+A sensor is told from its own noise: a reading that repeats exactly while it should move, or that lies far from both
+its neighbours while these agree, is none. Streams that repeat most of the time (simulated without noise, coarsely
+quantised at rest) say nothing of the kind and are left alone.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.errors import InputError
+from pipelines.recording.checks import count
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# A reading frozen for at least so long, s, and so many samples, that jumps to where the sensor has moved meanwhile.
+_FROZEN, _FROZEN_SAMPLES = 0.1, 10
+# A jump is more than so many usual steps; a spike more than so many times what its neighbours differ by.
+_JUMP, _SPIKE = 10.0, 10.0
+# A reading at the end of the range for so many samples is clipped, if the range is more than so many quanta.
+_CLIPPED, _QUANTA = 3, 20.0
+# More repeats than this are the nature of the stream.
+_MOST_REPEATED = 0.5
+# A recording that loses more than this is not worth solving.
+_MOST_LOST = 0.2
+
+
+def drop_faults(topic: str, t: Array, values: Array, dropped: dict[str, int], unit: str) -> NDArray[np.intp]:
+    """Rows of values (N, k) at t (N,), s, that are sound; what is not is counted in `dropped`.
+
+    Raises:
+        InputError: an axis never moves while the others do, or more than a fifth of the samples is lost.
+    """
+    _check_alive(topic, values)
+    spikes = np.stack([_spikes(column) for column in values.T], axis=1)
+    rest = np.where(spikes, np.nan, values)
+    clipped, frozen = (np.stack([find(t, column) for column in rest.T], axis=1) for find in (_clipped, _frozen))
+    reasons = {"spike": spikes, "at the end of the sensor's range": clipped, "frozen, the same value for long": frozen}
+    for reason, mask in reasons.items():
+        lost = mask.any(axis=1)
+        if lost.mean() > _MOST_LOST:
+            first = int(np.argmax(lost))
+            axis = int(np.argmax(mask[first]))
+            raise InputError(
+                f"topic {topic}: {100.0 * lost.mean():.0f} % of the samples cannot be used: {reason} "
+                f"({values[first, axis]:.6g} {unit} on axis {'xyz'[axis]}, the first at {t[first]:.3f} s); "
+                "check the sensor and its range, and record again"
+            )
+        count(dropped, f"{topic}: {reason}", int(lost.sum()))
+    return np.flatnonzero(~np.any([mask.any(axis=1) for mask in reasons.values()], axis=0))
+
+
+def _check_alive(topic: str, values: Array) -> None:
+    """Refuse an axis that never changes beside others that always do."""
+    repeated = (np.diff(values, axis=0) == 0.0).mean(axis=0)
+    for axis in np.flatnonzero(repeated == 1.0):
+        if len(values) > _FROZEN_SAMPLES and np.delete(repeated, axis).max(initial=0.0) < 0.1:
+            raise InputError(
+                f"topic {topic}: axis {'xyz'[axis]} reads {values[0, axis]:.6g} throughout while the others move; "
+                "the sensor is dead or its driver does not fill it in: check it and record again"
+            )
+
+
+def _spikes(x: Array) -> Mask:
+    """Single readings far from both neighbours, which agree."""
+    out = np.zeros(len(x), dtype=bool)
+    if len(x) < 5:
+        return out
+    away = np.abs(x[2:-2] - 0.5 * (x[1:-3] + x[3:-1]))
+    around = np.abs(x[3:-1] - x[1:-3]) + np.abs(x[1:-3] - x[:-4]) + np.abs(x[4:] - x[3:-1])
+    step = np.abs(np.diff(x))
+    usual = 1.5 * np.median(step[step > 0.0]) if step.any() else 0.0
+    out[2:-2] = away > _SPIKE * (around + usual)
+    return out
+
+
+def _runs(x: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """First and last index of every stretch of equal readings; NaN equals nothing."""
+    change = np.flatnonzero(np.diff(x) != 0.0)
+    return np.concatenate([[0], change + 1]), np.concatenate([change, [len(x) - 1]])
+
+
+def _mask(size: int, starts: NDArray[np.intp], stops: NDArray[np.intp]) -> Mask:
+    """True from each start to its stop."""
+    edges = np.zeros(size + 1, dtype=int)
+    np.add.at(edges, starts, 1)
+    np.add.at(edges, stops + 1, -1)
+    return np.asarray(np.cumsum(edges[:-1]) > 0)
+
+
+def _edge(step: Array, starts: NDArray[np.intp], stops: NDArray[np.intp]) -> Array:
+    """The larger of the steps into and out of each run."""
+    return np.fmax(np.concatenate([[0.0], step])[starts], np.concatenate([step, [0.0]])[stops])
+
+
+def _frozen(t: Array, x: Array) -> Mask:
+    """Long runs of one value that end in a jump."""
+    starts, stops = _runs(x)
+    long = (stops - starts + 1 >= _FROZEN_SAMPLES) & (t[stops] - t[starts] >= _FROZEN)
+    step = np.abs(np.diff(x))
+    usual = np.nanmedian(step[step > 0.0]) if np.any(step > 0.0) else 0.0
+    # The first reading of a run was a good one.
+    jumps = long & (_edge(step, starts, stops) > _JUMP * usual)
+    out = _mask(len(x), starts[jumps] + 1, stops[jumps])
+    return out if out.mean() < _MOST_REPEATED else np.zeros(len(x), dtype=bool)
+
+
+def _clipped(_: Array, x: Array) -> Mask:
+    """Runs at the largest or the smallest reading of the stream."""
+    starts, stops = _runs(x)
+    step = np.abs(np.diff(x))
+    if not np.any(step > 0.0):
+        return np.zeros(len(x), dtype=bool)
+    quantum = float(np.nanmin(step[step > 0.0]))
+    low, high = np.nanmin(x), np.nanmax(x)
+    at_end = (stops - starts + 1 >= _CLIPPED) & ((x[starts] == low) | (x[starts] == high))
+    at_end &= np.abs(x[starts] - 0.5 * (low + high)) > _QUANTA * quantum
+    # The rounded top of a smooth motion is entered and left by a quantum or two.
+    at_end &= _edge(step, starts, stops) > 3.5 * quantum
+    out = _mask(len(x), starts[at_end], stops[at_end])
+    inside = np.diff(x)[~out[1:]] == 0.0
+    noisy = len(inside) > 0 and inside.mean() < _MOST_REPEATED
+    return out if noisy else np.zeros(len(x), dtype=bool)

@@ -1,0 +1,39 @@
+"""The gyro of an Imu topic as methods read it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.recording.checks import check_gyro, clean, count, gyro_density
+from pipelines.recording.faults import drop_faults
+from pipelines.recording.reading import Recording
+from pipelines.recording.series import ImuSeries
+
+Array = NDArray[np.float64]
+
+
+def read_gyro(
+    recording: Recording, topic: str, epoch_ns: int, dropped: dict[str, int]
+) -> tuple[Array, Array, float | None]:
+    """Times (N,) s from the epoch, rates (N, 3) rad/s, and the density its messages state (rad/s/sqrt(Hz)) or None.
+
+    Samples that cannot be used are counted in `dropped`. Raises InputError as pipelines.recording.checks does.
+    """
+    imu = recording.imu(topic)
+    t, keep = usable(topic, imu, epoch_ns, dropped)
+    return t, imu.gyro[keep], gyro_density(t, imu.gyro_cov[keep])
+
+
+def usable(
+    topic: str, imu: ImuSeries, epoch_ns: int, dropped: dict[str, int], least: int = 2
+) -> tuple[Array, NDArray[np.intp]]:
+    """Times (N,) s from the epoch of the samples whose rates can be used, and which they are (indexes into the series).
+
+    Raises InputError as pipelines.recording.checks and pipelines.recording.faults do.
+    """
+    count(dropped, f"{topic}: stamped by log time (kept)", imu.stamped_by_log)
+    t, keep = clean(topic, imu.t_ns, epoch_ns, imu.gyro, dropped, least)
+    sound = drop_faults(topic, t, imu.gyro[keep], dropped, "rad/s")
+    check_gyro(topic, t[sound], imu.gyro[keep[sound]])
+    return t[sound], keep[sound]

@@ -1,1 +1,0 @@
-"""MCAP recordings and configs, in and out; the only place that knows topics."""

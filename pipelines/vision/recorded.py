@@ -1,0 +1,19 @@
+"""The camera of a recording, from its CameraInfo."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipelines.config import Config
+from pipelines.recording.reading import Recording
+
+if TYPE_CHECKING:
+    from pipelines.vision.camera import Camera
+
+
+def camera_of(recording: Recording, config: Config) -> Camera:
+    """The camera. Raises InputError when its topic is missing or says what no camera can be."""
+    from pipelines.vision.camera import Camera
+
+    info = recording.camera_info(config.topic("camera_info"))
+    return Camera(info.width, info.height, info.k, info.distortion_model, info.d)
