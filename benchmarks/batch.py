@@ -12,8 +12,8 @@ from benchmarks.measure import Ratio, costs, growth
 from pipelines.config import load_config
 from pipelines.graph.problem import Factor, Problem
 from pipelines.methods.head import graph as head
-from pipelines.methods.los import graph as los
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from pipelines.methods.los import graph as los
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.solvers.batch import CHUNK, Solution, optimize

@@ -16,9 +16,9 @@ from pipelines.errors import InputError
 from pipelines.graph.problem import Array, Estimate, Problem
 from pipelines.judgement.observability import assess
 from pipelines.methods.head import graph as head
-from pipelines.methods.los import graph as los
 from pipelines.methods.head.recording import read_head, write_head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from pipelines.methods.los import graph as los
 from pipelines.methods.los.recording import read_los, write_los
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from pipelines.recording.faults import drop_faults

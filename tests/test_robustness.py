@@ -15,11 +15,11 @@ from pipelines.config import load_config
 from pipelines.graph.problem import Estimate, Problem
 from pipelines.judgement.observability import assess
 from pipelines.methods.cube import graph as cube
-from pipelines.methods.indexer import graph as indexer
-from pipelines.methods.los import graph as los
 from pipelines.methods.cube.parameters import triad_names
 from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.indexer import graph as indexer
 from pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
+from pipelines.methods.los import graph as los
 from pipelines.methods.los.recording import write_los
 from pipelines.methods.los.simulation import LosAngles, LosScenario, los_config, simulate_los
 from pipelines.session import calibrate
