@@ -14,7 +14,7 @@ from rosbags.highlevel import AnyReader
 
 from benchmarks.measure import Ratio, costs
 from pipelines.recording import series
-from pipelines.recording.container import McapFile
+from pipelines.recording.mcap_file import McapFile
 from pipelines.recording.reading import open_recording
 from pipelines.recording.writing import write_session
 

@@ -13,8 +13,8 @@ from mcap.writer import CompressionType, Writer
 
 from pipelines.errors import InputError
 from pipelines.recording import series
+from pipelines.recording.mcap_records import HEAD, MAGIC
 from pipelines.recording.reading import Recording, open_recording
-from pipelines.recording.records import HEAD, MAGIC
 from pipelines.recording.writing import write_session
 
 T0 = 1_700_000_000_123_456_789

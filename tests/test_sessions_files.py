@@ -13,8 +13,9 @@ from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.highlevel import AnyReader
 
 from pipelines.errors import InputError
-from pipelines.recording import messages, records, series
-from pipelines.recording.container import McapFile
+from pipelines.recording import mcap_records as records
+from pipelines.recording import messages, series
+from pipelines.recording.mcap_file import McapFile
 from pipelines.recording.reading import open_recording
 from pipelines.recording.writing import write_session
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.recording.container import Rows
+from pipelines.recording.mcap_records import windows
 from pipelines.recording.messages import Array, Definition, Layout, Leaf, MessageError, at
-from pipelines.recording.records import windows
 
 # Which numbers of a field, as indexes, given the message; None if the message has not got them.
 Order = Callable[[Any], Sequence[int] | None]

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from pipelines.config import Config
 from pipelines.errors import InputError
-from pipelines.recording.reading import ENCODING, Recording, Topic
+from pipelines.recording.message_reader import ENCODING, Topic
+from pipelines.recording.reading import Recording
 from pipelines.recording.topics import METHODS, NEEDED, TOPICS
 
 

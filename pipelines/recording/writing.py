@@ -38,8 +38,8 @@ from numpy.typing import NDArray
 from pipelines import progress
 from pipelines.config import ATTACHMENT, TRUTH
 from pipelines.recording import messages, series
+from pipelines.recording.mcap_records import MAGIC, MESSAGE_HEAD, windows
 from pipelines.recording.messages import Array, Definition, known
-from pipelines.recording.records import MAGIC, MESSAGE_HEAD, windows
 
 _CHUNK = 1 << 20
 _LEVEL = 1  # noise does not compress better at higher ones

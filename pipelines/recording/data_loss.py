@@ -13,7 +13,7 @@ Kind = Literal["cut", "damage", "summary", "definition", "attachment"]
 
 
 @dataclass(frozen=True)
-class Loss:
+class DataLoss:
     """A stretch of a file that cannot be used.
 
     Attributes:
@@ -36,7 +36,7 @@ class Loss:
 
 
 def described(
-    losses: Sequence[Loss], missing: Mapping[str, int], total: int, start_ns: int | None, duration_s: float
+    losses: Sequence[DataLoss], missing: Mapping[str, int], total: int, start_ns: int | None, duration_s: float
 ) -> tuple[str, ...]:
     """Sentences about what is lost, one a kind.
 
@@ -78,7 +78,7 @@ def described(
     return tuple(notes)
 
 
-def _when(losses: Sequence[Loss], start_ns: int | None, duration_s: float) -> str:
+def _when(losses: Sequence[DataLoss], start_ns: int | None, duration_s: float) -> str:
     """Where on the session's clock the losses are; nothing where that is unknown or cannot be."""
     if start_ns is None:
         return ""

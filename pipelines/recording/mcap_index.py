@@ -1,4 +1,4 @@
-"""What lies where in an MCAP file, from one walk from record head to record head.
+"""The index of an MCAP file: what lies where, from one walk from record head to record head.
 
 The walk needs neither a summary nor a chunk index. Where bytes are damaged it goes on at the next record that can be
 told, at worst the next chunk; what is left out is noted. The summary behind the data is believed if its checksum holds:
@@ -16,9 +16,10 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from pipelines.errors import InputError
-from pipelines.recording import records
-from pipelines.recording.losses import Loss
-from pipelines.recording.records import HEAD, MAGIC, MESSAGE_HEAD, Channel, DamagedError, Fields, Schema
+from pipelines.recording import mcap_records as records
+from pipelines.recording.container import Channel, Schema
+from pipelines.recording.data_loss import DataLoss
+from pipelines.recording.mcap_records import HEAD, MAGIC, MESSAGE_HEAD, DamagedError, Fields
 
 _RAW_BLOCK = 1 << 20
 _FOOTER = struct.Struct("<BQQQI")
@@ -55,7 +56,7 @@ class Block:
     is_lost: bool = False  # found damaged within
 
 
-class Survey:
+class McapIndex:
     """The walk over an open file.
 
     Raises InputError when the file is hostile: more definitions than any recording has, or a decompression bomb.
@@ -78,7 +79,7 @@ class Survey:
         self.blocks: list[Block] = []
         self.attachments: dict[str, int] = {}
         self.stated: dict[int, int] | None = None
-        self.losses: list[Loss] = []
+        self.losses: list[DataLoss] = []
         self._name, self._text, self._unpacked = name, 0, 0
         self._chunk: Block | None = None
         self._data_end: tuple[int, int] | None = None  # byte and checksum
@@ -131,7 +132,7 @@ class Survey:
                 self._take_summary(opcode, summary[first + HEAD.size : last])
         except DamagedError as damaged:
             self.stated = None
-            self.losses.append(Loss("summary", start, max(0, at - start), reason=str(damaged)))
+            self.losses.append(DataLoss("summary", start, max(0, at - start), reason=str(damaged)))
         return at
 
     def _take_summary(self, opcode: int, record: bytes) -> None:
@@ -179,7 +180,7 @@ class Survey:
         self._chunk = None
         cut = end == stop == self.size
         self.losses.append(
-            Loss("cut" if cut else "damage", position, end - position, int(span is not None), span, reason)
+            DataLoss("cut" if cut else "damage", position, end - position, int(span is not None), span, reason)
         )
         return end
 
@@ -248,11 +249,11 @@ class Survey:
         if closed:
             pass
         elif self._data_end is None and not any(loss.kind == "cut" for loss in self.losses):
-            self.losses.append(Loss("cut", self.size, 0))
+            self.losses.append(DataLoss("cut", self.size, 0))
         elif self._data_end is not None:
             at = self._data_end[0] + HEAD.size + 4
             self.losses.append(
-                Loss("summary", at, self.size - at, reason="the file ends in it or its footer is damaged")
+                DataLoss("summary", at, self.size - at, reason="the file ends in it or its footer is damaged")
             )
         raw = [block for block in self.blocks if not block.is_chunk]
         if not raw:
@@ -264,7 +265,7 @@ class Survey:
             self.blocks = [block for block in self.blocks if block.is_chunk]
             size = sum(block.end - block.start for block in raw)
             reason = "messages outside chunks, whose only checksum is another"
-            self.losses.append(Loss("damage", raw[0].start, size, reason=reason))
+            self.losses.append(DataLoss("damage", raw[0].start, size, reason=reason))
 
 
 def _is_record(stream: BinaryIO, position: int, stop: int) -> bool:

@@ -1,4 +1,4 @@
-"""What is taken out of the messages of a topic of numbers."""
+"""The columns that the messages of a topic of numbers become."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _SERIES: Mapping[str, type[series.Series]] = {
         series.FixSeries,
     )
 }
-# Message types that can be taken.
+# Message types that become columns.
 NUMBERS = {*_SERIES, messages.JOINT_STATE}
 
 
-class Taking:
-    """What is taken out of the messages of a topic: the columns of a series, or the positions of the joints `names`.
+class TopicColumns:
+    """The columns of a topic: those of a series, or the positions of the joints `names`.
 
     Attributes:
         table: to be filled.

@@ -16,6 +16,8 @@ import zstandard
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
+from pipelines.recording.container import Channel, Schema
+
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")
 
@@ -46,24 +48,6 @@ _PIECE = 1 << 20
 
 class DamagedError(Exception):
     """Bytes that are not what they should be; the message says why, as a part of a sentence."""
-
-
-class Schema(NamedTuple):
-    """How messages are defined."""
-
-    id: int
-    name: str
-    encoding: str
-    data: bytes
-
-
-class Channel(NamedTuple):
-    """A topic and how its messages are encoded."""
-
-    id: int
-    topic: str
-    message_encoding: str
-    schema_id: int
 
 
 class ChunkHead(NamedTuple):
