@@ -1,4 +1,4 @@
-"""Rotation of a gyro over any window, with its derivatives with respect to the gyro's bias and the window's end.
+"""Rotation of a gyro over any window, with its derivatives with respect to the gyro's errors and the window's end.
 
 A gyro sample is the mean rate over an interval centred on its stamp. The rate is taken as linear between stamps
 (trapezoid), through points a little off the means: a mean m is w + h^2 w''/24 of the point rate w, the trapezoid's own
@@ -9,9 +9,9 @@ expansion of a linear rate (Iserles et al., Acta Numerica 2000).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,6 +37,9 @@ class Increments:
         rate: (n, 3), rate at the window's end with bias_hat taken off, rad/s.
         unseen: (n,) rad^2 per axis, variance of what the sensor may have turned in gaps of its record, beyond the
             straight line between the rates on either side.
+        scale_jacobian: (n, 3, 9), None unless asked for; for a gyro that reads D w too much the rotation is
+            wxyz * Exp(J vec(D)), to first order, w the rate with bias_hat taken off, vec by rows: xx, xy, xz, yx ...
+        g_jacobian: (n, 3, 9), likewise for a gyro that reads D f too much, f the specific force; None without it.
     """
 
     duration: Array
@@ -44,10 +47,17 @@ class Increments:
     bias_jacobian: Array
     rate: Array
     unseen: Array
+    scale_jacobian: Array | None = None
+    g_jacobian: Array | None = None
+    stacked: ClassVar = ("duration", "wxyz", "bias_jacobian", "rate", "unseen", "scale_jacobian", "g_jacobian")
 
     def __getitem__(self, rows: Any) -> Increments:
         """Those over some of the windows."""
-        return Increments(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+        def taken(part: Any) -> Any:
+            return None if part is None else part[rows]
+
+        return Increments(*(taken(getattr(self, name)) for name in self.stacked))
 
 
 class GyroPath:
@@ -57,14 +67,27 @@ class GyroPath:
         t: (N,) stamps, s, increasing, N >= 2.
         rate: (N, 3) angular rate, rad/s.
         bias_hat: (3,) taken off all rates.
+        specific_force: (N, 3) by the accelerometer of the same IMU, at the same stamps and in the same frame, m/s^2.
     """
 
-    def __init__(self, t: ArrayLike, rate: ArrayLike, bias_hat: ArrayLike = (0.0, 0.0, 0.0)) -> None:
+    def __init__(
+        self,
+        t: ArrayLike,
+        rate: ArrayLike,
+        bias_hat: ArrayLike = (0.0, 0.0, 0.0),
+        specific_force: ArrayLike | None = None,
+    ) -> None:
         self.t = np.asarray(t, dtype=float)
         self.bias_hat = np.asarray(bias_hat, dtype=float)
         mean = np.asarray(rate, dtype=float)
         if len(self.t) < 2 or mean.shape != (len(self.t), 3):
             raise ValueError(f"needs stamps (N,) and rates (N, 3), N >= 2; got {self.t.shape} and {mean.shape}")
+        self._force: Array | None = None
+        if specific_force is not None:
+            force = np.asarray(specific_force, dtype=float)
+            if force.shape != mean.shape:
+                raise ValueError(f"needs a specific force for each rate; got {force.shape} and {mean.shape}")
+            self._force = force - _trapezoid_excess(self.t, force)
         self._rate = mean - self.bias_hat - _trapezoid_excess(self.t, mean)
         self._slope = np.diff(self._rate, axis=0) / np.diff(self.t)[:, None]
         self._arcs = _arc(self._rate[:-1], self._slope, np.diff(self.t)[:, None])
@@ -88,26 +111,72 @@ class GyroPath:
         w0, a = self._rate[i], self._slope[i]
         return _rate(w0, a, s, _arc(w0, a, s))
 
-    def increments(self, start: ArrayLike, stop: ArrayLike) -> Increments:
+    def specific_force(self, at: ArrayLike) -> Array | None:
+        """Specific force (n, 3) at the times, m/s^2; None where it is not known."""
+        if self._force is None:
+            return None
+        i, s = self._place(np.asarray(at, dtype=float))
+        return self._force[i] + (self._force[i + 1] - self._force[i]) * (s / (self.t[i + 1] - self.t[i])[:, None])
+
+    def increments(self, start: ArrayLike, stop: ArrayLike, scale: bool = False) -> Increments:
         """Rotations over the windows [start, stop], (n,) each, s; a window may be empty or run backwards.
 
         Beyond the first and the last stamp the outermost rates are continued; callers keep windows inside.
+
+        Args:
+            start, stop: the windows' ends.
+            scale: also the derivatives by the gyro's scale and, with a specific force, by its g-sensitivity. They cost
+                as much as the rest and one pass over the whole stream.
         """
         start, stop = np.asarray(start, dtype=float), np.asarray(stop, dtype=float)
         # Both ends in one call: what a few windows cost is calls.
-        (q0, q1), (c0, c1), (_, rate) = (np.split(each, 2) for each in self._at(np.concatenate([start, stop])))
-        jacobian = -so3.matrix(so3.inverse(q1)) @ (c1 - c0)
+        ends = np.concatenate([start, stop])
+        (q0, q1), (p0, p1), (_, rate) = (np.split(each, 2) for each in self._at(ends))
+        i0, i1 = np.split(self._place(ends)[0], 2)
+        to_end = -so3.matrix(so3.inverse(q1))
+        jacobian = to_end @ ((self._integral[i1] - self._integral[i0]) + (p1 - p0))
         unseen = np.abs(np.interp(stop, self.t, self._unseen) - np.interp(start, self.t, self._unseen))
-        return Increments(stop - start, so3.multiply(so3.inverse(q0), q1), jacobian, rate, unseen)
+        turned = Increments(stop - start, so3.multiply(so3.inverse(q0), q1), jacobian, rate, unseen)
+        if not scale:
+            return turned
+        by = [
+            to_end @ self._moments(ends, np.concatenate([p0, p1]), v)
+            for v in (self._rate, self._force)
+            if v is not None
+        ]
+        return replace(turned, scale_jacobian=by[0], g_jacobian=by[1] if len(by) == 2 else None)
 
     def _at(self, at: Array) -> tuple[Array, Array, Array]:
-        """Attitude, integral of the attitude matrix and rate at the times."""
+        """Attitude, integral of its matrix since the sample interval's start, and rate at the times."""
         i, s = self._place(at)
         w0, a = self._rate[i], self._slope[i]
         arc = _arc(w0, a, s)
-        turn = so3.exp(arc)
-        integral = self._integral[i] + so3.matrix(self._attitude[i]) @ (s[..., None] * so3.right_jacobian(-arc))
-        return so3.multiply(self._attitude[i], turn), integral, _rate(w0, a, s, arc)
+        begun = so3.matrix(self._attitude[i]) @ (s[..., None] * so3.right_jacobian(-arc))
+        return so3.multiply(self._attitude[i], so3.exp(arc)), begun, _rate(w0, a, s, arc)
+
+    def _moments(self, ends: Array, begun: Array, vector: Array) -> Array:
+        """Integral over windows of the attitude matrix times each component of a vector, (n, 3, 9): [i, 3 a + b].
+
+        Within a sample interval the attitude's integral is taken with the vector's mean, which leaves out a twelfth of
+        how both change in it. Column by column: all at once would take 27 times the stream's memory.
+
+        Args:
+            ends: (2 n,) the windows' starts, then their ends.
+            begun: (2 n, 3, 3) integral of the attitude matrix from the sample before each end.
+            vector: (N, 3) at the stamps, linear in between.
+        """
+        i, s = self._place(ends)
+        slope = (vector[i + 1] - vector[i]) / (self.t[i + 1] - self.t[i])[:, None]
+        at_ends = np.einsum("nia,nb->niab", begun, vector[i] + 0.5 * s * slope).reshape(-1, 3, 9)
+        start, stop = np.split(i, 2)
+        attitude = np.ascontiguousarray(np.diff(self._integral, axis=0).reshape(-1, 9).T)
+        mean = np.ascontiguousarray(0.5 * (vector[1:] + vector[:-1]).T)
+        out = at_ends[len(start) :] - at_ends[: len(start)]
+        until = np.zeros(len(self.t))
+        for row, column in np.ndindex(9, 3):
+            np.cumsum(attitude[row] * mean[column], out=until[1:])
+            out[:, row // 3, 3 * (row % 3) + column] += until[stop] - until[start]
+        return out
 
     def _place(self, at: Array) -> tuple[NDArray[np.intp], Array]:
         """The sample intervals that hold the times, (n,), and the time since their start, (n, 1), s."""

@@ -1,0 +1,66 @@
+"""The gyro chain: what scale and g-sensitivity as variables cost over a gyro with a bias only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import gtsam
+import numpy as np
+
+from benchmarks.measure import Ratio, costs
+from factors import so3
+from factors.attitude import ahrs_factors
+from factors.gyro import GyroIncrementFactor
+from factors.preintegration import GyroPath
+from factors.vectorized import Ensemble, VectorizedFactor
+from pipelines.solvers.batch import CHUNK
+
+SAMPLES, WINDOWS = 300_000, 36_000
+BIAS, SCALE, G = (int(gtsam.symbol(c, 0)) for c in "bsg")
+
+
+def run() -> Iterator[Ratio]:
+    """Integrating a stream, and linearising the factors on it, with and without."""
+    rng = np.random.default_rng(0)
+    t = np.arange(SAMPLES) / 500.0
+    rate, force = (np.sin(t[:, None] * rng.uniform(1.0, 6.0, 3)) for _ in range(2))
+    edges = np.linspace(t[0], t[-1], WINDOWS + 1)
+    windows = edges[:-1], edges[1:]
+    chain, plain = costs(
+        [
+            lambda: GyroPath(t, rate, specific_force=force).increments(*windows, scale=True),
+            lambda: GyroPath(t, rate).increments(*windows),
+        ]
+    )
+    compared = "increments with derivatives by scale and g-sensitivity over those with a bias only, 300,000 samples"
+    yield Ratio("gyro.integration", compared, chain.seconds / plain.seconds, wanted=2.0, ours=chain, theirs=plain)
+
+    path = GyroPath(t, rate, specific_force=force)
+    turns = path.increments(*windows, scale=True)
+    values = gtsam.Values()
+    for k, attitude in enumerate(path.attitude(edges)):
+        values.insert(k, so3.to_gtsam(attitude))
+    for key, size in [(BIAS, 3), (SCALE, 6), (G, 9)]:
+        values.insert(key, np.zeros(size))
+    factors = [
+        VectorizedFactor(
+            GyroIncrementFactor(edges[k + 1], turns[k], path, np.full(len(k), 1e-5)),
+            [k.tolist(), (k + 1).tolist(), BIAS, SCALE, G],
+            ["rotation", "rotation", 3, 6, 9],
+        )
+        for k in np.array_split(np.arange(WINDOWS), WINDOWS // CHUNK)
+    ]
+    ours, native = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
+    for factor in factors:
+        ours.add(factor.factor)
+    keys = list(range(WINDOWS + 1))
+    for each in ahrs_factors(keys[:-1], keys[1:], [BIAS] * WINDOWS, turns, path.bias_hat, np.full(WINDOWS, 1e-10)):
+        native.add(each)
+
+    def linearize() -> None:
+        with Ensemble(factors).at(values):
+            ours.linearize(values)
+
+    chain, plain = costs([linearize, lambda: native.linearize(values)])
+    compared = "linearising increments with scale and g-sensitivity over native AHRSFactors, 36,000 keyframes"
+    yield Ratio("gyro.linearisation", compared, chain.seconds / plain.seconds, ours=chain, theirs=plain)
