@@ -12,9 +12,12 @@ from pipelines.config import load_config
 from pipelines.graph.problem import Problem
 from pipelines.methods.head import graph as head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from pipelines.methods.indexer import graph as indexer
+from pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
 from pipelines.methods.los import graph as los
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from pipelines.simulation.motion import EulerMotion, Swing
+from pipelines.simulation.scenario import load_scenario
 from pipelines.solvers.batch import solve_batch
 
 LOS = LosScenario(duration_s=30.0, image_rate_hz=20.0, gyro_rate_hz=200.0, gimbal_rate_hz=100.0)
@@ -59,3 +62,15 @@ def test_history_agrees_with_solving_the_past_alone(make: Callable[[], Problem])
     )
     np.testing.assert_allclose(past.history.sigmas[-2], sigmas, rtol=0.1)
     assert np.abs((past.history.values[-2] - values) / sigmas).max() < 0.3
+
+
+def test_history_where_sigmas_are_below_what_gtsam_takes_for_a_constraint() -> None:
+    """A quiet gyro, or hours of one, ties the session's mean bias to less than 1e-8 rad/s: no constraint for that."""
+    ideal = load_scenario(IndexerScenario, "indexer_rough")
+    noise = ideal.noise.model_copy(update={"gyro_density": 1e-8, "gyro_bias_walk": 1e-12})
+    scenario = ideal.model_copy(update={"noise": noise})
+    data, _ = simulate_indexer(scenario, 1)
+    whole = solve_batch(indexer.problem(data, load_config(indexer_config(scenario).encode())))
+    assert whole.history is not None
+    np.testing.assert_allclose(whole.history.values[-1], whole.values, atol=1e-3 * whole.sigmas.min())
+    np.testing.assert_allclose(whole.history.sigmas[-1], whole.sigmas, rtol=1e-6)

@@ -181,3 +181,6 @@ def test_families_account_for_every_degree_of_freedom() -> None:
     dof = {family: d for family, (_, d) in estimate.chi_square.families.items()}
     assert dof["bias walk"] < 1.0
     assert dof["turn"] > 0.8 * estimate.chi_square.dof
+    # Also of factors that are compressed: a family's squares are what its freedoms say.
+    for square, freedoms in estimate.chi_square.families.values():
+        assert abs(square - freedoms) < 4.0 * np.sqrt(2.0 * freedoms) + 1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -149,6 +150,17 @@ def test_degrees_of_freedom_are_the_expected_sum_of_squares(h_of: Callable[[np.r
     for family in ("seen", "walk"):
         squares, expected = (np.array([c.families[family][i] for c in found if c]) for i in (0, 1))
         assert squares.mean() == pytest.approx(expected.mean(), rel=0.15)
+
+
+def test_families_share_the_freedoms_of_a_tight_process_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the normal equations have lost their digits: never a whole that goes to the first family."""
+    monkeypatch.setattr(sys.modules[__name__], "WALK", 1e-10)
+    walk, _ = Walk.random(1)
+    summary = solve_batch(walk.problem()).chi_square
+    assert summary is not None
+    # A walk this tight is no measurement of anything: its rows take as many unknowns away as they are.
+    assert summary.families["walk"][1] == pytest.approx(0.0, abs=1e-3)
+    assert summary.families["seen"][1] == pytest.approx(57.0, abs=1.0)
 
 
 def test_errors_are_as_large_as_the_covariance_says() -> None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from pipelines.graph.linear import linear_factor
 from pipelines.graph.problem import Array, Factor
 
 # A stretch may bend the angle by this fraction of what gyro noise does over it ...
@@ -92,20 +93,9 @@ class WalkingBias:
         share = float(stretch / whole)
         # Within the stretch the walk's own mean departs from the node's constant by this much.
         departure = self.walk * np.sqrt(stretch / 12.0) * share
-        keys = (self.mean_key(node), self.mean_key(node - 1), self.key(node))
-        zeros = gtsam.Values()
-        for key in keys:
-            zeros.insert(key, np.zeros(3))
-        linear = gtsam.JacobianFactor(
-            keys[0],
-            np.eye(3),
-            keys[1],
-            -(1.0 - share) * np.eye(3),
-            keys[2],
-            -share * np.eye(3),
-            np.zeros(3),
-            gtsam.noiseModel.Isotropic.Sigma(
-                3, float(np.hypot(departure, _MEAN_SLACK * self._unknown(stretch) * share))
-            ),
+        sigma = float(np.hypot(departure, _MEAN_SLACK * self._unknown(stretch) * share))
+        blocks = {self.mean_key(node): 1.0, self.mean_key(node - 1): share - 1.0, self.key(node): -share}
+        factor = linear_factor(
+            {key: scale * np.eye(3) for key, scale in blocks.items()}, dict.fromkeys(blocks, np.zeros(3)), sigma
         )
-        return Factor("definition", gtsam.LinearContainerFactor(linear, zeros))
+        return Factor("definition", factor)

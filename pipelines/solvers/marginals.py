@@ -14,6 +14,8 @@ from pipelines.graph.problem import Array, ChiSquare, Factor, History, Parameter
 # named with the others instead of making the system unsolvable.
 _UNKNOWN = 1e4
 _SAMPLES = 6
+# Families whose residuals say nothing about the noise of the recording.
+_NO_MEASUREMENTS = ("prior", "definition")
 
 
 class IndeterminateError(Exception):
@@ -147,24 +149,27 @@ def chi_square(
     sampled, the largest family's taken as what is left of the whole.
     """
     value: dict[str, float] = {}
-    rows = 0
+    rows: list[int] = []
     for f in factors:
-        if f.family in ("prior", "definition"):
-            rows += f.factor.dim() if f.family == "definition" else 0
-            continue
         if f.measurement is None:
-            square, count = 2.0 * f.factor.error(values), f.factor.dim()
+            rows.append(f.factor.dim())
         else:
-            used = f.measurement.used(values)
-            square = float((f.measurement.residuals(values)[used] ** 2).sum())
-            count = f.measurement.model.rows * int(used.sum())
-        value[f.family] = value.get(f.family, 0.0) + square
-        rows += count
-    dof = rows - values.dim() + _from_priors(problem, covariance)
-    families = _family_dof([f.family for f in factors], linear, ordering)
+            rows.append(f.measurement.model.rows * int(f.measurement.used(values).sum()))
+        if f.family not in _NO_MEASUREMENTS:
+            value[f.family] = value.get(f.family, 0.0) + _square(f, values)
+    counted = sum(count for f, count in zip(factors, rows, strict=True) if f.family != "prior")
+    dof = counted - values.dim() + _from_priors(problem, covariance)
+    families = _family_dof(factors, rows, linear, ordering)
     largest = max(value, key=lambda family: families[family])
     families[largest] = dof - sum(families[family] for family in value if family != largest)
     return ChiSquare(sum(value.values()), dof, {family: (value[family], families[family]) for family in value})
+
+
+def _square(factor: Factor, values: gtsam.Values) -> float:
+    """Sum of squares of a factor's whitened residuals, rejected ones left out."""
+    if factor.measurement is None:
+        return 2.0 * float(factor.factor.error(values))
+    return float((factor.measurement.residuals(values)[factor.measurement.used(values)] ** 2).sum())
 
 
 def _from_priors(problem: Problem, covariance: Array) -> float:
@@ -179,29 +184,43 @@ def _from_priors(problem: Problem, covariance: Array) -> float:
 
 
 def _family_dof(
-    families: Sequence[str], linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
+    factors: Sequence[Factor], rows: Sequence[int], linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
 ) -> dict[str, float]:
     """Expected sum of squares of each family: that of random signs after solving for the same unknowns.
 
     Noise of variance one would do too; signs tell the traces of projections with less scatter (Hutchinson 1989).
+
+    Args:
+        factors: of the graph.
+        rows: how many each stands for, rejected measurements left out.
+        linear: the factors linearised; a compressed one has fewer rows than it stands for.
+        ordering: of the elimination.
+
+    Raises:
+        IndeterminateError: a variable is undetermined.
     """
     try:
-        # By Cholesky: of the conditionals that QR leaves, backSubstituteTranspose forgets the sigmas.
-        bayes_net = linear.eliminateSequential(ordering)
-    except RuntimeError:  # singular: no sampling
-        return dict.fromkeys(families, 0.0)
-    origin = bayes_net.optimize()
+        # By QR: tight processes beside loose priors cost Cholesky its digits, and with them the whole system.
+        bayes_net = linear.eliminateSequential(ordering, gtsam.EliminateQR)
+        origin = bayes_net.optimize()
+    except RuntimeError as error:
+        raise IndeterminateError(explain(str(error))) from None
     keys = sorted(linear.keyVector())
     ends = np.cumsum([len(origin.at(key)) for key in keys]).tolist()
     # Nonzero elements of the system: rows in the order of the factors, columns in that of the keys, then those of b.
     elements = linear.sparseJacobian_()
     elements = elements[:, elements[1] <= ends[-1]]
     row, column, element = elements[0].astype(int) - 1, elements[1].astype(int) - 1, elements[2]
-    names = sorted(set(families))
+    names = sorted({f.family for f in factors})
+    index = np.array([names.index(f.family) for f in factors])
     sizes = [len(linear.at(i).jacobian()[1]) for i in range(linear.size())]
-    family = np.repeat([names.index(name) for name in families], sizes)
+    family = np.repeat(index, sizes)
     # Rejected measurements and free priors have empty rows, which are no measurements.
     counted = np.bincount(row, minlength=len(family)) > 0
+    held = np.bincount(np.repeat(np.arange(len(sizes)), sizes), counted, len(sizes))
+    measured = np.array([f.measurement is not None for f in factors])
+    # What compression took out of the system holds no unknowns: each such row is expected to be one.
+    absent = np.bincount(index, np.where(measured, np.array(rows) - held, 0.0), len(names))
     square = np.zeros(len(names))
     generator = np.random.default_rng(0)
     for _ in range(_SAMPLES):
@@ -213,7 +232,7 @@ def _family_dof(
         x = bayes_net.backSubstitute(bayes_net.backSubstituteTranspose(projection)).vector(keys)
         left = np.bincount(row, element * x[column], len(family)) - noise
         square += np.bincount(family, left**2, len(names))
-    return dict(zip(names, (square / _SAMPLES).tolist(), strict=True))
+    return dict(zip(names, (absent + square / _SAMPLES).tolist(), strict=True))
 
 
 def explain(message: str) -> str:

@@ -35,6 +35,7 @@ from factors.triad import (
 from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
 from pipelines.config import DEFAULT_NOISE, Config, first_given
 from pipelines.errors import InputError
+from pipelines.graph.linear import linear_factor
 from pipelines.graph.problem import Array, Attitudes, Factor, Problem, Step
 from pipelines.methods.cube.parameters import (
     FIELD_KEY,
@@ -287,14 +288,12 @@ def _process(model: _Model, k: int) -> list[Factor]:
 def _wander_factors(model: _Model, k: int) -> list[Factor]:
     """How the offset of the gyro came to where it is in pose k; after the last, that c is its mean over the session."""
     wander, key = model.wander, _wandered_key(k)
-    noise = gtsam.noiseModel.Isotropic.Sigma(3, float(wander.sigma[k]))
+    sigma = float(wander.sigma[k])
     if k == 0:
+        noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
         return [Factor("bias walk", gtsam.PriorFactorVector(key, np.zeros(3), noise))]
-    zeros = gtsam.Values()
-    zeros.insert(key, np.zeros(3))
-    zeros.insert(_wandered_key(k - 1), np.zeros(3))
-    step = gtsam.JacobianFactor(key, np.eye(3), _wandered_key(k - 1), -wander.kept[k] * np.eye(3), np.zeros(3), noise)
-    factors = [Factor("bias walk", gtsam.LinearContainerFactor(step, zeros))]
+    blocks = {key: np.eye(3), _wandered_key(k - 1): -wander.kept[k] * np.eye(3)}
+    factors = [Factor("bias walk", linear_factor(blocks, dict.fromkeys(blocks, np.zeros(3)), sigma))]
     if k == len(model.poses) - 1:
         mean = WeightedSumFactor(model.poses.span[-1:, 1], wander.weights, _STEADY)
         keys = [_wandered_key(i) for i in range(k + 1)]

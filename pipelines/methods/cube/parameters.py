@@ -13,6 +13,7 @@ from factors import so3
 from factors.triad import TriadPriorFactor, calibration, triad
 from factors.vectorized import VectorizedFactor
 from pipelines.config import Config, RawConversion, check_names
+from pipelines.graph.linear import linear_factor
 from pipelines.graph.priors import prior_sigmas, rotation_prior, vector_prior
 from pipelines.graph.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
 
@@ -108,10 +109,7 @@ def _strength(key: int, model: Array) -> Factor:
     iron nearby turns.
     """
     along = (model / np.linalg.norm(model))[None]
-    noise = gtsam.noiseModel.Isotropic.Sigma(1, _STRENGTH_SIGMA)
-    at = gtsam.Values()
-    at.insert(key, model)
-    return Factor("prior", gtsam.LinearContainerFactor(gtsam.JacobianFactor(key, along, np.zeros(1), noise), at))
+    return Factor("prior", linear_factor({key: along}, {key: model}, _STRENGTH_SIGMA))
 
 
 def cube_parameters(config: Config, camera: bool, reference: bool, field: Array | None) -> Parameters:

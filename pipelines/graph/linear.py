@@ -1,0 +1,33 @@
+"""Linear factors between vector variables, whitened when they are built."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from pipelines.graph.problem import Array
+
+
+def linear_factor(
+    blocks: Mapping[int, Array], origin: Mapping[int, Array], sigma: float
+) -> gtsam.LinearContainerFactor:
+    """The measurement 0 = sum of blocks[key] (x[key] - origin[key]), with `sigma` in each of its m rows.
+
+    The rows are divided by sigma here. With a noise model beside them gtsam's elimination would take any row whose
+    sigma is below 1e-8, in whatever unit, for an exact constraint, which later steps then cannot handle.
+
+    Args:
+        blocks: up to three variables and their coefficients (m, d).
+        origin: variable -> (d,).
+        sigma: of each row, in the unit of the rows.
+    """
+    terms: list[Any] = [part for key, block in blocks.items() for part in (key, block / sigma)]
+    rows = len(next(iter(blocks.values())))
+    values = gtsam.Values()
+    for key in blocks:
+        values.insert(key, origin[key])
+    linear = gtsam.JacobianFactor(*terms, np.zeros(rows), gtsam.noiseModel.Unit.Create(rows))
+    return gtsam.LinearContainerFactor(linear, values)
