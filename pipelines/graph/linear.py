@@ -24,10 +24,11 @@ def linear_factor(
         origin: variable -> (d,).
         sigma: of each row, in the unit of the rows.
     """
-    terms: list[Any] = [part for key, block in blocks.items() for part in (key, block / sigma)]
+    terms = [part for key, block in blocks.items() for part in (key, block / sigma)]
     rows = len(next(iter(blocks.values())))
     values = gtsam.Values()
     for key in blocks:
         values.insert(key, origin[key])
-    linear = gtsam.JacobianFactor(*terms, np.zeros(rows), gtsam.noiseModel.Unit.Create(rows))
+    jacobian: Any = gtsam.JacobianFactor  # its stubs cannot be called with as many blocks as there are
+    linear = jacobian(*terms, np.zeros(rows), gtsam.noiseModel.Unit.Create(rows))
     return gtsam.LinearContainerFactor(linear, values)
