@@ -47,16 +47,24 @@ class WalkingBias:
     stop: float
 
     @classmethod
-    def over(cls, start: float, stop: float, walk: float, density: float) -> WalkingBias:
+    def over(cls, start: float, stop: float, middles: Array, walk: float, density: float) -> WalkingBias:
         """Stretches short enough for the walk (rad/s/sqrt(s)) to stay below gyro noise (rad/s/sqrt(Hz)).
 
-        All are of one length, so that those behind stay as they are while a recording grows.
+        All are of one length, so that those behind stay as they are while a recording grows; but one that holds none
+        of the times at which the bias is asked for is part of the stretch before it.
+
+        Args:
+            start, stop: s.
+            middles: (n,) s, the times at which `node_at` will be asked, increasing; every node is in force at one.
+            walk, density: as above.
         """
         if walk <= 0.0:
             return cls(np.array([start, stop]), 0.0, density, stop)
         length = max(min(_LONGEST, _FRACTION * np.sqrt(3.0) * density / walk), 1e-3)
         count = max(1, int(np.ceil((stop - start) / length - _SHORTEST)))
-        return cls(start + length * np.arange(count + 1), walk, density, stop)
+        edges = start + length * np.arange(count + 1)
+        asked = np.searchsorted(edges[1:-1], middles, side="right")
+        return cls(np.append(start, edges[np.append(np.unique(asked)[1:], count)]), walk, density, stop)
 
     @property
     def nodes(self) -> int:

@@ -128,7 +128,7 @@ def _prepare(data: HeadData, config: Config) -> _Model:
         platform=platform,
         variance_rate=density**2 + platform_density**2,
         scale_error=first_given(config.noise.gyro_scale, DEFAULT_NOISE.gyro_scale),
-        bias=WalkingBias.over(time[0], time[-1], walk, density),
+        bias=WalkingBias.over(time[0], time[-1], 0.5 * (time[1:] + time[:-1]), walk, density),
         bias_hat=bias_hat,
         loss=TruncatedLoss(gate(3)),
         parameters=_parameters(config, platform is not None),

@@ -117,8 +117,8 @@ def _prepare(data: LosData, config: Config) -> tuple[_Model, dict[str, int]]:
     names = tuple(q.name for q in parameters[0].quantities)
     gyro = GyroPath(data.gyro_t, data.gyro, bias_hat)
     motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal) if has_offset else None
-    bias = WalkingBias.over(time[0], time[-1], walk, density)
     middle = np.where(starts, time, 0.5 * (time + np.roll(time, 1)))
+    bias = WalkingBias.over(time[0], time[-1], middle, walk, density)
     model = _Model(
         time=time,
         starts=starts,
