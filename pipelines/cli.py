@@ -172,10 +172,10 @@ def simulate(
 ) -> None:
     """Simulate a recording with its truth."""
     from pipelines import progress, terminal
-    from pipelines.registry import method as find
+    from pipelines.methods import simulate as run
 
     with progress.shown(quiet), progress.doing("simulating"):
-        find(method).simulate(scenario, seed, out, images)
+        run(method, scenario, seed, out, images)
     terminal.say(f"Wrote {out}")
 
 
@@ -208,8 +208,8 @@ def info(session: _Session, config: _ConfigFile = None, strict: _Strict = False,
     """What is in a recording: topics, rates, gaps, and the methods it can serve."""
     from pipelines import progress, terminal
     from pipelines.config import ATTACHMENT, load_config
-    from pipelines.recording.info import session_facts
     from pipelines.recording.reading import open_recording
+    from pipelines.session import session_facts
 
     with progress.shown(quiet), progress.doing("reading"):
         recording = open_recording(session, strict)
@@ -225,7 +225,7 @@ def demo(
 ) -> None:
     """Simulate a helmet on a manoeuvring platform, calibrate it with all three solvers, say where the report is."""
     from pipelines import progress, terminal
-    from pipelines.registry import method
+    from pipelines.methods import simulate as simulated
     from pipelines.reports.write import write_results
     from pipelines.session import calibrate as run
 
@@ -233,7 +233,7 @@ def demo(
     session = out / "head_mounts.mcap"
     with progress.shown(quiet):
         with progress.doing("simulating"):
-            method("head").simulate("head_mounts", 1, session, False)
+            simulated("head", "head_mounts", 1, session, False)
         calibrations = run(session, ["published", "batch", "incremental"])
         for calibration in progress.track(calibrations, "writing", len(calibrations)):
             write_results(out / calibration.estimate.solver, calibration)
@@ -305,14 +305,14 @@ def fleet(
 
 @app.command()
 def export(
-    calibration: Annotated[Path, typer.Argument(metavar="CALIBRATION.yaml", help="Of a cube calibration.")],
-    form: Annotated[str, typer.Option("--format", help="px4, ardupilot, ros2 or kalibr.")],
+    calibration: Annotated[Path, typer.Argument(metavar="CALIBRATION.yaml", help="The calibration.")],
+    form: Annotated[str, typer.Option("--format", help="Of a cube: px4, ardupilot, ros2 or kalibr.")],
     out: Annotated[Path | None, typer.Option(help="The file to write; default: printed.")] = None,
 ) -> None:
-    """A cube calibration as the parameters of another program, in its own conventions."""
+    """A calibration as the parameters of another program, in its own conventions."""
     from pipelines import terminal
-    from pipelines.methods.cube.export import exported
     from pipelines.reports.calibration import load_calibration
+    from pipelines.reports.export import exported
 
     text = exported(load_calibration(calibration), form)
     if out is None:

@@ -1,161 +1,27 @@
-"""The config of a session: what it may say, and how attachment and file are put together.
+"""How the config of a session is read: an attachment of the recording, overridden key by key by a file.
 
     config = load_config(recording.attachment("alidade.yaml"), Path("more.yaml"))
-    config.noise.gyro_density           # None where the config does not say
 
 Everything wrong in a config is an InputError that names the key and the source it stands in.
 """
 
 from __future__ import annotations
 
-import datetime
-import difflib
 import reprlib
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ValidationError, create_model
 
-from pipelines.errors import InputError
-from pipelines.recording.topics import TOPICS, topic_name
+from pipelines import methods
+from pipelines.errors import InputError, nearest
+from pipelines.settings import Config
 
 ATTACHMENT = "alidade.yaml"
 TRUTH = "truth.json"
-_UNIT_TOLERANCE = 1e-3
 _LONGEST = 1 << 20
-
-
-def _unit(wxyz: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
-    norm = sum(x * x for x in wxyz) ** 0.5
-    if abs(norm - 1.0) > _UNIT_TOLERANCE:
-        raise ValueError(f"a unit quaternion w, x, y, z is needed, this one has norm {norm:.4g}")
-    w, x, y, z = (component / norm for component in wxyz)
-    return w, x, y, z
-
-
-def _date(value: object) -> object:
-    return datetime.date.fromisoformat(value) if isinstance(value, str) else value
-
-
-Sigma = Annotated[float, Field(gt=0.0)]
-SigmaOrZero = Annotated[float, Field(ge=0.0)]
-Date = Annotated[datetime.date, BeforeValidator(_date)]
-Quaternion = Annotated[tuple[float, float, float, float], Field(strict=False), AfterValidator(_unit)]
-Vector = Annotated[tuple[float, float, float], Field(strict=False)]
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
-
-
-class Noise(_Section):
-    """Noise of the sensors: densities per sqrt(Hz), walks per sqrt(s), the others per sample; None where not given.
-
-    gyro_scale (no unit) is what scale and alignment errors of the gyro add: a fraction of the angle turned.
-    """
-
-    gyro_density: Sigma | None = None
-    gyro_bias_walk: SigmaOrZero | None = None
-    gyro_scale: SigmaOrZero | None = None
-    platform_gyro_density: SigmaOrZero | None = None
-    accel_density: Sigma | None = None
-    mag_density: Sigma | None = None
-    los_error: Sigma | None = None
-    los_roll: Sigma | None = None
-    encoder: SigmaOrZero | None = None
-    vision_attitude: Sigma | None = None
-    corner_px: Sigma | None = None
-
-
-# Where neither the config nor a message says anything.
-DEFAULT_NOISE = Noise(
-    gyro_density=5.0e-5,
-    gyro_bias_walk=1.0e-6,
-    gyro_scale=0.0,
-    platform_gyro_density=1.0e-5,
-    accel_density=2.0e-3,
-    mag_density=5.0e-8,
-    los_error=2.0e-5,
-    los_roll=2.0e-4,
-    encoder=1.0e-5,
-    vision_attitude=8.7e-3,
-    corner_px=0.3,
-)
-
-
-class Tag(_Section):
-    """A tag: edge of the black square m, rotation bodyRtag (w, x, y, z), position in the body m."""
-
-    size: Sigma
-    rotation: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    position: Vector = (0.0, 0.0, 0.0)
-
-
-class Board(_Section):
-    """Tags on one rigid body, by id."""
-
-    tag_family: str = "36h11"
-    tags: dict[int, Tag] = {}
-
-
-class RawConversion(_Section):
-    """Nominal conversion of counts: (raw - offset) * scale."""
-
-    scale: Sigma
-    offset: float = 0.0
-
-
-class Raw(_Section):
-    """Conversions of the sensors that record counts."""
-
-    accel: RawConversion | None = None
-    gyro: RawConversion | None = None
-    mag: RawConversion | None = None
-
-
-class Cube(Board):
-    """The cube: its tags, the camera on the reference (BRC: w, x, y, z), counts, the date for the field model."""
-
-    camera_rotation: Quaternion | None = None
-    raw: Raw = Raw()
-    date: Date | None = None
-
-
-class Indexer(_Section):
-    """The indexer: attitude nRbase (w, x, y, z) of its base."""
-
-    base_attitude: Quaternion = (1.0, 0.0, 0.0, 0.0)
-
-
-class Head(_Section):
-    """The helmet: the tag board on it."""
-
-    board: Board | None = None
-
-
-class Config(_Section):
-    """A whole config; every key optional."""
-
-    method: Literal["los", "indexer", "head", "cube"] | None = None
-    topics: dict[str, str] = {}
-    noise: Noise = Noise()
-    priors: dict[str, SigmaOrZero | None] = {}
-    require: dict[str, Sigma] = {}
-    latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None
-    date: Date | None = None
-    indexer: Indexer = Indexer()
-    cube: Cube = Cube()
-    head: Head = Head()
-
-    def topic(self, key: str) -> str:
-        """Name of the topic with this key (see topics.TOPICS), renamed or default."""
-        return topic_name(key, self.topics)
-
-    @property
-    def field_date(self) -> datetime.date | None:
-        """Date for the field model, at the top or under `cube`."""
-        return self.date or self.cube.date
 
 
 def load_config(attachment: bytes | None, override: Path | None = None) -> Config:
@@ -168,7 +34,7 @@ def load_config(attachment: bytes | None, override: Path | None = None) -> Confi
         except OSError as error:
             raise InputError(f"{override}: cannot be opened ({error.strerror})") from error
     try:
-        config = Config.model_validate(_merge(base, more))
+        config = _model().model_validate(_merge(base, more))
     except ValidationError as error:
         # An unknown key explains more than what follows from it.
         first = min(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
@@ -176,34 +42,21 @@ def load_config(attachment: bytes | None, override: Path | None = None) -> Confi
         said = path[:-1] if first["type"] == "missing" else path
         where = str(override) if _has(more, said) else f"attachment {ATTACHMENT}"
         raise InputError(f"{where}: {_explain(path, first)}") from error
-    for key in config.topics.keys() - TOPICS.keys():
+    known = {topic.key for name in methods.names() for topic in methods.method(name).topics}
+    for key in config.topics.keys() - known:
         where = str(override) if _has(more, ("topics", key)) else f"attachment {ATTACHMENT}"
-        raise InputError(f"{where}: unknown key topics.{key}{nearest(key, TOPICS)}")
+        raise InputError(f"{where}: unknown key topics.{key}{nearest(key, sorted(known))}")
     return config
 
 
-def check_names(given: Iterable[str], known: Collection[str], where: str) -> None:
-    """Raise InputError, naming the nearest known name, if one given under the key `where` is not known."""
-    for name in given:
-        if name not in known:
-            raise InputError(f"unknown key {where}.{name}{nearest(name, known)}")
-
-
-def nearest(name: str, known: Collection[str]) -> str:
-    """A phrase that names the known name nearest to a wrong one."""
-    found = difflib.get_close_matches(name, known, n=1, cutoff=0.0)
-    return f"; the nearest known key is {found[0]}" if found else ""
-
-
-def first_given(*values: float | None) -> float:
-    """Of config, message covariance and default, in this order, the first that says something.
-
-    Raises ValueError if none does.
-    """
-    for value in values:
-        if value is not None:
-            return value
-    raise ValueError("no value given, not even a default")
+@cache
+def _model() -> type[Config]:
+    """The config with the sections of all methods there are."""
+    names = methods.names()
+    sections = [section for name in names if (section := methods.method(name).section) is not None]
+    fields: dict[str, Any] = {section.key: (section, section()) for section in sections}
+    fields["method"] = (Literal[names] | None, None)
+    return create_model("Config", __base__=Config, __doc__=Config.__doc__, **fields)
 
 
 def _read(data: bytes, where: str) -> dict[Any, Any]:
@@ -237,10 +90,7 @@ def _merge(base: Mapping[Any, Any], more: Mapping[Any, Any]) -> dict[Any, Any]:
         both = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
         merged[key] = _merge(merged[key], value) if both else value
     # A section left empty says nothing.
-    return {key: value for key, value in merged.items() if value is not None or key not in _SECTIONS}
-
-
-_SECTIONS = {"topics", "noise", "priors", "require", "indexer", "cube", "head", "raw"}
+    return {key: value for key, value in merged.items() if value is not None or key not in _sections()}
 
 
 def _has(content: Any, path: tuple[int | str, ...]) -> bool:
@@ -266,7 +116,7 @@ def _explain(path: tuple[int | str, ...], error: Any) -> str:
 
 def _known_at(path: tuple[int | str, ...]) -> list[str]:
     """The keys of the section at the path."""
-    section: type[BaseModel] = Config
+    section: type[BaseModel] = _model()
     for key in path:
         field = section.model_fields.get(str(key))
         found = _section_in(field.annotation) if field else None
@@ -280,3 +130,18 @@ def _section_in(annotation: Any) -> type[BaseModel] | None:
         return annotation
     arguments = getattr(annotation, "__args__", ())
     return next((found for found in map(_section_in, arguments) if found), None)
+
+
+@cache
+def _sections() -> frozenset[str]:
+    """Keys that have keys under them, at any depth."""
+
+    def inside(section: type[BaseModel]) -> set[str]:
+        found = set()
+        for key, field in section.model_fields.items():
+            deeper = _section_in(field.annotation)
+            if deeper is not None or getattr(field.annotation, "__origin__", None) is dict:
+                found |= {key, *(inside(deeper) if deeper else ())}
+        return found
+
+    return frozenset(inside(_model()))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 # Longer lines help nobody; names in a hostile recording can be as long as it likes.
 _LONGEST = 2000
 
@@ -23,3 +26,9 @@ def printable(text: str, longest: int = 200) -> str:
     if len(text) > longest:
         text = f"{text[: longest // 2]} ... {text[-longest // 2 :]}"
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """A phrase that names the known name nearest to a wrong one."""
+    found = difflib.get_close_matches(name, list(known), n=1, cutoff=0.0)
+    return f"; the nearest known key is {found[0]}" if found else ""

@@ -1,27 +1,244 @@
-"""From a recording to calibrations: reading, solving, judging."""
+"""From a recording to calibrations: open, choose the method, solve, judge.
+
+session = open_session(Path("session.mcap"))
+session.calibrate("batch").status
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cache, partial
+from dataclasses import dataclass, fields, replace
+from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from pipelines import progress
-from pipelines.config import ATTACHMENT, TRUTH, Config, load_config
+import numpy as np
+
+from pipelines import methods, progress
+from pipelines.config import ATTACHMENT, TRUTH, load_config
 from pipelines.errors import InputError
 from pipelines.graph.problem import Estimate, Problem, Step
-from pipelines.judgement.consistency import Halves, find_causes, held_out, mostly_rejected, split_halves
+from pipelines.judgement.causes import find_causes
+from pipelines.judgement.halves import Halves, held_out, split_halves
 from pipelines.judgement.observability import Cause, assess
-from pipelines.recording.info import resolve_method, session_facts
+from pipelines.judgement.outcome import mostly_rejected
+from pipelines.methods import Method
+from pipelines.recording.info import SessionFacts, facts_of, lacking
+from pipelines.recording.message_reader import ENCODING
 from pipelines.recording.reading import Recording, open_recording
-from pipelines.registry import Method, method
 from pipelines.reports.result import Calibration
+from pipelines.settings import Config
+from pipelines.simulation.simulated import Simulated
 
 SOLVERS = ("batch", "incremental", "published")
+
+
+class Origin(Protocol):
+    """Where a session's data come from."""
+
+    @property
+    def name(self) -> str:
+        """For people."""
+
+    @property
+    def epoch_ns(self) -> int:
+        """Zero of all times, Unix ns."""
+
+    def sha256(self) -> str:
+        """Of what was recorded, hexadecimal."""
+
+    def facts(self, config: Config) -> SessionFacts:
+        """Topics, rates, gaps, losses."""
+
+    def truth(self) -> dict[str, object] | None:
+        """Parameter -> true value, where known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """A recording as origin."""
+
+    recording: Recording
+
+    @property
+    def name(self) -> str:
+        """Of the file."""
+        return self.recording.path.name
+
+    @property
+    def epoch_ns(self) -> int:
+        """First stamp."""
+        return self.recording.epoch_ns
+
+    def sha256(self) -> str:
+        """Of the file."""
+        return self.recording.sha256()
+
+    def facts(self, config: Config) -> SessionFacts:
+        """Of the recording."""
+        return session_facts(self.recording, config)
+
+    def truth(self) -> dict[str, object] | None:
+        """The attachment's. Raises InputError when it is no JSON object."""
+        attachment = self.recording.attachment(TRUTH, needed=False)
+        try:
+            return None if attachment is None else dict(json.loads(attachment, parse_int=float))
+        except (ValueError, TypeError, RecursionError) as error:
+            raise InputError(
+                f"{self.recording.path}: the attachment {TRUTH} is no JSON object of parameters and their values"
+            ) from error
+
+
+@dataclass(frozen=True, eq=False)
+class Arrays:
+    """Data in memory as origin."""
+
+    method: Method
+    data: Any
+    known: Mapping[str, float] | None = None
+
+    @property
+    def name(self) -> str:
+        """There is no file."""
+        return "arrays"
+
+    @property
+    def epoch_ns(self) -> int:
+        """The data's own."""
+        return int(self.data.epoch_ns)
+
+    def sha256(self) -> str:
+        """Of the arrays' bytes, field by field."""
+        digest = hashlib.sha256()
+        for field in fields(self.data):
+            value = getattr(self.data, field.name)
+            digest.update(field.name.encode())
+            digest.update(np.ascontiguousarray(value).tobytes() if isinstance(value, np.ndarray) else b"")
+        return digest.hexdigest()
+
+    def facts(self, _: Config) -> SessionFacts:
+        """Length of the data; there are no topics."""
+        times = [t for name in self.method.hypotheses().streams if (t := getattr(self.data, name)) is not None]
+        spans = [(float(t[0]), float(t[-1])) for t in times if len(t)]
+        duration = max(stop for _, stop in spans) - min(start for start, _ in spans) if spans else 0.0
+        return SessionFacts(self.epoch_ns, duration, (), (), {self.method.name: ()})
+
+    def truth(self) -> dict[str, object] | None:
+        """As given."""
+        return None if self.known is None else dict(self.known)
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """Data as their method takes them, the config in force, and where both come from."""
+
+    method: Method
+    data: Any
+    config: Config
+    origin: Origin
+
+    @classmethod
+    def read(cls, recording: Recording, method_name: str | None, config_file: Path | None) -> Session:
+        """Read and check a recording (arguments and exceptions as `calibrate` has them)."""
+        config = load_config(recording.attachment(ATTACHMENT, needed=config_file is None), config_file)
+        chosen = methods.method(resolve_method(method_name, recording, config))
+        return cls(chosen, chosen.read(recording, config), config, Recorded(recording))
+
+    @classmethod
+    def of(cls, method: Method, simulated: Simulated, config_file: Path | None = None) -> Session:
+        """A simulated recording that was never written."""
+        config = load_config(simulated.config.encode(), config_file)
+        return cls(method, simulated.data, config, Arrays(method, simulated.data, simulated.truth))
+
+    def problem(self) -> Problem:
+        """The graph."""
+        return self.method.problem(self.data, self.config)
+
+    @cached_property
+    def facts(self) -> SessionFacts:
+        """What went in."""
+        return self.origin.facts(self.config)
+
+    def calibrate(self, solver: str = "batch", window: float | None = 1.0) -> Calibration:
+        """The calibration by one of SOLVERS; `window` in s is the incremental one's, None keeps the whole history.
+
+        Raises:
+            InputError: no such solver, or the data cannot be used.
+            IndeterminateError: states other than the parameters are not determined.
+        """
+        (calibration,) = self.calibrations([solver], window)
+        return calibration
+
+    def calibrations(
+        self, solvers: Sequence[str], window: float | None = 1.0, seconds: Mapping[str, float] | None = None
+    ) -> list[Calibration]:
+        """One calibration a solver; `seconds` is what came before (phase -> s). Raises as `calibrate` does."""
+        if isinstance(solvers, str):
+            raise InputError(f"solvers: a list of names is needed, not the text {solvers!r}")
+        for solver in solvers:
+            if solver not in SOLVERS:
+                raise InputError(f"no solver {solver!r}; there are {', '.join(SOLVERS)}")
+        return self.judged((self._solve(solver, window) for solver in solvers), seconds or {})
+
+    def judged(self, solved: Iterable[tuple[Estimate, Problem]], seconds: Mapping[str, float]) -> list[Calibration]:
+        """Estimates, each with the problem it solves, ready to be reported; `seconds` is what reading took."""
+        sha256, truth = self.origin.sha256(), self.origin.truth()
+        found = []
+        causes: tuple[Cause, ...] | None = None
+        for estimate, problem in solved:
+            quantities = tuple(q for q in problem.quantities if q.name in estimate.names)
+            assessment = assess(quantities, estimate.covariance, estimate.chi_square, problem.advice)
+            # The published solvers stand beside as they are.
+            ours = estimate.solver != "published"
+            if ours and not estimate.converged:
+                assessment = assessment.unsolved(estimate.message)
+            elif ours and (assessment.status == "inconsistent" or mostly_rejected(estimate)):
+                with progress.doing("looking for causes"):
+                    if causes is None:
+                        causes = find_causes(self.method, self.data, self.config, estimate)
+                assessment = assessment.explained(causes)
+            found.append(
+                Calibration(
+                    method=self.method,
+                    problem=problem,
+                    estimate=estimate,
+                    assessment=assessment,
+                    recording=self.origin.name,
+                    sha256=sha256,
+                    facts=self.facts,
+                    config_text=self.config.model_dump_json(indent=1, exclude_defaults=True),
+                    truth=truth,
+                    seconds=seconds,
+                    plots=partial(self.method.figures, self.data),
+                    beside=cache(self._published) if estimate.solver == "incremental" else None,
+                    findings=self.method.findings(self.data, self.config, estimate),
+                )
+            )
+        return found
+
+    def _solve(self, solver: str, window: float | None) -> tuple[Estimate, Problem]:
+        problem = self.problem()
+        if solver == "published":
+            return self.method.published(self.data, self.config, problem), problem
+        if solver == "incremental":
+            from pipelines.solvers.incremental import solve_incremental
+
+            shown = replace(problem, steps=partial(_shown, problem, self.facts.duration_s))
+            return solve_incremental(shown, window), problem
+        from pipelines.solvers.batch import solve_batch
+
+        with progress.doing("solving"):
+            return solve_batch(problem), problem
+
+    def _published(self) -> Estimate | None:
+        """The published solver's estimate, where it can serve the recording: it needs more than the graphs."""
+        try:
+            return self._solve("published", None)[0]
+        except InputError:
+            return None
 
 
 def calibrate(
@@ -43,79 +260,13 @@ def calibrate(
         strict: refuse a recording of which anything is lost.
 
     Raises:
-        InputError: recording or config cannot be used.
+        InputError: recording or config cannot be used, or there is no such solver.
         IndeterminateError: states other than the parameters are not determined.
     """
     start = time.perf_counter()
     with progress.doing("reading"):
         session = Session.read(open_recording(path, strict), method_name, config_file)
-    read = time.perf_counter() - start
-    duration = session.recording.duration_s
-    solved = (_solve(solver, session.method, session.data, session.config, window, duration) for solver in solvers)
-    return calibrations(session, solved, {"read": read})
-
-
-@dataclass(frozen=True)
-class Session:
-    """A recording as its method reads it: the config in force, the method and its data."""
-
-    recording: Recording
-    config: Config
-    name: str
-    method: Method
-    data: Any
-
-    @classmethod
-    def read(cls, recording: Recording, method_name: str | None, config_file: Path | None) -> Session:
-        """Read and check (arguments and exceptions as `calibrate` has them)."""
-        config = load_config(recording.attachment(ATTACHMENT, needed=config_file is None), config_file)
-        name = resolve_method(method_name, recording, config)
-        chosen = method(name)
-        return cls(recording, config, name, chosen, chosen.read(recording, config))
-
-    def problem(self) -> Problem:
-        """The graph."""
-        return self.method.problem(self.data, self.config)
-
-
-def calibrations(
-    session: Session, solved: Iterable[tuple[Estimate, Problem]], seconds: Mapping[str, float]
-) -> list[Calibration]:
-    """Estimates, each with the problem it solves, judged and ready to be reported; `seconds` is what reading took."""
-    chosen, data, config = session.method, session.data, session.config
-    sha256, truth = session.recording.sha256(), _truth(session.recording)
-    facts = session_facts(session.recording, config)
-    found = []
-    causes: tuple[Cause, ...] | None = None
-    for estimate, problem in solved:
-        incremental = estimate.solver == "incremental"
-        quantities = tuple(q for q in problem.quantities if q.name in estimate.names)
-        assessment = assess(quantities, estimate.covariance, estimate.chi_square, problem.advice)
-        # The published solvers stand beside as they are.
-        ours = estimate.solver != "published"
-        if ours and not estimate.converged:
-            assessment = assessment.unsolved(estimate.message)
-        elif ours and (assessment.status == "inconsistent" or mostly_rejected(estimate)):
-            with progress.doing("looking for causes"):
-                causes = find_causes(chosen, data, config, estimate) if causes is None else causes
-            assessment = assessment.explained(causes)
-        found.append(
-            Calibration(
-                problem=problem,
-                estimate=estimate,
-                assessment=assessment,
-                recording=session.recording.path.name,
-                sha256=sha256,
-                facts=facts,
-                config_text=config.model_dump_json(indent=1, exclude_defaults=True),
-                truth=truth,
-                seconds=seconds,
-                plots=chosen.plots(data) if chosen.plots else None,
-                beside=cache(partial(_published, chosen, data, config)) if incremental else None,
-                findings=chosen.findings(data, config, estimate) if chosen.findings else {},
-            )
-        )
-    return found
+    return session.calibrations(solvers, window, {"read": time.perf_counter() - start})
 
 
 def self_agreement(
@@ -126,20 +277,34 @@ def self_agreement(
     return split_halves(session.method, session.data, session.config), held_out(session.problem())
 
 
-def _solve(
-    solver: str, chosen: Method, data: object, config: Config, window: float | None, duration: float
-) -> tuple[Estimate, Problem]:
-    problem = chosen.problem(data, config)
-    if solver == "published":
-        return chosen.published(data, config, problem), problem
-    if solver == "incremental":
-        from pipelines.solvers.incremental import solve_incremental
+def session_facts(recording: Recording, config: Config) -> SessionFacts:
+    """Facts about all topics of a recording, and what it lacks for each method."""
+    return facts_of(recording, config, {name: methods.method(name).needs for name in methods.names()})
 
-        return solve_incremental(replace(problem, steps=partial(_shown, problem, duration)), window), problem
-    from pipelines.solvers.batch import solve_batch
 
-    with progress.doing("solving"):
-        return solve_batch(problem), problem
+def missing_for(name: str, recording: Recording, config: Config) -> tuple[str, ...]:
+    """What a recording with this config lacks for a method, one phrase each; nothing if it can serve it."""
+    return lacking(methods.method(name).needs, recording, config)
+
+
+def resolve_method(option: str | None, recording: Recording, config: Config) -> str:
+    """The method to use: the option, else the config's, else the only one the recording has the topics for.
+
+    Raises InputError when the option is no method, and when none or several methods could be meant.
+    """
+    if option is not None:
+        return methods.method(option).name
+    if config.method:
+        return config.method
+    able = [name for name in methods.names() if not missing_for(name, recording, config)]
+    if len(able) == 1:
+        return able[0]
+    if able:
+        raise InputError(f"{recording.path}: the topics serve {' and '.join(able)}; choose with --method")
+    raise InputError(
+        f"{recording.path}: no usable topics for any method; {recording.there()}; needed are ROS 2 messages "
+        f"({ENCODING}): `alidade info` tells which for each method, `topics:` in the config can rename"
+    )
 
 
 def _shown(problem: Problem, duration: float, chunk: int) -> Iterator[Step]:
@@ -147,21 +312,3 @@ def _shown(problem: Problem, duration: float, chunk: int) -> Iterator[Step]:
     if chunk > 1:
         return problem.steps(chunk)
     return progress.track(problem.steps(chunk), "step by step", duration, lambda step: step.time)
-
-
-def _published(chosen: Method, data: object, config: Config) -> Estimate | None:
-    """The published solver's estimate, where it can serve the recording: it needs more than the graphs."""
-    try:
-        return chosen.published(data, config, chosen.problem(data, config))
-    except InputError:
-        return None
-
-
-def _truth(recording: Recording) -> dict[str, object] | None:
-    attachment = recording.attachment(TRUTH, needed=False)
-    try:
-        return None if attachment is None else dict(json.loads(attachment, parse_int=float))
-    except (ValueError, TypeError, RecursionError) as error:
-        raise InputError(
-            f"{recording.path}: the attachment {TRUTH} is no JSON object of parameters and their values"
-        ) from error

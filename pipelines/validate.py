@@ -9,11 +9,11 @@ from pathlib import Path
 from pipelines.config import ATTACHMENT, load_config
 from pipelines.errors import InputError
 from pipelines.judgement.validation import Validation
-from pipelines.recording.info import resolve_method
+from pipelines.methods import method
 from pipelines.recording.reading import open_recording
-from pipelines.registry import method
 from pipelines.reports.calibration import SavedCalibration, load_calibration
 from pipelines.reports.validation import validation_html, validation_rows
+from pipelines.session import resolve_method
 
 FILE = "validation.html"
 
@@ -73,8 +73,6 @@ def validate(
     if name != calibration.method:
         raise InputError(f"{calibration_file}: is a calibration of {calibration.method}, not of {name}")
     chosen = method(name)
-    if chosen.validate is None:
-        raise InputError(f"method {name} has no validation")
     values = {parameter: saved.value for parameter, saved in calibration.parameters.items()}
     validations = chosen.validate(chosen.read(recording, config), config, values)
     same = calibration.recording.sha256 == recording.sha256()

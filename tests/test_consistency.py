@@ -12,15 +12,19 @@ import pytest
 from typer.testing import CliRunner
 
 from pipelines.cli import app
-from pipelines.config import Config, load_config
+from pipelines.config import load_config
 from pipelines.graph.problem import Estimate, Residuals
-from pipelines.judgement.consistency import cut, find_causes, held_out, mostly_rejected, split_halves
+from pipelines.judgement.causes import find_causes
+from pipelines.judgement.halves import cut, held_out, split_halves
+from pipelines.judgement.outcome import mostly_rejected
+from pipelines.methods import Method, method
 from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.topics import CubeConfig
 from pipelines.methods.head.recording import write_head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.registry import Method, method
+from pipelines.settings import Config
 from pipelines.simulation.motion import EulerMotion, Swing
 
 Case = tuple[Method, Any, Config]
@@ -165,8 +169,8 @@ def test_size_of_the_cubes_tags(seed: int) -> None:
     scenario = CubeScenario(poses=8, static_s=2, imu_rate_hz=50, camera_rate_hz=5)
     data, _ = simulate_cube(scenario, seed)
     config = load_config(cube_config(scenario).encode())
-    tags = {i: tag.model_copy(update={"size": 1.03 * tag.size}) for i, tag in config.cube.tags.items()}
-    wrong = config.model_copy(update={"cube": config.cube.model_copy(update={"tags": tags})})
+    tags = {i: tag.model_copy(update={"size": 1.03 * tag.size}) for i, tag in config.section(CubeConfig).tags.items()}
+    wrong = config.model_copy(update={"cube": config.section(CubeConfig).model_copy(update={"tags": tags})})
     label = first_cause((method("cube"), data, wrong))
     assert label.startswith("the tags are ")
     assert float(label.split()[3]) == pytest.approx(1.0 / 1.03, abs=0.005)
@@ -174,7 +178,7 @@ def test_size_of_the_cubes_tags(seed: int) -> None:
 
 def test_a_cut_keeps_stamps_and_readings_together(head: Case) -> None:
     _, data, _ = head
-    part = cut("head", data, 3.0, 7.0)
+    part = cut(method("head").hypotheses(), data, 3.0, 7.0)
     for stamps, values in ((part.head_t, part.head_gyro), (part.vision_t, part.vision_wxyz)):
         assert len(stamps) == len(values)
         assert 3.0 <= stamps[0] < stamps[-1] < 7.0

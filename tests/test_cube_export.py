@@ -9,9 +9,9 @@ import pytest
 from ruamel.yaml import YAML
 
 from pipelines.errors import InputError
-from pipelines.methods.cube.export import exported
 from pipelines.methods.cube.printing import print_cube, tag_size
 from pipelines.reports.calibration import SavedCalibration
+from pipelines.reports.export import exported
 
 RNG = np.random.default_rng(1)
 BIAS = {"accel": 0.3, "gyro": 0.02, "mag": 2e-5}

@@ -15,6 +15,7 @@ from pipelines.errors import InputError
 from pipelines.methods.cube.layout import cube_layout, layout_yaml
 from pipelines.methods.cube.recording import write_cube
 from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.topics import CubeConfig
 from pipelines.recording.reading import open_recording
 
 SCENARIO = CubeScenario(poses=16, static_s=1.0, turn_rad_s=1.5, camera_rate_hz=4.0, tag_mount=0.02, magnetometer=False)
@@ -33,11 +34,11 @@ def test_tags_are_found_where_they_are_with_honest_sigmas(tmp_path: Path) -> Non
         recording = open_recording(tmp_path / "s.mcap")
         config = load_config(recording.attachment("alidade.yaml"))
         layout = cube_layout(recording, config)
-        assert layout.body.ids.tolist() == sorted(config.cube.tags)
+        assert layout.body.ids.tolist() == sorted(config.section(CubeConfig).tags)
         assert layout.sigma_px == pytest.approx(SCENARIO.noise.corner_px, rel=0.1)
         error = []
         for k, tag in enumerate(layout.body.ids.tolist()):
-            given = config.cube.tags[tag]
+            given = config.section(CubeConfig).tags[tag]
             true = so3.multiply(given.rotation, so3.exp([truth[f"tag_{tag}_{axis}"] for axis in "xyz"]))
             delta = so3.log(so3.multiply(so3.inverse(true), layout.body.bRt[k]))
             error.append(np.concatenate([delta, layout.body.position[k] - given.position]))
@@ -56,8 +57,8 @@ def test_layout_as_a_config_reads_back(tmp_path: Path) -> None:
     (tmp_path / "cube.yaml").write_text(layout_yaml(layout))
     config = load_config(None, tmp_path / "cube.yaml")
     for k, tag in enumerate(layout.body.ids.tolist()):
-        np.testing.assert_allclose(config.cube.tags[tag].position, layout.body.position[k], rtol=1e-12)
-        np.testing.assert_allclose(config.cube.tags[tag].rotation, layout.body.bRt[k], rtol=1e-9)
+        np.testing.assert_allclose(config.section(CubeConfig).tags[tag].position, layout.body.position[k], rtol=1e-12)
+        np.testing.assert_allclose(config.section(CubeConfig).tags[tag].rotation, layout.body.bRt[k], rtol=1e-9)
 
 
 def test_a_tag_never_seen_is_not_placed(tmp_path: Path) -> None:

@@ -13,18 +13,21 @@ import pytest
 
 from datasets import imu_tk_xsens
 from factors import so3
-from pipelines.config import Config, Raw, RawConversion, load_config
+from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.graph.problem import Estimate, Problem
 from pipelines.judgement.observability import Assessment, assess
 from pipelines.judgement.validation import rms
+from pipelines.methods import simulate
 from pipelines.methods.cube.findings import findings
 from pipelines.methods.cube.graph import problem
 from pipelines.methods.cube.published import published_estimate
 from pipelines.methods.cube.recording import CubeData, read_cube, rests
-from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube, write_simulation
+from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.topics import CubeConfig, Raw, RawConversion
 from pipelines.methods.cube.validation import validate
 from pipelines.recording.reading import open_recording
+from pipelines.settings import Config
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.incremental import solve_incremental
 
@@ -181,10 +184,9 @@ def _turned_with_camera(data: CubeData) -> CubeData:
     config = _simulated(12, poses=12)[2]
     edges = rests(data, config)[1:, 0] - 0.3
     turns = so3.exp(0.03 * np.random.default_rng(1).normal(size=(len(edges) + 1, 3)))
-    assert config.cube.camera_rotation is not None
-    BRC = so3.multiply(
-        config.cube.camera_rotation, so3.exp([_simulated(12, poses=12)[1][f"camera_mount_{a}"] for a in "xyz"])
-    )
+    drawn = config.section(CubeConfig).camera_rotation
+    assert drawn is not None
+    BRC = so3.multiply(drawn, so3.exp([_simulated(12, poses=12)[1][f"camera_mount_{a}"] for a in "xyz"]))
     turned_B = turns[np.searchsorted(edges, data.reference_t)]
     seen = data.sightings
     turned_C = so3.compose(so3.inverse(BRC), turns, BRC)[np.searchsorted(edges, seen.t[seen.frame])]
@@ -219,7 +221,7 @@ def test_counts_are_calibrated_as_recorded() -> None:
     scale, offset = 2e-3, 30000.0
     counts = replace(data, accel=data.accel / scale + offset)
     raw = Raw(accel=RawConversion(scale=scale, offset=offset))
-    in_counts = config.model_copy(update={"cube": config.cube.model_copy(update={"raw": raw})})
+    in_counts = config.model_copy(update={"cube": config.section(CubeConfig).model_copy(update={"raw": raw})})
     plain, found = _solved(data, config)[1], _solved(counts, in_counts)[1]
     a, b = (dict(zip(e.names, e.values, strict=True)) for e in (plain, found))
     for i in "123":
@@ -269,8 +271,11 @@ def _contract(shared_data: Path, name: str, solve: Any) -> tuple[Estimate, dict[
         return so3.log(so3.multiply(so3.inverse(given), np.roll(true_xyzw, 1)))
 
     frames = said["_truth_frames"]
-    vectors = {f"tag_{i}": correction(config.cube.tags[int(i)].rotation, q) for i, q in frames["tags_xyzw"].items()}
-    vectors["camera_mount"] = correction(config.cube.camera_rotation, frames["BRC_xyzw"])
+    vectors = {
+        f"tag_{i}": correction(config.section(CubeConfig).tags[int(i)].rotation, q)
+        for i, q in frames["tags_xyzw"].items()
+    }
+    vectors["camera_mount"] = correction(config.section(CubeConfig).camera_rotation, frames["BRC_xyzw"])
     truth |= {f"{n}_{axis}": float(x) for n, v in vectors.items() for axis, x in zip("xyz", v, strict=True)}
     truth |= {f"field_{axis}": x for axis, x in zip("enu", frames["field_enu_T"], strict=True)}
     return solve(problem(read_cube(recording, config), config)), truth
@@ -323,7 +328,7 @@ def test_sigmas_are_consistent_over_thirty_runs() -> None:
 
 def _solved_from(folder: Path, scenario: str, images: bool) -> tuple[Estimate, dict[str, float]]:
     (folder / "scenario.yaml").write_text(scenario)
-    write_simulation(str(folder / "scenario.yaml"), 1, folder / "s.mcap", images)
+    simulate("cube", str(folder / "scenario.yaml"), 1, folder / "s.mcap", images)
     recording = open_recording(folder / "s.mcap")
     config = load_config(recording.attachment("alidade.yaml"))
     truth = json.loads(recording.attachment("truth.json") or b"")

@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 from factors import so3
-from pipelines.config import Config, load_config
+from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.methods.cube.poses import static_poses
 from pipelines.methods.cube.recording import CubeData, Sightings, local_field, read_cube, rests, write_cube
 from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.topics import CubeConfig
 from pipelines.recording.reading import open_recording
+from pipelines.settings import Config
 from pipelines.vision.camera import Camera
 
 SCENARIO = CubeScenario(poses=4, static_s=2.0, camera_rate_hz=5.0)
@@ -157,10 +159,10 @@ def test_no_static_pose(session: CubeData) -> None:
 def test_a_tag_that_is_not_where_the_config_says_is_named() -> None:
     scenario = CubeScenario(poses=12, static_s=2.0, camera_rate_hz=5.0, magnetometer=False)
     session, config = simulate_cube(scenario, 3)[0], load_config(cube_config(scenario).encode())
-    tags = dict(config.cube.tags)
+    tags = dict(config.section(CubeConfig).tags)
     turned = so3.multiply(tags[18].rotation, so3.exp([0.0, 0.0, np.pi / 2]))
     tags[18] = tags[18].model_copy(update={"rotation": tuple(turned)})
-    cube = config.cube.model_copy(update={"tags": tags})
+    cube = config.section(CubeConfig).model_copy(update={"tags": tags})
     with pytest.raises(InputError, match="cube not rigid: tag 18 disagrees"):
         static_poses(session, config.model_copy(update={"cube": cube}))
 

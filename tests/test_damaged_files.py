@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from mcap.opcode import Opcode
 
-from pipelines.config import Config
 from pipelines.errors import InputError
 from pipelines.recording import writing
-from pipelines.recording.info import session_facts
 from pipelines.recording.reading import open_recording
+from pipelines.session import session_facts
+from pipelines.settings import Config
 from tests.damage import (
     CONFIG,
     FORMS,

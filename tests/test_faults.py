@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.config import Config, load_config
+from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.graph.problem import Array, Estimate, Problem
 from pipelines.judgement.observability import assess
@@ -23,6 +23,7 @@ from pipelines.methods.los.recording import read_los, write_los
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from pipelines.recording.faults import drop_faults
 from pipelines.recording.reading import Recording, open_recording
+from pipelines.settings import Config
 from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.solvers.batch import solve_batch
 

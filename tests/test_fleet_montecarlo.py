@@ -11,7 +11,7 @@ import pytest
 
 from pipelines.fleet import consistency
 from pipelines.fleet.montecarlo import SOLVERS, run_study, simulate_and_solve
-from pipelines.recording.topics import METHODS
+from pipelines.methods import names
 from tests.test_fleet_recordings import alidade
 
 distributed = pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
@@ -126,7 +126,7 @@ def test_the_consistency_page_lists_every_solver(scheduler: str, scenario: Path,
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", names())
 def test_batch_and_incremental_are_consistent(method: str, tmp_path: Path) -> None:
     study = run_study(method, None, range(200), ("batch", "incremental"), tmp_path, jobs=2)
     for solver in study.solvers:

@@ -209,7 +209,7 @@ def test_what_is_missing_is_said_until_the_accuracy_is_reached(whole: Path, tmp_
     early = [view for view in views if not view.done]
     assert early, "it was to be seen before enough was there"
     assert all(view.missing or view.assessment is None for view in early)
-    assert {c.what for c in last.collected} >= {"target", "sway about x", "sway about y", "sway about z"}
+    assert {c.what for c in last.checklist} >= {"target", "sway about x", "sway about y", "sway about z"}
 
 
 def test_no_file(tmp_path: Path) -> None:

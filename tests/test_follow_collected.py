@@ -8,23 +8,19 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from pipelines.config import Config, load_config
+from pipelines.config import load_config
 from pipelines.follow.guidance import View
 from pipelines.follow.screen import Screen
 from pipelines.graph.problem import Quantity
+from pipelines.judgement.checklist import ChecklistItem
 from pipelines.judgement.observability import assess
-from pipelines.methods.collected import (
-    Collected,
-    collected_cube,
-    collected_head,
-    collected_indexer,
-    collected_los,
-    next_pose,
-)
+from pipelines.methods import method
+from pipelines.methods.cube.guidance import next_pose
 from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
 from pipelines.methods.head.simulation import HeadScenario, simulate_head
 from pipelines.methods.indexer.simulation import IndexerScenario, simulate_indexer
 from pipelines.methods.los.simulation import LosScenario, simulate_los
+from pipelines.settings import Config
 from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.simulation.scenario import load_scenario
 
@@ -44,7 +40,7 @@ def test_los_names_the_axis_that_did_not_sway() -> None:
         image_rate_hz=10.0,
     )
     data, _ = simulate_los(scenario, 0)
-    wanted = _wanted(collected_los(data, Config()))
+    wanted = _wanted(method("los").checklist(data, Config()))
     assert wanted["sway about z"] == "sway the carrier about its z by 2 deg and more"
     assert not wanted["sway about x"]
     assert not wanted["sway about y"]
@@ -55,7 +51,10 @@ def test_head_names_what_did_not_move() -> None:
     data, _ = simulate_head(scenario, 0)
     assert data.platform_gyro is not None
     still = replace(data, platform_gyro=np.zeros_like(data.platform_gyro))
-    moved, wanted = _wanted(collected_head(data, Config())), _wanted(collected_head(still, Config()))
+    moved, wanted = (
+        _wanted(method("head").checklist(data, Config())),
+        _wanted(method("head").checklist(still, Config())),
+    )
     assert not moved["head about x"]
     assert not moved["platform about x"]
     assert wanted["platform about x"] == "turn the platform about its x by 5 deg and more"
@@ -63,7 +62,7 @@ def test_head_names_what_did_not_move() -> None:
 
 def test_indexer_counts_turns_by_position() -> None:
     data, _ = simulate_indexer(IndexerScenario(), 0)
-    assert set(_wanted(collected_indexer(data, Config())).values()) == {""}
+    assert set(_wanted(method("indexer").checklist(data, Config())).values()) == {""}
     half = data.encoder_t < 0.4 * data.encoder_t[-1]
     early = replace(
         data,
@@ -71,22 +70,22 @@ def test_indexer_counts_turns_by_position() -> None:
         outer=data.outer[half],
         inner=data.inner[half],
     )
-    wanted = _wanted(collected_indexer(early, Config()))
+    wanted = _wanted(method("indexer").checklist(early, Config()))
     assert not wanted["outer axis, inner one at 0 deg"]
     assert wanted["inner axis, outer one at 180 deg"] == "three whole turns forward and back"
 
 
 @pytest.fixture(scope="module")
-def cube() -> tuple[Collected, ...]:
+def cube() -> tuple[ChecklistItem, ...]:
     scenario = CubeScenario()
     data, _ = simulate_cube(scenario, 0)
     config = load_config(cube_config(scenario).encode())
     few = data.imu_t < 45.0
     first = replace(data, imu_t=data.imu_t[few], gyro=data.gyro[few], accel=data.accel[few])
-    return tuple(collected_cube(first, config))
+    return tuple(method("cube").checklist(first, config))
 
 
-def test_cube_counts_poses_and_faces(cube: tuple[Collected, ...]) -> None:
+def test_cube_counts_poses_and_faces(cube: tuple[ChecklistItem, ...]) -> None:
     found = {c.what: c for c in cube}
     count = dict(item.split(" ") for item in found["faces up"].have.split(", "))
     assert set(count) == {"+x", "-x", "+y", "-y", "+z", "-z"}
@@ -105,7 +104,7 @@ def test_the_next_best_pose_shows_the_axis_that_was_not_up() -> None:
 def _view(sigma: float) -> View:
     quantities = (Quantity("delta_px", "rad", 0.1, 0.1, 1e-3),)
     assessment = assess(quantities, np.eye(1) * sigma**2, None, lambda _: "sway it more")
-    wanted = Collected("sway", "1.0 deg", "turn it")
+    wanted = ChecklistItem("sway", "1.0 deg", "turn it")
     return View(3.0, 0, quantities, np.array([0.02]), assessment, (wanted,))
 
 

@@ -10,10 +10,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipelines.config import Config, load_config
+from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.recording import messages
 from pipelines.recording.reading import open_recording
+from pipelines.settings import Config
 from tests.damage import Whole, check_sound, read, write_small
 from tests.test_sessions_messages import T0, read_any, write_raw
 

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from factors import so3
 from pipelines.cli import app
-from pipelines.config import Config, load_config
+from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.judgement.validation import peak, rms
 from pipelines.methods.head.graph import problem
@@ -20,6 +20,7 @@ from pipelines.methods.head.recording import HeadData, write_head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from pipelines.methods.head.validation import validate
 from pipelines.session import calibrate
+from pipelines.settings import Config
 from pipelines.simulation.scenario import load_scenario
 
 QUIET = {"gyro_density": 0.0, "gyro_bias_walk": 0.0, "platform_gyro_density": 0.0, "vision_attitude": 0.0}

@@ -20,9 +20,9 @@ from mcap.opcode import Opcode
 from pipelines.config import load_config
 from pipelines.errors import InputError, printable
 from pipelines.recording import messages
-from pipelines.recording.info import resolve_method, session_facts
 from pipelines.recording.mcap_records import HEAD, MAGIC
 from pipelines.recording.reading import open_recording
+from pipelines.session import resolve_method, session_facts
 from tests.test_sessions_messages import STORE, T0, random_message
 
 MIB = 1 << 20

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.config import Config, load_config
+from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.methods.indexer.graph import problem, validate
 from pipelines.methods.indexer.recording import IndexerData
@@ -19,6 +19,7 @@ from pipelines.methods.indexer.simulation import (
     indexer_config,
     simulate_indexer,
 )
+from pipelines.settings import Config
 from pipelines.solvers.batch import solve_batch
 
 SCENARIO = IndexerScenario(

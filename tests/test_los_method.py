@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from factors.chi_square import quantile
-from pipelines.config import Config, Noise, load_config
+from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.graph.problem import Array, Estimate
 from pipelines.judgement.observability import Assessment, assess
@@ -19,6 +19,7 @@ from pipelines.methods.los.published import recursive_least_squares
 from pipelines.methods.los.recording import LosData, read_los
 from pipelines.methods.los.simulation import LosAngles, LosScenario, los_config, simulate_los
 from pipelines.recording.reading import open_recording
+from pipelines.settings import Config, Noise
 from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.simulation.scenario import load_scenario
 from pipelines.solvers.batch import solve_batch

@@ -9,18 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.config import Config, load_config
+from pipelines.config import load_config
 from pipelines.errors import InputError
+from pipelines.methods import simulate
 from pipelines.methods.los.recording import LosData, read_los, write_los
-from pipelines.methods.los.simulation import (
-    LosCamera,
-    LosScenario,
-    los_config,
-    simulate_los,
-    simulate_pictures,
-    write_simulation,
-)
+from pipelines.methods.los.simulation import LosCamera, LosScenario, los_config, simulate_los, simulate_pictures
 from pipelines.recording.reading import open_recording
+from pipelines.settings import Config
 from pipelines.simulation.scenario import load_scenario
 
 DATA, TRUTH = simulate_los(LosScenario(duration_s=12.0, measures_roll=True), 1)
@@ -151,10 +146,10 @@ def test_pictures_without_camera_info(tmp_path: Path) -> None:
 
 def test_simulate_writes_a_whole_session(tmp_path: Path) -> None:
     path = tmp_path / "s.mcap"
-    write_simulation(None, 1, path, images=False)
+    simulate("los", None, 1, path, images=False)
     recording = open_recording(path)
     data = read_los(recording, load_config(recording.attachment("alidade.yaml")))
     assert len(data.image_t) == 3000
     with pytest.raises(InputError, match="pictures are simulated of a single target"):
-        write_simulation("los_outliers", 1, tmp_path / "p.mcap", images=True)
+        simulate("los", "los_outliers", 1, tmp_path / "p.mcap", images=True)
     assert not (tmp_path / "p.mcap").exists()

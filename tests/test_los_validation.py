@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.config import Config, load_config
+from pipelines.config import load_config
 from pipelines.judgement.validation import peak, rms
 from pipelines.methods.los.graph import problem
 from pipelines.methods.los.simulation import LosNoise, LosScenario, los_config, simulate_los
 from pipelines.methods.los.validation import validate
+from pipelines.settings import Config
 from pipelines.simulation.scenario import load_scenario
 from pipelines.solvers.batch import solve_batch
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from factors.los import GimbalPath, LosRateFactor
-from pipelines.config import Config
 from pipelines.errors import InputError
 from pipelines.methods.los.graph import problem
 from pipelines.methods.los.published import NAMES, published_estimate, rates, recursive_least_squares
 from pipelines.methods.los.recording import LosData
 from pipelines.methods.los.simulation import LosAngles, LosScenario, simulate_los
+from pipelines.settings import Config
 from pipelines.simulation.scenario import load_scenario
 
 

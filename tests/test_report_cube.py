@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from factors import so3
-from pipelines.config import Config, load_config
+from pipelines.config import load_config
 from pipelines.graph.problem import Estimate, Findings
 from pipelines.methods.cube.figures import cube_plots
 from pipelines.methods.cube.findings import findings, parts_of, white_noise
@@ -18,6 +18,7 @@ from pipelines.methods.cube.recording import CubeData
 from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
 from pipelines.methods.cube.tables import described
 from pipelines.reports.result import Calibration, Plot, Table
+from pipelines.settings import Config
 from pipelines.solvers.batch import solve_batch
 
 SCENARIO = CubeScenario(poses=10, static_s=3.0, turn_rad_s=1.2, camera_rate_hz=5.0)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.registry import method
+from pipelines.methods import simulate
 from pipelines.reports.html import report_html
 from pipelines.session import calibrate
 from tests.browser import drawn, needs_browser
@@ -25,7 +25,7 @@ SCENARIOS = {
 )
 def test_a_browser_draws_the_report_at_the_width_of_a_desktop_and_of_a_phone(name: str, tmp_path: Path) -> None:
     (tmp_path / "scenario.yaml").write_text(SCENARIOS[name])
-    method(name).simulate(str(tmp_path / "scenario.yaml"), 1, tmp_path / "s.mcap", False)
+    simulate(name, str(tmp_path / "scenario.yaml"), 1, tmp_path / "s.mcap")
     solver = "incremental" if name == "los" else "batch"
     (calibration,) = calibrate(tmp_path / "s.mcap", [solver])
     text = report_html(calibration)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pipelines.errors import InputError
-from pipelines.judgement.consistency import Halves
+from pipelines.judgement.halves import Halves
 from pipelines.reports.compare import compare_html, write_compare
 from pipelines.reports.plots import common_plots
 from pipelines.reports.result import Calibration

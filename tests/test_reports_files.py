@@ -28,6 +28,7 @@ from pipelines.graph.problem import (
     rotation_vector_coordinates,
 )
 from pipelines.judgement.observability import assess
+from pipelines.methods import method
 from pipelines.recording.info import SessionFacts, TopicFacts
 from pipelines.recording.messages import definition
 from pipelines.reports import write
@@ -82,6 +83,7 @@ def make_calibration(**changes: object) -> Calibration:
     estimate = replace(estimate, **{k: v for k, v in changes.items() if hasattr(estimate, k)})  # type: ignore[arg-type]
     problem = make_problem()
     calibration = Calibration(
+        method=method("head"),
         problem=problem,
         estimate=estimate,
         assessment=assess(quantities_of(problem, estimate), estimate.covariance, estimate.chi_square, None),

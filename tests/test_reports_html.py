@@ -14,12 +14,13 @@ import pytest
 from factors import so3
 from pipelines.graph.problem import Attitudes, Quantity, Residuals
 from pipelines.judgement.observability import assess
+from pipelines.judgement.robust import robust_sigma
 from pipelines.methods.head.figures import head_plots
 from pipelines.methods.head.recording import HeadData
 from pipelines.reports.html import report_html
 from pipelines.reports.plots import common_plots
 from pipelines.reports.result import Calibration, quantities_of
-from pipelines.reports.units import human_unit, robust_sigma, to_digits_of
+from pipelines.reports.units import human_unit, to_digits_of
 from tests.browser import drawn, needs_browser
 from tests.test_reports_files import make_calibration
 

@@ -7,8 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.config import Tag, check_names, first_given, load_config
+from pipelines.config import load_config
 from pipelines.errors import InputError
+from pipelines.methods.cube.topics import CubeConfig, field_date
+from pipelines.methods.head.topics import HEAD_IMU, HeadConfig
+from pipelines.methods.los.topics import GIMBAL
+from pipelines.settings import Tag, check_names, first_given
 
 # The example of the file format, with every key.
 FULL = b"""
@@ -33,26 +37,28 @@ def test_every_key_of_the_format() -> None:
     assert config.method == "los"
     assert config.noise.gyro_density == 5e-5
     assert config.priors == {"delta_px": 0.05, "delta_gx": 0.0, "delta_gy": None}
-    assert config.cube.tags[16] == Tag(size=0.12, position=(0.0, 0.0, 0.08))
-    assert config.cube.raw.accel is not None
-    assert config.cube.raw.accel.offset == 33000.0
-    assert config.head.board is not None
-    assert config.head.board.tags[0].size == 0.04
-    assert config.field_date == datetime.date(2026, 11, 20)
-    assert config.topic("gimbal") == "/gimbal/joint_states"
+    assert config.section(CubeConfig).tags[16] == Tag(size=0.12, position=(0.0, 0.0, 0.08))
+    accel = config.section(CubeConfig).raw.accel
+    assert accel is not None
+    assert accel.offset == 33000.0
+    board = config.section(HeadConfig).board
+    assert board is not None
+    assert board.tags[0].size == 0.04
+    assert field_date(config) == datetime.date(2026, 11, 20)
+    assert config.topic(GIMBAL) == "/gimbal/joint_states"
 
 
 def test_nothing_given_is_visible_as_nothing() -> None:
     for config in (load_config(None), load_config(b""), load_config(b"noise:\ncube:\n")):
         assert config.noise.gyro_density is None
         assert config.method is None
-        assert config.head.board is None
-        assert config.topic("head_imu") == "/head/imu"
+        assert config.section(HeadConfig).board is None
+        assert config.topic(HEAD_IMU) == "/head/imu"
 
 
 def test_a_date_under_cube_is_taken() -> None:
-    assert load_config(b"cube: {date: 2026-11-20}").field_date == datetime.date(2026, 11, 20)
-    assert load_config(b"cube: {date: '2026-11-20'}").field_date == datetime.date(2026, 11, 20)
+    assert field_date(load_config(b"cube: {date: 2026-11-20}")) == datetime.date(2026, 11, 20)
+    assert field_date(load_config(b"cube: {date: '2026-11-20'}")) == datetime.date(2026, 11, 20)
 
 
 def test_the_file_overrides_key_by_key(tmp_path: Path) -> None:
@@ -62,8 +68,11 @@ def test_the_file_overrides_key_by_key(tmp_path: Path) -> None:
     )
     config = load_config(FULL, other)
     assert (config.noise.gyro_density, config.noise.los_error) == (1e-3, 2e-5)
-    assert (config.cube.tags[16].size, config.cube.tags[16].position) == (0.2, (0.0, 0.0, 0.08))
-    assert config.cube.tags[17].size == 0.1
+    assert (config.section(CubeConfig).tags[16].size, config.section(CubeConfig).tags[16].position) == (
+        0.2,
+        (0.0, 0.0, 0.08),
+    )
+    assert config.section(CubeConfig).tags[17].size == 0.1
     assert config.priors["delta_px"] is None
     assert config.require == {"delta_px": 1.7e-4}
 
@@ -147,6 +156,6 @@ def test_configs_of_the_independent_recordings(shared_data: Path) -> None:
     for path in (shared_data / "contract").glob("*.mcap"):
         config = load_config(open_recording(path).attachment("alidade.yaml"))
         methods[path.stem] = config.method
-        assert (config.field_date is not None) == (config.method == "cube")
+        assert (field_date(config) is not None) == (config.method == "cube")
     assert methods["head_mounts"] == "head"
     assert len(methods) == 6

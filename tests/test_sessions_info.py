@@ -9,11 +9,12 @@ import pytest
 
 from pipelines.config import load_config
 from pipelines.errors import InputError
+from pipelines.methods import method, names
 from pipelines.recording import series
-from pipelines.recording.info import missing_for, resolve_method, session_facts
 from pipelines.recording.reading import open_recording
-from pipelines.recording.topics import NEEDED, TOPICS, topic_name
+from pipelines.recording.topics import Setting, Topic
 from pipelines.recording.writing import write_session
+from pipelines.session import missing_for, resolve_method, session_facts
 
 T0 = 1_800_000_000_000_000_000
 NONE = load_config(None)
@@ -106,9 +107,13 @@ def test_several_methods_served_is_an_error_that_names_them(tmp_path: Path) -> N
 
 
 def test_needs_are_made_of_known_keys() -> None:
-    keys = {key for needs in NEEDED.values() for groups in needs for group in groups for key in group}
-    assert keys <= {*TOPICS, "latitude_deg", "head.board", "cube.tags", "method: cube"}
-    assert {topic_name(key, {}) for key in TOPICS} >= {"/imu", "/los/error", "/platform/imu"}
+    topics = {topic for name in names() for topic in method(name).topics}
+    needed = {one for name in names() for need in method(name).needs for group in need for one in group}
+    settings = {one.phrase.split(" in the config")[0] for one in needed if isinstance(one, Setting)}
+    assert {one for one in needed if isinstance(one, Topic)} <= topics
+    assert settings <= {"latitude_deg", "head.board", "cube.tags", "`method: cube`"}
+    assert {topic.name for topic in topics} >= {"/imu", "/los/error", "/platform/imu"}
+    assert len({topic.key for topic in topics}) == len(topics)
 
 
 @pytest.mark.parametrize("name", ["compressed", "ros2_talker", "ros2_only_topics", "ros2_service_events"])

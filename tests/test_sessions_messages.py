@@ -11,11 +11,11 @@ import pytest
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pipelines.config import Config
 from pipelines.errors import InputError
 from pipelines.recording import messages
-from pipelines.recording.info import resolve_method, session_facts
 from pipelines.recording.reading import open_recording
+from pipelines.session import resolve_method, session_facts
+from pipelines.settings import Config
 
 T0 = 1_700_000_000_000_000_000
 STORE = get_typestore(Stores.ROS2_HUMBLE)

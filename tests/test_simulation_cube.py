@@ -11,17 +11,12 @@ from factors import so3
 from factors.earth import earth_rate, gravity, magnetic_field
 from pipelines.config import load_config
 from pipelines.errors import InputError
+from pipelines.methods import simulate
 from pipelines.methods.cube.faces import Resting
 from pipelines.methods.cube.poses import static_poses
 from pipelines.methods.cube.recording import read_cube, rests
-from pipelines.methods.cube.simulation import (
-    YEAR,
-    CubeNoise,
-    CubeScenario,
-    cube_config,
-    simulate_cube,
-    write_simulation,
-)
+from pipelines.methods.cube.simulation import YEAR, CubeNoise, CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.topics import CubeConfig
 from pipelines.recording.reading import open_recording
 from pipelines.simulation.scenario import load_scenario
 
@@ -53,8 +48,9 @@ def test_at_rest_every_sensor_says_what_the_attitude_seen_by_the_camera_predicts
     poses = static_poses(data, config)
     assert len(poses) == EXACT.poses
     assert data.reference_wxyz is not None
-    assert config.cube.camera_rotation is not None
-    nRC = so3.multiply(data.reference_wxyz[0], config.cube.camera_rotation)
+    BRC = config.section(CubeConfig).camera_rotation
+    assert BRC is not None
+    nRC = so3.multiply(data.reference_wxyz[0], BRC)
     field = np.array([truth[f"field_{axis}"] for axis in "enu"])
     latitude = float(np.deg2rad(EXACT.latitude_deg))
     vectors = {"accel": np.array([0, 0, gravity(latitude, EXACT.height)]), "gyro": earth_rate(latitude), "mag": field}
@@ -93,7 +89,7 @@ def test_the_gyro_leads_from_pose_to_pose() -> None:
 
 
 def _nRC(nRB: np.ndarray, config: object) -> np.ndarray:
-    return so3.multiply(nRB, config.cube.camera_rotation)  # type: ignore[attr-defined]
+    return so3.multiply(nRB, config.section(CubeConfig).camera_rotation)  # type: ignore[attr-defined]
 
 
 def test_noise_is_as_stated() -> None:
@@ -171,8 +167,8 @@ def test_scenarios_are_valid(name: str) -> None:
 def test_pictures_show_the_tags_where_the_detections_have_them(tmp_path: Path) -> None:
     scenario = tmp_path / "short.yaml"
     scenario.write_text("{poses: 1, static_s: 2.0, occluded: 0.0, tag_mount: 0.002, picture_rate_hz: 1.0}")
-    write_simulation(str(scenario), 5, tmp_path / "p.mcap", images=True)
-    write_simulation(str(scenario), 5, tmp_path / "d.mcap", images=False)
+    simulate("cube", str(scenario), 5, tmp_path / "p.mcap", images=True)
+    simulate("cube", str(scenario), 5, tmp_path / "d.mcap", images=False)
     seen = []
     for file in ("p.mcap", "d.mcap"):
         recording = open_recording(tmp_path / file)

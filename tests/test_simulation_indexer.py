@@ -10,16 +10,10 @@ import pytest
 from factors import so3
 from factors.earth import EARTH_RATE
 from pipelines.config import load_config
+from pipelines.methods import simulate
 from pipelines.methods.indexer.recording import read_indexer
 from pipelines.methods.indexer.runs import axis_motion
-from pipelines.methods.indexer.simulation import (
-    ARCSEC,
-    IndexerNoise,
-    IndexerScenario,
-    Position,
-    simulate_indexer,
-    write_simulation,
-)
+from pipelines.methods.indexer.simulation import ARCSEC, IndexerNoise, IndexerScenario, Position, simulate_indexer
 from pipelines.recording.reading import open_recording
 from pipelines.simulation.scenario import load_scenario
 
@@ -117,7 +111,7 @@ def test_written_and_read_back_gives_the_same_arrays(tmp_path: Path) -> None:
         "positions: [{axis: inner, other_deg: 0, turns: 1}]\nattitude_noise_arcsec: 1\nencoder_phase: 0.3\n"
         "priors: {gyro_scale_x: 1.0e-3}\n"
     )
-    write_simulation(str(settings), 5, tmp_path / "s.mcap", images=False)
+    simulate("indexer", str(settings), 5, tmp_path / "s.mcap", images=False)
     recording = open_recording(tmp_path / "s.mcap")
     config = load_config(recording.attachment("alidade.yaml"))
     data, _ = simulate_indexer(load_scenario(IndexerScenario, settings), 5)

@@ -12,11 +12,11 @@ from typing import Annotated
 
 import typer
 
+from pipelines import methods as known
 from pipelines import progress
 from pipelines.errors import InputError
 from pipelines.fleet import statistics
 from pipelines.fleet.montecarlo import SOLVERS, Study, run_study
-from pipelines.recording.topics import METHODS
 
 # Seeds by which the studies of the incremental solver grow together.
 _BLOCK = 25
@@ -39,7 +39,7 @@ with its histograms: `alidade montecarlo METHOD`.
 
 def main(
     runs: Annotated[int, typer.Option(help="Simulated recordings a method.")] = 200,
-    methods: Annotated[str, typer.Option(help="Some of the methods; by default all.")] = ",".join(METHODS),
+    methods: Annotated[str, typer.Option(help="Some of the methods; by default all.")] = ",".join(known.names()),
     scheduler: Annotated[str | None, typer.Option(help="Of a dask cluster; default: this machine.")] = None,
     jobs: Annotated[int | None, typer.Option(help="Local worker processes; default: one a core.")] = None,
     work: Annotated[Path, typer.Option(help="Folder for what is finished.")] = Path("consistency"),

@@ -14,14 +14,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from pipelines import exit_codes, progress
+from pipelines import exit_codes, methods, progress
 from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.fleet.attempt import attempt, failure, set_aside
 from pipelines.fleet.engine import Killed, cluster, completed, source_version
 from pipelines.fleet.recordings import as_date, from_metadata, from_name, local
 from pipelines.fleet.store import Result, Store, settings_key
-from pipelines.recording.topics import METHODS
 
 if TYPE_CHECKING:
     from fsspec.core import OpenFile
@@ -48,8 +47,8 @@ class Settings:
     @classmethod
     def of(cls, method: str | None, config: Path | None, solver: str, window: float | None) -> Settings:
         """With the text of a config file. Raises InputError when there is no such method or the config is wrong."""
-        if method is not None and method not in METHODS:
-            raise InputError(f"no method {method!r}; the methods are {', '.join(METHODS)}")
+        if method is not None:
+            methods.method(method)  # there is one of that name
         if config is None:
             return cls(method, None, solver, window)
         load_config(None, config)

@@ -177,14 +177,14 @@ def simulate_and_solve(
     method: str, scenario: str, text: str | None, seed: int, solvers: Sequence[str], window: float | None
 ) -> dict[str, Result]:
     """On the worker: solver -> numbers of one seed. `text` is the scenario file's, which the worker may not see."""
-    from pipelines.registry import method as find
+    from pipelines import methods
 
     with TemporaryDirectory(prefix="alidade.") as folder:
         if text is not None:
             scenario = str(Path(folder) / "scenario.yaml")
             Path(scenario).write_text(text, encoding="utf-8")
         session = Path(folder) / "session.mcap"
-        find(method).simulate(scenario, seed, session, False)
+        methods.simulate(method, scenario, seed, session)
         return {solver: attempt(_numbers, session, solver, method, None, window) for solver in solvers}
 
 
@@ -232,11 +232,11 @@ def _coverage_cells(shares: tuple[float, float, float]) -> dict[str, Cell]:
 
 
 def _fingerprint(method: str, scenario: str, seed: int) -> str:
-    from pipelines.registry import method as find
+    from pipelines import methods
 
     with TemporaryDirectory(prefix="alidade.") as folder:
         session = Path(folder) / "session.mcap"
-        find(method).simulate(scenario, seed, session, False)
+        methods.simulate(method, scenario, seed, session)
         with session.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
 

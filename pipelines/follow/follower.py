@@ -20,10 +20,10 @@ from pipelines.errors import InputError
 from pipelines.follow.growing import is_finished, size_of
 from pipelines.follow.guidance import View, view_of
 from pipelines.graph.problem import Problem, Step
-from pipelines.methods.collected import Collected
+from pipelines.judgement.checklist import ChecklistItem
 from pipelines.recording.reading import open_recording
 from pipelines.reports.result import Calibration
-from pipelines.session import Session, calibrations
+from pipelines.session import Session
 from pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
 from pipelines.solvers.incremental import Run
 
@@ -78,7 +78,7 @@ class Follower:
         self._resumable = settings.checkpoint is not None and settings.checkpoint.exists()
         self._shown = 0.0
         self._waiting = ""
-        self._collected: tuple[Collected, ...] = ()
+        self._checklist: tuple[ChecklistItem, ...] = ()
         if settings.checkpoint is not None and settings.window is None:
             raise InputError("--window all has no checkpoints: it forgets nothing; give seconds")
 
@@ -121,7 +121,7 @@ class Follower:
         self._take(problem, _settled(self._new_steps(session, problem)))
 
     def _wait(self, reason: str) -> None:
-        """What is there is no MCAP file, or too little yet."""
+        """The recording cannot be read yet, or holds too little; raises InputError when it never will."""
         if "not an MCAP file" in reason:
             raise InputError(reason)
         reason = reason.removeprefix(f"{self.settings.path}: ")
@@ -135,9 +135,9 @@ class Follower:
     def _new_steps(self, session: Session, problem: Problem) -> Iterator[Step]:
         """The steps not taken yet, for a run that is the one to take them: a new one if the past has changed."""
         identity = self._identify(session)
-        if problem.steps_after is None or identity != self._identity or session.recording.epoch_ns != self._epoch_ns:
+        if problem.steps_after is None or identity != self._identity or session.origin.epoch_ns != self._epoch_ns:
             self._run = None
-        self._identity, self._epoch_ns = identity, session.recording.epoch_ns
+        self._identity, self._epoch_ns = identity, session.origin.epoch_ns
         if self._run is None and problem.steps_after is not None:
             self._run = self._resumed(problem)
         if self._run is None:
@@ -153,8 +153,7 @@ class Follower:
         return problem.steps_after(self._run.time)
 
     def _collect(self, session: Session) -> None:
-        collected = session.method.collected
-        self._collected = () if collected is None else tuple(collected(session.data, session.config))
+        self._checklist = tuple(session.method.checklist(session.data, session.config))
 
     def _take(self, problem: Problem, steps: Iterable[Step]) -> None:
         run = self._run
@@ -170,7 +169,7 @@ class Follower:
 
     def _view(self) -> None:
         assert self._run is not None
-        self._show(view_of(self._epoch_ns, self._run, self._collected))
+        self._show(view_of(self._epoch_ns, self._run, self._checklist))
         self._shown = time.monotonic()
 
     # -- the checkpoint
@@ -196,8 +195,8 @@ class Follower:
         with self.settings.path.open("rb") as stream:
             head = hashlib.sha256(stream.read(_FINGERPRINT)).hexdigest()[:12]
         return {
-            "recording": f"one that starts at {session.recording.epoch_ns} ns ({head})",
-            "method": session.name,
+            "recording": f"one that starts at {session.origin.epoch_ns} ns ({head})",
+            "method": session.method.name,
             "config": session.config.model_dump_json(exclude_defaults=True),
             "window": f"{self.settings.window} s",
             "version": f"alidade {metadata.version('alidade')} with gtsam {metadata.version('gtsam')}",
@@ -222,7 +221,7 @@ class Follower:
         self._take(problem, self._new_steps(session, problem))
         assert self._run is not None
         estimate = self._run.finish(time.perf_counter() - started)
-        (calibration,) = calibrations(session, [(estimate, problem)], {"read": read})
+        (calibration,) = session.judged([(estimate, problem)], {"read": read})
         return calibration
 
 

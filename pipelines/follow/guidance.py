@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.graph.problem import Array, Quantity
+from pipelines.judgement.checklist import ChecklistItem
 from pipelines.judgement.observability import Assessment, assess
-from pipelines.methods.collected import Collected
 from pipelines.solvers.incremental import Run
 
 # Parameters a sentence names.
@@ -25,7 +25,7 @@ class View:
         quantities: what is calibrated.
         values: (n,) of them, as estimated by now; None while there is too little.
         assessment: of that estimate.
-        collected: of what the method needs.
+        checklist: what there is of what the method needs.
     """
 
     time: float
@@ -33,7 +33,7 @@ class View:
     quantities: tuple[Quantity, ...]
     values: Array | None
     assessment: Assessment | None
-    collected: tuple[Collected, ...]
+    checklist: tuple[ChecklistItem, ...]
 
     @property
     def sigmas(self) -> Array | None:
@@ -56,7 +56,7 @@ class View:
     def missing(self) -> tuple[str, ...]:
         """What to do, the most urgent first, each sentence once."""
         advice = () if self.assessment is None else tuple(d.advice for d in self.assessment.directions)
-        wanted = tuple(f"{c.what}: {c.wanted}" for c in self.collected if c.wanted)
+        wanted = tuple(f"{c.what}: {c.wanted}" for c in self.checklist if c.wanted)
         return tuple(dict.fromkeys((*advice, *wanted)))
 
     @property
@@ -73,7 +73,7 @@ class View:
         return f"not yet as accurate as required: {names}"
 
 
-def view_of(epoch_ns: int, run: Run, collected: tuple[Collected, ...]) -> View:
+def view_of(epoch_ns: int, run: Run, checklist: tuple[ChecklistItem, ...]) -> View:
     """The view of a run so far."""
     quantities = run.problem.quantities
     values, assessment = None, None
@@ -81,4 +81,4 @@ def view_of(epoch_ns: int, run: Run, collected: tuple[Collected, ...]) -> View:
         values = run.values()
         assessment = assess(quantities, run.covariance(), run.chi_square(), run.problem.advice)
     time = run.time if np.isfinite(run.time) else 0.0
-    return View(time, epoch_ns, quantities, values, assessment, collected)
+    return View(time, epoch_ns, quantities, values, assessment, checklist)

@@ -101,6 +101,6 @@ def _collected(view: View) -> Table:
     table.add_column("collected", no_wrap=True)
     table.add_column("so far")
     table.add_column("still wanted")
-    for c in view.collected:
+    for c in view.checklist:
         table.add_row(c.what, c.have, c.wanted or "[green]enough[/]")
     return table

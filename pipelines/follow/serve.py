@@ -95,7 +95,7 @@ class LiveServer:
             "status": "" if view.assessment is None else view.assessment.status,
             "headline": view.headline,
             "missing": list(view.missing),
-            "collected": [{"what": c.what, "have": c.have, "wanted": c.wanted} for c in view.collected],
+            "collected": [{"what": c.what, "have": c.have, "wanted": c.wanted} for c in view.checklist],
         }
         self._log("/status", _STATUS, {}, status, at)
 

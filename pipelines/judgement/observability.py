@@ -246,7 +246,7 @@ class Assessment:
         covariance: (n, n), the one judged: symmetric and finite whatever was given.
         consistency: None when the solver has no chi-square.
         headline: the verdict in one sentence.
-        causes: of residuals that do not fit, the likeliest first; see pipelines.judgement.consistency.
+        causes: of residuals that do not fit, the likeliest first; see pipelines.judgement.causes.
     """
 
     status: Status

@@ -1,1 +1,185 @@
-"""One module a method: recording to Problem."""
+"""Methods: what the rest of the toolkit may ask of one, and which there are.
+
+    method("head").simulate("head_nominal", seed=1).data      # arrays
+    names()                                                   # ("los", "indexer", "head", "cube", ...)
+
+A method is an object of a class derived from `Method`. The four of the toolkit stand in folders beside this file; other
+distributions bring theirs as entry points of the group `alidade.methods`, name = the method's, value = the class.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import cache
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from pipelines.errors import InputError
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    from pipelines.graph.problem import Estimate, Findings, Problem
+    from pipelines.judgement.checklist import ChecklistItem
+    from pipelines.judgement.hypotheses import Hypotheses
+    from pipelines.judgement.validation import Validation
+    from pipelines.methods.formula import Formula
+    from pipelines.recording.reading import Recording
+    from pipelines.recording.topics import Need, Topic
+    from pipelines.reports.calibration import SavedCalibration
+    from pipelines.reports.result import Calibration, Plot, Table
+    from pipelines.settings import Config, MethodSection
+    from pipelines.simulation.simulated import Simulated
+
+GROUP = "alidade.methods"
+
+# A motion as a simulator's settings, plain values by key.
+Scenario = dict[str, Any]
+
+
+class Method(ABC):
+    """One method of calibration; `Any` stands for its data, a frozen dataclass of arrays that only it knows.
+
+    Modules that take long to import are imported by the functions that need them: every command asks all methods for
+    the attributes below.
+
+    Attributes:
+        name: as in configs and on the command line.
+        title: what people call it.
+        topics: what it reads, the optional ones included.
+        needs: what it cannot do without.
+        section: the model of its own section of the config, if it has one.
+        rotations: parameters that are rotation vectors, without their _x, _y, _z -> the rotation each is.
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    topics: ClassVar[tuple[Topic, ...]]
+    needs: ClassVar[tuple[Need, ...]]
+    section: ClassVar[type[MethodSection] | None] = None
+    rotations: ClassVar[Mapping[str, str]] = {}
+
+    # -- from a recording to estimates
+
+    @abstractmethod
+    def read(self, recording: Recording, config: Config) -> Any:
+        """The method's data. Raises InputError when the recording cannot be used."""
+
+    @abstractmethod
+    def problem(self, data: Any, config: Config) -> Problem:
+        """The graph. Raises InputError when the data are too few, or the config names no such parameter."""
+
+    @abstractmethod
+    def published(self, data: Any, config: Config, problem: Problem) -> Estimate:
+        """The published solver's estimate. Raises InputError where it cannot serve the data."""
+
+    # -- simulation and planning
+
+    @property
+    @abstractmethod
+    def scenario(self) -> type[BaseModel]:
+        """The model of the simulator's settings; all of them have defaults."""
+
+    @abstractmethod
+    def simulate(self, scenario: Any, seed: int, images: bool = False) -> Simulated:
+        """Data and truth of a scenario (of the model above), in memory; with `images` pictures are drawn too.
+
+        Raises InputError when the scenario cannot be drawn.
+        """
+
+    def nominal(self, images: bool = False) -> str:  # noqa: ARG002
+        """Name of the scenario that is simulated where none is named."""
+        return f"{self.name}_nominal"
+
+    @abstractmethod
+    def write(self, path: Path, simulated: Simulated) -> None:
+        """Write data as a recording, with truth and config attached. Raises InputError when it cannot be written."""
+
+    def candidates(self, scenario: Scenario) -> Iterator[tuple[str, Scenario]]:  # noqa: ARG002
+        """Changes of a motion that may tell more: in words, and the changed motion."""
+        return iter(())
+
+    # -- judgement
+
+    @abstractmethod
+    def hypotheses(self) -> Hypotheses:
+        """What can be wrong with its data, to be tried when residuals do not fit."""
+
+    def validate(self, data: Any, config: Config, values: Mapping[str, float]) -> Sequence[Validation]:  # noqa: ARG002
+        """Errors before and after compensation with parameter values by name. Raises InputError when there are none."""
+        raise InputError(f"method {self.name} has no validation")
+
+    def checklist(self, data: Any, config: Config) -> Sequence[ChecklistItem]:  # noqa: ARG002
+        """What there is by now of what the method needs, for the person recording."""
+        return ()
+
+    # -- reports
+
+    @abstractmethod
+    def formulas(self, parameters: Collection[str]) -> Sequence[Formula]:
+        """How a result with these parameters is applied, in the order of evaluation."""
+
+    def findings(self, data: Any, config: Config, estimate: Estimate) -> Findings:  # noqa: ARG002
+        """What there is to tell beside the parameters."""
+        return {}
+
+    def figures(self, data: Any, calibration: Calibration) -> Sequence[Plot | Table]:  # noqa: ARG002
+        """The method's own figures and tables for the report."""
+        return ()
+
+    @property
+    def exporters(self) -> Mapping[str, Callable[[SavedCalibration], str]]:
+        """Format -> what writes a calibration in it; may raise InputError."""
+        return {}
+
+
+_BUILT_IN = ("los", "indexer", "head", "cube")
+
+
+def names() -> tuple[str, ...]:
+    """All methods: the toolkit's own, then those that other distributions bring."""
+    return (*_BUILT_IN, *_brought())
+
+
+@cache
+def method(name: str) -> Method:
+    """The method of that name. Raises InputError when there is none, or when its distribution is broken."""
+    if name in _BUILT_IN:
+        found = import_module(f"pipelines.methods.{name}").METHOD
+        assert isinstance(found, Method)
+        return found
+    entry = _brought().get(name)
+    if entry is None:
+        raise InputError(f"no method {name!r}; the methods are {', '.join(names())}")
+    try:
+        made = entry.load()()
+    except Exception as error:
+        raise InputError(f"method {name}, brought by {_origin(entry)}, cannot be loaded: {error}") from error
+    if not isinstance(made, Method) or made.name != name:
+        raise InputError(f"method {name}, brought by {_origin(entry)}: {entry.value} is no Method of that name")
+    return made
+
+
+def simulate(name: str, scenario: str | None, seed: int, out: Path, images: bool = False) -> None:
+    """Simulate a scenario, by name or file (None: the method's nominal one), and write it as a recording.
+
+    Raises InputError when there is no such method or scenario, or the recording cannot be written.
+    """
+    from pipelines.simulation.scenario import load_scenario
+
+    chosen = method(name)
+    settings = load_scenario(chosen.scenario, scenario or chosen.nominal(images))
+    chosen.write(out, chosen.simulate(settings, seed, images))
+
+
+@cache
+def _brought() -> Mapping[str, EntryPoint]:
+    """Methods of other distributions, by name."""
+    return {entry.name: entry for entry in entry_points(group=GROUP) if entry.name not in _BUILT_IN}
+
+
+def _origin(entry: EntryPoint) -> str:
+    return entry.dist.name if entry.dist is not None else entry.value

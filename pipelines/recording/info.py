@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.config import Config
-from pipelines.errors import InputError
-from pipelines.recording.message_reader import ENCODING, Topic
+from pipelines.recording.message_reader import ENCODING
+from pipelines.recording.message_reader import Topic as RecordedTopic
 from pipelines.recording.reading import Recording
-from pipelines.recording.topics import METHODS, NEEDED, TOPICS
+from pipelines.recording.topics import Need, Setting, Topic
+from pipelines.settings import Config
 
 
 @dataclass(frozen=True)
@@ -54,48 +55,27 @@ class SessionFacts:
         return tuple(method for method, lacking in self.missing.items() if not lacking)
 
 
-def session_facts(recording: Recording, config: Config) -> SessionFacts:
-    """Facts about all topics of a recording."""
+def facts_of(recording: Recording, config: Config, needs: Mapping[str, Sequence[Need]]) -> SessionFacts:
+    """Facts about all topics of a recording, and what it lacks of the needs of methods."""
     epoch, times = recording.epoch_ns, recording.times
     topics = tuple(_facts(recording.topics[name], epoch, *times[name]) for name in recording.topics)
-    missing = {method: missing_for(method, recording, config) for method in METHODS}
+    missing = {method: lacking(wanted, recording, config) for method, wanted in needs.items()}
     return SessionFacts(
         epoch, recording.duration_s, recording.attachments, topics, missing, recording.missing, recording.notes
     )
 
 
-def missing_for(method: str, recording: Recording, config: Config) -> tuple[str, ...]:
-    """What a recording with this config lacks for a method, one phrase each; nothing if it can serve it."""
+def lacking(needs: Sequence[Need], recording: Recording, config: Config) -> tuple[str, ...]:
+    """What a recording with this config lacks of a method's needs, one phrase each; nothing if it can serve it."""
     phrases = []
-    for groups in NEEDED[method]:
-        lacking = [[_lack(key, recording, config) for key in group] for group in groups]
-        texts = [" and ".join(filter(None, group)) for group in lacking]
+    for groups in needs:
+        texts = [" and ".join(filter(None, (_lack(one, recording, config) for one in group))) for group in groups]
         if all(texts):
             phrases.append(", or ".join(texts))
     return tuple(phrases)
 
 
-def resolve_method(option: str | None, recording: Recording, config: Config) -> str:
-    """The method to use: the option, else the config's, else the only one the recording has the topics for.
-
-    Raises InputError when the option is no method, and when none or several methods could be meant.
-    """
-    if option is not None and option not in METHODS:
-        raise InputError(f"no method {option!r}; the methods are {', '.join(METHODS)}")
-    if option or config.method:
-        return str(option or config.method)
-    able = [method for method in METHODS if not missing_for(method, recording, config)]
-    if len(able) == 1:
-        return able[0]
-    if able:
-        raise InputError(f"{recording.path}: the topics serve {' and '.join(able)}; choose with --method")
-    raise InputError(
-        f"{recording.path}: no usable topics for any method; {recording.there()}; needed are ROS 2 messages "
-        f"({ENCODING}): `alidade info` tells which for each method, `topics:` in the config can rename"
-    )
-
-
-def _facts(topic: Topic, epoch_ns: int, t_ns: NDArray[np.int64], log_ns: NDArray[np.int64]) -> TopicFacts:
+def _facts(topic: RecordedTopic, epoch_ns: int, t_ns: NDArray[np.int64], log_ns: NDArray[np.int64]) -> TopicFacts:
     stamps = t_ns[np.argsort(log_ns, kind="stable")] - epoch_ns
     backward = int(np.count_nonzero(stamps < np.maximum.accumulate(stamps))) if len(stamps) else 0
     stamps = np.sort(stamps)
@@ -111,22 +91,16 @@ def _facts(topic: Topic, epoch_ns: int, t_ns: NDArray[np.int64], log_ns: NDArray
     return TopicFacts(topic.name, topic.type, len(stamps), start, duration, rate, gap, gap_at, duplicates, backward)
 
 
-def _lack(key: str, recording: Recording, config: Config) -> str:
+def _lack(need: Topic | Setting, recording: Recording, config: Config) -> str:
     """What is lacking of a topic or a key of the config, as a phrase; empty if nothing."""
-    if key == "latitude_deg":
-        return "" if config.latitude_deg is not None else "latitude_deg in the config"
-    if key == "head.board":
-        return "" if config.head.board is not None else "head.board in the config"
-    if key == "cube.tags":
-        return "" if config.cube.tags else "cube.tags in the config"
-    if key == "method: cube":
-        return "" if config.method == "cube" else "`method: cube` in the config"
-    name = config.topic(key)
+    if isinstance(need, Setting):
+        return "" if need.given(config) else need.phrase
+    name = config.topic(need)
     found = recording.topics.get(name)
-    types = " or ".join(TOPICS[key].types)
+    types = " or ".join(need.types)
     if found is None:
         return f"{name} ({types})"
-    if found.type not in TOPICS[key].types:
+    if found.type not in need.types:
         return f"{name} as {types}, not {found.type}"
     if found.encoding != ENCODING:
         return f"{name} in the encoding {ENCODING}, not {found.encoding}"

@@ -1,61 +1,44 @@
-"""Which topics a method reads, by the keys they have in the config."""
+"""Topics by the keys they have in the config, and what a method needs of a recording."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from pipelines.recording import messages
 
-METHODS = ("los", "indexer", "head", "cube")
+if TYPE_CHECKING:
+    from pipelines.recording.reading import Recording
+    from pipelines.settings import Config
 
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of the contract: its default name and the message types it may have."""
+    """A topic of the contract: its key in the config, its default name and the message types it may have."""
 
+    key: str
     name: str
     types: tuple[str, ...]
 
 
-# Key in the config -> topic.
-TOPICS = {
-    "imu": Topic("/imu", (messages.IMU,)),
-    "mag": Topic("/mag", (messages.MAGNETIC_FIELD,)),
-    "gimbal": Topic("/gimbal/joint_states", (messages.JOINT_STATE,)),
-    "los_error": Topic("/los/error", (messages.VECTOR,)),
-    "indexer": Topic("/indexer/joint_states", (messages.JOINT_STATE,)),
-    "fix": Topic("/fix", (messages.NAV_SAT_FIX,)),
-    "head_imu": Topic("/head/imu", (messages.IMU,)),
-    "platform_imu": Topic("/platform/imu", (messages.IMU,)),
-    "vision_attitude": Topic("/vision/attitude", (messages.POSE, messages.QUATERNION)),
-    "truth_attitude": Topic("/truth/attitude", (messages.QUATERNION,)),
-    "reference_fix": Topic("/reference/fix", (messages.NAV_SAT_FIX,)),
-    "reference_imu": Topic("/reference/imu", (messages.IMU,)),
-    "tag_detections": Topic("/tag_detections", (messages.TAG_DETECTIONS,)),
-    "image": Topic("/camera/image/compressed", (messages.COMPRESSED_IMAGE,)),
-    "camera_info": Topic("/camera/camera_info", (messages.CAMERA_INFO,)),
-}
+@dataclass(frozen=True)
+class Setting:
+    """A key of the config that stands in for a topic: how to ask for it, and whether a config has it."""
 
-# What a method cannot do without: of each line, all topics of at least one group.
-NEEDED: dict[str, tuple[tuple[tuple[str, ...], ...], ...]] = {
-    "los": ((("imu",),), (("gimbal",),), (("los_error",), ("image", "camera_info"))),
-    "indexer": ((("imu",),), (("indexer",),), (("fix",), ("latitude_deg",))),
-    "head": ((("head_imu",),), (("vision_attitude",), ("image", "camera_info", "head.board"))),
-    "cube": (
-        (("imu",),),
-        # Pictures alone could be of anything. Without camera the turns between poses and gravity serve; the config has
-        # to say that this is meant.
-        (
-            ("tag_detections", "camera_info"),
-            ("image", "camera_info", "reference_imu"),
-            ("image", "camera_info", "cube.tags"),
-            ("method: cube",),
-        ),
-    ),
-}
+    phrase: str
+    given: Callable[[Config], bool]
 
 
-def topic_name(key: str, renamed: Mapping[str, str]) -> str:
-    """Name of the topic with this key, as the config renames it."""
-    return renamed.get(key, TOPICS[key].name)
+# One thing a method cannot do without: all topics and settings of at least one group.
+Need = Sequence[Sequence[Topic | Setting]]
+
+# Topics that several methods read.
+IMU = Topic("imu", "/imu", (messages.IMU,))
+IMAGE = Topic("image", "/camera/image/compressed", (messages.COMPRESSED_IMAGE,))
+CAMERA_INFO = Topic("camera_info", "/camera/camera_info", (messages.CAMERA_INFO,))
+
+
+def wanted(recording: Recording, config: Config, topic: Topic) -> bool:
+    """Whether an optional topic is there, or the config asks for it by name."""
+    return config.topic(topic) in recording.topics or topic.key in config.topics

@@ -19,7 +19,6 @@ from factors import so3
 from pipelines.errors import InputError
 from pipelines.graph.problem import rotation_vector_coordinates
 from pipelines.judgement.observability import Status, Verdict
-from pipelines.reports.formulas import FORMULAS, ROTATIONS
 from pipelines.reports.result import Calibration
 
 _HEAD = """\
@@ -123,7 +122,7 @@ def saved(calibration: Calibration) -> SavedCalibration:
         parameters=parameters,
         rotations=_rotations(calibration),
         findings={name: [_plain(row) for row in rows] for name, rows in calibration.findings.items()},
-        formulas=list(FORMULAS.get(method, ())),
+        formulas=[formula.text for formula in calibration.formulas],
     )
 
 
@@ -150,7 +149,7 @@ def load_calibration(path: Path) -> SavedCalibration:
 def _rotations(calibration: Calibration) -> dict[str, SavedRotation]:
     """The parameters that are rotation vectors, as quaternions."""
     values: Mapping[str, float] = {p.name: p.value for p in calibration.parameters}
-    known = ROTATIONS.get(calibration.problem.method, {})
+    known = calibration.method.rotations
     found = {}
     for parameter in calibration.problem.parameters:
         names = [q.name for q in parameter.quantities]

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipelines.errors import InputError
 from pipelines.graph.problem import Quantity
-from pipelines.judgement.consistency import Halves
+from pipelines.judgement.halves import Halves
 from pipelines.reports.plots import COLORS, add_line, band, figure
 from pipelines.reports.result import Calibration, Plot, truth_errors
 from pipelines.reports.templating import environment
@@ -37,7 +37,7 @@ def compare_html(
 
     Args:
         calibrations: of one recording, by different solvers.
-        halves: of the recording, see pipelines.judgement.consistency.
+        halves: of the recording, see pipelines.judgement.halves.
         predicted: family -> size of the errors of held-out measurements, sigmas.
     """
 

@@ -10,7 +10,6 @@ import datetime
 from dataclasses import dataclass
 
 from pipelines.judgement.observability import by_advice
-from pipelines.reports.formulas import FORMULAS
 from pipelines.reports.plots import common_plots
 from pipelines.reports.result import Calibration, Plot, Table, quantities_of, truth_errors
 from pipelines.reports.templating import environment
@@ -18,7 +17,6 @@ from pipelines.reports.units import human_unit, to_digits_of
 
 # Beyond so many sigmas of its prior a number says nothing.
 _MEANINGLESS = 10.0
-_NAMES = {"los": "Line of sight", "indexer": "Indexer", "head": "Helmet", "cube": "Tag cube"}
 
 
 @dataclass(frozen=True)
@@ -48,10 +46,10 @@ def report_html(calibration: Calibration) -> str:
         .render(
             c=calibration,
             by_advice=by_advice,
-            method=_NAMES.get(calibration.problem.method, calibration.problem.method),
+            method=calibration.method.title,
             start=datetime.datetime.fromtimestamp(facts.epoch_ns // 1_000_000_000, datetime.UTC),
             rows=_rows(calibration),
-            formulas=FORMULAS.get(calibration.problem.method, ()),
+            formulas=[formula.text for formula in calibration.formulas],
             tables=[each for each in own if isinstance(each, Table)],
             plots=[(plot.title, plot.caption, _div(plot, i)) for i, plot in enumerate(plots)],
             plotly_js=get_plotlyjs() if plots else "",

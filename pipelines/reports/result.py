@@ -17,11 +17,14 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from pipelines.graph.problem import Estimate, Findings, Problem, Quantity, Residuals
 from pipelines.judgement.observability import Assessment, Fit, Innovations, Learning, Status, Verdict, learning
+from pipelines.judgement.robust import robust_sigma
 from pipelines.recording.info import SessionFacts
-from pipelines.reports.units import robust_sigma
 
 if TYPE_CHECKING:
     import plotly.graph_objects
+
+    from pipelines.methods import Method
+    from pipelines.methods.formula import Formula
 
 # Share of a family's measurements rejected that the reader is told of.
 _MANY_REJECTED = 0.2
@@ -60,6 +63,7 @@ class Calibration:
     """Everything the reports tell about one calibration.
 
     Attributes:
+        method: that was calibrated.
         problem: the method's.
         estimate: by any solver; its names are a part of the problem's.
         assessment: of that estimate.
@@ -76,6 +80,7 @@ class Calibration:
         findings: what the method found beside its parameters.
     """
 
+    method: Method
     problem: Problem
     estimate: Estimate
     assessment: Assessment
@@ -108,6 +113,11 @@ class Calibration:
             )
             for q, value, sigma in rows
         )
+
+    @property
+    def formulas(self) -> Sequence[Formula]:
+        """How it is applied."""
+        return self.method.formulas([q.name for q in self.problem.quantities])
 
     @property
     def counts(self) -> dict[str, int]:

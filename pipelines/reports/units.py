@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
-from pipelines.graph.problem import Array, Quantity
+from pipelines.graph.problem import Quantity
 
 # What is wanted to better than this, rad or rad/s, is read in arc seconds or degrees per hour.
 _FINE = 2e-4
@@ -41,8 +39,3 @@ def to_digits_of(value: float, sigma: float) -> str:
         return f"{value:.2e}"
     text = f"{value:.{max(decimals, 0)}f}"
     return text.removeprefix("-") if float(text) == 0.0 else text
-
-
-def robust_sigma(values: Array) -> float:
-    """Standard deviation of zero-mean normal numbers, told from their median so that outliers do not count."""
-    return float(np.median(np.abs(values))) / 0.6745 if values.size else 0.0

@@ -16,7 +16,7 @@ from pipelines.vision.camera import Camera
 from pipelines.vision.tags import Detections
 
 if TYPE_CHECKING:
-    from pipelines.config import Board
+    from pipelines.settings import Board
 
 Array = NDArray[np.float64]
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipelines.config import Config
 from pipelines.recording.reading import Recording
+from pipelines.recording.topics import CAMERA_INFO
+from pipelines.settings import Config
 
 if TYPE_CHECKING:
     from pipelines.vision.camera import Camera
@@ -15,5 +16,5 @@ def camera_of(recording: Recording, config: Config) -> Camera:
     """The camera. Raises InputError when its topic is missing or says what no camera can be."""
     from pipelines.vision.camera import Camera
 
-    info = recording.camera_info(config.topic("camera_info"))
+    info = recording.camera_info(config.topic(CAMERA_INFO))
     return Camera(info.width, info.height, info.k, info.distortion_model, info.d)

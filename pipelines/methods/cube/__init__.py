@@ -1,1 +1,110 @@
-"""The cube method."""
+"""The cube method: accelerometer, gyro and magnetometer of a device in a cube of AprilTags."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from pipelines.methods import Method, Scenario
+from pipelines.methods.cube.topics import NEEDS, TOPICS, CubeConfig
+
+if TYPE_CHECKING:
+    from pipelines.graph.problem import Estimate, Findings, Problem
+    from pipelines.judgement.checklist import ChecklistItem
+    from pipelines.judgement.hypotheses import Hypotheses
+    from pipelines.judgement.validation import Validation
+    from pipelines.methods.cube.recording import CubeData
+    from pipelines.methods.cube.simulation import CubeScenario
+    from pipelines.methods.formula import Formula
+    from pipelines.recording.reading import Recording
+    from pipelines.reports.calibration import SavedCalibration
+    from pipelines.reports.result import Calibration, Plot, Table
+    from pipelines.settings import Config
+    from pipelines.simulation.simulated import Simulated
+
+
+class Cube(Method):
+    """The door of the cube method."""
+
+    name = "cube"
+    title = "Tag cube"
+    topics = TOPICS
+    needs = NEEDS
+    section = CubeConfig
+    rotations: ClassVar[Mapping[str, str]] = {"camera_mount": "correction of BRC"}
+
+    def read(self, recording: Recording, config: Config) -> CubeData:
+        from pipelines.methods.cube.recording import read_cube
+
+        return read_cube(recording, config)
+
+    def problem(self, data: CubeData, config: Config) -> Problem:
+        from pipelines.methods.cube.graph import problem
+
+        return problem(data, config)
+
+    def published(self, data: CubeData, config: Config, problem: Problem) -> Estimate:
+        from pipelines.methods.cube.published import published_estimate
+
+        return published_estimate(data, config, problem)
+
+    @property
+    def scenario(self) -> type[CubeScenario]:
+        from pipelines.methods.cube.simulation import CubeScenario
+
+        return CubeScenario
+
+    def simulate(self, scenario: CubeScenario, seed: int, images: bool = False) -> Simulated:
+        from pipelines.methods.cube.simulation import simulated
+
+        return simulated(scenario, seed, images)
+
+    def write(self, path: Path, simulated: Simulated) -> None:
+        from pipelines.methods.cube.recording import write_cube
+
+        write_cube(path, simulated.data, simulated.truth, simulated.config, simulated.pictures)
+
+    def candidates(self, scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
+        from pipelines.methods.cube.candidates import candidates
+
+        return candidates(scenario)
+
+    def hypotheses(self) -> Hypotheses:
+        from pipelines.methods.cube.hypotheses import HYPOTHESES
+
+        return HYPOTHESES
+
+    def validate(self, data: CubeData, config: Config, values: Mapping[str, float]) -> Sequence[Validation]:
+        from pipelines.methods.cube.validation import validate
+
+        return validate(data, config, values)
+
+    def checklist(self, data: CubeData, config: Config) -> Sequence[ChecklistItem]:
+        from pipelines.methods.cube.guidance import checklist
+
+        return checklist(data, config)
+
+    def formulas(self, parameters: Collection[str]) -> Sequence[Formula]:
+        from pipelines.methods.cube.formulas import formulas
+
+        return formulas(parameters)
+
+    def figures(self, data: CubeData, calibration: Calibration) -> Sequence[Plot | Table]:
+        from pipelines.methods.cube.figures import cube_plots
+
+        return cube_plots(data, calibration)
+
+    def findings(self, data: CubeData, config: Config, estimate: Estimate) -> Findings:
+        from pipelines.methods.cube.findings import findings
+
+        return findings(data, config, estimate)
+
+    @property
+    def exporters(self) -> Mapping[str, Callable[[SavedCalibration], str]]:
+        from pipelines.methods.cube.export import FORMATS
+
+        return FORMATS
+
+
+METHOD = Cube()

@@ -21,15 +21,6 @@ _GAUSS, _MILLIGAUSS = 1e4, 1e7  # in a tesla
 _AXES = "XYZ"
 
 
-def exported(saved: SavedCalibration, form: str) -> str:
-    """The text of a parameter file. Raises InputError for an unknown format or a calibration of another method."""
-    if form not in FORMATS:
-        raise InputError(f"unknown format {form}; there are {', '.join(FORMATS)}")
-    if saved.method != "cube":
-        raise InputError(f"only calibrations of the cube method can be exported, this one is of {saved.method}")
-    return FORMATS[form](saved)
-
-
 def _triads(saved: SavedCalibration) -> dict[str, tuple[Array, Array]]:
     """K and b of the sensors there are."""
     names = [name for name in ("accel", "gyro", "mag") if f"{name}_k11" in saved.parameters]

@@ -10,15 +10,16 @@ import numpy as np
 from factors import so3
 from factors.earth import earth_rate, gravity
 from factors.preintegration import GyroPath
-from pipelines.config import Config
 from pipelines.graph.problem import Array
 from pipelines.methods.cube.coverage import coverage
 from pipelines.methods.cube.findings import calibrated, resting
 from pipelines.methods.cube.poses import StaticPoses, turn
 from pipelines.methods.cube.recording import CubeData, local_field, nominal
 from pipelines.methods.cube.tables import NAMES, cube_tables
+from pipelines.methods.cube.topics import CubeConfig
 from pipelines.reports.plots import COLORS, add_points, figure, thin
 from pipelines.reports.result import Calibration, Plot, Table
+from pipelines.settings import Config
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
@@ -75,7 +76,7 @@ def _turns(
 ) -> tuple[Array, Array, Array]:
     """Ends of the turns, and errors (n, 3), rad, of the gyro's rotation over each, before and after calibration."""
     assert data.latitude is not None
-    rates = nominal(data.gyro, config.cube.raw.gyro)
+    rates = nominal(data.gyro, config.section(CubeConfig).raw.gyro)
     time: list[float] = []
     before: list[Array] = []
     after: list[Array] = []
@@ -133,7 +134,7 @@ def _sphere(
         circle = {"mode": "lines", "line": {"color": "#c3ccd4", "width": 1}, "hoverinfo": "skip", "showlegend": False}
         out.add_scatter(x=np.cos(angle), y=np.sin(angle), row=1, col=column, **circle)
         if name == "mag" and data.mag is not None:
-            moving = calibrated(name, nominal(data.mag, config.cube.raw.mag), config, values) / strength
+            moving = calibrated(name, nominal(data.mag, config.section(CubeConfig).raw.mag), config, values) / strength
             some = moving[thin(3 * len(moving))]
             cloud = {"mode": "markers", "marker": {"color": "#9cc3de", "size": 3}, "name": "calibrated, all samples"}
             out.add_scatter(x=some[:, i], y=some[:, j], row=1, col=column, showlegend=column == 1, **cloud)

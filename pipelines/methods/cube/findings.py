@@ -8,11 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from factors import so3
-from pipelines.config import DEFAULT_NOISE, Config, first_given
 from pipelines.graph.problem import Array, Estimate, Findings
 from pipelines.methods.cube.parameters import TRIADS, triad_names
 from pipelines.methods.cube.poses import StaticPoses, static_poses
 from pipelines.methods.cube.recording import CubeData, noise_densities, nominal, recorded
+from pipelines.methods.cube.topics import MAG, CubeConfig
+from pipelines.recording.topics import IMU
+from pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 # White noise is told from means over this much time, s: shorter ones are what the device's own filter leaves.
 _BLOCK = 0.25
@@ -49,7 +51,7 @@ def resting(data: CubeData, config: Config) -> StaticPoses:
 def calibrated(name: str, vectors: Array, config: Config, values: Mapping[str, float]) -> Array:
     """K raw + b of vectors (n, 3) given in nominal units."""
     numbers = np.array([values[entry] for entry in triad_names(name)])
-    raw = recorded(vectors, getattr(config.cube.raw, name))
+    raw = recorded(vectors, getattr(config.section(CubeConfig).raw, name))
     return np.asarray(raw @ numbers[:9].reshape(3, 3).T + numbers[9:])
 
 
@@ -72,7 +74,7 @@ def parts_of(K: Array) -> Array:
 
 def _triad(name: str, config: Config, estimate: Estimate) -> dict[str, object] | None:
     rows = [estimate.names.index(entry) for entry in triad_names(name)[:9]]
-    conversion = getattr(config.cube.raw, name)
+    conversion = getattr(config.section(CubeConfig).raw, name)
     unit = 1.0 if conversion is None else conversion.scale
     K = estimate.values[rows] / unit
     try:
@@ -100,13 +102,13 @@ def _noise(
     }[name]
     assert t is not None
     assert samples is not None
-    vectors = calibrated(name, nominal(samples, getattr(config.cube.raw, name)), config, values)
+    vectors = calibrated(name, nominal(samples, getattr(config.section(CubeConfig).raw, name)), config, values)
     rate = 1.0 / float(np.median(np.diff(t)))
     density = white_noise(t, vectors, poses.span, rate)
     stated = dict(zip(("gyro", "accel", "mag"), noise_densities(data, config), strict=True))[name]
     row: dict[str, object] = {
         "sensor": name,
-        "topic": config.topic("mag" if name == "mag" else "imu"),
+        "topic": config.topic(MAG if name == "mag" else IMU),
         "rate_hz": float(f"{rate:.6g}"),
         "unit": _UNITS[name],
         "density": density.tolist(),

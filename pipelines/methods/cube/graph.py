@@ -33,7 +33,6 @@ from factors.triad import (
     parts,
 )
 from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
-from pipelines.config import DEFAULT_NOISE, Config, first_given
 from pipelines.errors import InputError
 from pipelines.graph.linear import linear_factor
 from pipelines.graph.problem import Array, Attitudes, Factor, Problem, Step
@@ -50,7 +49,9 @@ from pipelines.methods.cube.parameters import (
 from pipelines.methods.cube.poses import SeenTags, StaticPoses, static_poses, turn
 from pipelines.methods.cube.recording import CubeData, local_field, noise_densities, nominal
 from pipelines.methods.cube.reference import Reference, cube_reference, from_vectors
+from pipelines.methods.cube.topics import CubeConfig
 from pipelines.recording.checks import count
+from pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 # Nothing is known of the cube's place in the camera beforehand, m, nor of an attitude that no gyro leads to, rad: these
 # only make the new variables of a step determined without its measurements.
@@ -176,7 +177,7 @@ def _attitudes(
     data: CubeData, config: Config, poses: StaticPoses, reference: Reference, field: Array | None, bias: Array
 ) -> Array:
     """First guess of nRb (P, 4): seen by the camera, else carried on by the gyro and levelled."""
-    path = GyroPath(data.imu_t, nominal(data.gyro, config.cube.raw.gyro), bias)
+    path = GyroPath(data.imu_t, nominal(data.gyro, config.section(CubeConfig).raw.gyro), bias)
     found: list[Array] = []
     for k, seen in enumerate(poses.tags):
         if seen is not None:
@@ -303,7 +304,7 @@ def _wander_factors(model: _Model, k: int) -> list[Factor]:
 
 def _rotation_model(model: _Model, k: int) -> GyroRotationFactor:
     samples = _turn(model, k)
-    t, raw = model.data.imu_t[samples], nominal(model.data.gyro[samples], model.config.cube.raw.gyro)
+    t, raw = model.data.imu_t[samples], nominal(model.data.gyro[samples], model.config.section(CubeConfig).raw.gyro)
     duration = float(t[-1] - t[0])
     angle = np.linalg.norm(so3.log(GyroPath(t, raw, model.gyro_bias).attitude(t[-1:])[0]))
     known = model.density[0] ** 2 * duration + (model.scale_error * angle) ** 2
@@ -336,7 +337,7 @@ def _tag_factor(model: _Model, k: int, seen: SeenTags) -> Factor:
     """All tags seen in pose k."""
     from pipelines.vision.pose import TagBody
 
-    body = TagBody.from_board(model.config.cube)
+    body = TagBody.from_board(model.config.section(CubeConfig))
     camera = model.data.camera
     assert camera is not None
     rows = np.searchsorted(body.ids, seen.ids)
@@ -373,7 +374,7 @@ def _predict(model: _Model, k: int, initial: gtsam.Values, current: gtsam.Values
     out = gtsam.Values(initial)
     samples = _turn(model, k)
     A, c = parts(current.atVector(TRIAD_KEYS["gyro"]))
-    raw = nominal(model.data.gyro[samples], model.config.cube.raw.gyro)
+    raw = nominal(model.data.gyro[samples], model.config.section(CubeConfig).raw.gyro)
     wandered = current.atVector(_wandered_key(k - 1))
     out.update(_wandered_key(k), model.wander.kept[k] * wandered)
     path = GyroPath(model.data.imu_t[samples], (raw - c - wandered) @ np.linalg.inv(A).T)

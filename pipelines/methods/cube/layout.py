@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.config import DEFAULT_NOISE, Config, first_given
 from pipelines.errors import InputError
 from pipelines.methods.cube.recording import read_camera
+from pipelines.methods.cube.topics import TAG_DETECTIONS, CubeConfig
 from pipelines.recording.reading import Recording
+from pipelines.recording.topics import IMAGE
+from pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 if TYPE_CHECKING:
     from pipelines.vision.layout import Layout
@@ -33,18 +35,18 @@ def cube_layout(recording: Recording, config: Config) -> Layout:
     from pipelines.vision.pose import TagBody
 
     camera = read_camera(recording, config)
-    topic = config.topic("image")
+    topic = config.topic(IMAGE)
     if topic in recording.topics:
         from pipelines.vision.parallel import detections
 
         pictures = islice(recording.images(topic), None, None, _every(recording.topics[topic].count))
-        seen = detections(pictures, config.cube.tag_family, camera)
+        seen = detections(pictures, config.section(CubeConfig).tag_family, camera)
         found = [tags for _, tags in seen if tags is not None]
     else:
         found = _detections(recording, config)
     if not any(len(tags) for tags in found):
         raise InputError(f"no tag in any of {len(found)} pictures; are they blurred, or the tags of another family?")
-    return estimate_layout(camera, TagBody.from_board(config.cube), found)
+    return estimate_layout(camera, TagBody.from_board(config.section(CubeConfig)), found)
 
 
 def _every(pictures: int) -> int:
@@ -55,7 +57,7 @@ def _every(pictures: int) -> int:
 def _detections(recording: Recording, config: Config) -> list[Detections]:
     from pipelines.vision.tags import Detections
 
-    seen = recording.detections(config.topic("tag_detections"))
+    seen = recording.detections(config.topic(TAG_DETECTIONS))
     sigma = first_given(config.noise.corner_px, DEFAULT_NOISE.corner_px)
     found = []
     for frame in range(0, len(seen), _every(len(seen))):

@@ -12,10 +12,11 @@ import numpy as np
 from factors import so3
 from factors.triad import TriadPriorFactor, calibration, triad
 from factors.vectorized import VectorizedFactor
-from pipelines.config import Config, RawConversion, check_names
 from pipelines.graph.linear import linear_factor
 from pipelines.graph.priors import prior_sigmas, rotation_prior, vector_prior
 from pipelines.graph.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
+from pipelines.methods.cube.topics import CubeConfig, RawConversion
+from pipelines.settings import Config, check_names
 
 TRIADS = ("accel", "gyro", "mag")
 TRIAD_KEYS: dict[str, int] = {name: int(gtsam.symbol(c, 0)) for name, c in zip(TRIADS, "AGM", strict=True)}
@@ -124,7 +125,7 @@ def cube_parameters(config: Config, camera: bool, reference: bool, field: Array 
     Raises:
         InputError: the config names a parameter that the method does not know.
     """
-    tags = sorted(config.cube.tags)
+    tags = sorted(config.section(CubeConfig).tags)
     _check_names(config, tags)
 
     def quantity(name: str, unit: str, prior: float, require: float, fixed: bool = False) -> Quantity:
@@ -142,7 +143,7 @@ def cube_parameters(config: Config, camera: bool, reference: bool, field: Array 
         plain = [
             quantity(entry, "1", _GAIN_PRIOR, _GAIN_REQUIRE, entry in frame) for entry in triad_names(name)[:9]
         ] + [quantity(entry, unit, bias_prior, bias_require) for entry in triad_names(name)[9:]]
-        triads[name] = _triad_parameter(TRIAD_KEYS[name], plain, getattr(config.cube.raw, name))
+        triads[name] = _triad_parameter(TRIAD_KEYS[name], plain, getattr(config.section(CubeConfig).raw, name))
         priors[name] = prior_sigmas(Parameter(0, tuple(plain)))
     rotations: list[Parameter] = []
     heading = None

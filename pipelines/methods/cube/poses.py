@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from factors import so3
 from factors.preintegration import GyroPath
-from pipelines.config import DEFAULT_NOISE, Config, first_given
 from pipelines.errors import InputError
 from pipelines.methods.cube.recording import CubeData, nominal, rests
+from pipelines.methods.cube.topics import CubeConfig
 from pipelines.recording.checks import count
+from pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 if TYPE_CHECKING:
     from pipelines.vision.pose import BodyPose, TagBody
@@ -81,7 +82,7 @@ def static_poses(data: CubeData, config: Config) -> StaticPoses:
             others.
     """
     span = rests(data, config)
-    raw = config.cube.raw
+    raw = config.section(CubeConfig).raw
     gyro, duration = _means(data.imu_t, nominal(data.gyro, raw.gyro), span)
     accel, _ = _means(data.imu_t, nominal(data.accel, raw.accel), span)
     mag, mag_duration = None, np.zeros(len(span))
@@ -117,9 +118,9 @@ def _seen_tags(
     from pipelines.vision.pose import TagBody
 
     assert data.sightings is not None
-    body = TagBody.from_board(config.cube)
+    body = TagBody.from_board(config.section(CubeConfig))
     # The rates' median over the rests is the bias, near enough for what a pose is expected to be.
-    path = GyroPath(data.imu_t, nominal(data.gyro, config.cube.raw.gyro), np.median(gyro, axis=0))
+    path = GyroPath(data.imu_t, nominal(data.gyro, config.section(CubeConfig).raw.gyro), np.median(gyro, axis=0))
     found: list[SeenTags | None] = []
     last: tuple[float, Array] | None = None
     wrong: dict[int, int] = {}

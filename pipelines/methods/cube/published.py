@@ -19,11 +19,12 @@ from numpy.typing import NDArray
 
 from factors import so3
 from factors.earth import EARTH_RATE, earth_rate, gravity
-from pipelines.config import Config
 from pipelines.errors import InputError
 from pipelines.graph.problem import Attitudes, Estimate, Problem, Residuals
 from pipelines.methods.cube.poses import StaticPoses, static_poses
 from pipelines.methods.cube.recording import CubeData, local_field, recorded
+from pipelines.methods.cube.topics import CubeConfig
+from pipelines.settings import Config
 
 Array = NDArray[np.float64]
 
@@ -119,7 +120,7 @@ def published_estimate(data: CubeData, config: Config, problem: Problem) -> Esti
         means = raw[name]
         assert means is not None
         good = np.isfinite(means[k]).all(axis=1)
-        recorded_means = recorded(means[k][good], getattr(config.cube.raw, name))
+        recorded_means = recorded(means[k][good], getattr(config.section(CubeConfig).raw, name))
         found = regression(recorded_means, vectors[good])
         names += [f"{name}_k{r}{c}" for r in "123" for c in "123"] + [f"{name}_b{r}" for r in "123"]
         values += [*found.K.ravel(), *found.b]
@@ -150,7 +151,8 @@ def attitudes(data: CubeData, config: Config, poses: StaticPoses) -> tuple[NDArr
     """
     if data.camera is None or data.reference_t is None or data.reference_wxyz is None:
         raise InputError("the published solver needs a camera and a reference; without them use the graph")
-    if config.cube.camera_rotation is None:
+    BRC = config.section(CubeConfig).camera_rotation
+    if BRC is None:
         raise InputError("the camera's mount on the reference is not given: cube.camera_rotation")
     seen, found = [], []
     for k, tags in enumerate(poses.tags):
@@ -161,7 +163,7 @@ def attitudes(data: CubeData, config: Config, poses: StaticPoses) -> tuple[NDArr
         # Quaternions of one attitude with one sign: their mean is the mean attitude, as near as they are together.
         nRB = so3.normalize((samples * np.sign(samples @ samples[0])[:, None]).mean(axis=0))
         seen.append(k)
-        found.append(so3.compose(nRB, config.cube.camera_rotation, tags.pose.cRb))
+        found.append(so3.compose(nRB, BRC, tags.pose.cRb))
     return np.array(seen, dtype=np.intp), np.array(found).reshape(-1, 4)
 
 

@@ -12,9 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.earth import magnetic_field
-from pipelines.config import DEFAULT_NOISE, Config, RawConversion, first_given
 from pipelines.errors import InputError
 from pipelines.methods.cube.static_intervals import find_rests
+from pipelines.methods.cube.topics import (
+    MAG,
+    REFERENCE_FIX,
+    REFERENCE_IMU,
+    TAG_DETECTIONS,
+    CubeConfig,
+    RawConversion,
+    field_date,
+)
 from pipelines.recording import series
 from pipelines.recording.checks import (
     check_gyro,
@@ -26,8 +34,9 @@ from pipelines.recording.checks import (
     unit_quaternions,
 )
 from pipelines.recording.reading import Recording
-from pipelines.recording.topics import TOPICS
+from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, wanted
 from pipelines.recording.writing import attached, write_session
+from pipelines.settings import DEFAULT_NOISE, Config, first_given
 from pipelines.vision.recorded import camera_of
 
 if TYPE_CHECKING:
@@ -35,7 +44,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-_NUMBERS = ("imu", "mag", "reference_imu", "reference_fix")
+_NUMBERS = (IMU, MAG, REFERENCE_IMU, REFERENCE_FIX)
 
 # Norms at rest that no accelerometer in m/s^2 and no magnetometer in T shows, and what they are likely to be.
 _ACCEL_RANGE, _MAG_RANGE = (3.0, 30.0), (1e-6, 1e-3)
@@ -119,7 +128,7 @@ def local_field(data: CubeData, config: Config) -> Array:
     """
     assert data.latitude is not None
     assert data.longitude is not None
-    date = config.field_date or datetime.datetime.fromtimestamp(data.epoch_ns * 1e-9, datetime.UTC).date()
+    date = field_date(config) or datetime.datetime.fromtimestamp(data.epoch_ns * 1e-9, datetime.UTC).date()
     first, last = datetime.date(date.year, 1, 1), datetime.date(date.year + 1, 1, 1)
     year = date.year + (date - first) / (last - first)
     try:
@@ -136,7 +145,7 @@ def noise_densities(data: CubeData, config: Config) -> tuple[float, float, float
 def _densities(
     gyro: float | None, accel: float | None, mag: float | None, config: Config
 ) -> tuple[float, float, float]:
-    raw, noise, default = config.cube.raw, config.noise, DEFAULT_NOISE
+    raw, noise, default = config.section(CubeConfig).raw, config.noise, DEFAULT_NOISE
 
     def message(density: float | None, conversion: RawConversion | None) -> float | None:
         return density if density is None or conversion is None else density * conversion.scale
@@ -153,7 +162,7 @@ def _rests(
 ) -> Array:
     densities = _densities(gyro_density, accel_density, None, config)
     root_rate = float(np.median(np.diff(t))) ** -0.5
-    raw = config.cube.raw
+    raw = config.section(CubeConfig).raw
     return find_rests(
         t, nominal(gyro, raw.gyro), nominal(accel, raw.accel), densities[0] * root_rate, densities[1] * root_rate
     )
@@ -170,35 +179,41 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
     dropped: dict[str, int] = {}
     epoch = recording.epoch_ns
     recording.read_together(dict.fromkeys(map(config.topic, _NUMBERS), ()))
-    name = config.topic("imu")
+    name = config.topic(IMU)
     imu = recording.imu(name)
     count(dropped, f"{name}: stamped by log time (kept)", imu.stamped_by_log)
     imu_t, keep = clean(name, imu.t_ns, epoch, np.hstack([imu.gyro, imu.accel]), dropped, least=3)
     gyro, accel = imu.gyro[keep], imu.accel[keep]
-    check_gyro(name, imu_t, nominal(gyro, config.cube.raw.gyro))
-    _check_norm(f"{name}: acceleration", nominal(accel, config.cube.raw.accel), _ACCEL_RANGE, "m/s^2", _ACCEL_UNITS)
+    check_gyro(name, imu_t, nominal(gyro, config.section(CubeConfig).raw.gyro))
+    _check_norm(
+        f"{name}: acceleration",
+        nominal(accel, config.section(CubeConfig).raw.accel),
+        _ACCEL_RANGE,
+        "m/s^2",
+        _ACCEL_UNITS,
+    )
     densities = gyro_density(imu_t, imu.gyro_cov), gyro_density(imu_t, imu.accel_cov)
     spans = {name: imu_t}
 
     mag_t = mag = mag_density = None
-    name = config.topic("mag")
-    if _wanted(recording, config, "mag"):
+    name = config.topic(MAG)
+    if wanted(recording, config, MAG):
         field_ = recording.magnetic(name)
         mag_t, keep = clean(name, field_.t_ns, epoch, field_.field, dropped)
         mag, mag_density = field_.field[keep], gyro_density(mag_t, field_.field_cov)
-        _check_norm(f"{name}: field", nominal(mag, config.cube.raw.mag), _MAG_RANGE, "T", _MAG_UNITS)
+        _check_norm(f"{name}: field", nominal(mag, config.section(CubeConfig).raw.mag), _MAG_RANGE, "T", _MAG_UNITS)
         spans[name] = mag_t
 
     reference_t = reference_wxyz = reference_cov = None
-    if _wanted(recording, config, "reference_imu"):
+    if wanted(recording, config, REFERENCE_IMU):
         reference_t, reference_wxyz, reference_cov = _reference(recording, config, epoch, dropped)
-        spans[config.topic("reference_imu")] = reference_t
+        spans[config.topic(REFERENCE_IMU)] = reference_t
     check_overlap(spans)
 
     camera = sightings = None
     if _has_camera(recording, config):
         camera = read_camera(recording, config)
-        if "image" not in config.topics and _wanted(recording, config, "tag_detections"):
+        if IMAGE.key not in config.topics and wanted(recording, config, TAG_DETECTIONS):
             sightings = _detections(recording, config, epoch, dropped)
         else:
             found = _rests(imu_t, gyro, accel, *densities, config)
@@ -243,7 +258,7 @@ def write_cube(
         return (0.0 if density is None else density**2 / float(np.median(np.diff(t)))) * np.eye(3)
 
     topics: dict[str, series.Topic] = {
-        TOPICS["imu"].name: series.ImuSeries(
+        IMU.name: series.ImuSeries(
             nanoseconds(data.imu_t, epoch),
             data.gyro,
             data.accel,
@@ -254,12 +269,12 @@ def write_cube(
     }
     if data.mag_t is not None and data.mag is not None:
         cov = covariance(data.mag_t, data.mag_density)
-        topics[TOPICS["mag"].name] = series.MagneticSeries(
+        topics[MAG.name] = series.MagneticSeries(
             nanoseconds(data.mag_t, epoch), data.mag, field_cov=cov, frame_id="imu"
         )
     if data.reference_t is not None and data.reference_wxyz is not None:
         n = len(data.reference_t)
-        topics[TOPICS["reference_imu"].name] = series.ImuSeries(
+        topics[REFERENCE_IMU.name] = series.ImuSeries(
             nanoseconds(data.reference_t, epoch),
             np.zeros((n, 3)),
             wxyz=data.reference_wxyz,
@@ -269,11 +284,11 @@ def write_cube(
     start = np.array([epoch])
     if data.latitude is not None and data.longitude is not None:
         latitude, longitude = np.rad2deg([data.latitude, data.longitude])
-        topics[TOPICS["reference_fix"].name] = series.FixSeries(
+        topics[REFERENCE_FIX.name] = series.FixSeries(
             start, np.array([latitude]), np.array([longitude]), np.array([data.height]), frame_id="reference"
         )
     if data.camera is not None and data.sightings is not None:
-        topics[TOPICS["camera_info"].name] = _info_message(data.camera, epoch)
+        topics[CAMERA_INFO.name] = _info_message(data.camera, epoch)
         topics |= _pictures_or_tags(data.sightings, epoch, pictures)
     write_session(path, topics, attached(truth, config_yaml))
 
@@ -295,22 +310,17 @@ def _info_message(camera: Camera, epoch_ns: int) -> series.CameraInfo:
 def _pictures_or_tags(seen: Sightings, epoch_ns: int, pictures: Iterable[bytes] | None) -> dict[str, series.Topic]:
     t_ns = nanoseconds(seen.t, epoch_ns)
     if pictures is not None:
-        return {TOPICS["image"].name: series.ImageSeries(t_ns, pictures, format="jpeg", frame_id="camera")}
+        return {IMAGE.name: series.ImageSeries(t_ns, pictures, format="jpeg", frame_id="camera")}
     m = len(seen.ids)
     zero = np.zeros(m, dtype=np.int64)
     found = series.DetectionSeries(
         t_ns, seen.frame, seen.ids, seen.corners, zero, np.zeros(m), np.full(m, "tag36h11"), frame_id="camera"
     )
-    return {TOPICS["tag_detections"].name: found}
-
-
-def _wanted(recording: Recording, config: Config, key: str) -> bool:
-    """Whether an optional topic is there, or the config asks for it by name."""
-    return config.topic(key) in recording.topics or key in config.topics
+    return {TAG_DETECTIONS.name: found}
 
 
 def _has_camera(recording: Recording, config: Config) -> bool:
-    return any(_wanted(recording, config, key) for key in ("image", "tag_detections"))
+    return any(wanted(recording, config, topic) for topic in (IMAGE, TAG_DETECTIONS))
 
 
 def _check_norm(
@@ -331,7 +341,7 @@ def _check_norm(
 def _reference(
     recording: Recording, config: Config, epoch_ns: int, dropped: dict[str, int]
 ) -> tuple[Array, Array, Array | None]:
-    topic = config.topic("reference_imu")
+    topic = config.topic(REFERENCE_IMU)
     imu = recording.imu(topic)
     count(dropped, f"{topic}: stamped by log time (kept)", imu.stamped_by_log)
     if (imu.wxyz_cov[:, 0, 0] < 0.0).all():
@@ -348,8 +358,8 @@ def _reference(
 def _position(recording: Recording, config: Config) -> tuple[float | None, float | None, float]:
     """Latitude and longitude, rad, height, m: the median of the fixes; the config's latitude wins."""
     given = None if config.latitude_deg is None else float(np.deg2rad(config.latitude_deg))
-    topic = config.topic("reference_fix")
-    if not _wanted(recording, config, "reference_fix"):
+    topic = config.topic(REFERENCE_FIX)
+    if not wanted(recording, config, REFERENCE_FIX):
         return given, None, 0.0
     fixes = recording.fixes(topic)
     good = (fixes.status >= 0) & np.isfinite(fixes.latitude_deg + fixes.longitude_deg + fixes.height)
@@ -365,7 +375,7 @@ def _position(recording: Recording, config: Config) -> tuple[float | None, float
 
 def read_camera(recording: Recording, config: Config) -> Camera:
     """The camera that looks at the cube. Raises InputError when it, or the cube's tags, are not described."""
-    if not config.cube.tags:
+    if not config.section(CubeConfig).tags:
         raise InputError(
             "the tags on the cube are not given: name them in the config as cube.tags {id: {size, rotation, position}}"
         )
@@ -373,7 +383,7 @@ def read_camera(recording: Recording, config: Config) -> Camera:
 
 
 def _detections(recording: Recording, config: Config, epoch_ns: int, dropped: dict[str, int]) -> Sightings:
-    topic = config.topic("tag_detections")
+    topic = config.topic(TAG_DETECTIONS)
     found = recording.detections(topic)
     count(dropped, f"{topic}: stamped by log time (kept)", found.stamped_by_log)
     t, keep = clean(topic, found.t_ns, epoch_ns, np.zeros((len(found), 1)), dropped, least=1)
@@ -392,7 +402,7 @@ def _pictures(
     """Tags found in the pictures taken at rest; the others are not looked at."""
     from pipelines.vision.parallel import UNREADABLE, detections
 
-    topic = config.topic("image")
+    topic = config.topic(IMAGE)
     stamps: list[int] = []
     frame: list[int] = []
     parts = []
@@ -401,7 +411,7 @@ def _pictures(
         for t_ns, encoded in recording.images(topic)
         if ((rests[:, 0] <= (t_ns - epoch_ns) / 1e9) & ((t_ns - epoch_ns) / 1e9 <= rests[:, 1])).any()
     )
-    for t_ns, seen in detections(at_rest, config.cube.tag_family, camera):
+    for t_ns, seen in detections(at_rest, config.section(CubeConfig).tag_family, camera):
         if seen is None:
             count(dropped, f"{topic}: {UNREADABLE}", 1)
             continue
@@ -435,11 +445,11 @@ def _sightings(
     dropped: dict[str, int],
 ) -> Sightings:
     """The cube's tags among those seen, each at most once in a picture."""
-    known = np.isin(ids, list(config.cube.tags))
+    known = np.isin(ids, list(config.section(CubeConfig).tags))
     if not known.any():
         raise InputError(
             f"topic {topic}: no tag of the cube in any of {len(t)} pictures: seen {np.unique(ids).tolist() or 'none'}, "
-            f"the config names {sorted(config.cube.tags)}"
+            f"the config names {sorted(config.section(CubeConfig).tags)}"
         )
     count(dropped, f"{topic}: tag that is not on the cube", int((~known).sum()))
     _, inverse, counts = np.unique(np.stack([frame, ids]), axis=1, return_inverse=True, return_counts=True)

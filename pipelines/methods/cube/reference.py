@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from factors import so3
-from pipelines.config import Config
 from pipelines.errors import InputError
 from pipelines.graph.problem import Array
 from pipelines.methods.cube.poses import StaticPoses
 from pipelines.methods.cube.recording import CubeData
+from pipelines.methods.cube.topics import REFERENCE_IMU, CubeConfig
+from pipelines.settings import Config
 
 # Messages that scatter by more than this many times their stated variance are those of a reference that moved.
 _MOVES = 2.0
@@ -52,12 +53,12 @@ def cube_reference(data: CubeData, config: Config, poses: StaticPoses, field: Ar
         return Reference(so3.identity(len(poses)), None, False, so3.identity())
     if data.reference_t is None or data.reference_wxyz is None:
         return Reference(_camera_at_rest(poses, field), None, False, so3.identity())
-    if config.cube.camera_rotation is None:
+    if config.section(CubeConfig).camera_rotation is None:
         raise InputError(
             "the camera's mount on the reference is not given: cube.camera_rotation, the quaternion BRC of reference "
             "body from camera (x right, y down, z forward)"
         )
-    BRC = np.array(config.cube.camera_rotation)
+    BRC = np.array(config.section(CubeConfig).camera_rotation)
     wxyz = data.reference_wxyz
     whole, scatter = _mean(wxyz)
     n = len(wxyz)
@@ -71,7 +72,7 @@ def cube_reference(data: CubeData, config: Config, poses: StaticPoses, field: Ar
         rows = (data.reference_t >= start) & (data.reference_t <= stop)
         if not rows.any():
             raise InputError(
-                f"topic {config.topic('reference_imu')}: no attitude of the moving reference between {start:.3f} and "
+                f"topic {config.topic(REFERENCE_IMU)}: no attitude of the moving reference between {start:.3f} and "
                 f"{stop:.3f} s, while the cube stood still"
             )
         mean, _ = _mean(wxyz[rows])

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from io import StringIO
-from pathlib import Path
 from typing import Annotated, Any, Self
 
 import numpy as np
@@ -22,10 +21,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from factors import so3
 from factors.earth import earth_rate, gravity, magnetic_field
 from pipelines.methods.cube.faces import FACES, Resting
-from pipelines.methods.cube.recording import CubeData, Sightings, write_cube
+from pipelines.methods.cube.recording import CubeData, Sightings
 from pipelines.simulation.motion import sample_times
 from pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
-from pipelines.simulation.scenario import load_scenario
+from pipelines.simulation.simulated import Simulated
 from pipelines.vision.camera import Camera
 
 Array = NDArray[np.float64]
@@ -160,23 +159,15 @@ def simulate_cube(scenario: CubeScenario, seed: int) -> tuple[CubeData, dict[str
     return world.data(), world.truth
 
 
-def write_simulation(scenario: str | None, seed: int, out: Path, images: bool) -> None:
-    """Simulate a scenario (by name or file, None is cube_nominal) and write it as a session with its truth.
-
-    Raises:
-        InputError: no such scenario, or it cannot be written.
-    """
-    settings = load_scenario(CubeScenario, scenario or "cube_nominal")
+def simulated(scenario: CubeScenario, seed: int, images: bool = False) -> Simulated:
+    """A session in memory; with pictures in place of the detections if asked for."""
     if not images:
-        data, truth = simulate_cube(settings, seed)
-        write_cube(out, data, truth, cube_config(settings))
-        return
-    world = _World(settings, seed)
-    t = sample_times(world.duration, settings.picture_rate_hz, 0.5)
+        return Simulated(*simulate_cube(scenario, seed), cube_config(scenario))
+    world = _World(scenario, seed)
+    t = sample_times(world.duration, scenario.picture_rate_hz, 0.5)
     nothing = Sightings(t, *(np.zeros(0, dtype=np.int64),) * 2, np.zeros((0, 4, 2)), None)
-    write_cube(
-        out, replace(world.data(), sightings=nothing), world.truth, cube_config(settings, True), world.pictures(t)
-    )
+    data = replace(world.data(), sightings=nothing)
+    return Simulated(data, world.truth, cube_config(scenario, images=True), world.pictures(t))
 
 
 def cube_config(scenario: CubeScenario, images: bool = False) -> str:

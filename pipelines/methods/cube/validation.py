@@ -9,12 +9,13 @@ import numpy as np
 from factors import so3
 from factors.earth import gravity
 from factors.preintegration import GyroPath
-from pipelines.config import Config
 from pipelines.errors import InputError
 from pipelines.judgement.validation import Validation
 from pipelines.methods.cube.findings import calibrated
 from pipelines.methods.cube.poses import StaticPoses, static_poses, turn
 from pipelines.methods.cube.recording import CubeData, local_field, nominal
+from pipelines.methods.cube.topics import CubeConfig
+from pipelines.settings import Config
 
 
 def validate(data: CubeData, config: Config, values: Mapping[str, float]) -> list[Validation]:
@@ -57,7 +58,7 @@ def _turns(data: CubeData, config: Config, poses: StaticPoses, values: Mapping[s
 
     The camera is taken to stand still; the earth's own turning, 0.1 mrad in two seconds, is not taken off.
     """
-    rates = nominal(data.gyro, config.cube.raw.gyro)
+    rates = nominal(data.gyro, config.section(CubeConfig).raw.gyro)
     time, errors = [], []
     for k in range(1, len(poses)):
         before, after = poses.tags[k - 1], poses.tags[k]

@@ -1,1 +1,101 @@
-"""The head method."""
+"""The head method: helmet attitude, gyro bias and mounts from a helmet MIMU, the platform IMU and vision."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar
+
+from pipelines.methods import Method, Scenario
+from pipelines.methods.head.topics import NEEDS, TOPICS, HeadConfig
+
+if TYPE_CHECKING:
+    from pipelines.graph.problem import Estimate, Problem
+    from pipelines.judgement.checklist import ChecklistItem
+    from pipelines.judgement.hypotheses import Hypotheses
+    from pipelines.judgement.validation import Validation
+    from pipelines.methods.formula import Formula
+    from pipelines.methods.head.recording import HeadData
+    from pipelines.methods.head.simulation import HeadScenario
+    from pipelines.recording.reading import Recording
+    from pipelines.reports.result import Calibration, Plot
+    from pipelines.settings import Config
+    from pipelines.simulation.simulated import Simulated
+
+
+class Head(Method):
+    """The door of the head method."""
+
+    name = "head"
+    title = "Helmet"
+    topics = TOPICS
+    needs = NEEDS
+    section = HeadConfig
+    rotations: ClassVar[Mapping[str, str]] = {"helmet_mount": "vRh", "camera_mount": "cRb"}
+
+    def read(self, recording: Recording, config: Config) -> HeadData:
+        from pipelines.methods.head.recording import read_head
+
+        return read_head(recording, config)
+
+    def problem(self, data: HeadData, config: Config) -> Problem:
+        from pipelines.methods.head.graph import problem
+
+        return problem(data, config)
+
+    def published(self, data: HeadData, config: Config, problem: Problem) -> Estimate:
+        from pipelines.methods.head.published import published_estimate
+
+        return published_estimate(data, config, problem)
+
+    @property
+    def scenario(self) -> type[HeadScenario]:
+        from pipelines.methods.head.simulation import HeadScenario
+
+        return HeadScenario
+
+    def simulate(self, scenario: HeadScenario, seed: int, images: bool = False) -> Simulated:
+        from pipelines.methods.head.simulation import simulated
+
+        return simulated(scenario, seed, images)
+
+    def nominal(self, images: bool = False) -> str:
+        return "head_pictures" if images else "head_nominal"
+
+    def write(self, path: Path, simulated: Simulated) -> None:
+        from pipelines.methods.head.recording import write_head
+
+        write_head(path, simulated.data, simulated.truth, simulated.config, simulated.pictures)
+
+    def candidates(self, scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
+        from pipelines.methods.head.candidates import candidates
+
+        return candidates(scenario)
+
+    def hypotheses(self) -> Hypotheses:
+        from pipelines.methods.head.hypotheses import HYPOTHESES
+
+        return HYPOTHESES
+
+    def validate(self, data: HeadData, config: Config, values: Mapping[str, float]) -> Sequence[Validation]:
+        from pipelines.methods.head.validation import validate
+
+        return validate(data, config, values)
+
+    def checklist(self, data: HeadData, config: Config) -> Sequence[ChecklistItem]:
+        from pipelines.methods.head.guidance import checklist
+
+        return checklist(data, config)
+
+    def formulas(self, parameters: Collection[str]) -> Sequence[Formula]:
+        from pipelines.methods.head.formulas import formulas
+
+        return formulas(parameters)
+
+    def figures(self, data: HeadData, calibration: Calibration) -> Sequence[Plot]:
+        from pipelines.methods.head.figures import head_plots
+
+        return head_plots(data, calibration)
+
+
+METHOD = Head()

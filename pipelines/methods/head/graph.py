@@ -21,7 +21,6 @@ from factors.chi_square import gate
 from factors.earth import EARTH_RATE
 from factors.preintegration import GyroPath, Increments
 from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
-from pipelines.config import DEFAULT_NOISE, Config, check_names, first_given
 from pipelines.errors import InputError
 from pipelines.graph.priors import rotation_prior, vector_prior
 from pipelines.graph.problem import (
@@ -37,6 +36,7 @@ from pipelines.graph.problem import (
 from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
 from pipelines.graph.walking_bias import WalkingBias
 from pipelines.methods.head.recording import HeadData
+from pipelines.settings import DEFAULT_NOISE, Config, check_names, first_given
 
 # Without vision for longer than this, s, a keyframe is set in between: gtsam corrects an increment for the bias to
 # first order only.

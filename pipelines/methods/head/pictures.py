@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from factors import so3
-from pipelines.config import Board, Tag
 from pipelines.recording import series
+from pipelines.settings import Board, Tag
 from pipelines.simulation.rendering import Renderer, encode, expose, tag_quad
 from pipelines.vision.camera import Camera
 

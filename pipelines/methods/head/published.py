@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factors import so3
-from pipelines.config import DEFAULT_NOISE, Config, first_given
 from pipelines.errors import InputError
 from pipelines.graph.problem import Attitudes, ChiSquare, Estimate, History, Problem, Residuals
 from pipelines.methods.head.recording import HeadData
+from pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 Array = NDArray[np.float64]
 

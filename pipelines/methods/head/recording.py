@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.config import Config
 from pipelines.errors import InputError
+from pipelines.methods.head.topics import HEAD_IMU, PLATFORM_IMU, TRUTH_ATTITUDE, VISION_ATTITUDE, HeadConfig
 from pipelines.recording import series
 from pipelines.recording.checks import (
     check_overlap,
@@ -21,13 +21,14 @@ from pipelines.recording.checks import (
 )
 from pipelines.recording.gyro import read_gyro
 from pipelines.recording.reading import Recording
-from pipelines.recording.topics import TOPICS
+from pipelines.recording.topics import CAMERA_INFO, IMAGE, wanted
 from pipelines.recording.writing import attached, write_session
+from pipelines.settings import Config
 from pipelines.vision.recorded import camera_of
 
 Array = NDArray[np.float64]
 
-_NUMBERS = ("head_imu", "platform_imu", "vision_attitude", "truth_attitude")
+_NUMBERS = (HEAD_IMU, PLATFORM_IMU, VISION_ATTITUDE, TRUTH_ATTITUDE)
 _ROTATION = slice(3, 6)  # of the 6x6 covariance of a pose
 
 
@@ -66,28 +67,28 @@ def read_head(recording: Recording, config: Config) -> HeadData:
     dropped: dict[str, int] = {}
     epoch = recording.epoch_ns
     recording.read_together(dict.fromkeys(map(config.topic, _NUMBERS), ()))
-    name = config.topic("head_imu")
+    name = config.topic(HEAD_IMU)
     head_t, head_gyro, density = read_gyro(recording, name, epoch, dropped)
     spans = {name: head_t}
 
     platform_t = platform_gyro = platform_density = None
-    name = config.topic("platform_imu")
-    if _wanted(recording, config, "platform_imu"):
+    name = config.topic(PLATFORM_IMU)
+    if wanted(recording, config, PLATFORM_IMU):
         platform_t, platform_gyro, platform_density = read_gyro(recording, name, epoch, dropped)
         spans[name] = platform_t
 
-    name = config.topic("vision_attitude")
+    name = config.topic(VISION_ATTITUDE)
     vision_cov: Array | None
     if name in recording.topics or not _has_pictures(recording, config):
         vision_t, vision_wxyz, vision_cov = _vision(recording, name, epoch, dropped)
     else:
-        name = config.topic("image")
+        name = config.topic(IMAGE)
         vision_t, vision_wxyz, vision_cov = _from_pictures(recording, config, epoch, dropped)
     check_overlap({**spans, name: vision_t})
 
     truth_t = truth_wxyz = None
-    if _wanted(recording, config, "truth_attitude"):
-        truth_t, truth_wxyz, _ = _vision(recording, config.topic("truth_attitude"), epoch, dropped)
+    if wanted(recording, config, TRUTH_ATTITUDE):
+        truth_t, truth_wxyz, _ = _vision(recording, config.topic(TRUTH_ATTITUDE), epoch, dropped)
     return HeadData(
         epoch,
         head_t,
@@ -124,31 +125,26 @@ def write_head(
         return series.ImuSeries(t_ns, gyro, gyro_cov=variance * np.eye(3), frame_id="imu")
 
     topics: dict[str, series.Topic] = {
-        TOPICS["head_imu"].name: imu(data.head_t, data.head_gyro, data.gyro_density),
+        HEAD_IMU.name: imu(data.head_t, data.head_gyro, data.gyro_density),
     }
     if data.platform_t is not None and data.platform_gyro is not None:
-        topics[TOPICS["platform_imu"].name] = imu(data.platform_t, data.platform_gyro, data.platform_gyro_density)
+        topics[PLATFORM_IMU.name] = imu(data.platform_t, data.platform_gyro, data.platform_gyro_density)
     if pictures is None:
         cov = np.zeros((len(data.vision_t), 6, 6))
         if data.vision_cov is not None:
             cov[:, _ROTATION, _ROTATION] = data.vision_cov
         t_ns = nanoseconds(data.vision_t, data.epoch_ns)
-        topics[TOPICS["vision_attitude"].name] = series.PoseSeries(t_ns, data.vision_wxyz, cov=cov, frame_id="camera")
+        topics[VISION_ATTITUDE.name] = series.PoseSeries(t_ns, data.vision_wxyz, cov=cov, frame_id="camera")
     else:
-        topics[TOPICS["camera_info"].name], topics[TOPICS["image"].name] = pictures
+        topics[CAMERA_INFO.name], topics[IMAGE.name] = pictures
     if data.truth_t is not None and data.truth_wxyz is not None:
         t_ns = nanoseconds(data.truth_t, data.epoch_ns)
-        topics[TOPICS["truth_attitude"].name] = series.QuaternionSeries(t_ns, data.truth_wxyz, frame_id="platform")
+        topics[TRUTH_ATTITUDE.name] = series.QuaternionSeries(t_ns, data.truth_wxyz, frame_id="platform")
     write_session(path, topics, attached(truth, config_yaml))
 
 
-def _wanted(recording: Recording, config: Config, key: str) -> bool:
-    """Whether an optional topic is there, or the config asks for it by name."""
-    return config.topic(key) in recording.topics or key in config.topics
-
-
 def _has_pictures(recording: Recording, config: Config) -> bool:
-    return config.topic("image") in recording.topics and "vision_attitude" not in config.topics
+    return config.topic(IMAGE) in recording.topics and VISION_ATTITUDE.key not in config.topics
 
 
 def _from_pictures(
@@ -158,13 +154,14 @@ def _from_pictures(
     from pipelines.vision.board import board_attitudes
     from pipelines.vision.pose import TagBody
 
-    topic = config.topic("image")
-    if config.head.board is None or not config.head.board.tags:
+    topic = config.topic(IMAGE)
+    on_helmet = config.section(HeadConfig).board
+    if on_helmet is None or not on_helmet.tags:
         raise InputError(
             f"topic {topic}: the pictures need the tags on the helmet: give them in the config as head.board"
         )
     camera = camera_of(recording, config)
-    board = TagBody.from_board(config.head.board)
+    board = TagBody.from_board(on_helmet)
     seen = board_attitudes(recording.images(topic), camera, board, config.noise.corner_px)
     for reason, number in seen.dropped.items():
         count(dropped, f"{topic}: {reason}", number)

@@ -9,7 +9,6 @@ true attitude at the end of every interval, with no integration error.
 from __future__ import annotations
 
 from io import StringIO
-from pathlib import Path
 from typing import Annotated, Self
 
 import numpy as np
@@ -20,11 +19,11 @@ from factors import so3
 from factors.earth import earth_rate
 from pipelines.errors import InputError
 from pipelines.methods.head.pictures import HeadPictures, draw
-from pipelines.methods.head.recording import HeadData, write_head
+from pipelines.methods.head.recording import HeadData
 from pipelines.recording import series
 from pipelines.recording.checks import nanoseconds
 from pipelines.simulation.motion import EulerMotion, Swing, sample_times
-from pipelines.simulation.scenario import load_scenario
+from pipelines.simulation.simulated import Simulated
 
 Array = NDArray[np.float64]
 
@@ -222,15 +221,12 @@ def _truth(scenario: HeadScenario, bias: Array) -> dict[str, float]:
     return truth | {"time_offset": scenario.time_offset_s}
 
 
-def write_simulation(scenario: str | None, seed: int, out: Path, images: bool) -> None:
-    """Simulate a scenario and write it as a session with its truth.
-
-    By name or file; None is head_nominal, or head_pictures with images.
+def simulated(scenario: HeadScenario, seed: int, images: bool = False) -> Simulated:
+    """A session in memory, with pictures if asked for.
 
     Raises:
-        InputError: no such scenario, or it cannot be drawn or written.
+        InputError: its pictures cannot be drawn.
     """
-    settings = load_scenario(HeadScenario, scenario or ("head_pictures" if images else "head_nominal"))
-    data, truth = simulate_head(settings, seed)
-    pictures = simulate_pictures(settings, seed) if images else None
-    write_head(out, data, truth, head_config(settings, images), pictures)
+    data, truth = simulate_head(scenario, seed)
+    pictures = simulate_pictures(scenario, seed) if images else None
+    return Simulated(data, truth, head_config(scenario, images), pictures)

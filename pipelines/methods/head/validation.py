@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from factors import so3
 from factors.preintegration import GyroPath
-from pipelines.config import Config
 from pipelines.errors import InputError
 from pipelines.graph.problem import Array
 from pipelines.judgement.validation import Validation
 from pipelines.methods.head.recording import HeadData
+from pipelines.settings import Config
 
 # How long the gyros carry the attitude, s, and how far from that frames may lie.
 _SPAN, _SLACK = 1.0, 0.25

@@ -1,1 +1,97 @@
-"""The indexer method."""
+"""The indexer method: IMU-to-axes mounting angles of a two-axis rotating INS."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipelines.methods import Method, Scenario
+from pipelines.methods.indexer.topics import NEEDS, TOPICS, IndexerConfig
+
+if TYPE_CHECKING:
+    from pipelines.graph.problem import Estimate, Problem
+    from pipelines.judgement.checklist import ChecklistItem
+    from pipelines.judgement.hypotheses import Hypotheses
+    from pipelines.judgement.validation import Validation
+    from pipelines.methods.formula import Formula
+    from pipelines.methods.indexer.recording import IndexerData
+    from pipelines.methods.indexer.simulation import IndexerScenario
+    from pipelines.recording.reading import Recording
+    from pipelines.reports.result import Calibration, Plot
+    from pipelines.settings import Config
+    from pipelines.simulation.simulated import Simulated
+
+
+class Indexer(Method):
+    """The door of the indexer method."""
+
+    name = "indexer"
+    title = "Indexer"
+    topics = TOPICS
+    needs = NEEDS
+    section = IndexerConfig
+
+    def read(self, recording: Recording, config: Config) -> IndexerData:
+        from pipelines.methods.indexer.recording import read_indexer
+
+        return read_indexer(recording, config)
+
+    def problem(self, data: IndexerData, config: Config) -> Problem:
+        from pipelines.methods.indexer.graph import problem
+
+        return problem(data, config)
+
+    def published(self, data: IndexerData, config: Config, problem: Problem) -> Estimate:
+        from pipelines.methods.indexer.published import published_estimate
+
+        return published_estimate(data, config, problem)
+
+    @property
+    def scenario(self) -> type[IndexerScenario]:
+        from pipelines.methods.indexer.simulation import IndexerScenario
+
+        return IndexerScenario
+
+    def simulate(self, scenario: IndexerScenario, seed: int, images: bool = False) -> Simulated:
+        from pipelines.methods.indexer.simulation import simulated
+
+        return simulated(scenario, seed, images)
+
+    def write(self, path: Path, simulated: Simulated) -> None:
+        from pipelines.methods.indexer.recording import write_indexer
+
+        write_indexer(path, simulated.data, simulated.truth, simulated.config)
+
+    def candidates(self, scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
+        from pipelines.methods.indexer.candidates import candidates
+
+        return candidates(scenario)
+
+    def hypotheses(self) -> Hypotheses:
+        from pipelines.methods.indexer.hypotheses import HYPOTHESES
+
+        return HYPOTHESES
+
+    def validate(self, data: IndexerData, config: Config, values: Mapping[str, float]) -> Sequence[Validation]:
+        from pipelines.methods.indexer.graph import validate
+
+        return validate(data, config, values)
+
+    def checklist(self, data: IndexerData, config: Config) -> Sequence[ChecklistItem]:
+        from pipelines.methods.indexer.guidance import checklist
+
+        return checklist(data, config)
+
+    def formulas(self, parameters: Collection[str]) -> Sequence[Formula]:
+        from pipelines.methods.indexer.formulas import formulas
+
+        return formulas(parameters)
+
+    def figures(self, data: IndexerData, calibration: Calibration) -> Sequence[Plot]:
+        from pipelines.methods.indexer.figures import indexer_plots
+
+        return indexer_plots(data, calibration)
+
+
+METHOD = Indexer()

@@ -6,7 +6,7 @@ import numpy as np
 
 from factors import so3
 from factors.indexer import IndexerAverageFactor, mounting
-from pipelines.config import Config, load_config
+from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.graph.problem import Array
 from pipelines.methods.indexer.graph import BIAS, THETA, Group, groups_of, misfit, validate
@@ -15,6 +15,7 @@ from pipelines.methods.indexer.recording import IndexerData
 from pipelines.methods.indexer.runs import axis_motion
 from pipelines.reports.plots import COLORS, add_line, add_points, figure
 from pipelines.reports.result import Calibration, Plot
+from pipelines.settings import Config
 
 _ARCSEC = np.rad2deg(1.0) * 3600.0
 _AXES = "xyz"

@@ -33,7 +33,6 @@ from factors.indexer import (
     mounting_angles,
 )
 from factors.vectorized import VectorizedFactor
-from pipelines.config import DEFAULT_NOISE, Config, check_names, first_given
 from pipelines.errors import InputError
 from pipelines.graph.priors import prior_sigmas, vector_prior
 from pipelines.graph.problem import Array, Attitudes, Factor, Parameter, Problem, Quantity, Step
@@ -42,6 +41,8 @@ from pipelines.graph.walking_bias import WalkingBias
 from pipelines.judgement.validation import Validation
 from pipelines.methods.indexer.recording import IndexerData
 from pipelines.methods.indexer.runs import AxisMotion, Run, axis_motion
+from pipelines.methods.indexer.topics import FIX, IndexerConfig
+from pipelines.settings import DEFAULT_NOISE, Config, check_names, first_given
 
 THETA = ("theta_x", "theta_y", "theta_z")
 BIAS = ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")
@@ -184,7 +185,7 @@ def validate(data: IndexerData, config: Config, values: Mapping[str, float]) -> 
     found = [Validation("axis by mean rates, turn by turn", "rad", time, before, after)]
     if data.attitude is not None:
         rows = np.flatnonzero((data.gyro_t >= motion.t[0]) & (data.gyro_t <= motion.t[-1]))
-        bRn = so3.inverse(np.array(config.indexer.base_attitude))
+        bRn = so3.inverse(np.array(config.section(IndexerConfig).base_attitude))
         errors = [
             so3.log(so3.multiply(bRn, _carrier(data, motion, rows, _several(some, THETA), *_several(some, EPSILON))))
             for some in ({}, values)
@@ -219,7 +220,7 @@ def _several(values: Mapping[str, float], names: Sequence[str]) -> Array:
 
 def groups_of(data: IndexerData, config: Config, motion: AxisMotion, split: bool = True) -> tuple[Group, ...]:
     """The groups of a recording in time order; none shares an encoder sample with another."""
-    nRbase = np.array(config.indexer.base_attitude)
+    nRbase = np.array(config.section(IndexerConfig).base_attitude)
     latitude = data.latitude_deg
     earth = np.zeros(3) if latitude is None else earth_rate(np.deg2rad(latitude))
     path = AxisPath(motion.t, motion.angles[:, 0], motion.angles[:, 1], so3.rotate(so3.inverse(nRbase), earth))
@@ -285,7 +286,7 @@ def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]
         if density / np.sqrt(shortest) < EARTH_RATE:
             raise InputError(
                 f"indexer: the earth's rate shows in windows of {shortest:.3g} s and the latitude is not known; "
-                f"record {config.topic('fix')} or give latitude_deg in the config"
+                f"record {config.topic(FIX)} or give latitude_deg in the config"
             )
     groups, disagreeing = _agreeing(groups, config, density, encoder)
     theta_guess, bias_guess = _guess(groups)

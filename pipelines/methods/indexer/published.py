@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factors import so3
-from pipelines.config import DEFAULT_NOISE, Config, first_given
 from pipelines.errors import InputError
 from pipelines.graph.problem import Estimate, Problem
 from pipelines.methods.indexer.recording import IndexerData
 from pipelines.methods.indexer.runs import AxisMotion, Run, axis_motion
+from pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 Array = NDArray[np.float64]
 NAMES = ("theta_x", "theta_y", "theta_z")

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.config import Config
 from pipelines.errors import InputError
+from pipelines.methods.indexer.topics import FIX, INDEXER
 from pipelines.recording import series
 from pipelines.recording.checks import (
     check_overlap,
@@ -23,8 +23,9 @@ from pipelines.recording.checks import (
 )
 from pipelines.recording.gyro import usable
 from pipelines.recording.reading import Recording
-from pipelines.recording.topics import TOPICS
+from pipelines.recording.topics import IMU
 from pipelines.recording.writing import attached, write_session
+from pipelines.settings import Config
 
 Array = NDArray[np.float64]
 
@@ -61,8 +62,8 @@ def read_indexer(recording: Recording, config: Config) -> IndexerData:
     """
     dropped: dict[str, int] = {}
     epoch = recording.epoch_ns
-    imu_topic, encoder_topic = config.topic("imu"), config.topic("indexer")
-    recording.read_together({imu_topic: (), encoder_topic: JOINTS, config.topic("fix"): ()})
+    imu_topic, encoder_topic = config.topic(IMU), config.topic(INDEXER)
+    recording.read_together({imu_topic: (), encoder_topic: JOINTS, config.topic(FIX): ()})
     imu = recording.imu(imu_topic)
     gyro_t, keep = usable(imu_topic, imu, epoch, dropped, least=3)
     gyro = imu.gyro[keep]
@@ -103,22 +104,22 @@ def write_indexer(
     imu = series.ImuSeries(gyro_ns, data.gyro, gyro_cov=variance * np.eye(3), frame_id="imu", **orientation)
     angles = np.column_stack([data.outer, data.inner])
     topics: dict[str, series.Topic] = {
-        TOPICS["imu"].name: imu,
-        TOPICS["indexer"].name: series.JointSeries(encoder_ns, angles, JOINTS, frame_id="indexer"),
+        IMU.name: imu,
+        INDEXER.name: series.JointSeries(encoder_ns, angles, JOINTS, frame_id="indexer"),
     }
     if data.latitude_deg is not None:
         start = np.array([data.epoch_ns])
         fix = series.FixSeries(start, np.array([data.latitude_deg]), np.zeros(1), frame_id="gnss")
-        topics[TOPICS["fix"].name] = fix
+        topics[FIX.name] = fix
     write_session(path, topics, attached(truth, config_yaml))
 
 
 def _latitude(recording: Recording, config: Config) -> float | None:
     """Degrees: from the config, else the median of the fixes, else None."""
-    topic = config.topic("fix")
+    topic = config.topic(FIX)
     if config.latitude_deg is not None:
         return config.latitude_deg
-    if topic not in recording.topics and "fix" not in config.topics:
+    if topic not in recording.topics and FIX.key not in config.topics:
         return None
     fixes = recording.fixes(topic)
     good = fixes.latitude_deg[(fixes.status >= 0) & np.isfinite(fixes.latitude_deg)]

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from io import StringIO
-from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
@@ -19,9 +18,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from factors import so3
 from factors.earth import earth_rate
 from pipelines.errors import InputError
-from pipelines.methods.indexer.recording import IndexerData, write_indexer
+from pipelines.methods.indexer.recording import IndexerData
 from pipelines.simulation.motion import sample_times
-from pipelines.simulation.scenario import load_scenario
+from pipelines.simulation.simulated import Simulated
 
 Array = NDArray[np.float64]
 
@@ -152,17 +151,15 @@ def simulate_indexer(scenario: IndexerScenario, seed: int) -> tuple[IndexerData,
     return data, _truth(scenario, bias)
 
 
-def write_simulation(scenario: str | None, seed: int, out: Path, images: bool) -> None:
-    """Simulate a scenario (by name or file, None is indexer_nominal) and write it as a session with its truth.
+def simulated(scenario: IndexerScenario, seed: int, images: bool = False) -> Simulated:
+    """A session in memory.
 
     Raises:
-        InputError: no such scenario, or it cannot be written, or pictures are asked for.
+        InputError: pictures are asked for.
     """
-    settings = load_scenario(IndexerScenario, scenario or "indexer_nominal")
     if images:
         raise InputError("indexer: there is no camera in this method; leave out --images")
-    data, truth = simulate_indexer(settings, seed)
-    write_indexer(out, data, truth, indexer_config(settings))
+    return Simulated(*simulate_indexer(scenario, seed), indexer_config(scenario))
 
 
 def indexer_config(scenario: IndexerScenario) -> str:

@@ -1,1 +1,99 @@
-"""The los method."""
+"""The los method: gyro and camera mounting angles of an indirectly stabilised line of sight."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipelines.methods import Method, Scenario
+from pipelines.methods.los.topics import NEEDS, TOPICS
+
+if TYPE_CHECKING:
+    from pipelines.graph.problem import Estimate, Problem
+    from pipelines.judgement.checklist import ChecklistItem
+    from pipelines.judgement.hypotheses import Hypotheses
+    from pipelines.judgement.validation import Validation
+    from pipelines.methods.formula import Formula
+    from pipelines.methods.los.recording import LosData
+    from pipelines.methods.los.simulation import LosScenario
+    from pipelines.recording.reading import Recording
+    from pipelines.reports.result import Calibration, Plot
+    from pipelines.settings import Config
+    from pipelines.simulation.simulated import Simulated
+
+
+class Los(Method):
+    """The door of the los method."""
+
+    name = "los"
+    title = "Line of sight"
+    topics = TOPICS
+    needs = NEEDS
+
+    def read(self, recording: Recording, config: Config) -> LosData:
+        from pipelines.methods.los.recording import read_los
+
+        return read_los(recording, config)
+
+    def problem(self, data: LosData, config: Config) -> Problem:
+        from pipelines.methods.los.graph import problem
+
+        return problem(data, config)
+
+    def published(self, data: LosData, config: Config, problem: Problem) -> Estimate:
+        from pipelines.methods.los.published import published_estimate
+
+        return published_estimate(data, config, problem)
+
+    @property
+    def scenario(self) -> type[LosScenario]:
+        from pipelines.methods.los.simulation import LosScenario
+
+        return LosScenario
+
+    def simulate(self, scenario: LosScenario, seed: int, images: bool = False) -> Simulated:
+        from pipelines.methods.los.simulation import simulated
+
+        return simulated(scenario, seed, images)
+
+    def nominal(self, images: bool = False) -> str:
+        return "los_images" if images else "los_nominal"
+
+    def write(self, path: Path, simulated: Simulated) -> None:
+        from pipelines.methods.los.recording import write_los
+
+        write_los(path, simulated.data, simulated.truth, simulated.config, simulated.pictures)
+
+    def candidates(self, scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
+        from pipelines.methods.los.candidates import candidates
+
+        return candidates(scenario)
+
+    def hypotheses(self) -> Hypotheses:
+        from pipelines.methods.los.hypotheses import HYPOTHESES
+
+        return HYPOTHESES
+
+    def validate(self, data: LosData, config: Config, values: Mapping[str, float]) -> Sequence[Validation]:
+        from pipelines.methods.los.validation import validate
+
+        return validate(data, config, values)
+
+    def checklist(self, data: LosData, config: Config) -> Sequence[ChecklistItem]:
+        from pipelines.methods.los.guidance import checklist
+
+        return checklist(data, config)
+
+    def formulas(self, parameters: Collection[str]) -> Sequence[Formula]:
+        from pipelines.methods.los.formulas import formulas
+
+        return formulas(parameters)
+
+    def figures(self, data: LosData, calibration: Calibration) -> Sequence[Plot]:
+        from pipelines.methods.los.figures import los_plots
+
+        return los_plots(data, calibration)
+
+
+METHOD = Los()

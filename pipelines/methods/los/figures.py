@@ -11,14 +11,15 @@ import numpy as np
 
 from factors.los import SMOOTHING, GimbalPath
 from factors.preintegration import GyroPath
-from pipelines.config import DEFAULT_NOISE, first_given, load_config
+from pipelines.config import load_config
 from pipelines.graph.problem import Array
+from pipelines.judgement.robust import robust_sigma
 from pipelines.methods.los.graph import ANGLES, select_pictures
 from pipelines.methods.los.guess import camera, carried_errors
 from pipelines.methods.los.recording import LosData
 from pipelines.reports.plots import COLORS, add_line, add_points, figure
 from pipelines.reports.result import Calibration, Plot
-from pipelines.reports.units import robust_sigma
+from pipelines.settings import DEFAULT_NOISE, first_given
 
 _AXES = ("phx", "phz")
 _MRAD = 1e3

@@ -21,7 +21,6 @@ from factors.chi_square import gate
 from factors.los import SMOOTHING, GimbalPath, LocalMotion, LosDirectionFactor
 from factors.preintegration import GyroPath, Increments
 from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
-from pipelines.config import DEFAULT_NOISE, Config, check_names, first_given
 from pipelines.errors import InputError
 from pipelines.graph.priors import vector_prior
 from pipelines.graph.problem import Array, Factor, Parameter, Problem, Quantity, Step
@@ -29,6 +28,7 @@ from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
 from pipelines.graph.walking_bias import WalkingBias
 from pipelines.methods.los.guess import camera, guess, initial_attitudes, seen
 from pipelines.methods.los.recording import LosData
+from pipelines.settings import DEFAULT_NOISE, Config, check_names, first_given
 
 _ANGLES = ("delta_px", "delta_gx", "delta_gy")
 _SPLIT = ("delta_pz", "delta_gz")

@@ -10,14 +10,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.config import Config
 from pipelines.errors import InputError
+from pipelines.methods.los.topics import GIMBAL, LOS_ERROR
 from pipelines.recording import series
 from pipelines.recording.checks import check_overlap, clean, count, nanoseconds
 from pipelines.recording.gyro import read_gyro
 from pipelines.recording.reading import Recording
-from pipelines.recording.topics import TOPICS
+from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU
 from pipelines.recording.writing import attached, write_session
+from pipelines.settings import Config
 from pipelines.vision.recorded import camera_of
 
 Array = NDArray[np.float64]
@@ -65,14 +66,14 @@ def read_los(recording: Recording, config: Config) -> LosData:
     """
     dropped: dict[str, int] = {}
     epoch = recording.epoch_ns
-    gyro_name, gimbal_name, error_name = (config.topic(key) for key in ("imu", "gimbal", "los_error"))
-    from_pictures = error_name not in recording.topics and config.topic("image") in recording.topics
+    gyro_name, gimbal_name, error_name = map(config.topic, (IMU, GIMBAL, LOS_ERROR))
+    from_pictures = error_name not in recording.topics and config.topic(IMAGE) in recording.topics
     recording.read_together({gyro_name: (), gimbal_name: JOINTS, error_name: ()})
     gyro_t, gyro, density = read_gyro(recording, gyro_name, epoch, dropped)
     gimbal_t, gimbal = _gimbal(recording, gimbal_name, epoch, dropped)
     covariance = None
-    if from_pictures and "los_error" not in config.topics:
-        error_name = config.topic("image")
+    if from_pictures and LOS_ERROR.key not in config.topics:
+        error_name = config.topic(IMAGE)
         image_t, error, covariance = _from_pictures(recording, config, epoch, dropped)
     else:
         image_t, error = _error(recording, error_name, epoch, dropped)
@@ -101,14 +102,14 @@ def write_los(
 
     variance = 0.0 if data.gyro_density is None else data.gyro_density**2 / np.median(np.diff(data.gyro_t))
     topics: dict[str, series.Topic] = {
-        TOPICS["imu"].name: series.ImuSeries(ns(data.gyro_t), data.gyro, gyro_cov=variance * np.eye(3), frame_id="imu"),
-        TOPICS["gimbal"].name: series.JointSeries(ns(data.gimbal_t), data.gimbal, JOINTS, frame_id="gimbal"),
+        IMU.name: series.ImuSeries(ns(data.gyro_t), data.gyro, gyro_cov=variance * np.eye(3), frame_id="imu"),
+        GIMBAL.name: series.JointSeries(ns(data.gimbal_t), data.gimbal, JOINTS, frame_id="gimbal"),
     }
     if pictures is None:
         vector = data.error[:, [0, 2, 1]]
-        topics[TOPICS["los_error"].name] = series.VectorSeries(ns(data.image_t), vector, frame_id="los")
+        topics[LOS_ERROR.name] = series.VectorSeries(ns(data.image_t), vector, frame_id="los")
     else:
-        topics[TOPICS["camera_info"].name], topics[TOPICS["image"].name] = pictures
+        topics[CAMERA_INFO.name], topics[IMAGE.name] = pictures
     write_session(path, topics, attached(truth, config_yaml))
 
 
@@ -226,7 +227,7 @@ def _from_pictures(
     """LOS errors of the target that the first picture shows, with the tracker's covariance."""
     from pipelines.vision.target import los_errors
 
-    topic = config.topic("image")
+    topic = config.topic(IMAGE)
     camera = camera_of(recording, config)
     found = los_errors(recording.images(topic), camera)
     for reason, number in found.dropped.items():

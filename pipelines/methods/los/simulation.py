@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from io import StringIO
 from math import cos, sin
-from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -24,11 +23,11 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from factors import so3
 from factors.earth import earth_rate
 from pipelines.errors import InputError
-from pipelines.methods.los.recording import LosData, write_los
+from pipelines.methods.los.recording import LosData
 from pipelines.recording import series
 from pipelines.recording.checks import nanoseconds
 from pipelines.simulation.motion import EulerMotion, Swing, sample_times
-from pipelines.simulation.scenario import load_scenario
+from pipelines.simulation.simulated import Simulated
 
 Array = NDArray[np.float64]
 
@@ -227,16 +226,15 @@ def camera_attitude(scenario: LosScenario, gimbal: Array) -> Array:
     )
 
 
-def write_simulation(scenario: str | None, seed: int, out: Path, images: bool) -> None:
-    """Simulate a scenario (by name or file, None is los_nominal or los_images) and write it as a session with truth.
+def simulated(scenario: LosScenario, seed: int, images: bool = False) -> Simulated:
+    """A session in memory, with pictures if asked for.
 
     Raises:
-        InputError: no such scenario.
+        InputError: its pictures cannot be drawn.
     """
-    settings = load_scenario(LosScenario, scenario or ("los_images" if images else "los_nominal"))
-    data, truth = simulate_los(settings, seed)
-    pictures = simulate_pictures(settings, seed) if images else None
-    write_los(out, data, truth, los_config(settings, images), pictures)
+    data, truth = simulate_los(scenario, seed)
+    pictures = simulate_pictures(scenario, seed) if images else None
+    return Simulated(data, truth, los_config(scenario, images), pictures)
 
 
 def simulate_pictures(scenario: LosScenario, seed: int) -> tuple[series.CameraInfo, series.ImageSeries]:

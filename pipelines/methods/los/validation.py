@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from factors import so3
 from factors.los import GimbalPath
-from pipelines.config import DEFAULT_NOISE, Config, first_given
 from pipelines.graph.problem import Array
 from pipelines.judgement.validation import Validation
 from pipelines.methods.los.graph import select_pictures
 from pipelines.methods.los.guess import los_direction, los_error
 from pipelines.methods.los.recording import LosData
+from pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 # The replayed gimbal feeds back on its own commands; each pass is better by the carrier's sway, about a tenth.
 _PASSES = 6

@@ -1,0 +1,163 @@
+"""Why residuals do not fit: causes tried for real, each by solving again with the data or the config changed.
+
+    causes = find_causes(method, data, config)      # after a calibration that ended inconsistent
+    causes[0].label, causes[0].evidence             # the likeliest
+
+A cause counts when the recording fits with it, or fits far better. Signs of axes and the time offset go before the
+noise: noise large enough fits anything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipelines.graph.problem import Estimate, Residuals
+from pipelines.judgement.halves import cut
+from pipelines.judgement.hypotheses import Hypotheses
+from pipelines.judgement.observability import Cause
+from pipelines.judgement.outcome import Outcome, mostly_rejected, outcome, quick_score
+from pipelines.judgement.trials import OFFSET, Trial, trials
+from pipelines.settings import DEFAULT_NOISE, Config
+
+if TYPE_CHECKING:
+    from pipelines.methods import Method
+
+# Trials are made on this much of a recording, s, where it fits worst, and looked at on less.
+_STRETCH, _SHORT = 30.0, 8.0
+# Two numbers of one recording differ by more than chance beyond this many sigmas.
+_SIGNIFICANT = 5.0
+# A change that leaves more than this share of the noise factor explains little.
+_BETTER = 0.8
+_NOISE_STEPS = 5
+_NOISE_ACCURACY = 0.02
+_MOST_NAMED = 3
+# How far the typical residual has to fall for a change to be looked at closely.
+_PROMISING = 0.97
+# Noise this far from the one stated is worth a word.
+_NOTABLE = 1.1
+
+
+def find_causes(method: Method, data: Any, config: Config, estimate: Estimate | None = None) -> tuple[Cause, ...]:
+    """What makes a recording fit that does not, the likeliest first; empty when nothing that was tried does.
+
+    Args:
+        method: that read the data.
+        data: what the method read.
+        config: of the recording.
+        estimate: its calibration, which tells where to look; by default the whole is tried.
+    """
+    problem, hypotheses = method.problem(data, config), method.hypotheses()
+    if estimate is not None and estimate.solver == "batch" and not hypotheses.cut:
+        before = Outcome.of(problem, estimate)
+    else:
+        if estimate is not None and hypotheses.cut:
+            data = cut(hypotheses, data, *_worst_stretch(estimate.residuals, _STRETCH))
+        before = outcome(method, data, config)
+    if before is None or (before.fits and not mostly_rejected(before.estimate)):
+        return ()
+    found: list[tuple[Outcome, str]] = []
+    for label, changed, changed_config in _screened(method, data, config, before):
+        after = outcome(method, changed, changed_config)
+        if after is not None and _explains(before, after):
+            found.append((after, _named(label, after)))
+    found.sort(key=lambda each: each[0].factor)
+    if any(after.fits for after, _ in found):
+        found = [each for each in found if each[0].fits]
+    elif not found:
+        found = _noise(method, hypotheses, data, config, before)
+    return tuple(Cause(label, _evidence(before, after)) for after, label in found[:_MOST_NAMED])
+
+
+def _screened(method: Method, data: Any, config: Config, before: Outcome) -> list[Trial]:
+    """The changes worth a closer look, by the typical residual after a few iterations."""
+    hypotheses = method.hypotheses()
+    stretch = _worst_stretch(before.estimate.residuals, _SHORT) if hypotheses.cut else (-np.inf, np.inf)
+    found = list(trials(method, data, config))
+    scores = [quick_score(method, cut(hypotheses, changed, *stretch), other) for _, changed, other in found]
+    enough = _PROMISING * quick_score(method, cut(hypotheses, data, *stretch), config)
+    return [found[i] for i in np.argsort(scores)[:_MOST_NAMED] if scores[i] < enough]
+
+
+def _worst_stretch(residuals: Mapping[str, Residuals], length: float) -> tuple[float, float]:
+    """Of the residuals' time, the stretch with the largest sum of squares, rejected ones counted in full."""
+    time = np.concatenate([r.time for r in residuals.values()])
+    square = np.concatenate([(r.whitened**2).sum(axis=1) for r in residuals.values()])
+    order = np.argsort(time, kind="stable")
+    time, total = time[order], np.append(0.0, np.cumsum(square[order]))
+    ends = np.searchsorted(time, time + length)
+    first = int(np.argmax(total[ends] - total[: len(time)]))
+    start = max(min(time[first], time[-1] - length), time[0])
+    return float(start) - 0.1, float(start) + length + 0.1
+
+
+def _named(label: str, after: Outcome) -> str:
+    if "{" not in label:
+        return label
+    i = after.estimate.names.index(OFFSET)
+    value, sigma = 1e3 * after.estimate.values[i], 1e3 * after.estimate.sigmas[i]
+    return label.format(time_offset=f"{value:.3g} ± {sigma:.2g} ms")
+
+
+def _explains(before: Outcome, after: Outcome) -> bool:
+    """Whether a change makes chi-square fall by far more than chance and to (nearly) what it should be."""
+    fall = (before.cost - after.cost) / max(after.factor, 1.0) ** 2
+    return fall > _SIGNIFICANT**2 and (after.fits or after.factor < _BETTER * before.factor)
+
+
+def _evidence(before: Outcome, after: Outcome) -> str:
+    fits = "and fits" if after.fits else "and still does not fit"
+    return (
+        f"with that changed chi-square falls from {before.cost:.4g} to {after.cost:.4g} for {after.rows:.4g} degrees "
+        f"of freedom {fits}"
+    )
+
+
+def _noise(
+    method: Method, hypotheses: Hypotheses, data: Any, config: Config, before: Outcome
+) -> list[tuple[Outcome, str]]:
+    """The one noise that, stated larger, balances all families best; nothing when none brings chi-square to fit."""
+    found = []
+    for key in hypotheses.noise:
+        scaled = _scaled_to_fit(method, hypotheses, data, config, key, before)
+        if scaled is not None and scaled[1] > _NOTABLE:
+            found.append((scaled[0], f"the noise {key} is stated {scaled[1]:.2g} times too small"))
+    return sorted(found, key=lambda each: each[0].imbalance)[:1]
+
+
+def _scaled_to_fit(
+    method: Method, hypotheses: Hypotheses, data: Any, config: Config, key: str, before: Outcome
+) -> tuple[Outcome, float] | None:
+    """The solution with a noise multiplied so that its families' chi-square is the expected one, and the factor.
+
+    Variance component estimation, as Foerstner has it (1979).
+    """
+    families = hypotheses.noise[key][1]
+    factor, after = 1.0, before
+    for _ in range(_NOISE_STEPS):
+        step = after.spread(families)
+        if abs(step - 1.0) < _NOISE_ACCURACY:
+            break
+        factor *= step
+        found = outcome(method, *_with_noise(hypotheses, data, config, key, factor))
+        if found is None:
+            return None
+        after = found
+    return (after, factor) if after.fits else None
+
+
+def _with_noise(hypotheses: Hypotheses, data: Any, config: Config, key: str, factor: float) -> tuple[Any, Config]:
+    """Data and config with a noise multiplied, wherever it is stated."""
+    source = hypotheses.noise[key][0]
+    own = None if source is None else getattr(data, source)
+    if source is not None and own is not None:
+        data = replace(data, **{source: own * factor ** (1 if isinstance(own, float) else 2)})
+    given = getattr(config.noise, key)
+    if given is None and own is None:
+        given = getattr(DEFAULT_NOISE, key)
+    if given is not None:
+        config = config.model_copy(update={"noise": config.noise.model_copy(update={key: given * factor})})
+    return data, config

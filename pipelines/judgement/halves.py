@@ -1,0 +1,103 @@
+"""Whether a recording agrees with itself: either half by itself, and measurements held out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipelines.graph.problem import Array, Factor, Problem
+from pipelines.judgement.outcome import outcome
+from pipelines.judgement.robust import robust_sigma
+from pipelines.settings import Config
+
+if TYPE_CHECKING:
+    from pipelines.judgement.hypotheses import Hypotheses
+    from pipelines.methods import Method
+
+# A half determines a parameter when its sigma is below this share of the prior's; one chunk in so many is held out.
+_DETERMINED, _HELD_OUT = 0.5, 5
+
+
+def cut(hypotheses: Hypotheses, data: Any, start: float, stop: float) -> Any:
+    """The data of [start, stop), s; times stay as they are."""
+    changes: dict[str, Array] = {}
+    for stamps, fields in hypotheses.streams.items():
+        time = getattr(data, stamps)
+        if time is None:
+            continue
+        inside = (time >= start) & (time < stop)
+        for name in (stamps, *fields):
+            values = getattr(data, name)
+            if values is not None:
+                changes[name] = values[inside]
+    return replace(data, **changes)
+
+
+@dataclass(frozen=True)
+class Halves:
+    """A parameter from either half of a recording: values and sigmas, SI."""
+
+    first: float
+    first_sigma: float
+    second: float
+    second_sigma: float
+
+    @property
+    def difference_sigmas(self) -> float:
+        """Second less first, over the sigma of that difference."""
+        return (self.second - self.first) / float(np.hypot(self.first_sigma, self.second_sigma))
+
+
+def split_halves(method: Method, data: Any, config: Config) -> dict[str, Halves]:
+    """The parameters that each half of a recording determines by itself; none when a half cannot be solved.
+
+    Those that a prior holds in either half are left out: they would agree whatever was recorded. A bias that walks
+    differs between halves by its walk too.
+    """
+    hypotheses = method.hypotheses()
+    times = [time for stamps in hypotheses.streams if (time := getattr(data, stamps)) is not None]
+    start, stop = min(t[0] for t in times), max(t[-1] for t in times)
+    middle = 0.5 * (start + stop)
+    first, second = (
+        outcome(method, cut(hypotheses, data, *span), config) for span in ((start, middle), (middle, stop + 1.0))
+    )
+    if first is None or second is None:
+        return {}
+    a, b = first.estimate, second.estimate
+    found = {}
+    for i, q in enumerate(method.problem(data, config).quantities):
+        sigmas = float(a.sigmas[i]), float(b.sigmas[i])
+        if 0.0 < max(sigmas) < _DETERMINED * q.scale:
+            found[q.name] = Halves(float(a.values[i]), sigmas[0], float(b.values[i]), sigmas[1])
+    return found
+
+
+def held_out(problem: Problem) -> dict[str, float]:
+    """Family -> typical size of measurements that took no part in the solution, in sigmas of their own noise.
+
+    One chunk in five is held out. 1 is as good as the noise; a little more is the uncertainty of the prediction.
+    """
+    import gtsam
+
+    from pipelines.solvers.batch import CHUNK, optimize, residuals_of
+
+    if problem.loss is not None:
+        problem.loss.mu = np.inf
+    values = gtsam.Values()
+    stand_ins: dict[int, int] = {}
+    kept: list[Factor] = []
+    out: list[Factor] = []
+    for i, step in enumerate(problem.steps(CHUNK)):
+        values.insert(step.initial)
+        stand_ins.update(step.stand_ins)
+        for f in step.factors:
+            (out if f.measurement is not None and i % _HELD_OUT == _HELD_OUT - 1 else kept).append(f)
+    if not any(f.measurement is not None for f in kept):
+        return {}
+    shared = [stand_ins.get(p.key, p.key) for p in problem.parameters]
+    solution = optimize(kept, values, shared, problem.loss)
+    if not solution.converged:
+        return {}
+    return {family: robust_sigma(r.whitened) for family, r in residuals_of(out, solution.values).items()}

@@ -1,0 +1,48 @@
+"""What can be wrong with a method's data, in the names of its fields."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pipelines.settings import Config
+
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """A number of the config that may be off by an unknown factor.
+
+    Attributes:
+        label: the fault in words, with {factor}.
+        scaled: data, config and factor -> both with the number multiplied; None where it does not occur.
+    """
+
+    label: str
+    scaled: Callable[[Any, Config, float], tuple[Any, Config] | None]
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """Faults to be tried by solving again, told by the names of the data's fields.
+
+    Attributes:
+        streams: stamps -> what carries them.
+        signs: readings (n,) or (n, k) -> how people call them, and their columns.
+        noise: key of the config's noise -> the field that holds the messages' own, if any, and the families it is of.
+        offset: whether the method has a parameter `time_offset`.
+        clock: stamps that may be late, and how people call their source.
+        scalings: numbers of the config that may be off by a factor.
+        cut: whether a stretch of the recording is a recording.
+    """
+
+    streams: Mapping[str, Sequence[str]]
+    signs: Mapping[str, tuple[str, Sequence[str]]]
+    noise: Mapping[str, tuple[str | None, Sequence[str]]]
+    offset: bool = False
+    clock: tuple[str, str] | None = None
+    scalings: Sequence[Scaling] = ()
+    cut: bool = True

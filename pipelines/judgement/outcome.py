@@ -1,0 +1,133 @@
+"""How well a recording fits: a batch solution with what it rejected, and a quick score from a few iterations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipelines.errors import InputError
+from pipelines.graph.problem import ChiSquare, Estimate, Problem
+from pipelines.judgement.observability import Fit
+from pipelines.judgement.robust import robust_sigma
+from pipelines.settings import Config
+
+if TYPE_CHECKING:
+    from pipelines.methods import Method
+
+# A recording with more than this share rejected does not fit.
+_OUTLIERS = 0.1
+# A family of at least so many measurements is mostly rejected when less than this share is used.
+_FEWEST_MEASUREMENTS, _FEWEST_USED = 10, 0.6
+# Iterations of a quick score.
+_FEW = 5
+# A model that is right needs no more damping than this; one that needs more is not looked at any longer.
+_MOST_DAMPING = 1e-4
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How well a recording fits after a change: the solution, and the loss of what it rejected.
+
+    Attributes:
+        estimate: the solution.
+        chi_square: of what was used.
+        lost: what the rejected measurements cost, at the gate each.
+        rows: degrees of freedom, the rejected rows among them.
+    """
+
+    estimate: Estimate
+    chi_square: ChiSquare
+    lost: float
+    rows: float
+
+    @classmethod
+    def of(cls, problem: Problem, estimate: Estimate) -> Outcome | None:
+        """None without chi-square."""
+        if estimate.chi_square is None or not np.isfinite(estimate.chi_square.value):
+            return None
+        rejected = {f: int((~r.used).sum()) for f, r in estimate.residuals.items()}
+        rows = sum(n * estimate.residuals[f].whitened.shape[1] for f, n in rejected.items())
+        gate = problem.loss.gate if problem.loss else 0.0
+        lost = gate**2 * sum(rejected.values())
+        return cls(estimate, estimate.chi_square, lost, estimate.chi_square.dof + rows)
+
+    @property
+    def cost(self) -> float:
+        """Chi-square, the rejected included."""
+        return self.chi_square.value + self.lost
+
+    @property
+    def factor(self) -> float:
+        """By what the noise stated would have to be multiplied for the recording to fit."""
+        return float(np.sqrt(self.cost / max(self.rows, 1.0)))
+
+    @property
+    def fits(self) -> bool:
+        """Whether chi-square lies within its interval without more than a few outliers rejected."""
+        few = self.chi_square.dof > (1.0 - _OUTLIERS) * self.rows
+        return few and self.chi_square.value <= Fit.of(0.0, self.chi_square.dof).high
+
+    def spread(self, families: Sequence[str]) -> float:
+        """Size of the families' residuals in units of what is expected, those rejected not forgotten."""
+        of = [f for f in families if f in self.chi_square.families]
+        value, dof = (sum(self.chi_square.families[f][i] for f in of) for i in range(2))
+        rejected = [r for f, r in self.estimate.residuals.items() if f in of and not r.used.all()]
+        typical = max((robust_sigma(r.whitened) for r in rejected), default=0.0)
+        return max(float(np.sqrt(value / max(dof, 1.0))), typical)
+
+    @property
+    def imbalance(self) -> float:
+        """How far the family that fits worst is from its expectation, in standard deviations."""
+        fits = (Fit.of(value, dof) for value, dof in self.chi_square.families.values())
+        return max((abs(fit.excess) for fit in fits if fit.dof >= 1.0), default=0.0)
+
+
+def mostly_rejected(estimate: Estimate) -> bool:
+    """Whether so much of a family was rejected that these can be no outliers."""
+    many = (r.used for r in estimate.residuals.values() if len(r.used) >= _FEWEST_MEASUREMENTS)
+    return any(float(used.mean()) < _FEWEST_USED for used in many)
+
+
+def outcome(method: Method, data: Any, config: Config) -> Outcome | None:
+    """The batch solution; None when there is none."""
+    from pipelines.solvers.batch import solve_batch
+    from pipelines.solvers.marginals import IndeterminateError
+
+    try:
+        problem = method.problem(data, config)
+        return Outcome.of(problem, solve_batch(problem))
+    except (InputError, IndeterminateError):
+        return None
+
+
+def quick_score(method: Method, data: Any, config: Config) -> float:
+    """Typical residual of the measurements plus that of the processes near the least-squares solution, sigmas.
+
+    Infinite when there is no solution.
+    """
+    import gtsam
+
+    from pipelines.solvers.batch import CHUNK, optimize, residuals_of
+
+    try:
+        problem = method.problem(data, config)
+    except InputError:
+        return np.inf
+    if problem.loss is not None:
+        problem.loss.mu = 0.0
+    steps = list(problem.steps(CHUNK))
+    factors = [f for step in steps for f in step.factors]
+    values = gtsam.Values()
+    stand_ins: dict[int, int] = {}
+    for step in steps:
+        values.insert(step.initial)
+        stand_ins.update(step.stand_ins)
+    shared = [stand_ins.get(p.key, p.key) for p in problem.parameters]
+    values = optimize(factors, values, shared, None, _FEW, _MOST_DAMPING).values
+    measured = np.concatenate([np.abs(r.whitened).ravel() for r in residuals_of(factors, values).values()])
+    processes = [f.factor for f in factors if f.measurement is None and f.family not in ("prior", "definition")]
+    sizes = [np.sqrt(2.0 * f.error(values) / f.dim()) for f in processes]
+    return float(np.median(measured) + (np.median(sizes) if sizes else 0.0))

@@ -1,0 +1,146 @@
+"""Discrete faults and unknown shifts of a recording, each as changed data or a changed config to be solved again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import combinations, product
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipelines.judgement.hypotheses import Hypotheses, Scaling
+from pipelines.judgement.outcome import outcome, quick_score
+from pipelines.settings import Config
+
+if TYPE_CHECKING:
+    from pipelines.methods import Method
+
+OFFSET = "time_offset"
+_OFFSET_PRIOR = 0.05
+# Stamps are moved by this much first, s, and numbers scaled by this much; then so many times to the bottom of a
+# parabola.
+_FIRST_SHIFT, _FIRST_SCALING, _PARABOLAS = 0.01, 0.01, 4
+
+# What it would be, data and config.
+Trial = tuple[str, Any, Config]
+
+
+def trials(method: Method, data: Any, config: Config) -> Iterator[Trial]:
+    """All that is tried."""
+    hypotheses = method.hypotheses()
+    yield from flips(hypotheses, data, config)
+    yield from turned(hypotheses, data, config)
+    yield from units(hypotheses, data, config)
+    yield from offset(method, hypotheses, data, config)
+    yield from scaled(method, hypotheses, data, config)
+
+
+def flips(hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]:
+    """Every choice of opposite signs of a sensor's axes."""
+    for name, (sensor, columns) in hypotheses.signs.items():
+        values = getattr(data, name)
+        if values is None:
+            continue
+        for signs in product((1.0, -1.0), repeat=len(columns)):
+            wrong = [column for column, sign in zip(columns, signs, strict=True) if sign < 0.0]
+            if wrong:
+                axes = " and ".join(wrong)
+                label = f"the sign of the {sensor}'s {axes} is wrong"
+                factor = np.array(signs) if values.ndim > 1 else signs[0]
+                yield label, replace(data, **{name: factor * values}), config
+
+
+def turned(hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]:
+    """Axes of a sensor in another order: two of them swapped, or turned by a right angle about the third."""
+    for name, (sensor, columns) in hypotheses.signs.items():
+        values = getattr(data, name)
+        if values is None or len(columns) < 3:
+            continue
+        for i, j in combinations(range(3), 2):
+            swapped = np.eye(3)
+            swapped[[i, j]] = swapped[[j, i]]
+            third = columns[3 - i - j]
+            labels = {
+                f"the {sensor}'s {columns[i]} and {columns[j]} are swapped": np.ones(3),
+                f"the {sensor} is turned by 90 deg about its {third}": np.where(np.arange(3) == i, -1.0, 1.0),
+                f"the {sensor} is turned by 90 deg the other way about its {third}": np.where(
+                    np.arange(3) == j, -1.0, 1.0
+                ),
+            }
+            for label, signs in labels.items():
+                yield label, replace(data, **{name: values @ swapped * signs}), config
+
+
+def units(hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]:
+    """Rates in degrees a second, or turned into radians twice."""
+    for name, (sensor, _) in hypotheses.signs.items():
+        values = getattr(data, name)
+        if values is not None and "gyro" in name:
+            yield f"the {sensor} is in deg/s, not rad/s", replace(data, **{name: np.deg2rad(values)}), config
+            yield (
+                f"the {sensor} was turned from deg/s to rad/s twice",
+                replace(data, **{name: np.rad2deg(values)}),
+                config,
+            )
+
+
+def offset(method: Method, hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]:
+    """The time offset as a parameter, or the stamps that may be late moved to where residuals are smallest."""
+    if hypotheses.offset:
+        free = config.model_copy(update={"priors": {**config.priors, OFFSET: _OFFSET_PRIOR}})
+        yield "a time offset of {time_offset} is taken for known", data, free
+    if hypotheses.clock is None:
+        return
+    stamps, source = hypotheses.clock
+
+    def moved(shift: float) -> tuple[Any, Config]:
+        return replace(data, **{stamps: getattr(data, stamps) + shift}), config
+
+    def cost(shift: float) -> float:
+        found = outcome(method, *moved(shift))
+        return found.cost if found else np.inf
+
+    shift = _lowest(cost, _FIRST_SHIFT)
+    if shift is not None:
+        side = "early" if shift > 0.0 else "late"
+        yield f"the stamps of the {source} are {1e3 * abs(shift):.3g} ms too {side}", *moved(shift)
+
+
+def scaled(method: Method, hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]:
+    """Numbers of the config multiplied by what makes residuals smallest."""
+    for scaling in hypotheses.scalings:
+        if scaling.scaled(data, config, 1.0) is None:
+            continue
+
+        def changed(more: float, scaling: Scaling = scaling) -> tuple[Any, Config]:
+            found = scaling.scaled(data, config, 1.0 + more)
+            assert found is not None
+            return found
+
+        # Not chi-square, which levels off where most measurements are rejected.
+        more = _lowest(lambda more: quick_score(method, *changed(more)) ** 2, _FIRST_SCALING)
+        if more is not None:
+            yield scaling.label.format(factor=1.0 + more), *changed(more)
+
+
+def _lowest(cost: Callable[[float], float], step: float) -> float | None:
+    """The size of a change that costs least; None when there is none.
+
+    From the best so far a step to either side, and to the bottom of the parabola through the three.
+    """
+    known, best = {0.0: cost(0.0)}, 0.0
+    for _ in range(_PARABOLAS):
+        sides = best - step, best + step
+        known |= {size: cost(size) for size in sides if size not in known}
+        left, middle, right = known[sides[0]], known[best], known[sides[1]]
+        bend = left - 2.0 * middle + right
+        if not np.isfinite(bend):
+            return None
+        if bend > 0.0:
+            bottom = best + float(np.clip(0.5 * step * (left - right) / bend, -5.0 * step, 5.0 * step))
+            known[bottom] = cost(bottom)
+        best = min(known, key=known.__getitem__)
+        if best not in sides:
+            step *= 0.2
+    return best

@@ -1,0 +1,87 @@
+"""How a result is applied: formulas as text for people and as code.
+
+    Formula("rate of the helmet, rad/s in v", "w_iv", "gyro - gyro_bias", ("gyro",), lambda v: v.gyro - v.gyro_bias)
+
+The text is written in the names of the parameters and of what is measured, with * for the product of rotations and for
+a rotation applied to a vector, Exp the rotation of a rotation vector, and Rx(a) = transpose(Exp(a ex)), Ry and Rz
+likewise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from factors import so3
+from pipelines.errors import InputError
+from pipelines.graph.problem import Array
+
+
+@dataclass(frozen=True)
+class Formula:
+    """One quantity that follows from a calibration and, maybe, from measurements.
+
+    Attributes:
+        meaning: what it is, with unit and frame.
+        name: what later formulas call it.
+        expression: the formula's right-hand side.
+        measured: what it needs beside parameters and formulas before it.
+        compute: the same as code: from a namespace of parameters (numbers; three of them name_x, name_y, name_z also as
+            the vector `name`), measurements and earlier results. Rotations are quaternions w, x, y, z.
+    """
+
+    meaning: str
+    name: str
+    expression: str
+    measured: tuple[str, ...]
+    compute: Callable[[Any], Array]
+
+    @property
+    def text(self) -> str:
+        """As calibration.yaml has it."""
+        return f"{self.meaning}: {self.name} = {self.expression}"
+
+
+def passive(axis: int, angle: Any) -> Array:
+    """Rx, Ry or Rz (axis 0, 1, 2) of angles in rad, (..., 4): transpose(Exp(angle e_axis))."""
+    return so3.exp(-np.asarray(angle, dtype=float)[..., None] * np.eye(3)[axis])
+
+
+def apply(formulas: Sequence[Formula], values: Mapping[str, float], measured: Mapping[str, Any]) -> dict[str, Array]:
+    """Everything that follows from a calibration's values and what is measured.
+
+    Args:
+        formulas: of the method, in order.
+        values: parameter -> value, SI.
+        measured: name -> numbers, vectors (..., 3) or quaternions w, x, y, z (..., 4).
+
+    Returns:
+        Name -> result, for each formula whose measurements are given.
+
+    Raises:
+        InputError: something is given that no formula measures.
+    """
+    known = dict.fromkeys(name for formula in formulas for name in formula.measured)
+    for name in measured:
+        if name not in known:
+            raise InputError(f"apply: nothing is computed from {name}; measurements are {', '.join(known)}")
+    space = SimpleNamespace(**values, **_vectors(values), **{k: np.asarray(v, float) for k, v in measured.items()})
+    results: dict[str, Array] = {}
+    for formula in formulas:
+        if all(name in measured for name in formula.measured):
+            results[formula.name] = formula.compute(space)
+            setattr(space, formula.name, results[formula.name])
+    return results
+
+
+def _vectors(values: Mapping[str, float]) -> dict[str, Array]:
+    stems = dict.fromkeys(name[:-2] for name in values if name.endswith(("_x", "_y", "_z")))
+    return {
+        stem: np.array([values[f"{stem}_{axis}"] for axis in "xyz"])
+        for stem in stems
+        if all(f"{stem}_{axis}" in values for axis in "xyz")
+    }

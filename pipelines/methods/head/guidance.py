@@ -1,0 +1,25 @@
+"""What the person recording a head is told of what has been collected."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipelines.judgement.checklist import ChecklistItem, motion, turned
+from pipelines.methods.head.recording import HeadData
+from pipelines.settings import Config
+
+# Turns of a head and of the platform it sits in count from these angles on, rad.
+_NOD, _MANOEUVRE = np.deg2rad(10.0), np.deg2rad(5.0)
+
+
+def checklist(data: HeadData, _: Config) -> Sequence[ChecklistItem]:
+    """Motion of the head, and of the platform where there is one."""
+    found = [ChecklistItem("vision", f"{len(data.vision_t)} attitudes over {np.ptp(data.vision_t):.0f} s")]
+    found += motion("head", turned(data.head_t, data.head_gyro), _NOD, "turn the head about its")
+    if data.platform_t is not None and data.platform_gyro is not None:
+        found += motion(
+            "platform", turned(data.platform_t, data.platform_gyro), _MANOEUVRE, "turn the platform about its"
+        )
+    return found

@@ -1,0 +1,27 @@
+"""What the head method reads, and its section of the config."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from pipelines.recording import messages
+from pipelines.recording.topics import CAMERA_INFO, IMAGE, Need, Setting, Topic
+from pipelines.settings import Board, MethodSection
+
+HEAD_IMU = Topic("head_imu", "/head/imu", (messages.IMU,))
+PLATFORM_IMU = Topic("platform_imu", "/platform/imu", (messages.IMU,))
+VISION_ATTITUDE = Topic("vision_attitude", "/vision/attitude", (messages.POSE, messages.QUATERNION))
+TRUTH_ATTITUDE = Topic("truth_attitude", "/truth/attitude", (messages.QUATERNION,))
+
+
+class HeadConfig(MethodSection):
+    """The helmet: the tag board on it."""
+
+    key: ClassVar[str] = "head"
+
+    board: Board | None = None
+
+
+TOPICS = (HEAD_IMU, PLATFORM_IMU, VISION_ATTITUDE, TRUTH_ATTITUDE, IMAGE, CAMERA_INFO)
+_BOARD = Setting("head.board in the config", lambda config: config.section(HeadConfig).board is not None)
+NEEDS: tuple[Need, ...] = (((HEAD_IMU,),), ((VISION_ATTITUDE,), (IMAGE, CAMERA_INFO, _BOARD)))

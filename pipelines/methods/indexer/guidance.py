@@ -1,0 +1,31 @@
+"""What the person recording an indexer is told of what has been collected."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipelines.judgement.checklist import ChecklistItem
+from pipelines.methods.indexer.recording import IndexerData
+from pipelines.methods.indexer.runs import axis_motion
+from pipelines.settings import Config
+
+
+def checklist(data: IndexerData, _: Config) -> Sequence[ChecklistItem]:
+    """Turns forward and back about each axis, by the angle at which the other one stands."""
+    turns: dict[tuple[str, int], list[int]] = {}
+    for run in axis_motion(data).runs:
+        if run.axis in ("outer", "inner"):
+            # The publication has each axis turn with the other one at 0 and at 180 degrees.
+            position = (run.axis, round(np.rad2deg(run.other) / 180.0) % 2 * 180)
+            turns.setdefault(position, [0, 0])[0 if run.direction > 0 else 1] += run.whole_turns
+    found = []
+    for axis, other in (("outer", "inner"), ("inner", "outer")):
+        for angle in (0, 180):
+            forward, back = turns.get((axis, angle), [0, 0])
+            lacking = [word for word, n in (("forward", forward), ("back", back)) if n < 3]
+            wanted = f"three whole turns {' and '.join(lacking)}" if lacking else ""
+            what = f"{axis} axis, {other} one at {angle} deg"
+            found.append(ChecklistItem(what, f"{forward} turns forward, {back} back", wanted))
+    return found

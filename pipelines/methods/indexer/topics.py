@@ -1,0 +1,24 @@
+"""What the indexer method reads, and its section of the config."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from pipelines.recording import messages
+from pipelines.recording.topics import IMU, Need, Setting, Topic
+from pipelines.settings import MethodSection, Quaternion
+
+INDEXER = Topic("indexer", "/indexer/joint_states", (messages.JOINT_STATE,))
+FIX = Topic("fix", "/fix", (messages.NAV_SAT_FIX,))
+
+TOPICS = (IMU, INDEXER, FIX)
+_LATITUDE = Setting("latitude_deg in the config", lambda config: config.latitude_deg is not None)
+NEEDS: tuple[Need, ...] = (((IMU,),), ((INDEXER,),), ((FIX,), (_LATITUDE,)))
+
+
+class IndexerConfig(MethodSection):
+    """The indexer: attitude nRbase (w, x, y, z) of its base."""
+
+    key: ClassVar[str] = "indexer"
+
+    base_attitude: Quaternion = (1.0, 0.0, 0.0, 0.0)

@@ -1,0 +1,26 @@
+"""What the person recording a swaying carrier is told of what has been collected."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipelines.judgement.checklist import ChecklistItem, motion, turned
+from pipelines.methods.los.recording import LosData
+from pipelines.settings import Config
+
+# Sway of a carrier counts from this angle on, rad.
+_SWAY = np.deg2rad(2.0)
+
+
+def checklist(data: LosData, _: Config) -> Sequence[ChecklistItem]:
+    """Sway about each axis of the carrier, and whether the target was in sight."""
+    seen = f"{len(data.image_t)} LOS errors over {np.ptp(data.image_t):.0f} s"
+    sway = turned(data.gyro_t, data.gyro)
+    spread = np.rad2deg(np.ptp(data.gimbal, axis=0))
+    return (
+        ChecklistItem("target", seen),
+        *motion("sway", sway, _SWAY, "sway the carrier about its"),
+        ChecklistItem("gimbal", f"azimuth over {spread[0]:.0f}, elevation over {spread[1]:.0f} deg"),
+    )

@@ -1,0 +1,12 @@
+"""What the los method reads."""
+
+from __future__ import annotations
+
+from pipelines.recording import messages
+from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, Need, Topic
+
+GIMBAL = Topic("gimbal", "/gimbal/joint_states", (messages.JOINT_STATE,))
+LOS_ERROR = Topic("los_error", "/los/error", (messages.VECTOR,))
+
+TOPICS = (IMU, GIMBAL, LOS_ERROR, IMAGE, CAMERA_INFO)
+NEEDS: tuple[Need, ...] = (((IMU,),), ((GIMBAL,),), ((LOS_ERROR,), (IMAGE, CAMERA_INFO)))

@@ -1,0 +1,142 @@
+"""What the config of a session may say. Reading and checking one is pipelines.config's work.
+
+config.noise.gyro_density           # None where the config does not say
+config.topic(IMU)                   # the topic's name, renamed or default
+config.section(IndexerConfig)       # what is said for one method
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Collection, Iterable
+from typing import Annotated, ClassVar, TypeVar
+
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+
+from pipelines.errors import InputError, nearest
+from pipelines.recording.topics import Topic
+
+_UNIT_TOLERANCE = 1e-3
+
+
+def _unit(wxyz: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    norm = sum(x * x for x in wxyz) ** 0.5
+    if abs(norm - 1.0) > _UNIT_TOLERANCE:
+        raise ValueError(f"a unit quaternion w, x, y, z is needed, this one has norm {norm:.4g}")
+    w, x, y, z = (component / norm for component in wxyz)
+    return w, x, y, z
+
+
+def _date(value: object) -> object:
+    return datetime.date.fromisoformat(value) if isinstance(value, str) else value
+
+
+Sigma = Annotated[float, Field(gt=0.0)]
+SigmaOrZero = Annotated[float, Field(ge=0.0)]
+Date = Annotated[datetime.date, BeforeValidator(_date)]
+Quaternion = Annotated[tuple[float, float, float, float], Field(strict=False), AfterValidator(_unit)]
+Vector = Annotated[tuple[float, float, float], Field(strict=False)]
+
+
+class Section(BaseModel):
+    """Keys and values: strict, unknown keys refused."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+
+class Noise(Section):
+    """Noise of the sensors: densities per sqrt(Hz), walks per sqrt(s), the others per sample; None where not given.
+
+    gyro_scale (no unit) is what scale and alignment errors of the gyro add: a fraction of the angle turned.
+    """
+
+    gyro_density: Sigma | None = None
+    gyro_bias_walk: SigmaOrZero | None = None
+    gyro_scale: SigmaOrZero | None = None
+    platform_gyro_density: SigmaOrZero | None = None
+    accel_density: Sigma | None = None
+    mag_density: Sigma | None = None
+    los_error: Sigma | None = None
+    los_roll: Sigma | None = None
+    encoder: SigmaOrZero | None = None
+    vision_attitude: Sigma | None = None
+    corner_px: Sigma | None = None
+
+
+# Where neither the config nor a message says anything.
+DEFAULT_NOISE = Noise(
+    gyro_density=5.0e-5,
+    gyro_bias_walk=1.0e-6,
+    gyro_scale=0.0,
+    platform_gyro_density=1.0e-5,
+    accel_density=2.0e-3,
+    mag_density=5.0e-8,
+    los_error=2.0e-5,
+    los_roll=2.0e-4,
+    encoder=1.0e-5,
+    vision_attitude=8.7e-3,
+    corner_px=0.3,
+)
+
+
+class Tag(Section):
+    """A tag: edge of the black square m, rotation bodyRtag (w, x, y, z), position in the body m."""
+
+    size: Sigma
+    rotation: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    position: Vector = (0.0, 0.0, 0.0)
+
+
+class Board(Section):
+    """Tags on one rigid body, by id."""
+
+    tag_family: str = "36h11"
+    tags: dict[int, Tag] = {}
+
+
+class MethodSection(Section):
+    """What a config says for one method alone, under that method's key."""
+
+    key: ClassVar[str]
+
+
+_Own = TypeVar("_Own", bound=MethodSection)
+
+
+class Config(Section):
+    """A whole config; every key optional. Sections of methods are added where it is read, see pipelines.config."""
+
+    method: str | None = None
+    topics: dict[str, str] = {}
+    noise: Noise = Noise()
+    priors: dict[str, SigmaOrZero | None] = {}
+    require: dict[str, Sigma] = {}
+    latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None
+    date: Date | None = None
+
+    def topic(self, topic: Topic) -> str:
+        """Name of a topic, renamed or default."""
+        return self.topics.get(topic.key, topic.name)
+
+    def section(self, kind: type[_Own]) -> _Own:
+        """What it says for one method, by the model of that section; as by default where it says nothing."""
+        found = getattr(self, kind.key, None)
+        return found if isinstance(found, kind) else kind()
+
+
+def check_names(given: Iterable[str], known: Collection[str], where: str) -> None:
+    """Raise InputError, naming the nearest known name, if one given under the key `where` is not known."""
+    for name in given:
+        if name not in known:
+            raise InputError(f"unknown key {where}.{name}{nearest(name, known)}")
+
+
+def first_given(*values: float | None) -> float:
+    """Of config, message covariance and default, in this order, the first that says something.
+
+    Raises ValueError if none does.
+    """
+    for value in values:
+        if value is not None:
+            return value
+    raise ValueError("no value given, not even a default")

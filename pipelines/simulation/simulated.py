@@ -1,0 +1,24 @@
+"""What a simulator hands over: a recording's data in memory, with its truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True, eq=False)
+class Simulated:
+    """A simulated recording.
+
+    Attributes:
+        data: what its method reads from such a recording.
+        truth: parameter -> true value, SI.
+        config: the recording's config, YAML: the noise that was simulated and what else the scenario says.
+        pictures: as the method writes them in place of what is measured in them; None without.
+    """
+
+    data: Any
+    truth: Mapping[str, float]
+    config: str
+    pictures: Any = None
