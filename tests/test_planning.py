@@ -144,5 +144,5 @@ def test_requirements_are_read_and_checked() -> None:
             requirements([wrong])
     with pytest.raises(InputError, match="nearest known key is delta_px"):
         make_plan("los", require={"deltapx": 1.0})
-    with pytest.raises(InputError, match="no method gimbal"):
+    with pytest.raises(InputError, match="no method 'gimbal'"):
         make_plan("gimbal")
