@@ -209,7 +209,7 @@ class Session:
                     recording=self.origin.name,
                     sha256=sha256,
                     facts=self.facts,
-                    config_text=self.config.model_dump_json(indent=1, exclude_defaults=True),
+                    config=self.config,
                     truth=truth,
                     seconds=seconds,
                     plots=partial(self.method.figures, self.data),

@@ -19,8 +19,7 @@ def _plots(scenario: IndexerScenario) -> dict[str, Plot]:
     data, _ = simulate_indexer(scenario, 1)
     config = load_config(indexer_config(scenario).encode())
     estimate = solve_batch(problem(data, config))
-    text = config.model_dump_json(exclude_defaults=True)
-    found = indexer_plots(data, cast(Calibration, SimpleNamespace(config_text=text, estimate=estimate)))
+    found = indexer_plots(data, cast(Calibration, SimpleNamespace(config=config, estimate=estimate)))
     return {plot.title: plot for plot in found}
 
 

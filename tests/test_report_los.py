@@ -22,8 +22,7 @@ def _plots(priors: str) -> list[Plot]:
     data, _ = simulate_los(SCENARIO, 1)
     config = load_config(los_config(SCENARIO).replace("priors: {}", f"priors: {priors}").encode())
     estimate = solve_batch(problem(data, config))
-    text = config.model_dump_json(exclude_defaults=True)
-    return los_plots(data, cast(Calibration, SimpleNamespace(config_text=text, estimate=estimate)))
+    return los_plots(data, cast(Calibration, SimpleNamespace(config=config, estimate=estimate)))
 
 
 @pytest.mark.parametrize("priors", ["{}", "{time_offset: 0.01}"])

@@ -36,6 +36,7 @@ from pipelines.reports.calibration import SavedCalibration, calibration_yaml, lo
 from pipelines.reports.result import Calibration, quantities_of, result_json
 from pipelines.reports.trajectory import tum
 from pipelines.reports.write import write_results
+from pipelines.settings import Config
 
 EPOCH_NS = 1_795_176_000_123_456_789
 MOUNT = np.array([0.03, -0.02, 0.5])
@@ -96,7 +97,7 @@ def make_calibration(**changes: object) -> Calibration:
             (TopicFacts("/head/imu", "sensor_msgs/msg/Imu", 3800, 0.0, 9.5, 400.0, 0.0025, 0.1, 0, 0),),
             {},
         ),
-        config_text="method: head\n",
+        config=Config(method="head"),
         seconds={"read": 0.2},
     )
     return replace(calibration, **{k: v for k, v in changes.items() if not hasattr(estimate, k)})  # type: ignore[arg-type]

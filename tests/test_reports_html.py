@@ -21,6 +21,7 @@ from pipelines.reports.html import report_html
 from pipelines.reports.plots import common_plots
 from pipelines.reports.result import Calibration, quantities_of
 from pipelines.reports.units import human_unit, to_digits_of
+from pipelines.settings import Config
 from tests.browser import drawn, needs_browser
 from tests.test_reports_files import make_calibration
 
@@ -87,7 +88,9 @@ def test_free_and_undetermined_parameters_show_no_silly_number() -> None:
 
 
 def test_names_from_the_recording_are_escaped() -> None:
-    calibration = make_calibration(recording="<script>alert(1)</script>.mcap", config_text="a: </pre><script>")
+    calibration = make_calibration(
+        recording="<script>alert(1)</script>.mcap", config=Config(topics={"imu": "</pre><script>"})
+    )
     page = Page(report_html(calibration))
     assert page.scripts == Page(report_html(make_calibration())).scripts
     assert "<script>alert(1)</script>.mcap" in page.text

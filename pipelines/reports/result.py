@@ -19,6 +19,7 @@ from pipelines.graph.problem import Estimate, Findings, Problem, Quantity, Resid
 from pipelines.judgement.observability import Assessment, Fit, Innovations, Learning, Status, Verdict, learning
 from pipelines.judgement.robust import robust_sigma
 from pipelines.recording.info import SessionFacts
+from pipelines.settings import Config
 
 if TYPE_CHECKING:
     import plotly.graph_objects
@@ -70,7 +71,7 @@ class Calibration:
         recording: name of the file.
         sha256: of the file.
         facts: about the recording; its epoch is the zero of all times.
-        config_text: the config in force, YAML.
+        config: in force.
         truth: parameter -> value, when known; other keys are ignored.
         software: package -> version.
         seconds: phase -> wall time, beside those of the estimate.
@@ -87,7 +88,7 @@ class Calibration:
     recording: str
     sha256: str
     facts: SessionFacts
-    config_text: str = ""
+    config: Config = field(default_factory=Config)
     truth: Mapping[str, object] | None = None
     software: Mapping[str, str] = field(default_factory=lambda: software_versions())
     seconds: Mapping[str, float] = field(default_factory=dict)
@@ -113,6 +114,11 @@ class Calibration:
             )
             for q, value, sigma in rows
         )
+
+    @property
+    def config_text(self) -> str:
+        """The config in force, YAML."""
+        return self.config.model_dump_json(indent=1, exclude_defaults=True)
 
     @property
     def formulas(self) -> Sequence[Formula]:

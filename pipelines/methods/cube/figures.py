@@ -10,7 +10,6 @@ import numpy as np
 from factors import so3
 from factors.earth import earth_rate, gravity
 from factors.preintegration import GyroPath
-from pipelines.config import load_config
 from pipelines.graph.problem import Array
 from pipelines.methods.cube.coverage import coverage
 from pipelines.methods.cube.findings import calibrated, resting
@@ -32,7 +31,7 @@ _BEFORE, _AFTER = "#8a949e", COLORS[0]
 
 def cube_plots(data: CubeData, calibration: Calibration) -> list[Plot | Table]:
     """The method's own figures and tables; those that the recording has no data for are left out."""
-    config = load_config(calibration.config_text.encode())
+    config = calibration.config
     values = dict(zip(calibration.estimate.names, calibration.estimate.values.tolist(), strict=True))
     poses = resting(data, config)
     found: list[Plot | Table | None] = [*cube_tables(calibration)]

@@ -6,7 +6,6 @@ import numpy as np
 
 from factors import so3
 from factors.indexer import IndexerAverageFactor, mounting
-from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.graph.problem import Array
 from pipelines.methods.indexer.graph import BIAS, THETA, Group, groups_of, misfit, validate
@@ -23,7 +22,7 @@ _AXES = "xyz"
 
 def indexer_plots(data: IndexerData, calibration: Calibration) -> list[Plot]:
     """The method's own figures; those that the recording has no data for are left out."""
-    config = load_config(calibration.config_text.encode())
+    config = calibration.config
     values = dict(zip(calibration.estimate.names, calibration.estimate.values.tolist(), strict=True))
     turning = [g for g in groups_of(data, config, axis_motion(data)) if g.position is not None]
     plots = [_misfit(turning, values), _contributions(turning, values)]

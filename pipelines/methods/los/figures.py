@@ -11,7 +11,6 @@ import numpy as np
 
 from factors.los import SMOOTHING, GimbalPath
 from factors.preintegration import GyroPath
-from pipelines.config import load_config
 from pipelines.graph.problem import Array
 from pipelines.judgement.robust import robust_sigma
 from pipelines.methods.los.graph import ANGLES, select_pictures
@@ -30,7 +29,7 @@ _SHOWN = 6.0
 
 def los_plots(data: LosData, calibration: Calibration) -> list[Plot]:
     """LOS error measured and predicted, and their difference with and without the mounting angles."""
-    config = load_config(calibration.config_text.encode())
+    config = calibration.config
     values = dict(zip(calibration.estimate.names, calibration.estimate.values.tolist(), strict=True))
     sigma = first_given(config.noise.los_error, DEFAULT_NOISE.los_error)
     margin = SMOOTHING if "time_offset" in values else 0.0
