@@ -70,3 +70,14 @@ def test_stretches_behind_stay_while_a_recording_grows() -> None:
     whole = WalkingBias.over(0.0, 40.0, middles, 1e-2, 1e-4).edges
     half = WalkingBias.over(0.0, 20.0, middles[middles < 20.0], 1e-2, 1e-4).edges
     np.testing.assert_array_equal(half[:-1], whole[: len(half) - 1])
+
+
+def test_smoothed_sigma_of_the_first_stretch_is_its_own_not_that_of_the_mean() -> None:
+    """A stretch at the end has one neighbour to learn from and is known less well than the next one."""
+    scenario = HeadScenario(duration_s=30, vision_rate_hz=20, gyro_rate_hz=200)
+    data, _ = simulate_head(scenario, 1)
+    estimate = solve_batch(head_problem(data, _walking(head_config(scenario), 1e-5)))
+    assert estimate.smoothed is not None
+    sigmas = estimate.smoothed.sigmas[:, :3]
+    assert (sigmas[0] > sigmas[1]).all()
+    assert (sigmas[0] > estimate.sigmas[:3]).all()

@@ -99,9 +99,15 @@ class Factor:
         return cls(family, measurement.factor, measurement)
 
 
+def _no_values() -> gtsam.Values:
+    import gtsam
+
+    return gtsam.Values()
+
+
 @dataclass(frozen=True)
 class Step:
-    """What one moment adds to the graph.
+    """What one moment adds to the graph. A method builds it by adding to its collections, and then leaves it alone.
 
     Attributes:
         time: s from the session's start.
@@ -116,11 +122,11 @@ class Step:
     """
 
     time: float
-    initial: gtsam.Values
-    factors: Sequence[Factor]
+    initial: gtsam.Values = field(default_factory=_no_values)
+    factors: list[Factor] = field(default_factory=list)
     predict: Callable[[gtsam.Values], gtsam.Values] | None = None
-    timestamps: Mapping[int, float] = field(default_factory=dict)
-    stand_ins: Mapping[int, int] = field(default_factory=dict)
+    timestamps: dict[int, float] = field(default_factory=dict)
+    stand_ins: dict[int, int] = field(default_factory=dict)
     keyframes: range = range(0)
 
 

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.graph.linear import linear_factor
-from pipelines.graph.problem import Array, Factor
+from pipelines.graph.problem import Array, Factor, Step
 
 # A stretch may bend the angle by this fraction of what gyro noise does over it ...
 _FRACTION = 0.2
@@ -71,7 +72,7 @@ class WalkingBias:
         """Number of nodes."""
         return len(self.edges) - 1
 
-    def node_at(self, time: Array) -> Array:
+    def node_at(self, time: Array) -> NDArray[np.intp]:
         """Index of the node in force at the times."""
         return np.clip(np.searchsorted(self.edges, time, side="right") - 1, 0, self.nodes - 1)
 
@@ -83,7 +84,25 @@ class WalkingBias:
         """Variable of the mean up to the end of a node's stretch; the first stretch's mean is its node."""
         return self.key(0) if node == 0 else int(gtsam.symbol("m", node))
 
-    def walk_factor(self, node: int) -> Factor:
+    def begin(self, step: Step, node: int, guess: Array) -> None:
+        """Add a node to a step; `guess` is (3,) rad/s. What determines the first is the caller's to add."""
+        step.initial.insert(self.key(node), guess)
+        if node > 0:
+            step.factors.append(self._walk_factor(node))
+
+    def end(self, step: Step, node: int, guess: Array) -> None:
+        """Add the mean up to the end of a node's stretch to a step; the first stretch's mean is its node."""
+        if node > 0:
+            step.initial.insert(self.mean_key(node), guess)
+            step.factors.append(self._mean_factor(node))
+
+    def keep(self, step: Step, nodes: range, means: range) -> None:
+        """Keep nodes, and means up to the end of stretches, alive until the step; a bias of one node never ages."""
+        if self.nodes > 1:
+            keys = [*map(self.key, nodes), *map(self.mean_key, means)]
+            step.timestamps.update(dict.fromkeys(keys, step.time))
+
+    def _walk_factor(self, node: int) -> Factor:
         """Joins a node to the one before it."""
         spacing = 0.5 * (self.edges[node + 1] - self.edges[node - 1])
         step = self.walk * np.sqrt(spacing)
@@ -94,7 +113,7 @@ class WalkingBias:
         """Sigma that gyro noise leaves to the bias of a stretch (s), rad/s."""
         return self.density / float(np.sqrt(stretch))
 
-    def mean_factor(self, node: int) -> Factor:
+    def _mean_factor(self, node: int) -> Factor:
         """Defines the mean at the end of a node's stretch from the one before and the node (native, linear)."""
         end = self.stop if node == self.nodes - 1 else self.edges[node + 1]
         whole, stretch = end - self.edges[0], end - self.edges[node]

@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import so3
-from factors.attitude import VisionAttitudeFactor, ahrs_factors
+from factors.attitude import VisionAttitudeFactor
 from factors.chi_square import gate
 from factors.earth import EARTH_RATE
-from factors.preintegration import GyroPath, Increments
+from factors.preintegration import GyroPath
 from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
 from pipelines.errors import InputError
+from pipelines.graph.gyro_chain import GyroChain, state
 from pipelines.graph.priors import rotation_prior, vector_prior
 from pipelines.graph.problem import (
     Array,
@@ -34,7 +35,6 @@ from pipelines.graph.problem import (
     rotation_vector_coordinates,
 )
 from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
-from pipelines.graph.walking_bias import WalkingBias
 from pipelines.methods.head.recording import HeadData
 from pipelines.settings import DEFAULT_NOISE, Config, check_names, first_given
 
@@ -53,18 +53,11 @@ _HELMET_KEY, _CAMERA_KEY, _OFFSET_KEY = (int(gtsam.symbol(c, 0)) for c in "HCT")
 class _Model:
     """The recording prepared for the graph: what every step needs."""
 
-    time: Array  # (K,) keyframes
+    chain: GyroChain  # iRv at the keyframes
     vision: NDArray[np.intp]  # (K,) index into the vision frames, -1 where a keyframe only bridges a gap
-    initial: Array  # (K, 4) iRv from vision
     measured: Array  # (frames, 4) cRh
     sqrt_information: Array  # (frames, 3, 3)
-    helmet: GyroPath
-    turns: Increments  # (K - 1,) of the helmet from keyframe to keyframe
     platform: GyroPath | None
-    variance_rate: float  # rad^2 / s of an increment, both gyros
-    scale_error: float  # sigma of an increment per angle turned
-    bias: WalkingBias
-    bias_hat: Array
     loss: TruncatedLoss
     parameters: tuple[Parameter, ...]
     helmet_guess: Array  # vRh
@@ -115,21 +108,22 @@ def _prepare(data: HeadData, config: Config) -> _Model:
     sigma = float(1.0 / np.median(np.linalg.norm(sqrt_information, axis=(1, 2)) / np.sqrt(3.0)))
     bias_hat, vRh = _guess(data, vision_t, iRh, sigma)
     time, vision = _keyframes(vision_t)
-    walk = first_given(config.noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk)
-    helmet = GyroPath(data.head_t, data.head_gyro, bias_hat)
+    chain = GyroChain.over(
+        time,
+        np.arange(len(time)) == 0,
+        so3.interpolate(vision_t, so3.multiply(iRh, so3.inverse(vRh)), time),
+        GyroPath(data.head_t, data.head_gyro, bias_hat),
+        density=density,
+        other_density=platform_density,
+        walk=first_given(config.noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk),
+        scale_error=first_given(config.noise.gyro_scale, DEFAULT_NOISE.gyro_scale),
+    )
     return _Model(
-        time=time,
+        chain=chain,
         vision=vision,
-        initial=so3.interpolate(vision_t, so3.multiply(iRh, so3.inverse(vRh)), time),
         measured=measured,
         sqrt_information=sqrt_information,
-        helmet=helmet,
-        turns=helmet.increments(time[:-1], time[1:]),
         platform=platform,
-        variance_rate=density**2 + platform_density**2,
-        scale_error=first_given(config.noise.gyro_scale, DEFAULT_NOISE.gyro_scale),
-        bias=WalkingBias.over(time[0], time[-1], 0.5 * (time[1:] + time[:-1]), walk, density),
-        bias_hat=bias_hat,
         loss=TruncatedLoss(gate(3)),
         parameters=_parameters(config, platform is not None),
         helmet_guess=vRh,
@@ -211,104 +205,57 @@ def _parameters(config: Config, platform: bool) -> tuple[Parameter, ...]:
     return parameters
 
 
-def _state(keyframe: int) -> int:
-    return int(gtsam.symbol("x", keyframe))
-
-
 def _steps(model: _Model, chunk: int, after: float = -np.inf) -> Iterator[Step]:
     """The first keyframe with the calibration variables and their priors, then `chunk` keyframes at a time."""
-    taken = int(np.searchsorted(model.time, after, side="right"))
+    time = model.chain.time
+    taken = int(np.searchsorted(time, after, side="right"))
     if taken == 0:
-        yield _first_step(model)
-    for begin in range(max(taken, 1), len(model.time), chunk):
-        yield _step(model, range(begin, min(begin + chunk, len(model.time))))
-
-
-def _first_step(model: _Model) -> Step:
-    initial = gtsam.Values()
-    initial.insert(_state(0), so3.to_gtsam(model.initial[0]))
-    initial.insert(model.bias.key(0), model.bias_hat)
-    initial.insert(_HELMET_KEY, so3.to_gtsam(model.helmet_guess))
-    initial.insert(_CAMERA_KEY, so3.to_gtsam(so3.identity()))
-    initial.insert(_OFFSET_KEY, np.zeros(1))
-    bias, helmet, camera, offset = model.parameters
-    priors = [
-        vector_prior(bias, np.zeros(3)),
-        rotation_prior(helmet),
-        rotation_prior(camera),
-        vector_prior(offset, np.zeros(1)),
-    ]
-    vision = _vision_factor(model, range(1))
-    return Step(
-        time=float(model.time[0]),
-        initial=initial,
-        factors=[*priors, *vision],
-        timestamps=_timestamps(model, range(1)),
-        keyframes=range(1),
-    )
+        yield _step(model, range(1))
+    for begin in range(max(taken, 1), len(time), chunk):
+        yield _step(model, range(begin, min(begin + chunk, len(time))))
 
 
 def _step(model: _Model, keyframes: range) -> Step:
-    initial = gtsam.Values()
-    for k in keyframes:
-        initial.insert(_state(k), so3.to_gtsam(model.initial[k]))
-    before = np.array([k - 1 for k in keyframes])
-    after = np.array(keyframes)
-    nodes = model.bias.node_at(0.5 * (model.time[before] + model.time[after]))
-    factors: list[Factor] = []
-    stand_ins: dict[int, int] = {}
-    last_node = int(_node(model, keyframes.start - 1))
-    for node in range(last_node + 1, int(nodes[-1]) + 1):
-        initial.insert(model.bias.key(node), model.bias_hat)
-        factors.append(model.bias.walk_factor(node))
-        if node >= 2:
-            initial.insert(model.bias.mean_key(node - 1), model.bias_hat)
-            factors.append(model.bias.mean_factor(node - 1))
-        stand_ins[model.bias.key(0)] = model.bias.key(node)
-    if keyframes.stop == len(model.time) and model.bias.nodes > 1:
-        end = model.bias.nodes - 1
-        initial.insert(model.bias.mean_key(end), model.bias_hat)
-        factors.append(model.bias.mean_factor(end))
-        stand_ins[model.bias.key(0)] = model.bias.mean_key(end)
-    increments = model.turns[before]
-    turned = model.scale_error * np.linalg.norm(so3.log(increments.wxyz), axis=1)
-    gyro = ahrs_factors(
-        [_state(k) for k in before],
-        [_state(k) for k in after],
-        [model.bias.key(int(n)) for n in nodes],
-        increments,
-        model.bias_hat,
-        model.variance_rate * increments.duration + turned**2 + increments.unseen,
-    )
-    return Step(
-        time=float(model.time[keyframes[-1]]),
-        initial=initial,
-        factors=[*factors, *(Factor("gyro", f) for f in gyro), *_vision_factor(model, keyframes)],
-        predict=partial(_predict, model, keyframes, initial),
-        timestamps=_timestamps(model, keyframes),
-        stand_ins=stand_ins,
+    chain = model.chain
+    step = Step(
+        time=float(chain.time[keyframes[-1]]),
+        predict=partial(chain.predict, keyframes, lambda k, _: chain.initial[k]),
         keyframes=keyframes,
     )
+    if keyframes.start == 0:
+        _begin(model, step)
+    chain.add(step)
+    step.factors.extend(_vision_factor(model, keyframes))
+    return step
 
 
-def _node(model: _Model, keyframe: int) -> int:
-    """The bias node of the increment that ends at a keyframe; the first keyframe's is the first node."""
-    if keyframe == 0:
-        return 0
-    return int(model.bias.node_at(0.5 * (model.time[keyframe - 1] + model.time[keyframe])))
+def _begin(model: _Model, step: Step) -> None:
+    """The calibration variables and their priors."""
+    step.initial.insert(_HELMET_KEY, so3.to_gtsam(model.helmet_guess))
+    step.initial.insert(_CAMERA_KEY, so3.to_gtsam(so3.identity()))
+    step.initial.insert(_OFFSET_KEY, np.zeros(1))
+    bias, helmet, camera, offset = model.parameters
+    step.factors.extend(
+        [
+            vector_prior(bias, np.zeros(3)),
+            rotation_prior(helmet),
+            rotation_prior(camera),
+            vector_prior(offset, np.zeros(1)),
+        ]
+    )
 
 
 def _vision_factor(model: _Model, keyframes: range) -> list[Factor]:
     seen = [k for k in keyframes if model.vision[k] >= 0]
     if not seen:
         return []
-    rows = model.vision[seen]
+    chain, rows = model.chain, model.vision[seen]
     rows_model = VisionAttitudeFactor(
-        model.time[seen], model.measured[rows], model.sqrt_information[rows], model.helmet, model.platform
+        chain.time[seen], model.measured[rows], model.sqrt_information[rows], chain.gyro, model.platform
     )
     columns: list[int | list[int]] = [
-        [_state(k) for k in seen],
-        [model.bias.key(_node(model, k)) for k in seen],
+        [state(k) for k in seen],
+        chain.bias_keys(seen),
         _CAMERA_KEY,
         _HELMET_KEY,
         _OFFSET_KEY,
@@ -317,50 +264,18 @@ def _vision_factor(model: _Model, keyframes: range) -> list[Factor]:
     return [Factor.of("vision", VectorizedFactor(rows_model, columns, kinds, model.loss))]
 
 
-def _timestamps(model: _Model, keyframes: range) -> dict[int, float]:
-    """States age; the bias in force and the mean so far stay alive until the next stretch."""
-    stamps = {_state(k): float(model.time[k]) for k in keyframes}
-    if model.bias.nodes == 1:
-        return stamps
-    now = float(model.time[keyframes[-1]])
-    first, last = _node(model, keyframes.start), _node(model, keyframes[-1])
-    for node in range(first, last + 1):
-        stamps[model.bias.key(node)] = now
-        if node >= 1:
-            stamps[model.bias.mean_key(node - 1)] = now
-    if keyframes.stop == len(model.time):
-        stamps[model.bias.mean_key(model.bias.nodes - 1)] = now
-    return stamps
-
-
-def _predict(model: _Model, keyframes: range, initial: gtsam.Values, current: gtsam.Values) -> gtsam.Values:
-    """The new variables from the current estimate: attitudes carried by the gyro, biases carried over."""
-    out = gtsam.Values()
-    previous = _node(model, keyframes.start - 1)
-    bias = current.atVector(model.bias.key(previous))
-    for key in initial.keys():
-        if gtsam.Symbol(key).chr() in (ord("b"), ord("m")):
-            out.insert(key, bias)
-    attitude = so3.from_gtsam([current.atRot3(_state(keyframes.start - 1))])[0]
-    for k in keyframes:
-        step = model.turns[k - 1]
-        correction = step.bias_jacobian @ (bias - model.bias_hat)
-        attitude = so3.compose(attitude, step.wxyz, so3.exp(correction))
-        out.insert(_state(k), so3.to_gtsam(attitude))
-    return out
-
-
 def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) -> Attitudes:
     """bRv at the vision frames' true times, stamp + time offset, on the gyro's clock."""
     seen = [k for k in keyframes if model.vision[k] >= 0]
     if not seen:
         return Attitudes(np.empty(0), np.empty((0, 4)))
-    stamps = model.time[seen]
+    chain = model.chain
+    stamps = chain.time[seen]
     at = stamps + float(values.atVector(_OFFSET_KEY)[0])
-    iRv = so3.from_gtsam([values.atRot3(_state(k)) for k in seen])
-    bias = np.array([values.atVector(model.bias.key(_node(model, k))) for k in seen])
-    step = model.helmet.increments(stamps, at)
-    correction = np.einsum("nij,nj->ni", step.bias_jacobian, bias - model.bias_hat)
+    iRv = so3.from_gtsam([values.atRot3(state(k)) for k in seen])
+    bias = np.array([values.atVector(key) for key in chain.bias_keys(seen)])
+    step = chain.gyro.increments(stamps, at)
+    correction = np.einsum("nij,nj->ni", step.bias_jacobian, bias - chain.gyro.bias_hat)
     iRv_at = so3.compose(iRv, step.wxyz, so3.exp(correction))
     if model.platform is None:
         return Attitudes(at, iRv_at)

@@ -437,60 +437,55 @@ def _steps(model: _Model, chunk: int) -> Iterator[Step]:
     """A step for every group; in batch (chunk > 1) its factor is handed over compressed."""
     seen: set[tuple[str, int]] = set()
     for i, group in enumerate(model.groups):
-        initial = gtsam.Values()
-        factors: list[Factor] = []
-        if i == 0:
-            _begin(model, initial, factors)
-        stand_ins = _bias_step(model, i, initial, factors)
-        factors.append(_measurement(model, i, seen, initial, factors, compress=chunk > 1))
-        yield Step(
+        step = Step(
             time=float(group.rates.edges[-1]),
-            initial=initial,
-            factors=factors,
-            timestamps=_timestamps(model, i),
-            stand_ins=stand_ins,
             keyframes=range(int(model.frame_edges[i]), int(model.frame_edges[i + 1])),
         )
+        if i == 0:
+            _begin(model, step)
+        _add_bias(model, i, step)
+        _add_measurement(model, i, seen, step, compress=chunk > 1)
+        yield step
 
 
-def _begin(model: _Model, initial: gtsam.Values, factors: list[Factor]) -> None:
+def _begin(model: _Model, step: Step) -> None:
     """The calibration variables and their priors."""
-    guesses = {_KEYS["theta"]: model.theta_guess / _THETA_UNIT, model.bias.key(0): model.bias_guess}
     for parameter in model.parameters:
         size = len(parameter.quantities)
-        initial.insert(parameter.key, guesses.get(parameter.key, np.zeros(size)))
         if parameter.key == _KEYS["theta"]:
+            step.initial.insert(parameter.key, model.theta_guess / _THETA_UNIT)
             noise = gtsam.noiseModel.Diagonal.Precisions((prior_sigmas(parameter) / _THETA_UNIT) ** -2)
-            factors.append(Factor("prior", gtsam.PriorFactorVector(parameter.key, np.zeros(size), noise)))
-        else:
-            factors.append(vector_prior(parameter, np.zeros(size)))
+            step.factors.append(Factor("prior", gtsam.PriorFactorVector(parameter.key, np.zeros(size), noise)))
+            continue
+        if parameter.key != FIRST_BIAS:
+            step.initial.insert(parameter.key, np.zeros(size))
+        step.factors.append(vector_prior(parameter, np.zeros(size)))
 
 
-def _bias_step(model: _Model, i: int, initial: gtsam.Values, factors: list[Factor]) -> dict[int, int]:
-    """Adds the bias of a group and the mean so far; returns what holds the reported bias from now on."""
-    if i == 0:
-        return {}
-    initial.insert(model.bias.key(i), model.bias_guess)
-    initial.insert(model.bias.mean_key(i), model.bias_guess)
-    factors += [model.bias.walk_factor(i), model.bias.mean_factor(i)]
-    return {model.bias.key(0): model.bias.mean_key(i)}
+def _add_bias(model: _Model, i: int, step: Step) -> None:
+    """The bias of a group and the mean so far, which is what is reported from then on."""
+    bias = model.bias
+    bias.begin(step, i, model.bias_guess)
+    bias.end(step, i, model.bias_guess)
+    alive = range(max(0, i + 1 - _KEPT), i + 1)
+    bias.keep(step, alive, alive)
+    if i > 0:
+        step.stand_ins[bias.key(0)] = bias.mean_key(i)
 
 
-def _measurement(
-    model: _Model, i: int, seen: set[tuple[str, int]], initial: gtsam.Values, factors: list[Factor], compress: bool
-) -> Factor:
-    """The factor of a group; adds the tilt of its position when that is new."""
+def _add_measurement(model: _Model, i: int, seen: set[tuple[str, int]], step: Step, compress: bool) -> None:
+    """The factor of a group, and the tilt of its position when that is new."""
     group = model.groups[i]
     options = model.options
     columns = [_KEYS["theta"], model.bias.key(i), *(_KEYS[name] for name in options)]
     if model.slow > 0.0 and group.position is not None:
-        axis, step = group.position
-        key = int(gtsam.symbol("o" if axis == "outer" else "i", step))
+        axis, position = group.position
+        key = int(gtsam.symbol("o" if axis == "outer" else "i", position))
         if group.position not in seen:
             seen.add(group.position)
-            initial.insert(key, np.zeros(3))
+            step.initial.insert(key, np.zeros(3))
             noise = gtsam.noiseModel.Isotropic.Sigma(3, model.slow)
-            factors.append(Factor("prior", gtsam.PriorFactorVector(key, np.zeros(3), noise)))
+            step.factors.append(Factor("prior", gtsam.PriorFactorVector(key, np.zeros(3), noise)))
         options, columns = (*options, "tilt"), [*columns, key]
     wander = model.slow if group.kind == "move" else 0.0
     # A resting encoder repeats its slow errors from edge to edge, a turning one need not (quantisation).
@@ -498,14 +493,7 @@ def _measurement(
     encoder = np.hypot(model.encoder, np.where(turning, model.slow, 0.0))
     average = IndexerAverageFactor.of(group.gyro, group.rates, model.density, encoder, options, wander, _THETA_UNIT)
     kinds = [3, 3, *(1 if name == "epsilon" else 3 for name in options)]
-    return Factor.of(group.kind, VectorizedFactor(average, columns, kinds, compress=compress))
-
-
-def _timestamps(model: _Model, i: int) -> dict[int, float]:
-    """The biases and means of the last groups stay alive; what all groups share never ages."""
-    now = float(model.groups[i].rates.edges[-1])
-    alive = range(max(0, i + 1 - _KEPT), i + 1)
-    return {key: now for k in alive for key in (model.bias.key(k), model.bias.mean_key(k))}
+    step.factors.append(Factor.of(group.kind, VectorizedFactor(average, columns, kinds, compress=compress)))
 
 
 def _frames(data: IndexerData, motion: AxisMotion) -> NDArray[np.intp]:

@@ -16,16 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import so3
-from factors.attitude import ahrs_factors
 from factors.chi_square import gate
 from factors.los import SMOOTHING, GimbalPath, LocalMotion, LosDirectionFactor
-from factors.preintegration import GyroPath, Increments
+from factors.preintegration import GyroPath
 from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
 from pipelines.errors import InputError
+from pipelines.graph.gyro_chain import GyroChain, state
 from pipelines.graph.priors import vector_prior
 from pipelines.graph.problem import Array, Factor, Parameter, Problem, Quantity, Step
 from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
-from pipelines.graph.walking_bias import WalkingBias
 from pipelines.methods.los.guess import camera, guess, initial_attitudes, seen
 from pipelines.methods.los.recording import LosData
 from pipelines.settings import DEFAULT_NOISE, Config, check_names, first_given
@@ -58,20 +57,12 @@ _FOLLOWERS = 5
 class _Model:
     """The recording prepared for the graph: what every step needs."""
 
-    time: Array  # (K,) keyframes: the pictures used
-    starts: NDArray[np.bool_]  # (K,) whether a keyframe is the first of its target
+    chain: GyroChain  # tRm at the keyframes, which are the pictures used; a new chain for every target found
     mount: Array  # first guess of the mounting angles
-    initial: Array  # (K, 4) tRm
     measured: Array  # (K, 3) phx, phz, roll
     sqrt_information: Array  # (K, 3, 3), zero rows for a roll not measured
     angles: Array  # (K, 2) azimuth, elevation
-    turns: Increments  # (K - 1,) of the gyro from keyframe to keyframe
-    bias_hat: Array  # first guess of the gyro's bias
     motion: LocalMotion | None  # around the keyframes, when the time offset is a variable
-    variance_rate: float  # rad^2 / s of an increment
-    scale_error: float  # sigma of an increment per angle turned
-    bias: WalkingBias
-    nodes: Array  # (K,) whole numbers: of the bias in force up to each keyframe
     loss: TruncatedLoss
     parameters: tuple[Parameter, ...]
 
@@ -104,7 +95,6 @@ def _prepare(data: LosData, config: Config) -> tuple[_Model, dict[str, int]]:
     parameters = _parameters(config)
     noise = config.noise
     density = first_given(noise.gyro_density, data.gyro_density, DEFAULT_NOISE.gyro_density)
-    walk = first_given(noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk)
     gimbal, gyro = GimbalPath(data.gimbal_t, data.gimbal), GyroPath(data.gyro_t, data.gyro)
     covariance = _covariance(data, gimbal, config)
     has_offset = len(parameters) == 3
@@ -117,23 +107,22 @@ def _prepare(data: LosData, config: Config) -> tuple[_Model, dict[str, int]]:
     names = tuple(q.name for q in parameters[0].quantities)
     gyro = GyroPath(data.gyro_t, data.gyro, bias_hat)
     motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal) if has_offset else None
-    middle = np.where(starts, time, 0.5 * (time + np.roll(time, 1)))
-    bias = WalkingBias.over(time[0], time[-1], middle, walk, density)
+    chain = GyroChain.over(
+        time,
+        starts,
+        initial_attitudes(chains, time, camera(angles, mount, names), measured, gyro),
+        gyro,
+        density=density,
+        walk=first_given(noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk),
+        scale_error=first_given(noise.gyro_scale, DEFAULT_NOISE.gyro_scale),
+    )
     model = _Model(
-        time=time,
-        starts=starts,
+        chain=chain,
         mount=mount,
-        initial=initial_attitudes(chains, time, camera(angles, mount, names), measured, gyro),
         measured=measured,
         sqrt_information=_sqrt_information(covariance[rows]),
         angles=angles,
-        turns=gyro.increments(time[:-1], time[1:]),
-        bias_hat=bias_hat,
         motion=motion,
-        variance_rate=density**2,
-        scale_error=first_given(noise.gyro_scale, DEFAULT_NOISE.gyro_scale),
-        bias=bias,
-        nodes=bias.node_at(middle),
         loss=TruncatedLoss(gate(3 if np.isfinite(measured[:, 2]).any() else 2)),
         parameters=parameters,
     )
@@ -263,87 +252,44 @@ def _parameters(config: Config) -> tuple[Parameter, ...]:
     return tuple(parameters)
 
 
-def _state(keyframe: int) -> int:
-    return int(gtsam.symbol("x", keyframe))
-
-
 def _steps(model: _Model, chunk: int, after: float = -np.inf) -> Iterator[Step]:
     """`chunk` keyframes at a time; the first step brings the calibration variables and their priors too."""
-    for begin in range(int(np.searchsorted(model.time, after, side="right")), len(model.time), chunk):
-        yield _step(model, range(begin, min(begin + chunk, len(model.time))))
+    time = model.chain.time
+    for begin in range(int(np.searchsorted(time, after, side="right")), len(time), chunk):
+        yield _step(model, range(begin, min(begin + chunk, len(time))))
 
 
 def _step(model: _Model, keyframes: range) -> Step:
-    initial = gtsam.Values()
-    factors: list[Factor] = []
-    if keyframes.start == 0:
-        factors += [vector_prior(p, np.zeros(len(p.quantities))) for p in model.parameters]
-        initial.insert(_ANGLES_KEY, model.mount)
-        initial.insert(model.bias.key(0), model.bias_hat)
-        if model.motion is not None:
-            initial.insert(_OFFSET_KEY, np.zeros(1))
-    stand_ins = _bias_step(model, keyframes, initial, factors)
-    for k in keyframes:
-        initial.insert(_state(k), so3.to_gtsam(model.initial[k]))
-    factors += [*_gyro_factors(model, keyframes), *_picture_factors(model, keyframes)]
-    return Step(
-        time=float(model.time[keyframes[-1]]),
-        initial=initial,
-        factors=factors,
-        predict=partial(_predict, model, keyframes, initial),
-        timestamps=_timestamps(model, keyframes),
-        stand_ins=stand_ins,
+    chain = model.chain
+    step = Step(
+        time=float(chain.time[keyframes[-1]]),
+        predict=partial(chain.predict, keyframes, partial(_found, model)),
         keyframes=keyframes,
     )
+    if keyframes.start == 0:
+        step.initial.insert(_ANGLES_KEY, model.mount)
+        if model.motion is not None:
+            step.initial.insert(_OFFSET_KEY, np.zeros(1))
+        step.factors.extend(vector_prior(p, np.zeros(len(p.quantities))) for p in model.parameters)
+    step.factors.extend(_start_factor(model, k) for k in keyframes if chain.starts[k])
+    chain.add(step)
+    step.factors.extend(_picture_factors(model, keyframes))
+    return step
 
 
-def _before(model: _Model, keyframes: range) -> int:
-    """The bias node that was in force before these keyframes."""
-    return int(model.nodes[max(keyframes.start - 1, 0)])
-
-
-def _bias_step(model: _Model, keyframes: range, initial: gtsam.Values, factors: list[Factor]) -> dict[int, int]:
-    """Adds the bias nodes that begin with these keyframes; returns what holds the reported bias from now on."""
-    bias, bias_hat = model.bias, model.bias_hat
-    stand_ins: dict[int, int] = {}
-    for node in range(_before(model, keyframes) + 1, int(model.nodes[keyframes[-1]]) + 1):
-        initial.insert(bias.key(node), bias_hat)
-        factors.append(bias.walk_factor(node))
-        if node >= 2:
-            initial.insert(bias.mean_key(node - 1), bias_hat)
-            factors.append(bias.mean_factor(node - 1))
-        stand_ins[bias.key(0)] = bias.key(node)
-    if keyframes.stop == len(model.time) and bias.nodes > 1:
-        end = bias.nodes - 1
-        initial.insert(bias.mean_key(end), bias_hat)
-        factors.append(bias.mean_factor(end))
-        stand_ins[bias.key(0)] = bias.mean_key(end)
-    return stand_ins
-
-
-def _gyro_factors(model: _Model, keyframes: range) -> list[Factor]:
-    """The gyro between pictures of one target; a wide prior where a target is found."""
-    found = [k for k in keyframes if model.starts[k]]
-    after = np.array([k for k in keyframes if not model.starts[k]], dtype=int)
-    increments = model.turns[after - 1]
-    turned = model.scale_error * np.linalg.norm(so3.log(increments.wxyz), axis=1)
-    native = ahrs_factors(
-        [_state(k) for k in after - 1],
-        [_state(k) for k in after],
-        [model.bias.key(int(model.nodes[k])) for k in after],
-        increments,
-        model.bias_hat,
-        model.variance_rate * increments.duration + turned**2 + increments.unseen,
-    )
-    return [*(_start_factor(model, k) for k in found), *(Factor("gyro", f) for f in native)]
+def _found(model: _Model, k: int, current: gtsam.Values) -> Array:
+    """tRm (4,) where a target is found, with the mounting angles as estimated by now."""
+    cRm = camera(model.angles[k : k + 1], current.atVector(_ANGLES_KEY), model.names)
+    return seen(cRm, model.measured[k : k + 1])[0]
 
 
 def _start_factor(model: _Model, k: int) -> Factor:
     """Wide prior on the first attitude of a target."""
     rolls = np.isfinite(model.measured[:, 2]).any()
     sigmas = np.array([_WIDE, _WIDE if rolls else _HELD, _WIDE])
-    noise = gtsam.noiseModel.Gaussian.SqrtInformation(so3.matrix(model.initial[k]) / sigmas[:, None], False)
-    return Factor("prior", gtsam.PriorFactorRot3(_state(k), so3.to_gtsam(model.initial[k]), noise))
+    initial = model.chain.initial[k]
+    noise = gtsam.noiseModel.Gaussian.SqrtInformation(so3.matrix(initial) / sigmas[:, None], False)
+    return Factor("prior", gtsam.PriorFactorRot3(state(k), so3.to_gtsam(initial), noise))
 
 
 def _picture_factors(model: _Model, keyframes: range) -> list[Factor]:
@@ -359,55 +305,19 @@ def _picture_factors(model: _Model, keyframes: range) -> list[Factor]:
 
 def _picture_factor(model: _Model, k: NDArray[np.intp], rows: int, family: str) -> Factor:
     rows_model = LosDirectionFactor(
-        model.time[k],
+        model.chain.time[k],
         model.measured[k, :rows],
         model.sqrt_information[k, :rows, :rows],
         model.angles[k],
         model.names,
         None if model.motion is None else model.motion[k],
     )
-    columns: list[int | list[int]] = [[_state(i) for i in k], _ANGLES_KEY]
+    columns: list[int | list[int]] = [[state(i) for i in k], _ANGLES_KEY]
     kinds: list[Kind] = ["rotation", len(model.names)]
     if model.motion is not None:
-        columns += [[model.bias.key(int(n)) for n in model.nodes[k]], _OFFSET_KEY]
+        columns += [model.chain.bias_keys(k), _OFFSET_KEY]
         kinds += [3, 1]
     return Factor.of(family, VectorizedFactor(rows_model, columns, kinds, model.loss))
-
-
-def _timestamps(model: _Model, keyframes: range) -> dict[int, float]:
-    """States age; the bias in force and the mean so far stay alive until the next stretch."""
-    stamps = {_state(k): float(model.time[k]) for k in keyframes}
-    bias = model.bias
-    if bias.nodes == 1:
-        return stamps
-    now = float(model.time[keyframes[-1]])
-    for node in range(_before(model, keyframes), int(model.nodes[keyframes[-1]]) + 1):
-        stamps[bias.key(node)] = now
-        if node >= 1:
-            stamps[bias.mean_key(node - 1)] = now
-    if keyframes.stop == len(model.time):
-        stamps[bias.mean_key(bias.nodes - 1)] = now
-    return stamps
-
-
-def _predict(model: _Model, keyframes: range, initial: gtsam.Values, current: gtsam.Values) -> gtsam.Values:
-    """The new variables from the current estimate: attitudes carried by the gyro or seen anew, biases carried over."""
-    out = gtsam.Values()
-    bias = current.atVector(model.bias.key(_before(model, keyframes)))
-    for key in initial.keys():
-        if gtsam.Symbol(key).chr() in (ord("b"), ord("m")):
-            out.insert(key, bias)
-    for k in keyframes:
-        if model.starts[k]:
-            cRm = camera(model.angles[k : k + 1], current.atVector(_ANGLES_KEY), model.names)
-            attitude = seen(cRm, model.measured[k : k + 1])[0]
-        else:
-            before = out if out.exists(_state(k - 1)) else current
-            step = model.turns[k - 1]
-            previous = so3.from_gtsam([before.atRot3(_state(k - 1))])[0]
-            attitude = so3.compose(previous, step.wxyz, so3.exp(step.bias_jacobian @ (bias - model.bias_hat)))
-        out.insert(_state(k), so3.to_gtsam(attitude))
-    return out
 
 
 def _advice(weights: Mapping[str, float]) -> str:
