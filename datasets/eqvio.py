@@ -194,7 +194,7 @@ def two_view_rotations(recording: Recording) -> tuple[Index, Index, Array]:
 def hand_eye(recording: Recording) -> tuple[Array, Array]:
     """vRc (4,) and gyro bias (3,) from rates between two views: the gyro's = vRc the camera's + bias.
 
-    Kabsch's method. Two views of few near features may be far off, so it is repeated on the half that fits best.
+    Two views of few near features may be far off, so it is repeated on the half that fits best.
     """
     i, j, seen = two_view_rotations(recording)
     span = (recording.time[j] - recording.time[i])[:, None]
@@ -205,10 +205,9 @@ def hand_eye(recording: Recording) -> tuple[Array, Array]:
     for _ in range(10):
         good = off <= np.median(off)
         centre, gyro_centre = np.median(by_camera[good], axis=0), np.median(by_gyro[good], axis=0)
-        u, _, vt = np.linalg.svd((by_gyro[good] - gyro_centre).T @ (by_camera[good] - centre))
-        vRc = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-        off = np.linalg.norm(by_gyro - gyro_centre - (by_camera - centre) @ vRc.T, axis=1)
-    return so3.from_matrix(vRc), gyro_centre - vRc @ centre
+        vRc = so3.align(by_gyro[good] - gyro_centre, by_camera[good] - centre)
+        off = np.linalg.norm(by_gyro - gyro_centre - so3.rotate(vRc, by_camera - centre), axis=1)
+    return vRc, gyro_centre - so3.rotate(vRc, centre)
 
 
 def problem(recording: Recording, start: Array, bias: Array) -> Problem:

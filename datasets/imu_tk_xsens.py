@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from factors import so3
 from pipelines.errors import InputError
 from pipelines.methods.cube.recording import CubeData, write_cube
 
@@ -97,8 +98,7 @@ def as_on_sheet(values: Mapping[str, float]) -> tuple[Sheet, Sheet]:
         A = np.linalg.inv(K)
         scale = np.linalg.norm(A, axis=1)
         found.append(Sheet(scale, A / scale[:, None], -A @ [values[f"{name}_b{i}"] for i in "123"]))
-    u, _, vt = np.linalg.svd(found[0].misalignment.T @ ACCEL_SHEET.misalignment)
-    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    turn = so3.matrix(so3.align(found[0].misalignment, ACCEL_SHEET.misalignment))
     accel, gyro = (Sheet(s.scale, s.misalignment @ turn, s.offset) for s in found)
     return accel, gyro
 

@@ -113,8 +113,7 @@ def _reprojection(block: Block, body: TagBody) -> list[float]:
 def _apart(found: TagBody, published: TagBody, keep: NDArray[np.bool_]) -> tuple[float, float]:
     """Root mean square distance (m) and angle (rad) between the tags of two layouts laid over each other."""
     a, b = found.corners.reshape(-1, 3), published.corners[keep].reshape(-1, 3)
-    u, _, vt = np.linalg.svd((b - b.mean(axis=0)).T @ (a - a.mean(axis=0)))
-    turn = so3.from_matrix(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+    turn = so3.align(b - b.mean(axis=0), a - a.mean(axis=0))
     moved = so3.rotate(turn, found.position - a.mean(axis=0)) + b.mean(axis=0)
     distance = np.linalg.norm(moved - published.position[keep], axis=1)
     angle = np.linalg.norm(

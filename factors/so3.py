@@ -182,6 +182,23 @@ def right_jacobian_inverse(phi: ArrayLike) -> Array:
     return np.eye(3) + 0.5 * k + a * (k @ k)
 
 
+def align(a: ArrayLike, b: ArrayLike, weights: ArrayLike = 1.0) -> Array:
+    """The rotation aRb (..., 4) that minimises the sum of weights |a - aRb b|^2 over n vectors, (..., n, 3) each.
+
+    Vectors in one plane determine it, those along one line leave the turn about that line to chance. Positions are to
+    be given less their means. Kabsch, Acta Crystallographica A32 (1976) 922.
+
+    Args:
+        a, b: the same vectors in frame a and in frame b.
+        weights: (..., n), not negative; or one for all.
+    """
+    a, b, weights = np.asarray(a, dtype=float), np.asarray(b, dtype=float), np.asarray(weights, dtype=float)
+    u, _, vt = np.linalg.svd(np.swapaxes(a * weights[..., None], -1, -2) @ b)
+    # The nearest orthogonal matrix may be a reflection; the least certain axis is then turned round.
+    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    return from_matrix(u @ vt)
+
+
 def interpolate(t: ArrayLike, q: ArrayLike, at: ArrayLike) -> Array:
     """Attitudes at the times `at` on the constant-rate arcs between the samples (t, q), t increasing.
 

@@ -85,3 +85,30 @@ def test_interpolate_follows_constant_rates() -> None:
     np.testing.assert_allclose(
         so3.interpolate(t, so3.exp(t[:, None] * rate), at), so3.exp(at[:, None] * rate), atol=1e-14
     )
+
+
+def test_align_finds_the_rotation_between_vectors() -> None:
+    aRb, b = so3.exp(RNG.normal(size=(6, 3))), RNG.normal(size=(6, 5, 3))
+    found = so3.align(so3.rotate(aRb[:, None], b), b)
+    np.testing.assert_allclose(so3.log(so3.multiply(so3.inverse(aRb), found)), 0.0, atol=1e-12)
+
+
+def test_align_is_a_minimum_and_never_a_reflection() -> None:
+    a, b, weights = RNG.normal(size=(5, 3)), RNG.normal(size=(5, 3)), RNG.uniform(0.1, 2.0, 5)
+    a[:, 2] *= -1e-3
+
+    def cost(q: np.ndarray) -> float:
+        return float((weights[:, None] * (a - so3.rotate(q, b)) ** 2).sum())
+
+    for mirrored in (b, -b):
+        best = so3.align(a, mirrored, weights)
+        b = mirrored
+        assert all(cost(best) < cost(so3.multiply(best, so3.exp(d))) for d in 1e-3 * np.vstack([np.eye(3), -np.eye(3)]))
+        assert all(cost(best) <= cost(so3.exp(phi)) for phi in RNG.normal(size=(200, 3)))
+
+
+def test_align_of_vectors_without_weight_counts_nothing() -> None:
+    aRb, b = so3.exp([0.3, -0.2, 0.5]), RNG.normal(size=(4, 3))
+    a = so3.rotate(aRb, b)
+    a[0] = [9.0, 9.0, 9.0]
+    np.testing.assert_allclose(so3.align(a, b, [0.0, 1.0, 1.0, 1.0]), aRb, atol=1e-12)

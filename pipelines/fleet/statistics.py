@@ -105,7 +105,8 @@ def spread(values: Array, sigmas: Array, centre: float | None = None) -> Spread:
     where = centre if centre is not None else float(np.median(values))
     for _ in range(20):
         if centre is None:
-            where = _weighted_median(values, 1.0 / np.hypot(tau, sigmas))
+            weights = 1.0 / np.hypot(tau, sigmas)
+            where = float(np.quantile(values, 0.5, weights=weights, method="inverted_cdf"))
         previous, tau = tau, _excess((values - where) ** 2, sigmas**2)
         if math.isclose(tau, previous, rel_tol=1e-6):
             break
@@ -164,12 +165,6 @@ def changes(times: Sequence[float]) -> list[tuple[int, int]]:
 def varies(z: Array) -> bool:
     """Whether most units change beyond two sigmas: then sessions differ by nature, as a turn-on bias does."""
     return len(z) >= ENOUGH and float((np.abs(z) > 2.0).mean()) > 0.5
-
-
-def _weighted_median(values: Array, weights: Array) -> float:
-    order = np.argsort(values, kind="stable")
-    share = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(share, 0.5 * share[-1])])
 
 
 def _excess(squares: Array, variances: Array) -> float:

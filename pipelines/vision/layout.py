@@ -194,13 +194,11 @@ def _options() -> Any:
 
 
 def _squares(body: TagBody, corners: Array) -> TagBody:
-    """The body with each tag, but for the first, at the rigid square nearest to its corners (n, 4, 3) (Kabsch)."""
+    """The body with each tag, but for the first, at the rigid square nearest to its corners (n, 4, 3)."""
     bRt, position = body.bRt.copy(), corners.mean(axis=1)
     position[0] = body.position[0]
     local = so3.rotate(so3.inverse(body.bRt)[:, None], body.corners - body.position[:, None])
-    for k in range(1, len(body.ids)):
-        u, _, vt = np.linalg.svd((corners[k] - position[k]).T @ local[k])
-        bRt[k] = so3.from_matrix(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+    bRt[1:] = so3.align((corners - position[:, None])[1:], local[1:])
     return TagBody(body.ids, body.size, bRt, position, body.family)
 
 

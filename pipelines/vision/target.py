@@ -244,13 +244,11 @@ class _Texture:
 
 def _turn(match: _Match, camera: Camera) -> tuple[Array, Array]:
     """ckRc0 (4,) that turns the first directions into those now, and the covariance of a turn in c, (3, 3) rad^2."""
-    U, _, Vt = np.linalg.svd(match.now.T @ match.first)
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt
     n = len(match.now)
     # A direction tells nothing of a turn about itself.
     information = n * np.eye(3) - match.now.T @ match.now
     sigma = match.sigma_px / float(camera.focal.mean())
-    return so3.from_matrix(R), np.asarray(sigma**2 * np.linalg.inv(information))
+    return so3.align(match.now, match.first), np.asarray(sigma**2 * np.linalg.inv(information))
 
 
 def _miss(match: _Match, ckRc0: Array, camera: Camera) -> Array:

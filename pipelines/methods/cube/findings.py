@@ -59,7 +59,7 @@ def parts_of(K: Array) -> Array:
     """Scales (3), nonorthogonalities (3) and mounting (3) of a triad whose nominal = K raw + b; shape (9,).
 
     The rows of K^-1 are the sensitive axes in the body, as long as their scales; the mounting is the rotation nearest
-    to the unit axes (polar decomposition). Raises ValueError when K is singular or its axes are left-handed.
+    to the unit axes. Raises ValueError when K is singular or its axes are left-handed.
     """
     if not np.linalg.det(K) > 0.0:
         raise ValueError("K is singular or left-handed")
@@ -67,8 +67,7 @@ def parts_of(K: Array) -> Array:
     scale = np.linalg.norm(axes, axis=1)
     axes /= scale[:, None]
     across = (axes @ axes.T)[[0, 0, 1], [1, 2, 2]]
-    u, _, vt = np.linalg.svd(axes)
-    mounting = so3.log(so3.from_matrix((u @ vt).T))
+    mounting = so3.log(so3.align(axes, np.eye(3)))
     return np.concatenate([scale, np.arcsin(np.clip(across, -1.0, 1.0)), mounting])
 
 

@@ -84,14 +84,8 @@ def _turns_not(gyro: Array, runs: NDArray[np.intp], sigma: float) -> NDArray[np.
     """Which runs have the mean rate that most of the quiet time has."""
     means = np.array([gyro[a : b + 1].mean(axis=0) for a, b in runs]).reshape(-1, 3)
     lengths = runs[:, 1] - runs[:, 0] + 1
-    middle = np.array([_weighted_median(column, lengths) for column in means.T])
+    if not len(runs):
+        return np.zeros(0, dtype=bool)
+    middle = np.quantile(means, 0.5, axis=0, weights=lengths, method="inverted_cdf")
     allowed = _STEADY + 5.0 * sigma / np.sqrt(lengths)
-    return np.asarray(np.abs(means - middle).max(axis=1, initial=0.0) < allowed)
-
-
-def _weighted_median(values: Array, weights: NDArray[np.intp]) -> float:
-    if not len(values):
-        return 0.0
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
+    return np.asarray(np.abs(means - middle).max(axis=1) < allowed)

@@ -156,8 +156,8 @@ def _keyframes(vision_t: Array) -> tuple[Array, NDArray[np.intp]]:
 def _guess(data: HeadData, vision_t: Array, iRh: Array, sigma: float) -> tuple[Array, Array]:
     """First guess of the gyro bias (3,) and vRh (4,) from rates: w_v = vRh w_h + bias over short windows.
 
-    Rates seen by vision beyond what the gyro's length allows are outliers. The mount is taken from the singular value
-    decomposition (Kabsch) when the motion is about more than one axis, else as the identity.
+    Rates seen by vision beyond what the gyro's length allows are outliers. The mount is the rotation between the
+    rates when the motion is about more than one axis, else the identity.
     """
     stride = max(1, round(_GUESS_SPAN / max(float(np.median(np.diff(vision_t))), 1e-3)))
     if len(vision_t) <= stride:
@@ -171,12 +171,12 @@ def _guess(data: HeadData, vision_t: Array, iRh: Array, sigma: float) -> tuple[A
     if good.sum() < _FEWEST_FRAMES:
         return np.zeros(3), so3.identity()
     gyro, seen = gyro[good], seen[good]
-    u, s, vt = np.linalg.svd((gyro - gyro.mean(axis=0)).T @ (seen - seen.mean(axis=0)))
+    a, b = gyro - gyro.mean(axis=0), seen - seen.mean(axis=0)
+    s = np.linalg.svd(a.T @ b, compute_uv=False)
     noise = 2.0 * (sigma / _GUESS_SPAN) ** 2 * len(gyro)
-    vRh = np.eye(3)
-    if s[1] > 3.0 * noise / np.sqrt(len(gyro)) and s[1] > 0.01 * s[0]:
-        vRh = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return np.median(gyro - seen @ vRh.T, axis=0), so3.from_matrix(vRh)
+    two_axes = s[1] > 3.0 * noise / np.sqrt(len(gyro)) and s[1] > 0.01 * s[0]
+    vRh = so3.align(a, b) if two_axes else so3.identity()
+    return np.median(gyro - so3.rotate(vRh, seen), axis=0), vRh
 
 
 def _parameters(config: Config, platform: bool) -> tuple[Parameter, ...]:

@@ -406,11 +406,10 @@ def _guess(groups: tuple[Group, ...]) -> tuple[Array, Array]:
     gyro = np.array([g.mean_gyro for g in groups])
     weight = np.array([g.duration for g in groups])
     b = _fit(w, gyro, weight)[1]
-    moment = ((gyro - b) * weight[:, None]).T @ w
     # A trace of the identity decides what one axis alone leaves open.
-    u, _, vt = np.linalg.svd(moment + 1e-6 * np.linalg.norm(moment) * np.eye(3))
-    mRt = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return mounting_angles(so3.inverse(so3.from_matrix(mRt))), b
+    trace = 1e-6 * np.linalg.norm(((gyro - b) * weight[:, None]).T @ w)
+    tRm = so3.align(np.vstack([w, np.eye(3)]), np.vstack([gyro - b, np.eye(3)]), np.append(weight, np.full(3, trace)))
+    return mounting_angles(tRm), b
 
 
 def _scatter(motion: AxisMotion) -> float:
