@@ -12,7 +12,7 @@ from factors import so3
 from factors.attitude import ahrs_factors
 from factors.gyro import GyroIncrementFactor
 from factors.preintegration import GyroPath
-from factors.vectorized import Ensemble, VectorizedFactor
+from factors.vectorized import Ensemble
 from pipelines.solvers.batch import CHUNK
 
 SAMPLES, WINDOWS = 300_000, 36_000
@@ -43,11 +43,7 @@ def run() -> Iterator[Ratio]:
     for key, size in [(BIAS, 3), (SCALE, 6), (G, 9)]:
         values.insert(key, np.zeros(size))
     factors = [
-        VectorizedFactor(
-            GyroIncrementFactor(edges[k + 1], turns[k], path, np.full(len(k), 1e-5)),
-            [k.tolist(), (k + 1).tolist(), BIAS, SCALE, G],
-            ["rotation", "rotation", 3, 6, 9],
-        )
+        GyroIncrementFactor(edges[k + 1], turns[k], path, np.full(len(k), 1e-5)).on(k, k + 1, BIAS, SCALE, G)
         for k in np.array_split(np.arange(WINDOWS), WINDOWS // CHUNK)
     ]
     ours, native = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()

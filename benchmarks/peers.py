@@ -20,8 +20,8 @@ from benchmarks.batch import build, solve
 from benchmarks.measure import Ratio, costs
 from factors import so3
 from factors.attitude import RelativeAttitudeFactor
+from factors.model import Model
 from factors.preintegration import GyroPath
-from factors.vectorized import Model
 from pipelines.config import load_config
 from pipelines.graph.problem import Problem
 from pipelines.methods.los import graph as los

@@ -5,23 +5,20 @@ The indexer's graph is not here: its rows are means over turns, three a turn, an
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.measure import Ratio, costs
 from factors import so3
 from factors.los import LosRateFactor, rate_matrix
+from factors.model import Array, Model, Residuals
 from factors.triad import AccelFactor
-from factors.vectorized import Model, VectorizedFactor
 from pipelines.graph.problem import Factor
 from pipelines.solvers.batch import optimize
-
-Array = NDArray[np.float64]
 
 ROWS = 2_000_000
 SAME = 1e-9  # relative
@@ -29,18 +26,19 @@ GRAVITY = 9.8
 
 
 @dataclass(frozen=True)
-class AtKnownAttitudes:
+class AtKnownAttitudes(Model):
     """An accelerometer whose attitudes are known: of its factor, the triad alone is a variable."""
 
     whole: AccelFactor
     nRb: Array
     rows: int = 3
+    blocks = (12,)
 
     @property
     def time(self) -> Array:
         return self.whole.time
 
-    def __call__(self, triads: Array) -> tuple[Array, Callable[[], tuple[Array, ...]]]:
+    def __call__(self, triads: Array) -> Residuals:
         residuals, jacobians = self.whole(self.nRb, triads)
         return residuals, lambda: jacobians()[1:]
 
@@ -71,7 +69,7 @@ def accelerometer() -> tuple[Model, Array]:
 
 def ours(model: Model, start: Array) -> Array:
     """By the batch solver's loop."""
-    measurement = VectorizedFactor(model, [0], [len(start)], compress=True)
+    measurement = model.on(0, compress=True)
     values = gtsam.Values()
     values.insert(0, start)
     return optimize([Factor.of("rows", measurement)], values, [0], None).values.atVector(0)

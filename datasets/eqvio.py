@@ -13,7 +13,7 @@ Frames: v gyro (IMU), c camera (x right, y down, z ahead), w does not turn. The 
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 from factors import so3
 from factors.attitude import ahrs_factors
 from factors.chi_square import gate
+from factors.loss import TruncatedLoss
+from factors.model import ROT3, Array, Model, Residuals
 from factors.preintegration import GyroPath
-from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
 from pipelines.graph.problem import Estimate, Factor, Parameter, Problem, Quantity, Step, rotation_vector_coordinates
 from pipelines.solvers.batch import solve_batch
 
-Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
 # rad/s/sqrt(Hz). At rest it is 1.7e-4; in flight rotors shake the gyro (third differences of its samples: 1e-3 about x,
@@ -102,7 +102,7 @@ def read() -> Recording:
 
 
 @dataclass(frozen=True)
-class FeatureFactor:
+class FeatureFactor(Model):
     """Features seen again, each given by its place in the frame where it was first seen and its inverse depth there.
 
     Predicted: the direction cRw (wRa (x, y, 1) + rho (p_a - p)), wRc = wRv Exp(dt rate) vRc, a the first sight. Blocks:
@@ -122,11 +122,12 @@ class FeatureFactor:
     rate: Array
     sigma: float
     rows: int = 2
+    blocks = (ROT3, ROT3, ROT3, 3, 3, 3, 1)
     stacked: ClassVar = ("time", "seen", "rate_a", "rate")
 
     def __call__(
         self, wRv_a: Array, wRv: Array, vRc: Array, p_a: Array, p: Array, point: Array, dt: Array
-    ) -> tuple[Array, Callable[[], tuple[Array, ...]]]:
+    ) -> Residuals:
         """Residual (predicted - seen) / sigma, (n, 2)."""
         ray = np.concatenate([point[:, :2], np.ones((len(point), 1))], axis=1)
         rho = point[:, 2:]
@@ -311,7 +312,7 @@ def _feature_factors(recording: Recording, rate: Array, values: gtsam.Values, lo
             rate[recording.frame[rows]],
             FEATURE_SIGMA,
         )
-        columns: list[int | list[int]] = [
+        measurement = model.on(
             [_state(int(a)) for a in anchor[rows]],
             [_state(k)] * len(rows),
             MOUNT,
@@ -319,9 +320,9 @@ def _feature_factors(recording: Recording, rate: Array, values: gtsam.Values, lo
             [_place(k)] * len(rows),
             [_point(int(t)) for t in recording.track[rows]],
             OFFSET,
-        ]
-        kinds: list[Kind] = ["rotation", "rotation", "rotation", 3, 3, 3, 1]
-        yield Factor.of("features", VectorizedFactor(model, columns, kinds, loss))
+            loss=loss,
+        )
+        yield Factor.of("features", measurement)
 
 
 def error(vRc: Array, published: Array) -> Array:

@@ -7,19 +7,15 @@ frame at the session's start, held fixed ("inertial"). Source: methods page, sec
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from factors import so3
+from factors.model import ROT3, Array, Model, Residuals
 from factors.preintegration import GyroPath, Increments
-
-Array = NDArray[np.float64]
-Residuals = tuple[Array, Callable[[], tuple[Array, ...]]]
 
 
 def ahrs_factors(
@@ -56,7 +52,7 @@ def ahrs_factors(
 
 
 @dataclass(frozen=True)
-class RelativeAttitudeFactor:
+class RelativeAttitudeFactor(Model):
     """Relative attitude over n windows when the attitude itself is wanted as the variable: bRv_j = dB^T bRv_i dV(bias).
 
     Blocks: bRv_i, bRv_j (rotations), gyro bias (3). The head method uses `ahrs_factors` on iRv instead, which is the
@@ -76,6 +72,7 @@ class RelativeAttitudeFactor:
     bias_hat: Array
     sigma: Array
     rows: int = 3
+    blocks = (ROT3, ROT3, 3)
 
     def __call__(self, bRv_i: Array, bRv_j: Array, bias: Array) -> Residuals:
         """Residual Log((dB^T bRv_i dV)^T bRv_j) / sigma, (n, 3)."""
@@ -95,7 +92,7 @@ class RelativeAttitudeFactor:
 
 
 @dataclass(frozen=True)
-class VisionAttitudeFactor:
+class VisionAttitudeFactor(Model):
     """Attitudes of the helmet's marker frame seen by the platform's camera, at an unknown time offset.
 
     Predicted: cRh = cRb bRv(t + dt) vRh with bRv(t + dt) = iRb(t + dt)^T iRv(t) dV(t, t + dt; bias), the gyros' own
@@ -116,6 +113,7 @@ class VisionAttitudeFactor:
     helmet: GyroPath
     platform: GyroPath | None
     rows: int = 3
+    blocks = (ROT3, 3, ROT3, ROT3, 1)
     stacked: ClassVar = ("time", "measured", "sqrt_information")
 
     def __call__(self, iRv: Array, bias: Array, cRb: Array, vRh: Array, dt: Array) -> Residuals:

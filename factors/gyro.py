@@ -19,12 +19,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factors import so3
+from factors.model import ROT3, Array, Block, Model
 from factors.preintegration import GyroPath, Increments
 
-Array = NDArray[np.float64]
 # Derivatives by bias (n, 3, 3), by scale (n, 3, 6) and, where there is one, by g-sensitivity (n, 3, 9).
 Jacobians = Callable[[], tuple[Array, ...]]
 
@@ -97,7 +96,7 @@ def correction(turns: Increments, bias_error: Array, scale: Array, g: Array | No
 
 
 @dataclass(frozen=True)
-class GyroIncrementFactor:
+class GyroIncrementFactor(Model):
     """Attitudes joined by what a gyro measured between them, over n windows: iRm_j = iRm_i dV(bias, scale, g).
 
     The gyro's part of gtsam's AHRSFactor, to which it is equal where scale and g are zero. Blocks: iRm_i, iRm_j
@@ -116,6 +115,11 @@ class GyroIncrementFactor:
     sigma: Array
     rows: int = 3
     stacked: ClassVar = ("time", "turns", "sigma")
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """iRm_i, iRm_j, bias, scale and, with the turns' g_jacobian, g."""
+        return (ROT3, ROT3, 3, 6) if self.turns.g_jacobian is None else (ROT3, ROT3, 3, 6, 9)
 
     def __call__(
         self, iRm_i: Array, iRm_j: Array, bias: Array, scale: Array, g: Array | None = None

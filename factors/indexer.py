@@ -12,7 +12,6 @@ tRm = Exp(theta_z ez) Exp(theta_y ey) Exp(theta_x ex). Source: CN115265591B; met
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,9 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factors import so3
+from factors.model import Array, Block, Model, Residuals
 
-Array = NDArray[np.float64]
-Residuals = tuple[Array, Callable[[], tuple[Array, ...]]]
 Option = Literal["scale", "epsilon", "tilt"]
 
 _EX, _EY, _EZ = np.eye(3)
@@ -173,7 +171,7 @@ def gyro_means(edges: Array, rate: Array, cuts: NDArray[np.intp]) -> Array:
 
 
 @dataclass(frozen=True)
-class IndexerAverageFactor:
+class IndexerAverageFactor(Model):
     """Mean gyro rate over n adjoining windows against the mean that the encoders and the earth's rate say.
 
         gyro = (1 + scale) * mRt w + bias,    w = fixed + cos(epsilon) cosine + sin(epsilon) sine
@@ -232,6 +230,11 @@ class IndexerAverageFactor:
     def time(self) -> Array:
         """(n,) ends of the windows, s."""
         return self.rates.edges[1:]
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """theta, bias and the options."""
+        return (3, 3, *(1 if option == "epsilon" else 3 for option in self.options))
 
     def __call__(self, theta: Array, bias: Array, *more: Array) -> Residuals:
         """Residual sqrt_information * (tRm (gyro - bias) / (1 + scale) - Exp(tilt) w), (n, 3)."""

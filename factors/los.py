@@ -14,7 +14,6 @@ page, section 1.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
@@ -23,9 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factors import so3
-
-Array = NDArray[np.float64]
-Residuals = tuple[Array, Callable[[], tuple[Array, ...]]]
+from factors.model import ROT3, Array, Block, Model, Residuals
 
 # The turns of cRm, right to left, and their axes.
 _TURNS = {
@@ -131,7 +128,7 @@ def _local_polynomials(at: Array, t: Array, values: Array, degree: int) -> Array
 
 
 @dataclass(frozen=True)
-class LosDirectionFactor:
+class LosDirectionFactor(Model):
     """LOS errors of one fixed target, exact for mounting angles of any size.
 
     Predicted: phz = atan2(dx, dy), phx = -atan2(dz, dy) with d = cRm tRm^T ey and, as a third row, the camera's roll
@@ -161,6 +158,11 @@ class LosDirectionFactor:
     def rows(self) -> int:
         """2, or 3 with the roll."""
         return self.measured.shape[1]
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """tRm, the angles and, with motion, bias and time offset."""
+        return (ROT3, len(self.names)) if self.motion is None else (ROT3, len(self.names), 3, 1)
 
     def __call__(self, tRm: Array, angles: Array, bias: Array | None = None, dt: Array | None = None) -> Residuals:
         """Residual sqrt_information * (measured - predicted), (n, 2) or (n, 3)."""
@@ -270,7 +272,7 @@ def _picture_jacobian(cRt: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class LosRateFactor:
+class LosRateFactor(Model):
     """The linear model: LOS rates = H X, X = [px, gx, gy, dz] (static), second-order terms dropped. Block: X (4, rad).
 
     Attributes:
@@ -285,6 +287,7 @@ class LosRateFactor:
     H: Array
     sigma: Array
     rows: int = 2
+    blocks = (4,)
 
     @classmethod
     def between(

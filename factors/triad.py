@@ -12,17 +12,14 @@ sensor with an AprilTag hexahedron.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from factors import so3
+from factors.model import ROT3, Array, Block, Model, Residuals
 from factors.preintegration import GyroPath
-
-Array = NDArray[np.float64]
-Residuals = tuple[Array, Callable[[], tuple[Array, ...]]]
 
 _UP = np.array([0.0, 0.0, 1.0])
 
@@ -55,7 +52,7 @@ def calibration(triads: Array) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class TriadPriorFactor:
+class TriadPriorFactor(Model):
     """What is known of K and b beforehand. Block: triad (12).
 
     Attributes:
@@ -68,6 +65,7 @@ class TriadPriorFactor:
     mean: Array
     sigma: Array
     rows: int = 12
+    blocks = (12,)
 
     def __call__(self, triads: Array) -> Residuals:
         """Residual (K, b - mean) / sigma, (n, 12)."""
@@ -76,7 +74,7 @@ class TriadPriorFactor:
 
 
 @dataclass(frozen=True)
-class AccelFactor:
+class AccelFactor(Model):
     """Mean of an accelerometer at rest: raw = A bRn (0, 0, g) + c. Blocks: nRb (rotations), triad (12).
 
     Attributes:
@@ -91,6 +89,7 @@ class AccelFactor:
     sigma: Array
     gravity: float
     rows: int = 3
+    blocks = (ROT3, 12)
 
     def __call__(self, nRb: Array, triads: Array) -> Residuals:
         """Residual (predicted - raw) / sigma, (n, 3)."""
@@ -99,7 +98,7 @@ class AccelFactor:
 
 
 @dataclass(frozen=True)
-class GyroStaticFactor:
+class GyroStaticFactor(Model):
     """Mean of a gyro at rest on the turning earth: raw = A bRn w_ie + c + d.
 
     Blocks: nRb (rotations), triad (12), d (3; how far the gyro's offset has wandered, in the unit of raw).
@@ -116,6 +115,7 @@ class GyroStaticFactor:
     sigma: Array
     earth_rate: Array
     rows: int = 3
+    blocks = (ROT3, 12, 3)
 
     def __call__(self, nRb: Array, triads: Array, wandered: Array) -> Residuals:
         """Residual (predicted - raw) / sigma, (n, 3)."""
@@ -124,7 +124,7 @@ class GyroStaticFactor:
 
 
 @dataclass(frozen=True)
-class MagFactor:
+class MagFactor(Model):
     """Mean of a magnetometer at rest: raw = A bRn m + c. Blocks: nRb (rotations), triad (12), field m in n (3, T).
 
     Attributes:
@@ -137,6 +137,7 @@ class MagFactor:
     raw: Array
     sigma: Array
     rows: int = 3
+    blocks = (ROT3, 12, 3)
 
     def __call__(self, nRb: Array, triads: Array, field: Array) -> Residuals:
         """Residual (predicted - raw) / sigma, (n, 3)."""
@@ -167,7 +168,7 @@ def _by_triad(nominal: Array, weight: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class GyroRotationFactor:
+class GyroRotationFactor(Model):
     """A gyro's rotation between two attitudes, integrated with its whole triad: nRb_j = Exp(w_ie T)^T nRb_i dR(A, c).
 
     Blocks: nRb_i, nRb_j (rotations), triad (12), d_i, d_j (3 each; how far the gyro's offset has wandered at both ends,
@@ -188,6 +189,7 @@ class GyroRotationFactor:
     earth_rate: Array
     sigma: Array
     rows: int = 3
+    blocks = (ROT3, ROT3, 12, 3, 3)
 
     def __call__(self, nRb_i: Array, nRb_j: Array, triads: Array, wandered_i: Array, wandered_j: Array) -> Residuals:
         """Residual Log(predicted^T nRb_j) / sigma, (n, 3)."""
@@ -213,7 +215,7 @@ class GyroRotationFactor:
 
 
 @dataclass(frozen=True)
-class WeightedSumFactor:
+class WeightedSumFactor(Model):
     """The weighted sum of several vectors is zero. Blocks: as many vectors (3) as weights.
 
     Attributes:
@@ -226,6 +228,11 @@ class WeightedSumFactor:
     weights: Array
     sigma: float
     rows: int = 3
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """A vector for each weight."""
+        return (3,) * len(self.weights)
 
     def __call__(self, *vectors: Array) -> Residuals:
         """Residual sum / sigma, (1, 3)."""
@@ -254,7 +261,7 @@ def _turn_by_triad(path: GyroPath, rate: Array, K: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class TagAttitudeFactor:
+class TagAttitudeFactor(Model):
     """Attitude of the body by the corners of its tags: nRb = Exp(heading Up) nRB BRC cRb, cRb seen through the corners.
 
     A corner at q in the tag's frame stands at P = cRb (position of the tag + bRt D q) + p in the camera's frame and is
@@ -280,6 +287,7 @@ class TagAttitudeFactor:
     position: Array
     BRC: Array
     rows: int = 8
+    blocks = (ROT3, 3, ROT3, 1, ROT3, ROT3)
 
     def __call__(self, nRb: Array, p: Array, nRB: Array, heading: Array, mount: Array, tag: Array) -> Residuals:
         """Residual sqrt_information (predicted - measured), (n, 8)."""

@@ -1,8 +1,7 @@
 """The bridge from vectorised models to gtsam: many measurements in one CustomFactor.
 
-A *model* predicts n measurements of m rows each from blocks of variables, all at once in numpy. The bridge gathers the
-blocks from gtsam's Values, calls the model, weighs outliers down and lays the Jacobians out as gtsam wants them. One
-Python call for 20 measurements costs little more than for one.
+The bridge gathers the blocks from gtsam's Values, calls the model, weighs outliers down and lays the Jacobians out as
+gtsam wants them. One Python call for 20 measurements costs little more than for one.
 """
 
 from __future__ import annotations
@@ -11,81 +10,17 @@ from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any, Literal, Protocol
+from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-# What a block's variable is: a gtsam.Rot3, or a vector of so many numbers.
-Kind = Literal["rotation"] | int
+from factors.loss import TruncatedLoss
+from factors.model import POSE3, ROT3, Array, Block, Keys, Model, Residuals, check, dimension, width
 
-
-class Model(Protocol):
-    """n measurements of m rows each, predicted from blocks of variables.
-
-    A dataclass whose `stacked` names the fields that hold something for each measurement may be evaluated together with
-    others that agree in all other fields.
-    """
-
-    @property
-    def time(self) -> Array:
-        """When each measurement was made, (n,), s."""
-
-    @property
-    def rows(self) -> int:
-        """m, the rows of one measurement."""
-
-    def __call__(self, *blocks: Any, **_: Any) -> tuple[Array, Callable[[], tuple[Array, ...]]]:
-        """Whitened residuals and, on demand, their Jacobians.
-
-        A block is (n, 4), rotations as quaternions w, x, y, z, or (n, d), vectors. The residuals are (n, m); each
-        Jacobian is (n, m, d), d the dimension of the block's tangent (3 for a rotation, perturbed on the right).
-        """
-
-
-@dataclass
-class TruncatedLoss:
-    """Truncated least squares on each measurement's whitened norm, with its graduated relaxation.
-
-    Beyond `gate` a measurement costs gate**2 / 2, whatever its size: it has no pull. `mu` = inf is that loss; a small
-    mu is a convex surrogate, and raising mu from outside leads from one to the other; mu = 0 stands for plain least
-    squares. Yang, Antonante, Tzoumas,
-    Carlone, "Graduated non-convexity for robust spatial perception", RA-L 2020, eqs. 13 and 14.
-    """
-
-    gate: float
-    mu: float = np.inf
-
-    def weight(self, square: Array) -> Array:
-        """Weights in [0, 1] of measurements with squared norms `square`."""
-        inside, outside = self._limits()
-        if self.mu == 0.0:
-            return np.ones_like(square)
-        if np.isinf(self.mu):
-            return (square < inside).astype(float)
-        between = self.gate * np.sqrt(self.mu * (self.mu + 1.0) / np.maximum(square, 1e-300)) - self.mu
-        return np.where(square <= inside, 1.0, np.where(square >= outside, 0.0, between))
-
-    def cost(self, square: Array) -> Array:
-        """Twice the loss of each measurement; equal to `square` well inside the gate."""
-        inside, outside = self._limits()
-        beyond = np.full_like(square, self.gate**2)
-        if self.mu == 0.0:
-            return square
-        if np.isinf(self.mu):
-            return np.minimum(square, beyond)
-        norm = np.sqrt(square)
-        between = 2.0 * self.gate * norm * np.sqrt(self.mu * (self.mu + 1.0)) - self.mu * (self.gate**2 + square)
-        return np.where(square <= inside, square, np.where(square >= outside, beyond, between))
-
-    def _limits(self) -> tuple[float, float]:
-        if self.mu == 0.0:
-            return np.inf, np.inf
-        if np.isinf(self.mu):
-            return self.gate**2, self.gate**2
-        return self.gate**2 * self.mu / (self.mu + 1.0), self.gate**2 * (self.mu + 1.0) / self.mu
+# Models of these types, rows and blocks were seen to give what they declare.
+_CHECKED: set[Hashable] = set()
 
 
 class _Evaluation:
@@ -109,34 +44,35 @@ class _Evaluation:
 
 
 def _same(a: Any, b: Any) -> bool:
-    """Whether two values of a variable, Rot3 or vector, are equal to the last bit."""
-    return bool(a.equals(b, 0.0)) if isinstance(a, gtsam.Rot3) else a.tobytes() == b.tobytes()
+    """Whether two values of a variable are equal to the last bit."""
+    return a.tobytes() == b.tobytes() if isinstance(a, np.ndarray) else bool(a.equals(b, 0.0))
 
 
 @dataclass
 class VectorizedFactor:
     """A model tied to variables: what a gtsam graph takes (`.factor`) and what reports ask for (`.residuals`).
 
-    Args:
-        model: the prediction.
-        columns: for each block of the model, the variable's key: one key shared by all measurements, or one key a
-            measurement.
-        kinds: for each block, what its variable is: "rotation", or the length of a vector.
-        loss: how outlying measurements are weighed; None counts all in full.
-        compress: hand gtsam the square root of the normal equations instead of the rows (all columns shared). The
-            factor then has as many rows as unknowns and one more that keeps its error exact.
+    Built by `Model.on`, which says what the fields are. A compressed factor has as many rows as unknowns and one more
+    that keeps its error exact.
+
+    Raises:
+        ValueError: keys, noise or what the model declares do not fit.
     """
 
     model: Model
-    columns: Sequence[int | Sequence[int]]
-    kinds: Sequence[Kind]
+    tied: Sequence[Keys]
     loss: TruncatedLoss | None = None
     compress: bool = False
+    noise: gtsam.noiseModel.Base | None = None
+    columns: list[int | list[int]] = field(init=False)
     keys: list[int] = field(init=False)
 
     def __post_init__(self) -> None:
-        if self.compress and any(not isinstance(c, int) for c in self.columns):
-            raise ValueError("only a factor on variables shared by all its measurements can be compressed")
+        self.columns = [int(c) if isinstance(c, int | np.integer) else [int(key) for key in c] for c in self.tied]
+        self.blocks = self.model.blocks
+        self._require_fit()
+        if self.noise is not None:
+            self.model, self.noise = _Whitened.by(self.model, self.noise), None
         # Key -> position among the factor's keys, in order of first appearance.
         slots: dict[int, int] = {}
         for column in self.columns:
@@ -146,15 +82,29 @@ class VectorizedFactor:
         self._slots = [
             slots[column] if isinstance(column, int) else [slots[key] for key in column] for column in self.columns
         ]
-        unknowns = sum(3 if kind == "rotation" else kind for kind in self.kinds)
+        unknowns = sum(map(dimension, self.blocks))
         self._dim = unknowns + 1 if self.compress else len(self.model.time) * self.model.rows
-        self._reads = [
-            (key, kind == "rotation")
-            for column, kind in zip(self.columns, self.kinds, strict=True)
-            for key in ([column] if isinstance(column, int) else column)
-        ]
         self._last: tuple[list[Any], _Evaluation] | None = None
         self._given: _Evaluation | None = None
+
+    def _require_fit(self) -> None:
+        """Raise ValueError unless model, blocks and keys belong together."""
+        name, n = type(self.model).__name__, len(self.model.time)
+        kind = (type(self.model), self.model.rows, self.blocks)
+        if kind not in _CHECKED:
+            check(self.model)
+            _CHECKED.add(kind)
+        if len(self.columns) != len(self.blocks):
+            raise ValueError(f"{name} has {len(self.blocks)} blocks {list(self.blocks)}, given are {len(self.columns)}")
+        held: dict[int, Block] = {}
+        for i, (column, block) in enumerate(zip(self.columns, self.blocks, strict=True)):
+            if not isinstance(column, int) and len(column) != n:
+                raise ValueError(f"{name} of {n} measurements got {len(column)} keys for block {i}: one key, or {n}")
+            for key in [column] if isinstance(column, int) else column:
+                if held.setdefault(key, block) != block:
+                    raise ValueError(f"{name} takes {_name(key)} both as {held[key]!r} and as {block!r}")
+        if self.compress and (any(not isinstance(c, int) for c in self.columns) or len(held) < len(self.blocks)):
+            raise ValueError("only a factor on different variables shared by all its measurements can be compressed")
 
     @property
     def factor(self) -> gtsam.CustomFactor:
@@ -189,19 +139,23 @@ class VectorizedFactor:
         """
         if self._given is not None:
             return self._given
-        variables = [_read(values, key, rotation) for key, rotation in self._reads]
+        variables = [
+            variable
+            for column, block in zip(self.columns, self.blocks, strict=True)
+            for variable in _read(values, [column] if isinstance(column, int) else column, block)
+        ]
         if self._last is None or not all(map(_same, variables, self._last[0])):
-            self._last = variables, _Evaluation(*self.model(*self._blocks(variables)))
+            self._last = variables, _Evaluation(*self.model(*self._arrays(variables)))
         return self._last[1]
 
-    def _blocks(self, variables: list[Any]) -> Iterator[Array]:
-        """For each column its variables' values, (n, 4) or (n, d)."""
+    def _arrays(self, variables: list[Any]) -> Iterator[Array]:
+        """For each column its variables' values, (n, width)."""
         n = len(self.model.time)
         start = 0
-        for column, kind in zip(self.columns, self.kinds, strict=True):
+        for column, block in zip(self.columns, self.blocks, strict=True):
             stop = start + (1 if isinstance(column, int) else len(column))
-            block = _array(variables[start:stop], kind)
-            yield np.broadcast_to(block, (n, block.shape[1]))
+            array = _array(variables[start:stop], block)
+            yield np.broadcast_to(array, (n, array.shape[1]))
             start = stop
 
     def _evaluate(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
@@ -227,9 +181,9 @@ class VectorizedFactor:
     def _places(self) -> tuple[list[slice], list[Any]]:
         """The columns of each key in the whole Jacobian (n, m, width), and the elements each block is added to."""
         widths = [0] * len(self.keys)
-        for slots, kind in zip(self._slots, self.kinds, strict=True):
+        for slots, block in zip(self._slots, self.blocks, strict=True):
             for slot in [slots] if isinstance(slots, int) else slots:
-                widths[slot] = 3 if kind == "rotation" else kind
+                widths[slot] = dimension(block)
         ends = np.cumsum(widths)
         columns = [slice(int(end) - width, int(end)) for end, width in zip(ends, widths, strict=True)]
         n, m = len(self.model.time), self.model.rows
@@ -312,21 +266,21 @@ class _Group:
     def _column(self, i: int) -> tuple[list[int], NDArray[np.intp] | None]:
         """The variables of a column and which of them each measurement takes; None: there is only one."""
         keys: dict[int, int] = {}
-        index: list[Any] = []
+        rows: list[Any] = []
         for factor in self._factors:
             column = factor.columns[i]
             if isinstance(column, int):
-                index.append(np.broadcast_to(keys.setdefault(column, len(keys)), len(factor.model.time)))
+                rows.append(np.broadcast_to(keys.setdefault(column, len(keys)), len(factor.model.time)))
             else:
-                index.append([keys.setdefault(key, len(keys)) for key in column])
-        return list(keys), np.concatenate(index) if len(keys) > 1 else None
+                rows.append([keys.setdefault(key, len(keys)) for key in column])
+        return list(keys), np.concatenate(rows) if len(keys) > 1 else None
 
     def evaluate(self, values: gtsam.Values) -> None:
         n = self._spans[-1][1]
         blocks = []
-        for (keys, index), kind in zip(self._columns, self._factors[0].kinds, strict=True):
-            block = _array([_read(values, key, kind == "rotation") for key in keys], kind)
-            blocks.append(np.broadcast_to(block, (n, block.shape[1])) if index is None else block[index])
+        for (keys, rows), block in zip(self._columns, self._factors[0].blocks, strict=True):
+            array = _array(_read(values, keys, block), block)
+            blocks.append(np.broadcast_to(array, (n, array.shape[1])) if rows is None else array[rows])
         whole = _Evaluation(*self._model(*blocks))
         self._parts = [whole.part(start, stop) for start, stop in self._spans]
 
@@ -339,6 +293,45 @@ class _Group:
             factor._given = None
 
 
+@dataclass(frozen=True)
+class _Whitened(Model):
+    """A model whose residuals are whitened here.
+
+    Attributes:
+        model: whose residuals are not.
+        R: (m, m) square root of the information of one measurement.
+    """
+
+    model: Model
+    R: Array
+
+    @classmethod
+    def by(cls, model: Model, noise: gtsam.noiseModel.Base) -> _Whitened:
+        """Whitened by a Gaussian noise model of one measurement."""
+        gaussian, name = gtsam.noiseModel.Gaussian, type(model).__name__
+        if not isinstance(noise, gaussian) or isinstance(noise, gtsam.noiseModel.Constrained):
+            raise ValueError(f"{name}: the noise model must be Gaussian and no constraint; for outliers give a `loss`")
+        if noise.dim() != model.rows:
+            raise ValueError(f"{name}: one measurement has {model.rows} rows, the noise model {noise.dim()}")
+        return cls(model, noise.R())
+
+    @property
+    def time(self) -> Array:
+        return self.model.time
+
+    @property
+    def rows(self) -> int:
+        return self.model.rows
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        return self.model.blocks
+
+    def __call__(self, *blocks: Array) -> Residuals:
+        residuals, linearize = self.model(*blocks)
+        return residuals @ self.R.T, lambda: tuple(self.R @ jacobian for jacobian in linearize())
+
+
 def _kind(factor: VectorizedFactor) -> Hashable:
     """Equal for factors whose models can be evaluated as one."""
     stacked = getattr(factor.model, "stacked", None)
@@ -347,7 +340,7 @@ def _kind(factor: VectorizedFactor) -> Hashable:
     model: Any = factor.model
     shared = tuple(getattr(model, f.name) for f in fields(model) if f.name not in stacked)
     absent = tuple(getattr(model, name) is None for name in stacked)
-    return type(model), shared, absent, model.rows, tuple(factor.kinds)
+    return type(model), shared, absent, model.rows, model.blocks
 
 
 def _stack(parts: Sequence[Any]) -> Any:
@@ -371,15 +364,35 @@ def _squares(residuals: Array) -> Array:
     return np.einsum("nm,nm->n", residuals, residuals)
 
 
-def _read(values: gtsam.Values, key: int, rotation: bool) -> Any:
-    return values.atRot3(key) if rotation else values.atVector(key)
+def _read(values: gtsam.Values, keys: Sequence[int], block: Block) -> list[Any]:
+    """Values of variables of one kind."""
+    if block is ROT3:
+        return [values.atRot3(key) for key in keys]
+    if block is POSE3:
+        return [values.atPose3(key) for key in keys]
+    vectors = [values.atVector(key) for key in keys]
+    for key, vector in zip(keys, vectors, strict=True):
+        if len(vector) != block:
+            raise ValueError(f"{_name(key)} is a vector of {len(vector)} numbers, its factor takes {block}")
+    return vectors
 
 
-def _array(variables: Sequence[Any], kind: Kind) -> Array:
-    """Values of variables, (n, 4) or (n, d)."""
-    if kind == "rotation":
-        return np.array([r.toQuaternion().coeffs() for r in variables])[:, [3, 0, 1, 2]]
+def _array(variables: Sequence[Any], block: Block) -> Array:
+    """Values of variables, (n, width)."""
+    if not isinstance(block, int):
+        out = np.empty((len(variables), width(block)))
+        rotations = variables if block is ROT3 else [pose.rotation() for pose in variables]
+        out[:, :4] = np.array([r.toQuaternion().coeffs() for r in rotations])[:, [3, 0, 1, 2]]
+        if block is POSE3:
+            out[:, 4:] = [pose.translation() for pose in variables]
+        return out
     return np.array(variables)
+
+
+def _name(key: int) -> str:
+    """A variable as people write it."""
+    symbol = gtsam.Symbol(key)
+    return str(symbol.string()) if symbol.chr() else str(key)
 
 
 def square_root(information: Array, projection: Array, square: float) -> tuple[Array, Array, float]:

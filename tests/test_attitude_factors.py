@@ -8,9 +8,10 @@ import pytest
 
 from factors import so3
 from factors.attitude import RelativeAttitudeFactor, VisionAttitudeFactor, ahrs_factors
+from factors.model import Array
 from factors.preintegration import GyroPath
-from factors.vectorized import Array, VectorizedFactor
-from tests.numerics import assert_jacobians_match, assert_rows_are_independent
+from factors.testing import assert_jacobians
+from tests.numerics import assert_rows_are_independent
 
 RNG = np.random.default_rng(1)
 N = 12
@@ -62,14 +63,14 @@ def _vision_blocks(angle: float, dt: float) -> list[Array]:
 def test_vision_jacobians(angle: float, dt: float, platform: GyroPath | None) -> None:
     blocks = _vision_blocks(angle, dt)
     model = _vision(np.arange(N), blocks, 0.3, platform)
-    assert_jacobians_match(model, ["rotation", 3, "rotation", "rotation", 1], blocks, [1e-5, 1e-4, 1e-5, 1e-5, 1e-6])
+    assert_jacobians(model, blocks, [1e-5, 1e-4, 1e-5, 1e-5, 1e-6])
 
 
 def test_vision_jacobians_near_half_turn_errors() -> None:
     blocks = _vision_blocks(1.0, 0.01)
     model = _vision(np.arange(N), blocks, 1.5, PLATFORM)
     steps = [1e-6, 1e-4, 1e-6, 1e-6, 1e-7]
-    assert_jacobians_match(model, ["rotation", 3, "rotation", "rotation", 1], blocks, steps, rtol=2e-5)
+    assert_jacobians(model, blocks, steps, rtol=2e-5)
 
 
 def test_vision_rows_are_independent() -> None:
@@ -107,7 +108,7 @@ def _relative(rows: np.ndarray, noise: float) -> tuple[RelativeAttitudeFactor, l
 @pytest.mark.parametrize("noise", [0.5, 1e-7])
 def test_relative_jacobians(noise: float) -> None:
     model, blocks = _relative(np.arange(N), noise)
-    assert_jacobians_match(model, ["rotation", "rotation", 3], blocks)
+    assert_jacobians(model, blocks)
 
 
 def test_relative_rows_are_independent() -> None:
@@ -133,9 +134,7 @@ def test_relative_equals_native_path() -> None:
         ours.insert(N + k, so3.to_gtsam(bRv_j[k]))
         values.insert(2 * N + k, bias[k])
         ours.insert(2 * N + k, bias[k])
-    vectorized = VectorizedFactor(
-        model, [keys, [N + k for k in keys], [2 * N + k for k in keys]], ["rotation", "rotation", 3]
-    )
+    vectorized = model.on(keys, [N + k for k in keys], [2 * N + k for k in keys])
     assert vectorized.factor.error(ours) == pytest.approx(sum(f.error(values) for f in native), rel=1e-9)
     graph = gtsam.NonlinearFactorGraph()
     for f in native:

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 
+from factors.model import Model, Residuals
 from factors.vectorized import VectorizedFactor
 from pipelines.errors import InputError
 from pipelines.graph.problem import Array, Factor, Problem, Step
@@ -25,19 +26,20 @@ def _with(problem: Problem, at: int, change: Callable[[Step], Step]) -> Problem:
 
 
 @dataclass(frozen=True)
-class Broken:
+class Broken(Model):
     """A residual that is not a number."""
 
     time: Array
     rows: int = 1
+    blocks = (1, 2)
 
-    def __call__(self, s: Array, p: Array) -> tuple[Array, Callable[[], tuple[Array, ...]]]:
+    def __call__(self, s: Array, p: Array) -> Residuals:
         shapes = ((len(s), 1, 1), (len(s), 1, p.shape[1]))
         return np.full((len(s), 1), np.nan), lambda: tuple(np.zeros(shape) for shape in shapes)
 
 
 def _broken(k: int, time: float) -> VectorizedFactor:
-    return VectorizedFactor(Broken(np.array([time])), [[state(k)], PARAMETER], [1, 2])
+    return Broken(np.array([time])).on([state(k)], PARAMETER)
 
 
 def test_a_measurement_that_is_not_a_number_is_left_out_and_counted() -> None:

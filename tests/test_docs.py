@@ -15,11 +15,22 @@ from pipelines.config import load_config
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 _BLOCK = re.compile(r"^```(sh|yaml file=(\S+))\n(.*?)^```", re.MULTILINE | re.DOTALL)
+_PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"\]\((?!https?://)([^)#]+)")
 
 
+# Their Python needs the scheduler of a cluster.
+_CLUSTER = ("fleet.md",)
 # Their commands are those of other tests, on longer recordings.
 _LONG = ("cube.md", "fleet.md", "trust.md")
+
+
+def _text(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+def _name(page: Path) -> str:
+    return page.name
 
 
 @pytest.mark.parametrize(
@@ -42,6 +53,16 @@ def test_commands_work(page: Path, tmp_path: Path) -> None:
                 text=True,
             )
             assert run.returncode == 0, f"{line}\n{run.stdout}{run.stderr}"
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if p.name not in _CLUSTER and _PYTHON.search(_text(p))], ids=_name)
+def test_python_works(page: Path) -> None:
+    """Block after block, as one program."""
+    program = "\n".join(_PYTHON.findall(_text(page)))
+    run = subprocess.run(
+        [sys.executable, "-"], input=program, env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+    )
+    assert run.returncode == 0, run.stderr
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ vision attitudes, the whole through the batch solver.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import gtsam
@@ -14,18 +14,18 @@ import numpy as np
 
 from factors import so3
 from factors.attitude import ahrs_factors
+from factors.model import ROT3, Array, Model, Residuals
 from factors.preintegration import GyroPath
-from factors.vectorized import Array, VectorizedFactor
+from factors.testing import assert_jacobians
 from pipelines.graph.problem import Factor, Parameter, Problem, Quantity, Step, rotation_vector_coordinates
 from pipelines.solvers.batch import solve_batch
-from tests.numerics import assert_jacobians_match
 
 BIAS, MOUNT = gtsam.symbol("b", 0), gtsam.symbol("C", 0)
 LAST = 11_980  # the record's last samples jump
 
 
 @dataclass(frozen=True)
-class _DirectionFactor:
+class _DirectionFactor(Model):
     """A sensor mounted at vRs sees known directions: (vRs^T nRv^T direction) across the measured one, over sigma."""
 
     time: Array
@@ -33,8 +33,9 @@ class _DirectionFactor:
     measured: Array  # (n, 3) in s
     sigma: float
     rows: int = 2
+    blocks = (ROT3, ROT3)
 
-    def __call__(self, nRv: Array, vRs: Array) -> tuple[Array, Callable[[], tuple[Array, ...]]]:
+    def __call__(self, nRv: Array, vRs: Array) -> Residuals:
         in_v = so3.rotate(so3.inverse(nRv), self.direction)
         in_s = so3.rotate(so3.inverse(vRs), in_v)
         helper = np.eye(3)[np.argmin(np.abs(self.measured), axis=1)]
@@ -73,9 +74,7 @@ def _problem(data: np.ndarray) -> Problem:
         rows = np.flatnonzero(np.isfinite(vectors[frames, 0]))
         for part in np.array_split(rows, max(1, len(rows) // 20)):
             model = _DirectionFactor(t[frames[part]], directions[frames[part]], vectors[frames[part]], sigma)
-            yield Factor.of(
-                "directions", VectorizedFactor(model, [[keys[k] for k in part], columns], ["rotation", "rotation"])
-            )
+            yield Factor.of("directions", model.on([keys[k] for k in part], columns))
 
     def build(_: int) -> Iterator[Step]:
         values = gtsam.Values()
@@ -110,7 +109,7 @@ def test_direction_jacobians() -> None:
     unit = rng.normal(size=(2, 9, 3))
     unit /= np.linalg.norm(unit, axis=2, keepdims=True)
     model = _DirectionFactor(np.arange(9.0), unit[0], unit[1], 0.1)
-    assert_jacobians_match(model, ["rotation", "rotation"], [so3.exp(rng.normal(size=(9, 3))) for _ in range(2)])
+    assert_jacobians(model, [so3.exp(rng.normal(size=(9, 3))) for _ in range(2)])
 
 
 def test_bias_and_mount_within_three_sigma() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import gtsam
 import numpy as np
 import pytest
@@ -10,9 +12,11 @@ from numpy.typing import NDArray
 from factors import so3
 from factors.attitude import ahrs_factors
 from factors.gyro import GyroIncrementFactor, correction, rate_error, symmetric
+from factors.model import Array, Block, Model, Residuals
 from factors.preintegration import GyroPath, Increments
-from factors.vectorized import Array, Ensemble, Kind, VectorizedFactor
-from tests.numerics import assert_jacobians_match, assert_rows_are_independent
+from factors.testing import assert_jacobians
+from factors.vectorized import Ensemble
+from tests.numerics import assert_rows_are_independent
 
 N = 15
 T = np.arange(0.0, 20.0, 0.0025)
@@ -122,13 +126,27 @@ def _factor(rows: NDArray[np.intp], g: bool) -> GyroIncrementFactor:
 @pytest.mark.parametrize("g", [True, False], ids=["with g", "without g"])
 @pytest.mark.parametrize(("angle", "size"), [(0.7, 0.1), (1e-6, 1e-9)], ids=["random", "near zero"])
 def test_increment_jacobians(g: bool, angle: float, size: float) -> None:
-    kinds: list[Kind] = ["rotation", "rotation", 3, 6, 9]
-    assert_jacobians_match(_factor(np.arange(N), g), kinds[: 5 if g else 4], _blocks(angle, size, g))
+    assert_jacobians(_factor(np.arange(N), g), _blocks(angle, size, g))
 
 
 @pytest.mark.parametrize("g", [True, False], ids=["with g", "without g"])
 def test_increment_rows_are_independent(g: bool) -> None:
     assert_rows_are_independent(lambda rows: _factor(rows, g), _blocks(0.7, 0.05, g))
+
+
+@dataclass(frozen=True)
+class _RateError(Model):
+    time: Array
+    read: Array
+    force: Array | None
+    rows: int = 3
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        return (3, 6) if self.force is None else (3, 6, 9)
+
+    def __call__(self, bias: Array, scale: Array, g: Array | None = None) -> Residuals:
+        return rate_error(bias, scale, g, self.read, self.force)
 
 
 @pytest.mark.parametrize("g", [True, False], ids=["with g", "without g"])
@@ -142,11 +160,9 @@ def test_rate_error_and_its_jacobians(g: bool) -> None:
         read += np.einsum("nij,nj->ni", by_g[0].reshape(N, 3, 3), f)
     blocks = [bias, scale, *by_g]
 
-    def evaluate(bias: Array, scale: Array, g: Array | None = None) -> tuple[Array, object]:
-        return rate_error(bias, scale, g, read, f if g is not None else None)
-
-    np.testing.assert_allclose(read - evaluate(*blocks)[0], w, atol=1e-12)
-    assert_jacobians_match(evaluate, [3, 6, 9][: len(blocks)], blocks)  # type: ignore[arg-type]
+    model = _RateError(np.arange(float(N)), read, f if g else None)
+    np.testing.assert_allclose(read - model(*blocks)[0], w, atol=1e-12)
+    assert_jacobians(model, blocks)
 
 
 def test_equals_the_native_factor_where_the_gyro_is_perfect() -> None:
@@ -164,11 +180,7 @@ def test_equals_the_native_factor_where_the_gyro_is_perfect() -> None:
     values.insert(scale, np.zeros(6))
     values.insert(g, np.zeros(9))
     sigma = np.linspace(0.5, 2.0, N)
-    ours = VectorizedFactor(
-        GyroIncrementFactor(start + 0.1, turns, path, sigma),
-        [keys_i, keys_j, keys_bias, scale, g],
-        ["rotation", "rotation", 3, 6, 9],
-    )
+    ours = GyroIncrementFactor(start + 0.1, turns, path, sigma).on(keys_i, keys_j, keys_bias, scale, g)
     graph = gtsam.NonlinearFactorGraph()
     for factor in ahrs_factors(keys_i, keys_j, keys_bias, turns, BIAS_HAT, sigma**2):
         graph.add(factor)
@@ -193,10 +205,8 @@ def test_several_factors_are_evaluated_as_one() -> None:
         values.insert(key, block[0])
     whole = _factor(np.arange(N), True)
     factors = [
-        VectorizedFactor(
-            GyroIncrementFactor(whole.time[part], whole.turns[part], whole.gyro, whole.sigma[part]),
-            [list(part), [N + k for k in part], 100, 101, 102],
-            ["rotation", "rotation", 3, 6, 9],
+        GyroIncrementFactor(whole.time[part], whole.turns[part], whole.gyro, whole.sigma[part]).on(
+            part, [N + k for k in part], 100, 101, 102
         )
         for part in (range(4), range(4, 11), range(11, N))
     ]

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from factors.vectorized import TruncatedLoss, VectorizedFactor
+from factors.loss import TruncatedLoss
+from factors.model import Block, Model, Residuals
 from pipelines.graph.priors import vector_prior
 from pipelines.graph.problem import Array, Estimate, Factor, Parameter, Problem, Quantity, Step
 from pipelines.judgement.observability import assess
@@ -29,7 +30,7 @@ def state(k: int) -> int:
 
 
 @dataclass(frozen=True)
-class Line:
+class Line(Model):
     """Measurements z = s + h p of a walking number s, with a slope p (d,) of known rows h (n, d)."""
 
     time: Array
@@ -37,7 +38,11 @@ class Line:
     z: Array
     rows: int = 1
 
-    def __call__(self, s: Array, p: Array) -> tuple[Array, Callable[[], tuple[Array, ...]]]:
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        return (1, self.h.shape[1])
+
+    def __call__(self, s: Array, p: Array) -> Residuals:
         predicted = s[:, 0] + (self.h * p).sum(axis=1)
         jacobians = (np.full((len(s), 1, 1), 1.0 / NOISE), self.h[:, None, :] / NOISE)
         return ((predicted - self.z) / NOISE)[:, None], lambda: jacobians
@@ -87,7 +92,7 @@ class Walk:
             Factor("walk", gtsam.BetweenFactorVector(state(k - 1), state(k), np.zeros(1), noise)) for k in frames if k
         ]
         model = Line(time, self.h[list(frames)], self.z[list(frames)])
-        seen = VectorizedFactor(model, [[state(k) for k in frames], PARAMETER], [1, self.h.shape[1]], loss)
+        seen = model.on([state(k) for k in frames], PARAMETER, loss=loss)
         stamps = {state(k): float(t) for k, t in zip(frames, time, strict=True)}
 
         def predict(values: gtsam.Values) -> gtsam.Values:
@@ -196,13 +201,14 @@ def test_unknown_direction_is_named_not_raised(solve: Callable[[Problem], Estima
 
 
 @dataclass(frozen=True)
-class HalfSeen:
+class HalfSeen(Model):
     """Sees the first of two components of a state."""
 
     time: Array
     rows: int = 1
+    blocks = (2, 2)
 
-    def __call__(self, s: Array, p: Array) -> tuple[Array, Callable[[], tuple[Array, ...]]]:
+    def __call__(self, s: Array, p: Array) -> Residuals:
         first = np.tile([[[1.0, 0.0]]], (len(s), 1, 1))
         return s[:, :1] + p[:, :1], lambda: (first, np.tile([[[1.0, 0.0]]], (len(s), 1, 1)))
 
@@ -214,7 +220,7 @@ def test_undetermined_state_is_named() -> None:
         yield from walk.steps(chunk, None)
         initial = gtsam.Values()
         initial.insert(gtsam.symbol("q", 7), np.zeros(2))
-        half = VectorizedFactor(HalfSeen(np.array([9.0])), [gtsam.symbol("q", 7), PARAMETER], [2, 2])
+        half = HalfSeen(np.array([9.0])).on(gtsam.symbol("q", 7), PARAMETER)
         yield Step(9.0, initial, [Factor.of("half", half)])
 
     with pytest.raises(IndeterminateError, match="state q7"):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import subprocess
+import sys
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -10,20 +11,26 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors.vectorized import Array, Ensemble, TruncatedLoss, VectorizedFactor, square_root
+import factors
+from factors import so3
+from factors.loss import TruncatedLoss
+from factors.model import POSE3, Array, Keys, Model, Residuals
+from factors.testing import assert_jacobians
+from factors.vectorized import Ensemble, VectorizedFactor, square_root
 
 
 @dataclass(frozen=True)
-class _Line:
+class _Line(Model):
     """y = A_i x + b_i, two rows a measurement; linear, so gtsam's answer must be numpy's."""
 
     time: Array
     A: Array
     y: Array
     rows: int = 2
+    blocks = (3, 2)
     stacked: ClassVar = ("time", "A", "y")
 
-    def __call__(self, x: Array, b: Array) -> tuple[Array, Callable[[], tuple[Array, ...]]]:
+    def __call__(self, x: Array, b: Array) -> Residuals:
         residual = np.einsum("nij,nj->ni", self.A, x) + b - self.y
         return residual, lambda: (self.A, np.broadcast_to(np.eye(2), (len(self.A), 2, 2)))
 
@@ -50,7 +57,7 @@ def _normal_equations(factor: VectorizedFactor, values: gtsam.Values) -> tuple[A
 
 def test_shared_columns_stack_to_least_squares() -> None:
     model = _line(50)
-    factor = VectorizedFactor(model, [0, 1], [3, 2])
+    factor = model.on(0, 1)
     H, g = _normal_equations(factor, _values(np.zeros(3), np.zeros(2)))
     full = np.concatenate([model.A.reshape(-1, 3), np.tile(np.eye(2), (50, 1))], axis=1)
     np.testing.assert_allclose(H, full.T @ full, rtol=1e-12)
@@ -59,7 +66,7 @@ def test_shared_columns_stack_to_least_squares() -> None:
 
 def test_own_and_shared_variables_are_laid_out_row_by_row() -> None:
     model = _line(4)
-    factor = VectorizedFactor(model, [[0, 1, 0, 2], 3], [3, 2])
+    factor = model.on([0, 1, 0, 2], 3)
     assert factor.keys == [0, 1, 2, 3]
     x = np.random.default_rng(1).normal(size=(3, 3))
     H, _ = _normal_equations(factor, _values(*x, np.zeros(2)))
@@ -72,7 +79,7 @@ def test_own_and_shared_variables_are_laid_out_row_by_row() -> None:
 
 def test_compressed_factor_is_the_same_factor() -> None:
     model = _line(1000)
-    plain, small = (VectorizedFactor(model, [0, 1], [3, 2], compress=c) for c in (False, True))
+    plain, small = (model.on(0, 1, compress=c) for c in (False, True))
     assert small.factor.dim() == 6
     for values in (_values(np.zeros(3), np.zeros(2)), _values(np.array([1.0, -2, 0.5]), np.array([0.1, 0.2]))):
         assert small.factor.error(values) == pytest.approx(plain.factor.error(values), rel=1e-12)
@@ -97,14 +104,14 @@ def test_rows_are_the_plain_linearisation(compress: bool) -> None:
     model = _line(6)
     values = _values(np.array([0.2, 0.1, -0.3]), np.ones(2))
     loss = TruncatedLoss(gate=0.1)
-    error, A = VectorizedFactor(model, [0, 1], [3, 2], loss=loss, compress=compress).rows(values)
+    error, A = model.on(0, 1, loss=loss, compress=compress).rows(values)
     np.testing.assert_allclose(A, np.concatenate([model.A.reshape(-1, 3), np.tile(np.eye(2), (6, 1))], axis=1))
     np.testing.assert_allclose(error, A @ np.array([0.2, 0.1, -0.3, 1, 1]) - model.y.ravel())
 
 
 def test_compressed_factors_need_shared_columns() -> None:
     with pytest.raises(ValueError, match="shared by all"):
-        VectorizedFactor(_line(2), [[0, 1], 2], [3, 2], compress=True)
+        _line(2).on([0, 1], 2, compress=True)
 
 
 def test_outliers_lose_their_pull_and_no_more() -> None:
@@ -112,11 +119,11 @@ def test_outliers_lose_their_pull_and_no_more() -> None:
     bad = model.y.copy()
     bad[::5] += 50.0
     outlying = _Line(model.time, model.A, bad)
-    factor = VectorizedFactor(outlying, [0, 1], [3, 2], loss=TruncatedLoss(gate=1.0))
+    factor = outlying.on(0, 1, loss=TruncatedLoss(gate=1.0))
     truth = _values(np.array([1.0, -2.0, 0.5]), np.zeros(2))
     assert factor.used(truth).tolist() == [i % 5 != 0 for i in range(200)]
     inliers = np.flatnonzero(np.arange(200) % 5)
-    clean = VectorizedFactor(_Line(model.time[inliers], model.A[inliers], bad[inliers]), [0, 1], [3, 2])
+    clean = _Line(model.time[inliers], model.A[inliers], bad[inliers]).on(0, 1)
     for got, expected in zip(_normal_equations(factor, truth), _normal_equations(clean, truth), strict=True):
         np.testing.assert_allclose(got, expected, rtol=1e-12)
     assert factor.factor.error(truth) == pytest.approx(clean.factor.error(truth) + 40 * 0.5)
@@ -135,7 +142,7 @@ def test_loss_weight_is_the_slope_of_its_cost(mu: float) -> None:
 
 def test_an_ensemble_evaluates_what_its_factors_would() -> None:
     columns: list[tuple[list[int | list[int]], int]] = [([[0, 1], 5], 2), ([[1, 2, 1], 5], 3), ([3, 5], 4), ([3, 6], 4)]
-    factors = [VectorizedFactor(_line(n, seed), c, [3, 2]) for seed, (c, n) in enumerate(columns)]
+    factors = [_line(n, seed).on(*c) for seed, (c, n) in enumerate(columns)]
     rng = np.random.default_rng(1)
     graph, values, others = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.Values()
     for factor in factors:
@@ -159,12 +166,175 @@ def test_models_that_differ_in_more_than_measurements_are_evaluated_apart() -> N
     class Offset(_Line):
         offset: float = 0.0
 
-        def __call__(self, x: Array, b: Array) -> tuple[Array, Callable[[], tuple[Array, ...]]]:
+        def __call__(self, x: Array, b: Array) -> Residuals:
             residual, jacobians = super().__call__(x, b)
             return residual + self.offset, jacobians
 
     line = _line(2)
-    factors = [VectorizedFactor(Offset(line.time, line.A, line.y, offset=o), [0, 1], [3, 2]) for o in (0.0, 1.0)]
+    factors = [Offset(line.time, line.A, line.y, offset=o).on(0, 1) for o in (0.0, 1.0)]
     values = _values(np.zeros(3), np.zeros(2))
     with Ensemble(factors).at(values):
         np.testing.assert_allclose(factors[1].residuals(values), factors[0].residuals(values) + 1.0)
+
+
+@dataclass(frozen=True)
+class _Misdeclared(_Line):
+    """Says that x has two numbers; it has three."""
+
+    blocks = (2, 2)
+
+
+def test_a_factor_declared_with_the_wrong_length_is_refused_when_built() -> None:
+    line = _line(5)
+    with pytest.raises(ValueError, match=r"_Misdeclared cannot be evaluated with its blocks \[2, 2\]"):
+        _Misdeclared(line.time, line.A, line.y).on(0, 1)
+
+
+def test_a_jacobian_of_another_shape_than_declared_is_refused_when_built() -> None:
+    @dataclass(frozen=True)
+    class Flat(_Line):
+        def __call__(self, x: Array, b: Array) -> Residuals:
+            residual, jacobians = super().__call__(x, b)
+            return residual, lambda: (jacobians()[0], jacobians()[1][:, :1])
+
+    line = _line(5)
+    with pytest.raises(ValueError, match=r"Flat declares block 1 as 2: .* \(5, 2, 2\), not \(5, 1, 2\)"):
+        Flat(line.time, line.A, line.y).on(0, 1)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ((0,), r"_Line has 2 blocks \[3, 2\], given are 1"),
+        (([0, 1], 5), r"_Line of 4 measurements got 2 keys for block 0"),
+        ((7, 7), r"takes 7 both as 3 and as 2"),
+    ],
+)
+def test_keys_that_do_not_fit_are_refused_when_built(keys: tuple[Keys, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        _line(4).on(*keys)
+
+
+def test_a_vector_of_another_length_is_named() -> None:
+    factor = _line(4).on(gtsam.symbol("x", 1), 5)
+    values = gtsam.Values()
+    values.insert(gtsam.symbol("x", 1), np.zeros(4))
+    values.insert(5, np.zeros(2))
+    with pytest.raises(ValueError, match="x1 is a vector of 4 numbers, its factor takes 3"):
+        factor.residuals(values)
+
+
+def test_a_noise_model_whitens() -> None:
+    line = _line(6)
+    rng = np.random.default_rng(4)
+    covariance = np.cov(rng.normal(size=(2, 9)))
+    noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+    values = _values(rng.normal(size=3), rng.normal(size=2))
+    plain, whitened = line.on(0, 1).residuals(values), line.on(0, 1, noise=noise).residuals(values)
+    np.testing.assert_allclose(
+        (whitened**2).sum(axis=1), np.einsum("ni,ij,nj->n", plain, np.linalg.inv(covariance), plain)
+    )
+    H, _ = _normal_equations(line.on(0, 1, noise=noise), values)
+    A = np.concatenate([line.A, np.tile(np.eye(2), (6, 1, 1))], axis=2)
+    np.testing.assert_allclose(H, np.einsum("nik,ij,njl->kl", A, np.linalg.inv(covariance), A), rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("noise", "message"),
+    [
+        (gtsam.noiseModel.Isotropic.Sigma(3, 1.0), "one measurement has 2 rows, the noise model 3"),
+        (gtsam.noiseModel.Constrained.All(2), "no constraint"),
+        (
+            gtsam.noiseModel.Robust.Create(
+                gtsam.noiseModel.mEstimator.Huber.Create(1.0), gtsam.noiseModel.Unit.Create(2)
+            ),
+            "for outliers give a `loss`",
+        ),
+    ],
+)
+def test_a_noise_model_that_does_not_fit_is_refused_when_built(noise: gtsam.noiseModel.Base, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        _line(4).on(0, 1, noise=noise)
+
+
+@dataclass(frozen=True)
+class _PoseToPose(Model):
+    """wTa^-1 wTb as measured; to first order about agreement what gtsam's BetweenFactorPose3 is."""
+
+    time: Array
+    rotation: Array
+    translation: Array
+    rows: int = 6
+    blocks = (POSE3, POSE3)
+
+    def __call__(self, a: Array, b: Array) -> Residuals:
+        aRb = so3.multiply(so3.inverse(a[:, :4]), b[:, :4])
+        way = so3.rotate(so3.inverse(a[:, :4]), b[:, 4:] - a[:, 4:])
+        error = so3.log(so3.multiply(so3.inverse(self.rotation), aRb))
+
+        def jacobians() -> tuple[Array, ...]:
+            by_a, by_b = np.zeros((2, len(a), 6, 6))
+            right = so3.right_jacobian_inverse(error)
+            by_a[:, :3, :3], by_b[:, :3, :3] = -right @ so3.matrix(so3.inverse(aRb)), right
+            by_a[:, 3:, :3], by_a[:, 3:, 3:], by_b[:, 3:, 3:] = so3.hat(way), -np.eye(3), so3.matrix(aRb)
+            return by_a, by_b
+
+        return np.concatenate([error, way - self.translation], axis=1), jacobians
+
+
+def _poses(n: int, seed: int) -> Array:
+    rng = np.random.default_rng(seed)
+    return np.concatenate([so3.exp(rng.normal(size=(n, 3))), rng.normal(size=(n, 3))], axis=1)
+
+
+def test_jacobians_by_poses() -> None:
+    measured = _poses(5, 0)
+    assert_jacobians(_PoseToPose(np.arange(5.0), measured[:, :4], measured[:, 4:]), [_poses(5, 1), _poses(5, 2)])
+
+
+def test_a_wrong_jacobian_is_found() -> None:
+    @dataclass(frozen=True)
+    class Wrong(_Line):
+        def __call__(self, x: Array, b: Array) -> Residuals:
+            residual, jacobians = super().__call__(x, b)
+            return residual, lambda: (jacobians()[0], 1.001 * jacobians()[1])
+
+    line = _line(5)
+    blocks = [np.zeros((5, 3)), np.zeros((5, 2))]
+    assert_jacobians(line, blocks)
+    with pytest.raises(AssertionError, match="Jacobian by block 1, 2"):
+        assert_jacobians(Wrong(line.time, line.A, line.y), blocks)
+
+
+def test_poses_are_read_and_perturbed_as_gtsam_does() -> None:
+    """Where the poses agree with the measurement, the factor is gtsam's own; a step by gtsam does what is foreseen."""
+    a, b = gtsam.Pose3.Expmap(np.arange(6) / 5.0), gtsam.Pose3.Expmap(np.array([0.3, -1, 0.5, 2, 1, -1]))
+    between = a.between(b)
+    rotation = so3.from_gtsam([between.rotation()])
+    factor = _PoseToPose(np.zeros(1), rotation, between.translation()[None]).on(0, [1])
+    values = gtsam.Values()
+    values.insert(0, a)
+    values.insert(1, b)
+    np.testing.assert_allclose(factor.residuals(values), 0.0, atol=1e-12)
+    native = gtsam.NonlinearFactorGraph()
+    native.add(gtsam.BetweenFactorPose3(0, 1, between, gtsam.noiseModel.Unit.Create(6)))
+    # The translation's error is in a, gtsam's in b: the same but for a rotation of its three rows.
+    for got, expected in zip(_normal_equations(factor, values), native.linearize(values).hessian(), strict=True):
+        np.testing.assert_allclose(got, expected, atol=1e-9)
+    step = gtsam.VectorValues()
+    delta = 1e-6 * np.random.default_rng(0).normal(size=12)
+    step.insert(0, delta[:6])
+    step.insert(1, delta[6:])
+    _, A = factor.rows(values)
+    np.testing.assert_allclose(factor.residuals(values.retract(step)).ravel(), A @ delta, atol=1e-10)
+
+
+def test_importing_factors_needs_no_gtsam() -> None:
+    code = "import sys, factors; from factors import so3, model, Model; assert 'gtsam' not in sys.modules"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_every_exported_name_is_there() -> None:
+    for name in factors.__all__:
+        value = getattr(factors, name)
+        assert getattr(value, "__name__", repr(value)) == name

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import so3
-from factors.vectorized import TruncatedLoss, VectorizedFactor
+from factors.loss import TruncatedLoss
+from factors.vectorized import VectorizedFactor
 
 if TYPE_CHECKING:
     import gtsam

@@ -14,7 +14,8 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from factors.vectorized import Ensemble, TruncatedLoss
+from factors.loss import TruncatedLoss
+from factors.vectorized import Ensemble
 from pipelines.graph.problem import Estimate, Factor, Problem, Residuals
 from pipelines.solvers.growth import Mark, growth
 from pipelines.solvers.marginals import chi_square, joint_covariance, ordering_of, reported, smoothed

@@ -22,6 +22,7 @@ import numpy as np
 from factors import so3
 from factors.chi_square import gate
 from factors.earth import earth_rate, gravity
+from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
 from factors.triad import (
     AccelFactor,
@@ -32,7 +33,6 @@ from factors.triad import (
     WeightedSumFactor,
     parts,
 )
-from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
 from pipelines.errors import InputError
 from pipelines.graph.linear import linear_factor
 from pipelines.graph.problem import Array, Attitudes, Factor, Problem, Step
@@ -275,10 +275,8 @@ def _turn(model: _Model, k: int) -> slice:
 def _process(model: _Model, k: int) -> list[Factor]:
     """What leads to the attitude of pose k: the turn before it, or nothing."""
     if k > 0 and _turn_known(model, k):
-        measurement = VectorizedFactor(
-            _rotation_model(model, k),
-            [_pose_key(k - 1), _pose_key(k), TRIAD_KEYS["gyro"], _wandered_key(k - 1), _wandered_key(k)],
-            ["rotation", "rotation", 12, 3, 3],
+        measurement = _rotation_model(model, k).on(
+            _pose_key(k - 1), _pose_key(k), TRIAD_KEYS["gyro"], _wandered_key(k - 1), _wandered_key(k)
         )
         return [Factor("gyro turns", measurement.factor)]
     attitude = so3.to_gtsam(model.initial[k])
@@ -297,8 +295,7 @@ def _wander_factors(model: _Model, k: int) -> list[Factor]:
     factors = [Factor("bias walk", linear_factor(blocks, dict.fromkeys(blocks, np.zeros(3)), sigma))]
     if k == len(model.poses) - 1:
         mean = WeightedSumFactor(model.poses.span[-1:, 1], wander.weights, _STEADY)
-        keys = [_wandered_key(i) for i in range(k + 1)]
-        factors.append(Factor("definition", VectorizedFactor(mean, keys, [3] * len(keys)).factor))
+        factors.append(Factor("definition", mean.on(*(_wandered_key(i) for i in range(k + 1))).factor))
     return factors
 
 
@@ -321,15 +318,14 @@ def _sensor_factors(model: _Model, k: int) -> list[Factor]:
     accel = AccelFactor(time, poses.accel[row], accel_density / np.sqrt(duration), model.gravity)
     gyro_sigma = np.sqrt(gyro_density**2 / duration + model.unknown_rate**2)
     gyro = GyroStaticFactor(time, poses.gyro[row], gyro_sigma, model.earth_rate)
-    gyro_columns = [_pose_key(k), TRIAD_KEYS["gyro"], _wandered_key(k)]
     factors = [
-        Factor.of("accelerometer", VectorizedFactor(accel, [_pose_key(k), TRIAD_KEYS["accel"]], ["rotation", 12])),
-        Factor.of("gyro at rest", VectorizedFactor(gyro, gyro_columns, ["rotation", 12, 3])),
+        Factor.of("accelerometer", accel.on(_pose_key(k), TRIAD_KEYS["accel"])),
+        Factor.of("gyro at rest", gyro.on(_pose_key(k), TRIAD_KEYS["gyro"], _wandered_key(k))),
     ]
     if model.field is not None and poses.mag is not None and poses.mag_duration[k] > 0.0:
         mag = MagFactor(time, poses.mag[row], mag_density / np.sqrt(poses.mag_duration[row]))
-        columns = [_pose_key(k), TRIAD_KEYS["mag"], FIELD_KEY]
-        factors.append(Factor.of("magnetometer", VectorizedFactor(mag, columns, ["rotation", 12, 3], model.loss)))
+        seen = mag.on(_pose_key(k), TRIAD_KEYS["mag"], FIELD_KEY, loss=model.loss)
+        factors.append(Factor.of("magnetometer", seen))
     return factors
 
 
@@ -357,16 +353,16 @@ def _tag_factor(model: _Model, k: int, seen: SeenTags) -> Factor:
         BRC=model.reference.BRC,
     )
     reference = _reference_key(k if model.reference.moves else 0)
-    columns: list[int | list[int]] = [
+    measurement = tags.on(
         [_pose_key(k)] * n,
         [_place_key(k)] * n,
         [reference] * n,
         HEADING_KEY,
         MOUNT_KEY,
         [tag_key(int(i)) for i in seen.ids],
-    ]
-    kinds: list[Kind] = ["rotation", 3, "rotation", 1, "rotation", "rotation"]
-    return Factor.of("tags", VectorizedFactor(tags, columns, kinds, model.loss))
+        loss=model.loss,
+    )
+    return Factor.of("tags", measurement)
 
 
 def _predict(model: _Model, k: int, initial: gtsam.Values, current: gtsam.Values) -> gtsam.Values:

@@ -11,7 +11,6 @@ import numpy as np
 
 from factors import so3
 from factors.triad import TriadPriorFactor, calibration, triad
-from factors.vectorized import VectorizedFactor
 from pipelines.graph.linear import linear_factor
 from pipelines.graph.priors import prior_sigmas, rotation_prior, vector_prior
 from pipelines.graph.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
@@ -93,7 +92,7 @@ def first_priors(parameters: Parameters) -> list[Factor]:
     factors = []
     for name, parameter in parameters.triads.items():
         prior = TriadPriorFactor(np.zeros(1), mean[None], parameters.priors[name][None])
-        factors.append(Factor("prior", VectorizedFactor(prior, [parameter.key], [12]).factor))
+        factors.append(Factor("prior", prior.on(parameter.key).factor))
     factors += [rotation_prior(p) for p in parameters.rotations]
     if parameters.heading is not None:
         factors.append(vector_prior(parameters.heading, np.zeros(1)))

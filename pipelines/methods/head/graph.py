@@ -19,8 +19,8 @@ from factors import so3
 from factors.attitude import VisionAttitudeFactor
 from factors.chi_square import gate
 from factors.earth import EARTH_RATE
+from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
-from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
 from pipelines.errors import InputError
 from pipelines.graph.gyro_chain import GyroChain, state
 from pipelines.graph.priors import rotation_prior, vector_prior
@@ -253,15 +253,15 @@ def _vision_factor(model: _Model, keyframes: range) -> list[Factor]:
     rows_model = VisionAttitudeFactor(
         chain.time[seen], model.measured[rows], model.sqrt_information[rows], chain.gyro, model.platform
     )
-    columns: list[int | list[int]] = [
+    measurement = rows_model.on(
         [state(k) for k in seen],
         chain.bias_keys(seen),
         _CAMERA_KEY,
         _HELMET_KEY,
         _OFFSET_KEY,
-    ]
-    kinds: list[Kind] = ["rotation", 3, "rotation", "rotation", 1]
-    return [Factor.of("vision", VectorizedFactor(rows_model, columns, kinds, model.loss))]
+        loss=model.loss,
+    )
+    return [Factor.of("vision", measurement)]
 
 
 def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) -> Attitudes:

@@ -32,7 +32,6 @@ from factors.indexer import (
     mounting,
     mounting_angles,
 )
-from factors.vectorized import VectorizedFactor
 from pipelines.errors import InputError
 from pipelines.graph.priors import prior_sigmas, vector_prior
 from pipelines.graph.problem import Array, Attitudes, Factor, Parameter, Problem, Quantity, Step
@@ -491,8 +490,7 @@ def _add_measurement(model: _Model, i: int, seen: set[tuple[str, int]], step: St
     turning = np.array([group.run.axis in ("outer", "both"), group.run.axis in ("inner", "both")])
     encoder = np.hypot(model.encoder, np.where(turning, model.slow, 0.0))
     average = IndexerAverageFactor.of(group.gyro, group.rates, model.density, encoder, options, wander, _THETA_UNIT)
-    kinds = [3, 3, *(1 if name == "epsilon" else 3 for name in options)]
-    step.factors.append(Factor.of(group.kind, VectorizedFactor(average, columns, kinds, compress=compress)))
+    step.factors.append(Factor.of(group.kind, average.on(*columns, compress=compress)))
 
 
 def _frames(data: IndexerData, motion: AxisMotion) -> NDArray[np.intp]:

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from factors import so3
 from factors.chi_square import gate
 from factors.los import SMOOTHING, GimbalPath, LocalMotion, LosDirectionFactor
+from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
-from factors.vectorized import Kind, TruncatedLoss, VectorizedFactor
 from pipelines.errors import InputError
 from pipelines.graph.gyro_chain import GyroChain, state
 from pipelines.graph.priors import vector_prior
@@ -313,11 +313,9 @@ def _picture_factor(model: _Model, k: NDArray[np.intp], rows: int, family: str) 
         None if model.motion is None else model.motion[k],
     )
     columns: list[int | list[int]] = [[state(i) for i in k], _ANGLES_KEY]
-    kinds: list[Kind] = ["rotation", len(model.names)]
     if model.motion is not None:
         columns += [model.chain.bias_keys(k), _OFFSET_KEY]
-        kinds += [3, 1]
-    return Factor.of(family, VectorizedFactor(rows_model, columns, kinds, model.loss))
+    return Factor.of(family, rows_model.on(*columns, loss=model.loss))
 
 
 def _advice(weights: Mapping[str, float]) -> str:

@@ -1,0 +1,156 @@
+"""What a vectorised model is: many measurements predicted at once in numpy, and the variables they are predicted from.
+
+A model knows nothing of gtsam; `on` ties it to the variables of a graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from enum import Enum
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import so3
+
+if TYPE_CHECKING:
+    import gtsam
+
+    from factors.loss import TruncatedLoss
+    from factors.vectorized import VectorizedFactor
+
+Array = NDArray[np.float64]
+# Whitened residuals (n, m) and, on demand, their Jacobians by the blocks, (n, m, d) each.
+Residuals = tuple[Array, Callable[[], tuple[Array, ...]]]
+
+
+class LieGroup(Enum):
+    """Variables that are no vectors."""
+
+    ROT3 = "ROT3"
+    POSE3 = "POSE3"
+
+    def __repr__(self) -> str:
+        return self.value
+
+
+ROT3, POSE3 = LieGroup.ROT3, LieGroup.POSE3
+# What a block's variable is: ROT3 (gtsam.Rot3), POSE3 (gtsam.Pose3) or a vector of so many numbers.
+Block = LieGroup | int
+# Of a block: one variable that all measurements share, or one for each of them.
+Keys = int | Sequence[int] | NDArray[np.integer]
+
+
+class Model:
+    """n measurements of m rows each, predicted from blocks of variables; base class of all vectorised models.
+
+    A subclass, best a frozen dataclass, has
+
+    - `time`: (n,) when each measurement was made, s;
+    - `rows`: m, the rows of one measurement;
+    - `blocks`: what its variables are, in the order in which they are called with, for example (ROT3, 12);
+    - `__call__(*blocks)`: the whitened residuals (n, m) and a function of nothing that gives their Jacobians (n, m, d).
+
+    A block arrives as (n, 4) quaternions w x y z, (n, 7) quaternions and translations, or (n, d) vectors. Its tangent
+    has d = 3, 6 (rotation first, as in gtsam) or d numbers; rotations and poses are perturbed on the right.
+
+    A dataclass whose `stacked` names the fields that hold something for each measurement may be evaluated together with
+    others that agree in all other fields.
+    """
+
+    if TYPE_CHECKING:
+
+        @property
+        def time(self) -> Array:
+            """(n,) s."""
+
+        @property
+        def rows(self) -> int:
+            """m."""
+
+        @property
+        def blocks(self) -> tuple[Block, ...]:
+            """What the variables are."""
+
+        def __call__(self, *blocks: Any, **_: Any) -> Residuals:
+            """Residuals and Jacobians."""
+
+    def on(
+        self,
+        *keys: Keys,
+        loss: TruncatedLoss | None = None,
+        compress: bool = False,
+        noise: gtsam.noiseModel.Base | None = None,
+    ) -> VectorizedFactor:
+        """The model tied to variables; its `.factor` is what a gtsam graph takes.
+
+        Args:
+            keys: for each block one key that all measurements share, or a key for each of the n.
+            loss: how outlying measurements are weighed; None counts all in full.
+            compress: hand gtsam the square root of the normal equations instead of the rows (shared keys only).
+            noise: Gaussian, of one measurement's m rows, for a model whose residuals are not whitened.
+
+        Raises:
+            ValueError: keys, noise or the model's own blocks do not fit.
+        """
+        from factors.vectorized import VectorizedFactor
+
+        return VectorizedFactor(self, keys, loss, compress, noise)
+
+
+def width(block: Block) -> int:
+    """Numbers of a variable as a model gets it."""
+    return block if isinstance(block, int) else {ROT3: 4, POSE3: 7}[block]
+
+
+def dimension(block: Block) -> int:
+    """Numbers of a variable's tangent."""
+    return block if isinstance(block, int) else {ROT3: 3, POSE3: 6}[block]
+
+
+def retract(values: Array, block: Block, delta: Array) -> Array:
+    """Variables (n, width) moved by tangent vectors (dimension,) or (n, dimension)."""
+    if block is ROT3:
+        return so3.multiply(values, so3.exp(delta))
+    if block is POSE3:
+        turned = so3.multiply(values[..., :4], so3.exp(delta[..., :3]))
+        return np.concatenate([turned, values[..., 4:] + so3.rotate(values[..., :4], delta[..., 3:])], axis=-1)
+    return values + delta
+
+
+def check(model: Model) -> None:
+    """Evaluate a model once near the origin, to see that residuals and Jacobians are as it declares.
+
+    Raises:
+        ValueError: they are not; says what differs.
+    """
+    name, n, m = type(model).__name__, len(model.time), model.rows
+    rng = np.random.default_rng(0)
+    # Not at the origin itself, where matrices made of a block's numbers would be singular.
+    near = [1e-3 * rng.standard_normal((n, dimension(block))) for block in model.blocks]
+    start = [_origin(block, n) for block in model.blocks]
+    blocks = [retract(at, block, delta) for at, block, delta in zip(start, model.blocks, near, strict=True)]
+    try:
+        with np.errstate(all="ignore"):
+            residuals, linearize = model(*blocks)
+            jacobians = linearize()
+    except (TypeError, ValueError, IndexError, np.linalg.LinAlgError) as error:
+        raise ValueError(f"{name} cannot be evaluated with its blocks {list(model.blocks)}: {error}") from error
+    if np.shape(residuals) != (n, m):
+        raise ValueError(f"{name} of {n} measurements with {m} rows gives residuals of shape {np.shape(residuals)}")
+    if len(jacobians) != len(model.blocks):
+        raise ValueError(f"{name} declares {len(model.blocks)} blocks and gives {len(jacobians)} Jacobians")
+    for i, (block, jacobian) in enumerate(zip(model.blocks, jacobians, strict=True)):
+        if np.shape(jacobian) != (n, m, dimension(block)):
+            raise ValueError(
+                f"{name} declares block {i} as {block!r}: its Jacobian must have shape {(n, m, dimension(block))}, "
+                f"not {np.shape(jacobian)}"
+            )
+
+
+def _origin(block: Block, n: int) -> Array:
+    out = np.zeros((n, width(block)))
+    if isinstance(block, LieGroup):
+        out[:, 0] = 1.0
+    return out
