@@ -15,7 +15,7 @@ from factors import so3
 from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.methods.head.recording import HeadData, read_head
-from pipelines.recording.reading import Recording
+from pipelines.recording.reading import open_recording
 
 RATE_HZ = 2000.0 / 7.0
 BIAS = np.array([1e-3, -2e-3, 3e-3])
@@ -51,7 +51,7 @@ def trial_file(tmp_path: Path) -> Path:
 def converted(trial_file: Path, out: Path, *options: str) -> HeadData:
     command = [sys.executable, "-m", "datasets.broad", str(trial_file), "--out", str(out), *options]
     subprocess.run(command, check=True, cwd=Path(__file__).parents[1])
-    recording = Recording(out)
+    recording = open_recording(out)
     return read_head(recording, load_config(recording.attachment("alidade.yaml")))
 
 

@@ -324,8 +324,8 @@ def test_a_file_cut_anywhere_is_known_for_it(imu_file: Path) -> None:
     [
         (b"", "the file is empty"),
         (b"hello, this is text", "not an MCAP file"),
-        (b"#ROSBAG V2.0\n" + b"\0" * 50, "not an MCAP file, but a ROS 1 bag"),
-        (b"SQLite format 3\0" + b"\0" * 50, "not an MCAP file, but a rosbag2 SQLite file"),
+        (b"#ROSBAG V2.0\n" + b"\0" * 50, "truncated.*nothing in it can be read"),
+        (b"SQLite format 3\0" + b"\0" * 50, "cannot be opened .SQLite says: file is not a database"),
         (records.MAGIC, "truncated"),
         (records.MAGIC + b"\xff" * 60, "truncated"),
         (records.MAGIC + b"\x07" + (6).to_bytes(8, "little") + b"\0" * 60, "truncated"),
@@ -375,7 +375,9 @@ def error_of(path: Path, gyro: np.ndarray[Any, Any]) -> str | None:
 def test_missing_topic_lists_what_is_there(tmp_path: Path) -> None:
     write_session(tmp_path / "s.mcap", session(10))
     recording = open_recording(tmp_path / "s.mcap")
-    with pytest.raises(InputError, match=r"no topic /head/imu \(sensor_msgs/msg/Imu\).*/imu \(Imu\).*`topics:`"):
+    with pytest.raises(
+        InputError, match=r"no topic /head/imu \(sensor_msgs/msg/Imu or .*TwistStamped\);.*/imu \(Imu\).*`topics:`"
+    ):
         recording.imu("/head/imu")
     with pytest.raises(
         InputError, match="topic /mag holds sensor_msgs/msg/MagneticField, needed is sensor_msgs/msg/Imu"
@@ -457,7 +459,7 @@ def test_contract_recordings_agree_with_rosbags_own_reader(shared_data: Path) ->
     ("name", "topic", "message"),
     [
         ("compressed", "/imu", "no topic /imu .*a ROS 1 recording.*/diagnostics"),
-        ("compressed", "/tf", "holds tf2_msgs/TFMessage"),
+        ("compressed", "/tf", r"holds tf2_msgs/msg/TFMessage \(ros1/ros1msg\)"),
         ("ros2_talker", "/imu", "no topic /imu.*/rosout"),
         ("ros2_only_topics", "/imu", "no topic /imu"),
         ("ros2_service_events", "/imu", "no topic /imu"),

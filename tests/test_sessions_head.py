@@ -135,8 +135,8 @@ def test_few_bad_samples_are_dropped_or_sorted_and_counted(tmp_path: Path) -> No
         ({"head": None}, r"no topic /head/imu .*/platform/imu \(Imu\)"),
         ({"vision": None}, r"no topic /vision/attitude"),
         (
-            {"head": lambda one: series.VectorSeries(one.t_ns, one.gyro)},
-            "topic /head/imu holds geometry_msgs/msg/Vector3Stamped",
+            {"head": lambda one: series.MagneticSeries(one.t_ns, one.gyro)},
+            "topic /head/imu holds sensor_msgs/msg/MagneticField",
         ),
         (
             {"head": replaced("t_ns", slice(100, 200), T0)},

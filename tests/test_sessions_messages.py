@@ -304,9 +304,10 @@ def test_a_wrong_schema_of_the_right_name_is_one_line(kind: str, text: str, tmp_
 @pytest.mark.parametrize(
     ("message", "schema", "kind", "shown"),
     [
-        ("json", "jsonschema", "foxglove.Imu", r"/imu \(foxglove.Imu, json/jsonschema\)"),
-        ("protobuf", "protobuf", "foxglove.Imu", r"/imu \(foxglove.Imu, protobuf/protobuf\)"),
-        ("ros1", "ros1msg", "sensor_msgs/Imu", r"\(a ROS 1 recording\): /imu \(Imu, ros1/ros1msg\)"),
+        ("json", "jsonschema", "own.Gyro", r"/imu \(own.Gyro, json/jsonschema\)"),
+        ("protobuf", "protobuf", "own.Gyro", r"/imu \(own.Gyro, protobuf/protobuf\)"),
+        ("flatbuffer", "flatbuffer", "foxglove.Log", r"/imu \(foxglove.Log, flatbuffer/flatbuffer\)"),
+        ("ros1", "", "sensor_msgs/Imu", r"\(a ROS 1 recording\): /imu \(Imu, ros1/\)"),
         ("cdr", "ros2idl", messages.IMU, r"/imu \(Imu, cdr/ros2idl\)"),
         ("cdr", "", messages.IMU, r"/imu \(Imu, cdr/\)"),
     ],

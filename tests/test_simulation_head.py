@@ -14,7 +14,7 @@ from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.methods.head.recording import read_head, write_head
 from pipelines.methods.head.simulation import HeadNoise, HeadScenario, head_config, simulate_head
-from pipelines.recording.reading import Recording
+from pipelines.recording.reading import open_recording
 from pipelines.simulation.scenario import load_scenario
 
 SCENARIOS = ["head_nominal", "head_mounts", "head_outages", "head_turntable"]
@@ -172,7 +172,7 @@ def test_written_and_read_back_is_the_same_session(name: str, tmp_path: Path) ->
     data, truth = simulate_head(scenario, seed=2)
     path = tmp_path / "s.mcap"
     write_head(path, data, truth, head_config(scenario))
-    recording = Recording(path)
+    recording = open_recording(path)
     config = load_config(recording.attachment("alidade.yaml"))
     back = read_head(recording, config)
     for field in dataclasses.fields(data):

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from pipelines.recording.data_loss import DataLoss
 
@@ -49,11 +49,11 @@ class Rows(NamedTuple):
         return self.buffer[self.start[i] : self.start[i] + self.size[i]].tobytes()
 
 
-def rows_of(channel: int, messages: Sequence[bytes | memoryview], log_ns: Sequence[int]) -> Rows:
+def rows_of(channel: int, messages: Sequence[bytes], log_ns: ArrayLike) -> Rows:
     """Messages side by side in one buffer."""
     size = np.array([len(message) for message in messages], dtype=np.int64)
     buffer = np.frombuffer(b"".join(messages), np.uint8)
-    return Rows(channel, buffer, np.cumsum(size) - size, size, np.array(log_ns, dtype=np.int64))
+    return Rows(channel, buffer, np.cumsum(size) - size, size, np.asarray(log_ns, dtype=np.int64))
 
 
 def sha256_of(path: Path) -> str:
@@ -66,19 +66,24 @@ class Container(ABC):
     """Messages by channel, and what is known to be lost of them.
 
     Attributes:
-        path: of the file or folder.
+        path: of the file or folder, as it was named.
+        data: the file that is read: another one where `path` is compressed.
         profile: the recorder's, `ros2` for ROS 2.
         channels, schemas: definitions, by id.
         counts: channel -> messages that can be read, as far as is known.
         losses: what cannot be used; complete when everything has been read.
+        remarks: sentences about what was assumed, or is not there beside what was named.
     """
 
     path: Path
+    data: Path
     profile: str
     channels: Mapping[int, Channel]
     schemas: Mapping[int, Schema]
     counts: Mapping[int, int]
     losses: Sequence[DataLoss]
+    remarks: Sequence[str] = ()
+    unpacked: object = None  # a temporary file that lives as long as its container
 
     @abstractmethod
     def rows(self, channels: set[int]) -> Iterator[Rows]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipelines.recording.container import Rows
 from pipelines.recording.mcap_records import windows
-from pipelines.recording.messages import Array, Definition, Layout, Leaf, MessageError, at
+from pipelines.recording.messages import Array, Definition, Layout, Leaf, MessageError, Wire, at
 
 # Which numbers of a field, as indexes, given the message; None if the message has not got them.
 Order = Callable[[Any], Sequence[int] | None]
@@ -19,7 +19,7 @@ Order = Callable[[Any], Sequence[int] | None]
 # Stamps and log times, ns, in the file's order.
 Times = tuple[NDArray[np.int64], NDArray[np.int64]]
 
-# What every message with a header starts with: CDR encapsulation, then the stamp.
+# What every message with a header starts with: CDR encapsulation, in ROS 1 a sequence number; then the stamp.
 _STAMP = {
     order: np.dtype([("kind", "u1", 2), ("options", "u1", 2), ("sec", f"{order}i4"), ("nanosec", f"{order}u4")])
     for order in "<>"
@@ -126,7 +126,7 @@ class Decoder:
         if rows.size[largest] > _LARGEST:
             with logged_at(int(rows.log_ns[largest])):
                 raise MessageError(f"a message of {rows.size[largest]} bytes, which is no {self._definition.name}")
-        into = table.advance(rows.log_ns, header_stamps(self._definition.has_header, rows))
+        into = table.advance(rows.log_ns, header_stamps(self._definition.has_header, rows, self._definition.wire))
         left = np.arange(len(into) if self._fields else 0)
         for plan in self._plans:
             left = left[~self._append_alike(plan, rows, left, table, into)]
@@ -187,14 +187,14 @@ def logged_at(log_ns: int) -> Iterator[None]:
         raise
 
 
-def header_stamps(has_header: bool, rows: Rows) -> NDArray[np.int64]:
+def header_stamps(has_header: bool, rows: Rows, wire: Wire) -> NDArray[np.int64]:
     """Header stamps of messages, ns; 0 where the stamp is zero or the messages have no header."""
     stamps = np.zeros(len(rows.start), dtype=np.int64)
     long = rows.size >= _STAMP["<"].itemsize
     if has_header and long.any():
         heads = windows(rows.buffer, _STAMP["<"].itemsize)[rows.start[long]]
         little, big = heads.view(_STAMP["<"]), heads.view(_STAMP[">"])
-        is_little = little["kind"][:, 1] == 1
+        is_little = (little["kind"][:, 1] == 1) | (wire == "ros1")
         sec = np.where(is_little, little["sec"], big["sec"])
         stamps[long] = sec.astype(np.int64) * 1_000_000_000 + np.where(is_little, little["nanosec"], big["nanosec"])
     return stamps

@@ -31,10 +31,6 @@ from pipelines.recording.mcap_records import (
     windows,
 )
 
-_OTHER_FORMATS = {
-    b"#ROSBAG": "a ROS 1 bag; convert it to ROS 2 and MCAP first",
-    b"SQLite ": "a rosbag2 SQLite file; convert it, or record with `ros2 bag record -s mcap`",
-}
 _LARGEST_ATTACHMENT = 1 << 26
 
 
@@ -51,8 +47,8 @@ class McapFile(Container):
         losses: what cannot be used, as far as is known. A chunk that is damaged within is found when it is first read.
     """
 
-    def __init__(self, path: Path, strict: bool = False) -> None:
-        self.path = path
+    def __init__(self, path: Path, strict: bool = False, data: Path | None = None) -> None:
+        self.path, self.data = path, data or path
         self._strict = strict
         self.counts: dict[int, int] = {}
         self._lost: dict[int, int] = {}
@@ -153,10 +149,8 @@ class McapFile(Container):
         return described(self.losses, self.missing, self.size, start_ns, duration_s)
 
     def _open(self) -> BinaryIO:
-        if self.path.is_dir():
-            raise InputError(f"{self.path}: a folder; give the .mcap file in it")
         try:
-            return self.path.open("rb")
+            return self.data.open("rb")
         except OSError as error:
             raise InputError(f"{self.path}: cannot be opened ({error.strerror})") from error
 
@@ -165,8 +159,7 @@ class McapFile(Container):
         if not start:
             raise InputError(f"{self.path}: the file is empty; an MCAP recording is needed")
         if start != MAGIC:
-            what = next((text for head, text in _OTHER_FORMATS.items() if start.startswith(head)), "")
-            raise InputError(f"{self.path}: not an MCAP file{f', but {what}' if what else ''}")
+            raise InputError(f"{self.path}: not an MCAP file, nor any other recording that is known")
 
     def _defined(self, number: int) -> bool:
         return number in self.channels and self.channels[number].schema_id in {0, *self.schemas}

@@ -13,10 +13,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.errors import InputError
 from pipelines.recording import messages
+from pipelines.recording.channel_format import READABLE, ChannelFormat
 from pipelines.recording.clocks import check_clock
 from pipelines.recording.container import Container, Rows
 from pipelines.recording.decoding import Decoder, Times, header_stamps, logged_at
@@ -26,7 +26,8 @@ from pipelines.recording.topic_columns import NUMBERS, TopicColumns
 # Topics whose first stamp may start a session. Positions and intrinsics may be stamped long before it.
 TIMED = {
     *(messages.IMU, messages.MAGNETIC_FIELD, messages.JOINT_STATE, messages.VECTOR, messages.QUATERNION, messages.POSE),
-    *(messages.COMPRESSED_IMAGE, messages.TAG_DETECTIONS),
+    *(messages.COMPRESSED_IMAGE, messages.IMAGE, messages.TAG_DETECTIONS),
+    *(messages.PLAIN_POSE, messages.TRANSFORM, messages.ODOMETRY, messages.TWIST, messages.ACCEL),
 }
 # Message and schema encoding as ROS 2 records.
 ENCODING = "cdr/ros2msg"
@@ -36,12 +37,13 @@ _MOST_NAMED = 30
 
 @dataclass(frozen=True)
 class Topic:
-    """One topic of a recording."""
+    """One topic of a recording: its ROS 2 type, messages, encoding, and whether messages so encoded can be read."""
 
     name: str
     type: str
     count: int
     encoding: str
+    is_readable: bool
 
 
 class MessageReader:
@@ -57,6 +59,10 @@ class MessageReader:
 
     def __init__(self, container: Container, name: str) -> None:
         self._container, self._name = container, name
+        self._formats = {
+            number: ChannelFormat(channel, container.schemas.get(channel.schema_id))
+            for number, channel in container.channels.items()
+        }
         self.topics = self._list_topics()
         self._at_hand: dict[tuple[str, tuple[str, ...]], TopicColumns] = {}
         self._times: dict[str, Times] = {}
@@ -64,13 +70,13 @@ class MessageReader:
     @cached_property
     def epoch_ns(self) -> int:
         """Start of the session, Unix ns: the earliest first stamp of a sensor topic, else the first log time."""
-        timed = {name for name, topic in self.topics.items() if topic.type in TIMED and topic.encoding == ENCODING}
+        timed = {name for name, topic in self.topics.items() if topic.type in TIMED and topic.is_readable}
         channels, counts = self._container.channels, self._container.counts
         wanted = {number for number, channel in channels.items() if channel.topic in timed and counts.get(number)}
         first: dict[int, int] = {}
         for rows in self._container.rows(wanted):
             if rows.channel not in first:
-                first[rows.channel] = int(self._stamps(rows)[0])
+                first[rows.channel] = int(self._formats[rows.channel].stamps(rows)[0])
             if len(first) == len(wanted):
                 break
         return min(first.values()) if first else self.span[0]
@@ -86,7 +92,7 @@ class MessageReader:
         """Topic -> stamps (log times where there is no header to be read) and log times."""
         found: dict[str, list[Times]] = {name: [] for name in self.topics if name not in self._times}
         for name, rows in self._blocks(found):
-            found[name].append((self._stamps(rows), rows.log_ns))
+            found[name].append((self._formats[rows.channel].stamps(rows), rows.log_ns))
         self._times |= {name: _joined(parts) for name, parts in found.items()}
         return self._times
 
@@ -101,10 +107,10 @@ class MessageReader:
         if types and found.type not in types:
             kind = found.type if found.encoding == ENCODING else f"{found.type} ({found.encoding})"
             raise InputError(f"{self._name}: topic {topic} holds {kind}, needed is {' or '.join(types)} ({ENCODING})")
-        if found.encoding != ENCODING:
+        if not found.is_readable:
             raise InputError(
                 f"{self._name}: topic {topic} has the encoding {found.encoding}, needed is {ENCODING} (ROS 2, as "
-                "`ros2 bag record -s mcap` writes it)"
+                f"`ros2 bag record -s mcap` writes it), or one of {', '.join(READABLE[1:])}"
             )
         if not found.count:
             raise InputError(f"{self._name}: topic {topic} has no messages")
@@ -126,7 +132,7 @@ class MessageReader:
         wanted = {}
         for name in topics.keys() & self.topics.keys():
             topic = self.topics[name]
-            if topic.type in NUMBERS and topic.encoding == ENCODING and topic.count:
+            if topic.type in NUMBERS and topic.is_readable and topic.count:
                 wanted[name] = TopicColumns(topic.type, topic.count, topics[name])
         failed = self._fill(wanted)
         self._at_hand |= {(name, tuple(topics[name])): c for name, c in wanted.items() if name not in failed}
@@ -145,10 +151,14 @@ class MessageReader:
         """(stamp, whether it is the log time, message, its definition) one by one, in file order."""
         self.require(topic, *types)
         times = []
-        for _, rows in self._blocks([topic]):
-            definition = self._definition(topic, rows)
-            stamps = header_stamps(definition.has_header, rows)
-            times.append((self._stamps(rows), rows.log_ns))
+        for _, recorded in self._blocks([topic]):
+            try:
+                definition = self._formats[recorded.channel].definition
+                rows = self._formats[recorded.channel].rows(recorded)
+            except MessageError as error:
+                raise self._unreadable(topic, error) from error
+            stamps = header_stamps(definition.has_header, rows, definition.wire)
+            times.append((np.where(stamps == 0, rows.log_ns, stamps), rows.log_ns))
             for i, (t_ns, log_ns) in enumerate(zip(stamps.tolist(), rows.log_ns.tolist(), strict=True)):
                 try:
                     with logged_at(log_ns):
@@ -172,16 +182,14 @@ class MessageReader:
     def _list_topics(self) -> dict[str, Topic]:
         topics: dict[str, Topic] = {}
         for number, channel in self._container.channels.items():
-            schema = self._container.schemas.get(channel.schema_id)
-            kind = schema.name if schema else ""
-            encoding = f"{channel.message_encoding}/{schema.encoding if schema else ''}"
+            found = self._formats[number]
             before = topics.get(channel.topic)
-            if before and (before.type, before.encoding) != (kind, encoding):
+            if before and (before.type, before.encoding) != (found.type, found.encoding):
                 raise InputError(
-                    f"{self._name}: topic {channel.topic} has messages of two types, {before.type} and {kind}"
+                    f"{self._name}: topic {channel.topic} has messages of two types, {before.type} and {found.type}"
                 )
             count = self._container.counts.get(number, 0) + (before.count if before else 0)
-            topics[channel.topic] = Topic(channel.topic, kind, count, encoding)
+            topics[channel.topic] = Topic(channel.topic, found.type, count, found.encoding, found.is_readable)
         return dict(sorted(topics.items()))
 
     def _blocks(self, topics: Iterable[str]) -> Iterator[tuple[str, Rows]]:
@@ -190,24 +198,6 @@ class MessageReader:
         channels = {number for number, channel in self._container.channels.items() if channel.topic in wanted}
         for rows in self._container.rows(channels) if channels else ():
             yield self._container.channels[rows.channel].topic, rows
-
-    def _definition(self, topic: str, rows: Rows) -> Definition:
-        schema = self._container.schemas[self._container.channels[rows.channel].schema_id]
-        try:
-            found = messages.definition(schema.name, schema.data.decode(errors="replace"))
-            found.check()
-        except MessageError as error:
-            raise self._unreadable(topic, error) from error
-        return found
-
-    def _stamps(self, rows: Rows) -> NDArray[np.int64]:
-        """Header stamps, ns; log times where there are none."""
-        channel = self._container.channels[rows.channel]
-        if self.topics[channel.topic].encoding != ENCODING:
-            return rows.log_ns
-        text = self._container.schemas[channel.schema_id].data.decode(errors="replace")
-        stamps = header_stamps(messages.has_header(text), rows)
-        return np.where(stamps == 0, rows.log_ns, stamps)
 
     def _unreadable(self, topic: str, error: MessageError) -> InputError:
         when = f", logged at {(error.log_ns - self.epoch_ns) * 1e-9:.3f} s" if error.log_ns is not None else ""
@@ -226,11 +216,12 @@ class MessageReader:
         for topic, rows in self._blocks(wanted):
             if topic in failed:
                 continue
+            found = self._formats[rows.channel]
             try:
                 if rows.channel not in decoders:
-                    decoders[rows.channel] = Decoder(self._definition(topic, rows), wanted[topic].fields)
+                    decoders[rows.channel] = Decoder(found.definition, wanted[topic].fields)
                 with self.fields(topic):
-                    decoders[rows.channel].append(rows, wanted[topic].table)
+                    decoders[rows.channel].append(found.rows(rows), wanted[topic].table)
             except MessageError as error:
                 failed[topic] = self._unreadable(topic, error)
             except InputError as error:

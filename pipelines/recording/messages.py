@@ -1,6 +1,6 @@
-"""ROS 2 messages as bytes: definitions, the layout of CDR, many messages at once.
+"""ROS messages as bytes: definitions, the layout of CDR and of ROS 1, many messages at once.
 
-CDR has no field table: a string or a sequence moves everything after it. Messages of one topic, though, hardly ever
+Neither has a field table: a string or a sequence moves everything after it. Messages of one topic, though, hardly ever
 differ in their strings and lengths. So the layout is worked out once, by walking a message along its definition, and
 serves every message with the same size, strings and lengths; the others are decoded one by one with rosbags.
 """
@@ -19,16 +19,33 @@ from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typest
 
 Array = NDArray[np.float64]
 
+# How ROS 2 and ROS 1 lay a message out: ROS 1 without encapsulation and without alignment.
+Wire = Literal["cdr", "ros1"]
+
 IMU = "sensor_msgs/msg/Imu"
 MAGNETIC_FIELD = "sensor_msgs/msg/MagneticField"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+IMAGE = "sensor_msgs/msg/Image"
 VECTOR = "geometry_msgs/msg/Vector3Stamped"
 QUATERNION = "geometry_msgs/msg/QuaternionStamped"
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+PLAIN_POSE = "geometry_msgs/msg/PoseStamped"
+TRANSFORM = "geometry_msgs/msg/TransformStamped"
+ODOMETRY = "nav_msgs/msg/Odometry"
+TWIST = "geometry_msgs/msg/TwistStamped"
+ACCEL = "geometry_msgs/msg/AccelStamped"
+TF = "tf2_msgs/msg/TFMessage"
 TAG_DETECTIONS = "apriltag_msgs/msg/AprilTagDetectionArray"
+
+# What an attitude is taken from; of an Imu its orientation. A TFMessage besides needs the pair of frames.
+ATTITUDES = (POSE, PLAIN_POSE, QUATERNION, TRANSFORM, ODOMETRY, IMU)
+# What angular rates are taken from where no acceleration is needed.
+RATES = (IMU, VECTOR, TWIST)
+# Pictures, as files and raw.
+PICTURES = (COMPRESSED_IMAGE, IMAGE)
 
 # Not among the types rosbags brings along.
 _APRILTAG_MSGS = {
@@ -41,6 +58,13 @@ _APRILTAG_MSGS = {
 }
 
 _CODES = {"bool": "u1", "byte": "u1", "char": "u1"}
+
+# The primitive types `time` and `duration` of ROS 1.
+_ROS1_TIMES = {
+    name: fields
+    for name, fields in get_typestore(Stores.EMPTY).fielddefs.items()
+    if name in ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+}
 
 # No message of sensors comes near any of these.
 _LONGEST_TEXT, _MOST_FIELDS, _DEEPEST = 1 << 18, 10_000, 32
@@ -108,14 +132,19 @@ class Definition:
     The text is another's, and rosbags makes code of it, so that its size is looked at before.
     """
 
-    def __init__(self, name: str, text: str) -> None:
-        self.name = name
+    def __init__(self, name: str, text: str, wire: Wire = "cdr") -> None:
+        self.name, self.wire = name, wire
         if len(text) > _LONGEST_TEXT:
             raise MessageError(f"the definition of message type {name} has {len(text)} letters")
         try:
             self._types = get_types_from_msg(text, name)
         except Exception as error:  # a parser on a text that may be anything
             raise self._unreadable(error) from error
+        if wire == "ros1":  # where CameraInfo has K, ROS 2 has k
+            self._types = {
+                kind: (constants, [(field.lower(), what) for field, what in fields])
+                for kind, (constants, fields) in (_ROS1_TIMES | self._types).items()
+            }
         self.has_header = has_header(text)
 
     def check(self) -> None:
@@ -126,7 +155,7 @@ class Definition:
         """One message, decoded by rosbags. Raises MessageError."""
         store = self._store
         try:
-            return store.deserialize_cdr(data, self.name)
+            return (store.deserialize_cdr if self.wire == "cdr" else store.deserialize_ros1)(data, self.name)
         except (SerdeError, IndexError, TypeError, OverflowError, MemoryError) as error:
             reason = " ".join(str(error).split())
             raise MessageError(
@@ -146,6 +175,10 @@ class Definition:
         """The CDR bytes of one message, little endian."""
         return bytes(self._store.serialize_cdr(message, self.name, little_endian=True))
 
+    def fields(self, kind: str) -> Any:
+        """(name, what it is in rosbags' terms) of the fields of this type or of one it holds."""
+        return self._store.fielddefs[kind][1]
+
     def new(self, kind: str, /, **given: Any) -> Any:
         """A message of this type or of one it holds: fields not given are zero, empty, or themselves new."""
         values = {
@@ -154,18 +187,18 @@ class Definition:
         return self._store.types[kind](**values)
 
     def layout(self, data: bytes) -> Layout | None:
-        """The layout of a message, None if it is not one plain little- or big-endian CDR message."""
-        if data[:2] not in (b"\x00\x00", b"\x00\x01"):
+        """The layout of a message, None if it is not one plain little- or big-endian CDR message, or one of ROS 1."""
+        if self.wire == "cdr" and data[:2] not in (b"\x00\x00", b"\x00\x01"):
             return None
-        walk = _Walk(self._store.fielddefs, data)
+        walk = _Walk(self._store.fielddefs, data, self.wire)
         try:
             walk.struct(self.name, "")
         except (IndexError, KeyError):
             return None
-        # Up to three bytes of padding may follow.
-        if not 0 <= len(data) - walk.end <= 3:
+        # Up to three bytes of padding may follow in CDR.
+        if not 0 <= len(data) - walk.end <= (3 if self.wire == "cdr" else 0):
             return None
-        return Layout(data, tuple(walk.leaves), ((0, 2), *walk.fixed))
+        return Layout(data, tuple(walk.leaves), (*([(0, 2)] if self.wire == "cdr" else []), *walk.fixed))
 
     @cached_property
     def _store(self) -> Any:
@@ -198,9 +231,9 @@ class Definition:
 
 
 @lru_cache(maxsize=64)
-def definition(name: str, text: str) -> Definition:
+def definition(name: str, text: str, wire: Wire = "cdr") -> Definition:
     """The definition of a type in the text of a recording. Raises MessageError."""
-    return Definition(name, text)
+    return Definition(name, text, wire)
 
 
 def has_header(text: str) -> bool:
@@ -212,10 +245,15 @@ def has_header(text: str) -> bool:
 
 @lru_cache(maxsize=64)
 def definition_text(name: str) -> str:
-    """The text that a recording carries for a type, with all the types it is made of."""
+    """The text that a recording carries for a type, with all the types it is made of.
+
+    Raises MessageError for a type that is not one of ROS 2 Humble's or of apriltag_msgs.
+    """
     store = get_typestore(Stores.ROS2_HUMBLE)
     for own, text in _APRILTAG_MSGS.items():
         store.register(get_types_from_msg(text, own))
+    if name not in store.types:
+        raise MessageError(f"the message type {name} is not known, and the recording does not define it")
     return store.generate_msgdef(name, ros_version=2)[0]
 
 
@@ -252,12 +290,13 @@ class _Walk:
     Raises IndexError when the message is too short and KeyError at something CDR has no numbers for.
     """
 
-    def __init__(self, fielddefs: Any, data: bytes) -> None:
+    def __init__(self, fielddefs: Any, data: bytes, wire: Wire) -> None:
         self.fielddefs, self.data = fielddefs, data
-        self.end = 4  # behind the encapsulation; alignment counts from here
+        self.aligned = wire == "cdr"
+        self.end = 4 if self.aligned else 0  # behind the encapsulation; alignment counts from here
         self.leaves: list[Leaf] = []
         self.fixed: list[tuple[int, int]] = []
-        self.order: Literal["<", ">"] = "<" if data[1] else ">"
+        self.order: Literal["<", ">"] = ">" if self.aligned and not data[1] else "<"
 
     def struct(self, name: str, path: str) -> None:
         members = self.fielddefs[name][1]
@@ -297,7 +336,7 @@ class _Walk:
         return int(np.frombuffer(self.data, f"{self.order}u4", 1, start)[0])
 
     def take(self, align: int, size: int, fixed: bool = False) -> int:
-        start = 4 + -(-(self.end - 4) // align) * align
+        start = 4 + -(-(self.end - 4) // align) * align if self.aligned else self.end
         self.end = start + size
         if self.end > len(self.data):
             raise IndexError(self.end)

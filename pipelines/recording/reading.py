@@ -12,7 +12,6 @@ damaged is left out, see `Recording.notes`.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -21,30 +20,33 @@ from pipelines import progress
 from pipelines.errors import InputError
 from pipelines.recording import messages, series
 from pipelines.recording.clocks import check_clock
+from pipelines.recording.container import Container
 from pipelines.recording.data_loss import DataLoss
 from pipelines.recording.decoding import Times
-from pipelines.recording.mcap_file import McapFile
 from pipelines.recording.message_reader import TIMED, MessageReader, Topic
+from pipelines.recording.netpbm import netpbm
+from pipelines.recording.opening import Where, open_container
 
 AnySeries = TypeVar("AnySeries", bound=series.Series)
 
 
-def open_recording(path: Path | str, strict: bool = False) -> Recording:
-    """The recording in an MCAP file, also in one that is still being written, as far as it is sound.
+def open_recording(where: Where, strict: bool = False) -> Recording:
+    """The recording in a file, a folder of parts, files named by a pattern or a list; see docs/recordings.md.
 
-    Raises InputError when the file is missing, empty or no MCAP, when nothing in it can be read, and with `strict` when
-    anything is lost: truncated, damaged, without summary.
+    One that is still being written, or is damaged, is read as far as it is sound. Raises InputError when something is
+    missing, empty or no recording, when nothing in it can be read, and with `strict` when anything is lost: truncated,
+    damaged, without summary.
     """
-    return Recording(Path(path), strict)
+    return Recording(open_container(where, strict))
 
 
 class Recording:
-    """An MCAP recording of ROS 2 messages. Holds positions in the file and stamps, not the messages."""
+    """A recording, whatever its form. Holds positions in the file and stamps, not the messages."""
 
-    def __init__(self, path: Path, strict: bool = False) -> None:
-        self.path = path
-        self._container = McapFile(path, strict)
-        self._reader = MessageReader(self._container, str(path))
+    def __init__(self, container: Container) -> None:
+        self.path = container.path
+        self._container = container
+        self._reader = MessageReader(container, str(container.path))
         self.topics: Mapping[str, Topic] = self._reader.topics
 
     def sha256(self) -> str:
@@ -80,12 +82,10 @@ class Recording:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences about what is lost."""
-        return (
-            self._container.notes(self.epoch_ns, self.duration_s)
-            if self._container.losses or self._container.missing
-            else ()
-        )
+        """Sentences about what is lost, and what was assumed."""
+        container = self._container
+        lost = container.notes(self.epoch_ns, self.duration_s) if container.losses or container.missing else ()
+        return (*container.remarks, *lost)
 
     @property
     def epoch_ns(self) -> int:
@@ -118,15 +118,19 @@ class Recording:
         self._reader.read_together(topics)
 
     def imu(self, topic: str) -> series.ImuSeries:
-        """A sensor_msgs/msg/Imu topic."""
-        return self._series(series.ImuSeries, topic)
+        """A sensor_msgs/msg/Imu topic, or rates alone from a Vector3Stamped or TwistStamped one: accelerations NaN."""
+        self._reader.require(topic, *messages.RATES)
+        if self.topics[topic].type == messages.IMU:
+            return self._series(series.ImuSeries, topic)
+        rate = self._series(series.VectorSeries, topic)
+        return series.ImuSeries(rate.t_ns, rate.vector, np.full(3, np.nan), stamped_by_log=rate.stamped_by_log)
 
     def magnetic(self, topic: str) -> series.MagneticSeries:
         """A sensor_msgs/msg/MagneticField topic."""
         return self._series(series.MagneticSeries, topic)
 
     def vector(self, topic: str) -> series.VectorSeries:
-        """A geometry_msgs/msg/Vector3Stamped topic."""
+        """A geometry_msgs/msg/Vector3Stamped topic, a TwistStamped's rates or an AccelStamped's accelerations."""
         return self._series(series.VectorSeries, topic)
 
     def quaternion(self, topic: str) -> series.QuaternionSeries:
@@ -134,9 +138,12 @@ class Recording:
         return self._series(series.QuaternionSeries, topic)
 
     def poses(self, topic: str) -> series.PoseSeries:
-        """A geometry_msgs/msg/PoseWithCovarianceStamped topic, or attitudes alone from a QuaternionStamped one."""
-        self._reader.require(topic, messages.POSE, messages.QUATERNION)
-        if self.topics[topic].type == messages.POSE:
+        """A topic of poses, or of attitudes alone, in any of the types of messages.ATTITUDES."""
+        self._reader.require(topic, *messages.ATTITUDES)
+        kind = self.topics[topic].type
+        if kind == messages.IMU:
+            return self._attitudes(topic)
+        if kind != messages.QUATERNION:
             return self._series(series.PoseSeries, topic)
         attitude = self.quaternion(topic)
         return series.PoseSeries(attitude.t_ns, attitude.wxyz, stamped_by_log=attitude.stamped_by_log)
@@ -180,12 +187,13 @@ class Recording:
         raise AssertionError("an empty topic has been refused")
 
     def images(self, topic: str) -> Iterator[tuple[int, bytes]]:
-        """(stamp in ns, file) of the pictures on a sensor_msgs/msg/CompressedImage topic, one at a time."""
-        self._reader.require(topic, messages.COMPRESSED_IMAGE)
-        decoded = self._reader.decoded(topic, messages.COMPRESSED_IMAGE)
+        """(stamp in ns, file) of the pictures on a CompressedImage or Image topic, one by one; raw ones as Netpbm."""
+        self._reader.require(topic, *messages.PICTURES)
+        is_raw = self.topics[topic].type == messages.IMAGE
+        decoded = self._reader.decoded(topic, *messages.PICTURES)
         for t_ns, _, message, _ in progress.track(decoded, "pictures", self.topics[topic].count):
             with self._reader.fields(topic):
-                picture = message.data.tobytes()
+                picture = netpbm(message) if is_raw else message.data.tobytes()
             yield t_ns, picture
 
     def detections(self, topic: str) -> series.DetectionSeries:
@@ -216,10 +224,21 @@ class Recording:
             by_log,
         )
 
+    def _attitudes(self, topic: str) -> series.PoseSeries:
+        """The orientations of an Imu topic. Raises InputError where it has none."""
+        imu = self.imu(topic)
+        if (imu.wxyz_cov[:, 0, 0] < 0.0).all():
+            raise InputError(
+                f"{self.path}: topic {topic}: orientation_covariance starts with -1, so there is no attitude in it"
+            )
+        cov = np.zeros((len(imu), 6, 6))
+        cov[:, 3:, 3:] = imu.wxyz_cov
+        return series.PoseSeries(imu.t_ns, imu.wxyz, cov=cov, stamped_by_log=imu.stamped_by_log)
+
     def _series(self, kind: type[AnySeries], topic: str) -> AnySeries:
-        self._reader.require(topic, kind.TYPE)
+        self._reader.require(topic, kind.TYPE, *kind.OTHERS)
         table = self._reader.columns(topic).table
-        if kind.TYPE in TIMED:
+        if self.topics[topic].type in TIMED:
             check_clock(topic, *table.times(), self.epoch_ns)
         t_ns, by_log, columns = table.sorted()
         return kind(t_ns, stamped_by_log=by_log, **columns)

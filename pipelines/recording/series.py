@@ -41,6 +41,8 @@ class Series:
 
     TYPE: ClassVar[str]
     COLUMNS: ClassVar[dict[str, Column]]
+    # Where other types of messages hold the columns; what they have not got is filled in.
+    OTHERS: ClassVar[dict[str, dict[str, Column]]] = {}
     DEFAULTS: ClassVar[dict[str, ArrayLike]] = {}
 
     t_ns: Stamps
@@ -100,10 +102,14 @@ class MagneticSeries(Series):
 
 @dataclass(frozen=True, eq=False)
 class VectorSeries(Series):
-    """Vectors (N, 3)."""
+    """Vectors (N, 3): of a TwistStamped the angular rate, of an AccelStamped the linear acceleration."""
 
     TYPE: ClassVar[str] = messages.VECTOR
     COLUMNS: ClassVar[dict[str, Column]] = {"vector": Column("vector", (3,))}
+    OTHERS: ClassVar[dict[str, dict[str, Column]]] = {
+        messages.TWIST: {"vector": Column("twist.angular", (3,))},
+        messages.ACCEL: {"vector": Column("accel.linear", (3,))},
+    }
 
     vector: Array
 
@@ -127,6 +133,17 @@ class PoseSeries(Series):
         "wxyz": Column("pose.pose.orientation", (4,), _XYZW_TO_WXYZ),
         "position": Column("pose.pose.position", (3,)),
         "cov": Column("pose.covariance", (6, 6)),
+    }
+    OTHERS: ClassVar[dict[str, dict[str, Column]]] = {
+        messages.ODOMETRY: COLUMNS,
+        messages.PLAIN_POSE: {
+            "wxyz": Column("pose.orientation", (4,), _XYZW_TO_WXYZ),
+            "position": Column("pose.position", (3,)),
+        },
+        messages.TRANSFORM: {
+            "wxyz": Column("transform.rotation", (4,), _XYZW_TO_WXYZ),
+            "position": Column("transform.translation", (3,)),
+        },
     }
 
     wxyz: Array

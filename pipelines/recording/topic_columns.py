@@ -9,8 +9,8 @@ from typing import Any
 from pipelines.recording import messages, series
 from pipelines.recording.decoding import Order, Table
 
-_SERIES: Mapping[str, type[series.Series]] = {
-    kind.TYPE: kind
+_COLUMNS: Mapping[str, Mapping[str, series.Column]] = {
+    name: columns
     for kind in (
         series.ImuSeries,
         series.MagneticSeries,
@@ -19,9 +19,10 @@ _SERIES: Mapping[str, type[series.Series]] = {
         series.PoseSeries,
         series.FixSeries,
     )
+    for name, columns in ({kind.TYPE: kind.COLUMNS} | kind.OTHERS).items()
 }
 # Message types that become columns.
-NUMBERS = {*_SERIES, messages.JOINT_STATE}
+NUMBERS = {*_COLUMNS, messages.JOINT_STATE}
 
 
 class TopicColumns:
@@ -39,7 +40,7 @@ class TopicColumns:
             self.table = Table(count, {"position": (len(names),)})
             self.fields: dict[str, tuple[str, Order | None]] = {"position": ("position", partial(self._order, names))}
         else:
-            columns = _SERIES[kind].COLUMNS
+            columns = _COLUMNS[kind]
             self.table = Table(count, {name: column.shape for name, column in columns.items()})
             self.fields = {name: (column.path, _always(column.order)) for name, column in columns.items()}
 

@@ -7,14 +7,12 @@ and whole chunks are put together from them; the records around the chunks are t
 from __future__ import annotations
 
 import json
-import math
 import os
 import struct
 import zlib
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 import zstandard
@@ -39,14 +37,11 @@ from pipelines import progress
 from pipelines.config import ATTACHMENT, TRUTH
 from pipelines.recording import messages, series
 from pipelines.recording.mcap_records import MAGIC, MESSAGE_HEAD, windows
-from pipelines.recording.messages import Array, Definition, known
+from pipelines.recording.message_source import Source, message_source
 
 _CHUNK = 1 << 20
 _LEVEL = 1  # noise does not compress better at higher ones
 _MEDIA = {".yaml": "application/yaml", ".json": "application/json"}
-
-_PICTURE = 1 << 16  # expected size of a message of no fixed size; only chunk sizes depend on it
-_SEC_NS = 1_000_000_000
 
 
 def attached(truth: Mapping[str, float] | None, config_yaml: str | None) -> dict[str, bytes]:
@@ -86,7 +81,7 @@ class _File:
         self._attachments: list[AttachmentIndex] = []
 
     def write(self, topics: Mapping[str, series.Topic], attachments: Mapping[str, bytes]) -> None:
-        sources = [_source(i, topic) for i, topic in enumerate(topics.values(), start=1)]
+        sources = [message_source(i, topic) for i, topic in enumerate(topics.values(), start=1)]
         texts = {source.definition.name: messages.definition_text(source.definition.name) for source in sources}
         schemas = [Schema(i, text.encode(), "ros2msg", name) for i, (name, text) in enumerate(texts.items(), start=1)]
         ids = {schema.name: schema.id for schema in schemas}
@@ -128,7 +123,7 @@ class _File:
         length = self._put(Attachment(time_ns, time_ns, name, media, data))
         self._attachments.append(AttachmentIndex(offset, length, time_ns, time_ns, len(data), name, media))
 
-    def _write_chunks(self, sources: list[_Source]) -> None:
+    def _write_chunks(self, sources: list[Source]) -> None:
         """Cut the messages of all topics, in time order, into chunks of about the same size."""
         log_ns = np.concatenate([np.empty(0, np.int64), *(source.log_ns for source in sources)])
         owner = np.repeat(np.arange(len(sources)), [len(source.log_ns) for source in sources])
@@ -143,7 +138,7 @@ class _File:
             if end > start:
                 self._write_chunk(sources, owner[start:end], log_ns[start:end])
 
-    def _write_chunk(self, sources: list[_Source], owner: NDArray[np.int64], log_ns: NDArray[np.int64]) -> None:
+    def _write_chunk(self, sources: list[Source], owner: NDArray[np.int64], log_ns: NDArray[np.int64]) -> None:
         counts = np.bincount(owner, minlength=len(sources))
         size = np.empty(len(owner), dtype=np.int64)
         parts = {}
@@ -183,160 +178,6 @@ class _File:
         self._stream.write(records)
         self._put(Footer(start, 0, crc))
         self._stream.write(MAGIC)
-
-
-class _Source(ABC):
-    """A topic on its way into the file: message records, head and CDR bytes, taken in order."""
-
-    varies: bool
-
-    def __init__(self, channel: int, definition: Definition, t_ns: NDArray[np.int64], size: int) -> None:
-        self.channel, self.definition, self.size = channel, definition, size
-        self.t_ns = t_ns
-        # A message stamped before its predecessor is still logged after it.
-        self.log_ns = np.maximum.accumulate(t_ns)
-        self._done = 0
-
-    def take(self, count: int) -> Any:
-        """The next records: rows of bytes (count, width), or a list of bytes if their sizes vary."""
-        which = slice(self._done, self._done + count)
-        self._done = which.stop
-        return self._records(which)
-
-    @abstractmethod
-    def _records(self, which: slice) -> Any: ...
-
-    def _head(self, which: slice, size: int) -> NDArray[np.void]:
-        head = np.zeros(which.stop - which.start, MESSAGE_HEAD)
-        head["opcode"], head["channel"] = Opcode.MESSAGE, self.channel
-        head["length"] = MESSAGE_HEAD.itemsize - 9 + size
-        head["sequence"] = np.arange(which.start, which.stop)
-        head["log_ns"] = head["publish_ns"] = self.log_ns[which]
-        return head
-
-
-class _AlikeSource(_Source):
-    """Messages that differ in nothing but numbers: one is encoded by rosbags, its layout takes the arrays."""
-
-    varies = False
-
-    def __init__(
-        self, channel: int, definition: Definition, t_ns: NDArray[np.int64], first: object, columns: dict[str, Array]
-    ) -> None:
-        data = definition.encode(first)
-        layout = definition.layout(data)
-        assert layout is not None
-        super().__init__(channel, definition, t_ns, len(data))
-        self._first = np.frombuffer(data, np.uint8)
-        self._columns = [(layout.run(path), values) for path, values in columns.items()]
-        self._sec, self._nanosec = layout.run("header.stamp.sec"), layout.run("header.stamp.nanosec")
-
-    def _records(self, which: slice) -> NDArray[np.uint8]:
-        head = MESSAGE_HEAD.itemsize
-        rows = np.empty((which.stop - which.start, head + self.size), np.uint8)
-        rows[:, :head] = self._head(which, self.size).view(np.uint8).reshape(-1, head)
-        rows[:, head:] = self._first
-        self._sec.of(rows, head)[:, 0], self._nanosec.of(rows, head)[:, 0] = np.divmod(self.t_ns[which], _SEC_NS)
-        for run, values in self._columns:
-            run.of(rows, head)[:] = values[which]
-        return rows
-
-
-class _VariedSource(_Source):
-    """Messages of any size, encoded one by one by rosbags."""
-
-    varies = True
-
-    def __init__(
-        self, channel: int, definition: Definition, t_ns: NDArray[np.int64], encoded: Iterator[bytes], size: int
-    ) -> None:
-        super().__init__(channel, definition, t_ns, size)
-        self._encoded = encoded
-
-    def _records(self, which: slice) -> list[bytes]:
-        records = []
-        for i in range(which.start, which.stop):
-            data = next(self._encoded)
-            records.append(self._head(slice(i, i + 1), len(data)).tobytes() + data)
-        return records
-
-
-def _source(channel: int, topic: series.Topic) -> _Source:
-    if isinstance(topic, series.Series):
-        definition = known(topic.TYPE)
-        columns = {}
-        for name, column in topic.COLUMNS.items():
-            values = getattr(topic, name).reshape(len(topic), math.prod(column.shape))
-            back = np.argsort(column.order) if column.order else slice(None)
-            columns[column.path] = values[:, back]
-        first = definition.new(topic.TYPE, header=_header(definition, 0, topic.frame_id))
-        return _AlikeSource(channel, definition, topic.t_ns, first, columns)
-    if isinstance(topic, series.JointSeries):
-        definition = known(messages.JOINT_STATE)
-        header = _header(definition, 0, topic.frame_id)
-        zeros = np.zeros(len(topic.names))
-        first = definition.new(messages.JOINT_STATE, header=header, name=list(topic.names), position=zeros)
-        return _AlikeSource(channel, definition, topic.t_ns, first, {"position": topic.position})
-    if isinstance(topic, series.CameraInfo):
-        definition = known(messages.CAMERA_INFO)
-        t_ns = np.array([topic.t_ns], dtype=np.int64)
-        return _VariedSource(channel, definition, t_ns, iter([_camera_info(definition, topic)]), _PICTURE)
-    if isinstance(topic, series.ImageSeries):
-        definition = known(messages.COMPRESSED_IMAGE)
-        return _VariedSource(channel, definition, topic.t_ns, _images(definition, topic), _PICTURE)
-    definition = known(messages.TAG_DETECTIONS)
-    return _VariedSource(channel, definition, topic.t_ns, _detections(definition, topic), 1024)
-
-
-def _header(definition: Definition, t_ns: int, frame_id: str) -> Any:
-    sec, nanosec = divmod(int(t_ns), _SEC_NS)
-    stamp = definition.new("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-    return definition.new("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
-
-
-def _camera_info(definition: Definition, info: series.CameraInfo) -> bytes:
-    return definition.encode(
-        definition.new(
-            messages.CAMERA_INFO,
-            header=_header(definition, info.t_ns, info.frame_id),
-            width=info.width,
-            height=info.height,
-            distortion_model=info.distortion_model,
-            d=info.d,
-            k=info.k.ravel(),
-            r=info.r.ravel(),
-            p=info.p.ravel(),
-        )
-    )
-
-
-def _images(definition: Definition, images: series.ImageSeries) -> Iterator[bytes]:
-    for t_ns, data in zip(images.t_ns, images.data, strict=True):
-        header = _header(definition, t_ns, images.frame_id)
-        picture = np.frombuffer(data, np.uint8)
-        yield definition.encode(
-            definition.new(messages.COMPRESSED_IMAGE, header=header, format=images.format, data=picture)
-        )
-
-
-def _detections(definition: Definition, found: series.DetectionSeries) -> Iterator[bytes]:
-    point = "apriltag_msgs/msg/Point"
-    for i, t_ns in enumerate(found.t_ns):
-        tags = []
-        for k in np.flatnonzero(found.frame == i):
-            corners = [definition.new(point, x=x, y=y) for x, y in found.corners[k].tolist()]
-            tags.append(
-                definition.new(
-                    "apriltag_msgs/msg/AprilTagDetection",
-                    family=str(found.family[k]),
-                    id=int(found.tag_id[k]),
-                    hamming=int(found.hamming[k]),
-                    decision_margin=float(found.decision_margin[k]),
-                    corners=corners,
-                )
-            )
-        header = _header(definition, t_ns, found.frame_id)
-        yield definition.encode(definition.new(messages.TAG_DETECTIONS, header=header, detections=tags))
 
 
 def _bytes(*records: McapRecord) -> bytes:

@@ -1,0 +1,85 @@
+"""How the messages of a channel are read: as ROS 2 or ROS 1 lays them out, or translated from protobuf and JSON."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.recording import messages
+from pipelines.recording.container import Channel, Rows, Schema, rows_of
+from pipelines.recording.decoding import header_stamps, logged_at
+from pipelines.recording.messages import Definition, MessageError, Wire
+from pipelines.recording.translation import Translation, ros_type
+
+# Encoding of the messages and of what defines them -> layout.
+_ROS: dict[str, Wire] = {"cdr/ros2msg": "cdr", "ros1/ros1msg": "ros1"}
+_TRANSLATED = ("protobuf/protobuf", "json/jsonschema")
+READABLE = (*_ROS, *_TRANSLATED)
+
+
+class ChannelFormat:
+    """What the messages of a channel are.
+
+    Attributes:
+        type: the ROS 2 name of their type, or of the one they are translated into; as recorded where there is none.
+        encoding: of the messages and of what defines them, `cdr/ros2msg` in ROS 2.
+        is_readable: whether messages of this encoding and type can be read.
+    """
+
+    def __init__(self, channel: Channel, schema: Schema | None) -> None:
+        self._schema = schema
+        self.encoding = f"{channel.message_encoding}/{schema.encoding if schema else ''}"
+        self.type = schema.name if schema else ""
+        self._wire = _ROS.get(self.encoding)
+        self.is_readable = self._wire is not None
+        if self._wire == "ros1":
+            self.type = _ros2_name(self.type)
+        elif self.encoding in _TRANSLATED:
+            known = ros_type(self.type)
+            self.type, self.is_readable = known or self.type, known is not None
+
+    @cached_property
+    def definition(self) -> Definition:
+        """Of the type. Raises MessageError where it cannot be used."""
+        assert self._schema is not None
+        if self._wire is None:
+            return messages.known(self.type)
+        text = self._schema.data.decode(errors="replace") or messages.definition_text(self.type)
+        found = messages.definition(self.type, text, self._wire)
+        found.check()
+        return found
+
+    def rows(self, rows: Rows) -> Rows:
+        """The messages as `definition` tells them. Raises MessageError at one that cannot be translated."""
+        if self._wire is not None:
+            return rows
+        translated = []
+        for i, log_ns in enumerate(rows.log_ns.tolist()):
+            with logged_at(log_ns):
+                translated.append(self._translation(rows.message(i)))
+        return rows_of(rows.channel, translated, rows.log_ns)
+
+    def stamps(self, rows: Rows) -> NDArray[np.int64]:
+        """Header stamps of messages as the container has them, ns; log times where there are none to be read."""
+        stamps = rows.log_ns
+        if self._wire is not None and self._schema is not None:
+            has_header = messages.has_header(self._schema.data.decode(errors="replace"))
+            stamps = header_stamps(has_header, rows, self._wire)
+        elif self.is_readable:
+            try:
+                stamps = header_stamps(self.definition.has_header, self.rows(rows), "cdr")
+            except MessageError:
+                return rows.log_ns
+        return np.where(stamps == 0, rows.log_ns, stamps)
+
+    @cached_property
+    def _translation(self) -> Translation:
+        assert self._schema is not None
+        return Translation(self._schema, self.definition)
+
+
+def _ros2_name(name: str) -> str:
+    package, _, kind = name.partition("/")
+    return name if kind.startswith("msg/") else f"{package}/msg/{kind}"

@@ -1,0 +1,125 @@
+"""Data sets in the form of EuRoC (ASL), as TUM-VI has it too: a folder a sensor, with data.csv and sensor.yaml.
+
+Of the table's header the names count: w_ and a_ are an IMU, p_ and q_ poses, filename pictures. The topic of a sensor
+is the name of its folder, `/imu0`; of a camera `/cam0/image` and `/cam0/camera_info`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.errors import InputError
+from pipelines.recording import series
+from pipelines.recording.arrays import ArrayContainer
+from pipelines.recording.tables import column_names, nanoseconds, numbers, read_columns
+
+_DISTORTION = {"radial-tangential": "plumb_bob", "equidistant": "equidistant"}
+_LONGEST_YAML = 1 << 20
+
+
+def find_euroc(path: Path) -> Path | None:
+    """The folder that has the sensors' folders, at the path or at `mav0` in it; None if it is no such data set."""
+    return next((root for root in (path, path / "mav0") if any(root.glob("*/data.csv"))), None)
+
+
+def read_euroc(path: Path, root: Path) -> ArrayContainer:
+    """All sensors of a data set."""
+    topics: dict[str, series.Topic] = {}
+    remarks = []
+    for table in sorted(root.glob("*/data.csv")):
+        sensor = _sensor(table.with_name("sensor.yaml"))
+        found = _topics(table, f"/{table.parent.name}", sensor)
+        topics |= found
+        if not found:
+            remarks.append(f"{table.parent.name} is not used: columns {', '.join(column_names(table, table))}")
+    container = ArrayContainer(path, topics, remarks)
+    container.data = next(iter(sorted(root.glob("*/data.csv"))))
+    return container
+
+
+def _topics(table: Path, name: str, sensor: Mapping[str, Any]) -> dict[str, series.Topic]:
+    """What a sensor's table holds."""
+    names = column_names(table, table)
+    columns = read_columns(table, table, names)
+    t_ns = nanoseconds(table, columns[names[0]], "ns")
+
+    def chosen(letter: str) -> list[str]:
+        """Names of the columns of a quantity, in the order of the axes."""
+        return [one for one in names[1:] if one.split(" ")[0].startswith(f"{letter}_")]
+
+    def of(letter: str) -> NDArray[np.float64]:
+        return numbers(table, columns, chosen(letter))
+
+    if len(chosen("w")) == len(chosen("a")) == 3:
+        gyro_var, accel_var = (
+            (sensor.get(key, 0.0) ** 2) * sensor.get("rate_hz", 0.0)
+            for key in ("gyroscope_noise_density", "accelerometer_noise_density")
+        )
+        imu = series.ImuSeries(
+            t_ns, of("w"), of("a"), gyro_cov=gyro_var * np.eye(3), accel_cov=accel_var * np.eye(3), frame_id=name
+        )
+        return {name: imu}
+    if len(chosen("q")) == 4:
+        position = of("p") if len(chosen("p")) == 3 else None
+        return {name: series.PoseSeries(t_ns, of("q"), np.zeros(3) if position is None else position)}
+    if "filename" in names:
+        files = [table.parent / "data" / Path(file).name for file in columns["filename"].tolist()]
+        form = files[0].suffix.lstrip(".") if files else ""
+        found: dict[str, series.Topic] = {f"{name}/image": series.ImageSeries(t_ns, _Pictures(files), form)}
+        if sensor:
+            found[f"{name}/camera_info"] = _camera_info(table, int(t_ns[0]) if len(t_ns) else 0, sensor)
+        return found
+    return {}
+
+
+class _Pictures:
+    """The files of pictures, read one by one and anew each time."""
+
+    def __init__(self, files: list[Path]) -> None:
+        self._files = files
+
+    def __iter__(self) -> Iterator[bytes]:
+        for file in self._files:
+            try:
+                yield file.read_bytes()
+            except OSError as error:
+                raise InputError(f"{file}: cannot be opened ({error.strerror})") from error
+
+
+def _camera_info(table: Path, t_ns: int, sensor: Mapping[str, Any]) -> series.CameraInfo:
+    try:
+        fu, fv, cu, cv = map(float, sensor["intrinsics"])
+        width, height = map(int, sensor["resolution"])
+        model = _DISTORTION[sensor["distortion_model"]]
+        d = np.array(sensor["distortion_coefficients"], dtype=float)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{table.with_name('sensor.yaml')}: no usable camera ({error})") from error
+    k = np.array([[fu, 0.0, cu], [0.0, fv, cv], [0.0, 0.0, 1.0]])
+    d = np.append(d, 0.0) if model == "plumb_bob" and len(d) == 4 else d
+    p = np.hstack([k, np.zeros((3, 1))])
+    return series.CameraInfo(t_ns, width, height, model, d, k, np.eye(3), p, frame_id=table.parent.name)
+
+
+def _sensor(path: Path) -> dict[str, Any]:
+    """What a sensor.yaml says; nothing if there is none."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    if not path.is_file() or path.stat().st_size > _LONGEST_YAML:
+        return {}
+    try:
+        text = path.read_text(errors="replace").removeprefix("%YAML:1.0\n")
+        content = YAML(typ="safe", pure=True).load(text)
+    except (YAMLError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: unreadable YAML: {' '.join(str(error).split())[:200]}") from error
+    if not isinstance(content, dict):
+        return {}
+    for key in ("gyroscope_noise_density", "accelerometer_noise_density", "rate_hz"):
+        if key in content and not isinstance(content[key], (int, float)):
+            raise InputError(f"{path}: {key} is no number")
+    return content

@@ -1,0 +1,179 @@
+"""What a path names: a file of one of the forms that are read, a folder of parts, a pattern, a list of them."""
+
+from __future__ import annotations
+
+import glob
+import re
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import zstandard
+
+from pipelines.errors import InputError
+from pipelines.recording import ros1_bag
+from pipelines.recording.container import Container
+from pipelines.recording.mcap_file import McapFile
+from pipelines.recording.parts import Parts
+
+_ZSTD, _SQLITE, _ULOG, _ARDUPILOT = b"\x28\xb5\x2f\xfd", b"SQLite format 3\0", b"ULog\x01\x12\x35", b"\xa3\x95"
+_TABLES = {".csv", ".tum", ".txt"}
+_PARTS = (".mcap", ".db3", ".bag", ".zstd", ".zst")
+# A compressed file may unpack to so many times its size, beyond so many bytes.
+_LARGEST_RATIO, _SMALL = 100, 1 << 28
+_METADATA, _LONGEST_METADATA = "metadata.yaml", 1 << 24
+# What tells the parts of one recording from each other: their number, and their suffix.
+_PART_NAME = re.compile(r"(_\d+)?(\.[a-z0-9]+)+$")
+
+Where = Path | str | Sequence[Path | str]
+
+
+def open_container(where: Where, strict: bool = False) -> Container:
+    """The container that a path, a pattern or a list of paths names.
+
+    Raises InputError when something is missing, is no recording, or cannot be read; with `strict` also when anything
+    is lost.
+    """
+    if not isinstance(where, (str, Path)):
+        return _together([Path(one) for one in where], strict)
+    path = Path(where)
+    if path.is_dir():
+        return _folder(path, strict)
+    if not path.exists() and any(letter in str(path) for letter in "*?["):
+        found = [Path(name) for name in sorted(glob.glob(str(path)))]
+        if not found:
+            raise InputError(f"{path}: no file is named so")
+        return _together(found, strict)
+    return _together([path], strict)
+
+
+def _together(paths: Sequence[Path], strict: bool, at: Path | None = None, remarks: Sequence[str] = ()) -> Container:
+    """Several files as one recording."""
+    if not paths:
+        raise InputError("a recording of no files")
+    if len({path.resolve() for path in paths}) < len(paths):
+        raise InputError(f"{paths[0]}: the same file is named twice")
+    parts = [_file(path, strict) for path in paths]
+    if at is None:
+        remarks = _part_of(paths)
+    whole = parts[0] if len(parts) == 1 else Parts(at or paths[0], parts)
+    whole.remarks = (*remarks, *whole.remarks)
+    return whole
+
+
+def _file(path: Path, strict: bool) -> Container:
+    """One file, by what it begins with."""
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(16)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be opened ({error.strerror})") from error
+    return _unpacked(path, strict) if start.startswith(_ZSTD) else _by_content(path, path, strict)
+
+
+def _by_content(path: Path, data: Path, strict: bool) -> Container:
+    """The container in a file `data`, which is named `path`."""
+    with data.open("rb") as stream:
+        start = stream.read(16)
+    if start.startswith(ros1_bag.MAGIC):
+        return ros1_bag.Ros1Bag(path, strict, data)
+    if start.startswith(_SQLITE):
+        from pipelines.recording.sqlite_file import SqliteFile
+
+        return SqliteFile(path, strict, data)
+    if start.startswith(_ULOG):
+        from pipelines.recording.ulog import read_ulog
+
+        return read_ulog(path, strict, data)
+    if start.startswith(_ARDUPILOT):
+        raise InputError(
+            f"{path}: an ArduPilot log; make CSV of it (`mavlogdump.py --format csv`, from pymavlink) and say under "
+            "`columns:` in the config which column is what"
+        )
+    if start.startswith(_ZSTD):
+        raise InputError(f"{path}: compressed twice")
+    if _TABLES & set(path.suffixes) and start:
+        from pipelines.recording.tables import read_table
+
+        return read_table(path, data)
+    return McapFile(path, strict, data)
+
+
+def _unpacked(path: Path, strict: bool) -> Container:
+    """A file compressed as a whole: unpacked into a temporary one, which goes with the container."""
+    whole = tempfile.NamedTemporaryFile(prefix="alidade-", suffix=".unpacked")  # noqa: SIM115
+    limit = _SMALL + _LARGEST_RATIO * path.stat().st_size
+    damaged = ""
+    with path.open("rb") as stream:
+        try:
+            reader = zstandard.ZstdDecompressor(max_window_size=1 << 27).stream_reader(stream, read_across_frames=True)
+            while piece := reader.read(1 << 20):
+                whole.write(piece)
+                if whole.tell() > limit:
+                    raise InputError(f"{path}: unpacks to over {limit >> 20} MiB; it may be made to exhaust the disk")
+        except zstandard.ZstdError:
+            damaged = "its compression is damaged, what is behind cannot be read"
+    whole.flush()
+    if damaged and (strict or whole.tell() == 0):
+        raise InputError(f"{path}: {damaged}: record again")
+    container = _by_content(path, Path(whole.name), strict)
+    container.unpacked = whole
+    if damaged:
+        container.remarks = (*container.remarks, damaged)
+    return container
+
+
+def _folder(path: Path, strict: bool) -> Container:
+    """A folder: of a bag with its metadata.yaml, of the parts of one recording, or of a data set in EuRoC's form."""
+    listed = _listed(path / _METADATA)
+    if listed:
+        there = [found for name in listed if (found := _stored(path / name)) is not None]
+        lost = [name for name in listed if _stored(path / name) is None]
+        if not there:
+            raise InputError(f"{path}: none of the files is there that its {_METADATA} names: {', '.join(lost)}")
+        remarks = [f"{len(lost)} of {len(listed)} parts are not there: {', '.join(lost)}"] if lost else []
+        if remarks and strict:
+            raise InputError(f"{path}: {remarks[0]}; --strict reads nothing of which anything is lost")
+        return _together(there, strict, path, remarks)
+    from pipelines.recording.euroc import find_euroc, read_euroc
+
+    root = find_euroc(path)
+    if root is not None:
+        return read_euroc(path, root)
+    there = sorted(file for file in path.iterdir() if file.suffix in _PARTS and file.is_file())
+    if len({_PART_NAME.sub("", file.name) for file in there}) > 1:
+        names = ", ".join(file.name for file in there)
+        raise InputError(f"{path}: a folder of several recordings ({names}); name one, or the parts by a pattern")
+    if not there:
+        raise InputError(f"{path}: a folder without a recording")
+    return _together(there, strict, path)
+
+
+def _listed(metadata: Path) -> list[str]:
+    """The files that a bag's metadata.yaml names, in their order; none if it is not there or is something else."""
+    if not metadata.is_file() or metadata.stat().st_size > _LONGEST_METADATA:
+        return []
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        content = YAML(typ="safe", pure=True).load(metadata.read_text(errors="replace"))
+        names = content["rosbag2_bagfile_information"]["relative_file_paths"]
+        return [Path(name).name for name in names]
+    except (YAMLError, ValueError, KeyError, TypeError, RecursionError):
+        return []
+
+
+def _stored(path: Path) -> Path | None:
+    """The file of that name, compressed or not."""
+    return next((one for one in (path, path.with_name(f"{path.name}.zstd")) if one.is_file()), None)
+
+
+def _part_of(paths: Sequence[Path]) -> Sequence[str]:
+    """A sentence if the files are parts of a bag, and others of it lie beside them."""
+    listed = _listed(paths[0].with_name(_METADATA))
+    here = [i for i, name in enumerate(listed, start=1) if name in {path.name for path in paths}]
+    if not here or len(here) == len(listed):
+        return ()
+    which = f"part {here[0]}" if len(here) == 1 else f"parts {', '.join(map(str, here))}"
+    return (f"{which} of {len(listed)} of a bag; name the folder to read all of it",)

@@ -1,0 +1,264 @@
+"""ROS 1 bags, version 2.0.
+
+A bag has no checksums but those of its compression. It is walked from record to record, so that one that was never
+closed is read as well; where a record is not whole the walk ends, and what is behind is noted as lost.
+"""
+
+from __future__ import annotations
+
+import bz2
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO
+
+import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
+
+from pipelines.errors import InputError
+from pipelines.recording.container import Channel, Container, Rows, Schema
+from pipelines.recording.data_loss import DataLoss, described
+from pipelines.recording.mcap_records import DamagedError
+
+MAGIC = b"#ROSBAG V2.0\n"
+
+_MESSAGE, _INDEX, _CHUNK, _CHUNK_INFO, _BAG, _CONNECTION = 2, 4, 5, 6, 3, 7
+# No header, definition, chunk or number of topics of a recording comes near these.
+_LONGEST_HEADER, _LONGEST_TEXT, _LARGEST_CHUNK, _MOST_CONNECTIONS = 1 << 16, 1 << 20, 1 << 28, 10_000
+_LARGEST_RATIO, _SMALL = 2000, 1 << 16
+_LENGTH = struct.Struct("<I")
+_TIME = struct.Struct("<II")
+
+
+@dataclass
+class _Chunk:
+    """A chunk: where its data lie in the file, how they are packed, and the messages of each connection."""
+
+    start: int
+    end: int
+    compression: str
+    size: int
+    counts: dict[int, int] = field(default_factory=dict)
+
+
+class Ros1Bag(Container):
+    """A bag; the file is opened again for every read.
+
+    Args:
+        path: of the file, as it is named.
+        strict: raise InputError at the first loss.
+        data: the file to read instead.
+
+    Raises InputError when nothing in it can be read, or when it is hostile.
+    """
+
+    def __init__(self, path: Path, strict: bool = False, data: Path | None = None) -> None:
+        self.path, self.data, self._strict = path, data or path, strict
+        self.profile = "ros1"
+        self.channels: dict[int, Channel] = {}
+        self.schemas: dict[int, Schema] = {}
+        self.losses: list[DataLoss] = []
+        self._chunks: list[_Chunk] = []
+        self._lost: dict[int, int] = {}
+        self._size = self.data.stat().st_size
+        with self.data.open("rb") as stream:
+            self._walk(stream)
+            for chunk in self._chunks:
+                if not chunk.counts or not chunk.counts.keys() <= self.channels.keys():
+                    self._verify(stream, chunk)
+        self.counts: dict[int, int] = {}
+        for chunk in self._chunks:
+            for number, n in chunk.counts.items():
+                self.counts[number] = self.counts.get(number, 0) + n
+        undefined = sum(n for number, n in self.counts.items() if number not in self.channels)
+        if undefined:
+            self.losses.append(DataLoss("definition", 0, undefined))
+            self.counts = {number: n for number, n in self.counts.items() if number in self.channels}
+        if self.losses and (strict or not self.counts):
+            self._refuse()
+
+    @property
+    def missing(self) -> dict[str, int]:
+        """Topic -> messages known to be lost."""
+        missing: dict[str, int] = {}
+        for number, n in self._lost.items():
+            if number in self.channels:
+                topic = self.channels[number].topic
+                missing[topic] = missing.get(topic, 0) + n
+        return missing
+
+    def rows(self, channels: set[int]) -> Iterator[Rows]:
+        """The messages of these connections, chunk by chunk."""
+        with self.data.open("rb") as stream:
+            for chunk in self._chunks:
+                if not channels & chunk.counts.keys():
+                    continue
+                try:
+                    found = self._messages(stream, chunk)
+                    if {number: len(rows.start) for number, rows in found.items()} != chunk.counts:
+                        raise DamagedError("its index is wrong")
+                except DamagedError as damaged:
+                    self._lose(chunk, str(damaged))
+                    continue
+                for number in sorted(channels & found.keys()):
+                    yield found[number]
+
+    def notes(self, start_ns: int | None, duration_s: float = 0.0) -> tuple[str, ...]:
+        """Sentences about what is lost, and when."""
+        return described(self.losses, self.missing, self._size, start_ns, duration_s)
+
+    def _walk(self, stream: BinaryIO) -> None:
+        """Note where the chunks are, what connections there are, and where the file ends too early."""
+        position, unpacked, indexed = len(MAGIC), 0, 0
+        while position < self._size:
+            try:
+                header, start, end = _record(stream, position, self._size)
+                (op,) = header.get(b"op", b"\0")[:1] or b"\0"
+                if op == _BAG:
+                    indexed = int.from_bytes(header.get(b"index_pos", b""), "little")
+                elif op == _CHUNK:
+                    size = int.from_bytes(header.get(b"size", b""), "little")
+                    compression = header.get(b"compression", b"").decode(errors="replace")
+                    unpacked += size
+                    if unpacked > _LARGEST_CHUNK + 100 * self._size:
+                        raise InputError(
+                            f"{self.path}: its chunks say that they unpack to over {unpacked >> 20} MiB, 100 times "
+                            "the file; it may be made to exhaust the memory"
+                        )
+                    self._chunks.append(_Chunk(start, end, compression, size))
+                elif op == _INDEX and self._chunks:
+                    number = int.from_bytes(header.get(b"conn", b""), "little")
+                    counts = self._chunks[-1].counts
+                    count = int.from_bytes(header.get(b"count", b""), "little")
+                    if 12 * count != end - start:
+                        raise DamagedError("an index of another size")
+                    counts[number] = counts.get(number, 0) + count
+                elif op == _CONNECTION:
+                    stream.seek(start)
+                    self._connect(header, stream.read(min(end - start, _LONGEST_TEXT + 1)))
+                elif op not in (_INDEX, _CHUNK_INFO):
+                    raise DamagedError(f"a record of unknown kind {op}")
+            except DamagedError as damaged:
+                kind, reason = ("damage", str(damaged)) if indexed else ("cut", "")
+                self.losses.append(DataLoss(kind, position, self._size - position, reason=reason))  # type: ignore[arg-type]
+                return
+            position = end
+        if not indexed:
+            self.losses.append(DataLoss("cut", self._size, 0))
+
+    def _connect(self, header: dict[bytes, bytes], data: bytes) -> None:
+        if len(data) > _LONGEST_TEXT:
+            raise DamagedError("a definition that is too long")
+        fields = _fields(data)
+        number = int.from_bytes(header.get(b"conn", b""), "little")
+        if number in self.channels:
+            return
+        if len(self.channels) >= _MOST_CONNECTIONS:
+            raise InputError(f"{self.path}: more than {_MOST_CONNECTIONS} connections, which no recording has")
+        topic, kind = (text.decode(errors="replace") for text in (header.get(b"topic", b""), fields.get(b"type", b"")))
+        self.schemas[number] = Schema(number, kind, "ros1msg", fields.get(b"message_definition", b""))
+        self.channels[number] = Channel(number, topic, "ros1", number)
+
+    def _messages(self, stream: BinaryIO, chunk: _Chunk) -> dict[int, Rows]:
+        """The messages in a chunk, by connection. Raises DamagedError."""
+        stream.seek(chunk.start)
+        data = _unpacked(stream.read(chunk.end - chunk.start), chunk.compression, chunk.size)
+        found: dict[int, tuple[list[int], list[int], list[int]]] = {}
+        position = 0
+        while position < len(data):
+            header, start, end = _record_in(data, position)
+            (op,) = header.get(b"op", b"\0")[:1] or b"\0"
+            if op == _CONNECTION:
+                self._connect(header, data[start:end])
+            elif op == _MESSAGE:
+                try:
+                    number = _LENGTH.unpack(header[b"conn"])[0]
+                    sec, nanosec = _TIME.unpack(header[b"time"])
+                except (KeyError, struct.error) as error:
+                    raise DamagedError("a message without its head") from error
+                starts, sizes, times = found.setdefault(number, ([], [], []))
+                starts.append(start)
+                sizes.append(end - start)
+                times.append(sec * 1_000_000_000 + nanosec)
+            position = end
+        buffer = np.frombuffer(data, np.uint8)
+        return {number: Rows(number, buffer, *map(np.array, parts)) for number, parts in found.items()}
+
+    def _verify(self, stream: BinaryIO, chunk: _Chunk) -> None:
+        """Count the messages of a chunk whose index is missing."""
+        try:
+            chunk.counts = {number: len(rows.start) for number, rows in self._messages(stream, chunk).items()}
+        except DamagedError as damaged:
+            self._lose(chunk, str(damaged))
+
+    def _lose(self, chunk: _Chunk, reason: str) -> None:
+        for number, n in chunk.counts.items():
+            self._lost[number] = self._lost.get(number, 0) + n
+        chunk.counts = {}
+        self.losses.append(DataLoss("damage", chunk.start, chunk.end - chunk.start, 1, reason=reason))
+        if self._strict:
+            self._refuse()
+
+    def _refuse(self) -> None:
+        what = "--strict reads nothing that is damaged" if self._strict else "nothing in it can be read"
+        raise InputError(f"{self.path}: {'; '.join(self.notes(None))}; {what}: record again")
+
+
+def _record(stream: BinaryIO, position: int, stop: int) -> tuple[dict[bytes, bytes], int, int]:
+    """Header of the record at a byte of the file, and where its data begin and end. Raises DamagedError."""
+    stream.seek(position)
+    head = stream.read(4)
+    length = _LENGTH.unpack(head)[0] if len(head) == 4 else stop
+    if length > _LONGEST_HEADER or position + length + 8 > stop:
+        raise DamagedError("a record is not whole")
+    header = stream.read(length + 4)
+    start = position + length + 8
+    end = start + _LENGTH.unpack(header[length:])[0]
+    if end > stop:
+        raise DamagedError("a record is not whole")
+    return _fields(header[:length]), start, end
+
+
+def _record_in(data: bytes, position: int) -> tuple[dict[bytes, bytes], int, int]:
+    """The same in a chunk's data."""
+    try:
+        (length,) = _LENGTH.unpack_from(data, position)
+        start = position + length + 8
+        end = start + _LENGTH.unpack_from(data, start - 4)[0]
+    except struct.error as error:
+        raise DamagedError("a record in it is not whole") from error
+    if length > _LONGEST_HEADER or end > len(data):
+        raise DamagedError("a record in it is not whole")
+    return _fields(data[position + 4 : start - 4]), start, end
+
+
+def _fields(header: bytes) -> dict[bytes, bytes]:
+    """name=value, each after its length. Raises DamagedError."""
+    fields, at = {}, 0
+    while at < len(header):
+        length = int.from_bytes(header[at : at + 4], "little")
+        name, equals, value = header[at + 4 : at + 4 + length].partition(b"=")
+        at += 4 + length
+        if not equals or at > len(header):
+            raise DamagedError("a header is not whole")
+        fields[name] = value
+    return fields
+
+
+def _unpacked(packed: bytes, compression: str, size: int) -> bytes:
+    """The data of a chunk. At most one byte more than it says is decompressed. Raises DamagedError."""
+    if compression not in ("none", "bz2", "lz4"):
+        raise DamagedError(f"unknown compression {compression!r}")
+    if size > min(_LARGEST_CHUNK, _SMALL + _LARGEST_RATIO * len(packed)):
+        raise DamagedError(f"it says that {len(packed)} bytes hold {size}")
+    try:
+        if compression == "bz2":
+            packed = bz2.BZ2Decompressor().decompress(packed, size + 1)
+        elif compression == "lz4":
+            packed = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
+    except (OSError, RuntimeError, ValueError, EOFError, MemoryError) as error:
+        raise DamagedError("it cannot be decompressed") from error
+    if len(packed) != size:
+        raise DamagedError(f"{len(packed)} bytes instead of {size}")
+    return packed

@@ -1,0 +1,169 @@
+"""rosbag2's SQLite files (.db3).
+
+SQLite has no checksum of what it stores: a file that is cut or whose structure is damaged is read up to there, and
+that is noted; a byte that is damaged within a message is not found.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from pipelines.errors import InputError
+from pipelines.recording.container import Channel, Container, Rows, Schema, rows_of
+from pipelines.recording.data_loss import DataLoss
+
+# No message, definition or number of topics of a recording comes near these.
+_LARGEST, _MOST_TOPICS = 1 << 28, 10_000
+# So many bytes or messages are read at a time.
+_BLOCK, _MOST = 1 << 22, 8192
+
+
+class SqliteFile(Container):
+    """A SQLite file as rosbag2 writes it; opened again for every read.
+
+    Args:
+        path: of the file, as it is named.
+        strict: raise InputError at the first loss.
+        data: the file to read instead.
+
+    Raises InputError when it cannot be opened or is no recording.
+    """
+
+    def __init__(self, path: Path, strict: bool = False, data: Path | None = None) -> None:
+        self.path, self.data, self._strict = path, data or path, strict
+        self.profile = "ros2"
+        self.losses: list[DataLoss] = []
+        self._lost: dict[int, int] = {}
+        try:
+            with self._open() as database:
+                self._check_tables(database)
+                self.channels, self.schemas = self._definitions(database)
+                self.counts = self._counted(database)
+        except (sqlite3.Error, ValueError, OverflowError, MemoryError) as error:
+            raise InputError(f"{path}: not a recording, or damaged: SQLite says: {error}") from error
+        if strict or not self.counts:
+            self._refuse()
+
+    @property
+    def missing(self) -> dict[str, int]:
+        """Topic -> messages known to be lost."""
+        return {self.channels[number].topic: n for number, n in self._lost.items() if n}
+
+    def rows(self, channels: set[int]) -> Iterator[Rows]:
+        """The messages of these channels in the order they were recorded."""
+        left = {number: self.counts.get(number, 0) for number in channels}
+        reason = ""
+        with self._open() as database:
+            found: dict[int, tuple[list[bytes], list[int]]] = {}
+            size = taken = 0
+            cursor = iter(database.execute("SELECT topic_id, timestamp, data FROM messages ORDER BY rowid"))
+            while True:
+                try:
+                    row = next(cursor, None)
+                except (sqlite3.Error, OverflowError, MemoryError) as error:
+                    row, reason = None, str(error)
+                if row is not None:
+                    number, log_ns, data = row
+                    if number not in left or not left[number]:
+                        continue
+                    if not isinstance(data, bytes) or not isinstance(log_ns, int):
+                        reason = "a message that is none"
+                        continue
+                    messages, times = found.setdefault(number, ([], []))
+                    messages.append(data)
+                    times.append(log_ns)
+                    left[number] -= 1
+                    size, taken = size + len(data), taken + 1
+                if row is None or size > _BLOCK or taken > _MOST:
+                    for number, (messages, times) in sorted(found.items()):
+                        yield rows_of(number, messages, times)
+                    found, size, taken = {}, 0, 0
+                if row is None:
+                    break
+        if reason or any(left.values()):
+            self._lose(left, reason or "fewer messages than it says")
+
+    def notes(self, start_ns: int | None, duration_s: float = 0.0) -> tuple[str, ...]:  # noqa: ARG002
+        """Sentences about what is lost."""
+        lost = ", ".join(f"{n} of {topic}" for topic, n in self.missing.items())
+        return tuple(
+            f"the recording is damaged ({loss.reason}){f'; messages lost: {lost}' if lost else ''}"
+            for loss in self.losses[:1]
+        )
+
+    @contextmanager
+    def _open(self) -> Iterator[sqlite3.Connection]:
+        # A file beside which a log of writes lies cannot be opened for reading where the folder cannot be written.
+        last = None
+        for mode in ("mode=ro", "mode=ro&immutable=1"):
+            try:
+                database = sqlite3.connect(f"file:{quote(str(self.data.resolve()))}?{mode}", uri=True)
+                database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LARGEST)
+                database.text_factory = lambda text: text.decode(errors="replace")
+                database.execute("PRAGMA trusted_schema=OFF")
+                database.execute("SELECT name FROM sqlite_master LIMIT 1").fetchone()
+            except sqlite3.Error as error:
+                last = error
+                continue
+            with closing(database):
+                yield database
+            return
+        raise InputError(f"{self.path}: cannot be opened (SQLite says: {last})")
+
+    def _check_tables(self, database: sqlite3.Connection) -> None:
+        """Real tables alone: a view could be anything, and last for ever."""
+        tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table' LIMIT 100")}
+        if not {"topics", "messages"} <= tables:
+            raise InputError(
+                f"{self.path}: a SQLite file that is no rosbag2 recording; its tables: {', '.join(sorted(tables))}"
+            )
+
+    def _definitions(self, database: sqlite3.Connection) -> tuple[dict[int, Channel], dict[int, Schema]]:
+        texts: dict[str, tuple[str, bytes]] = {}
+        if database.execute("SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'").fetchone():
+            query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions LIMIT ?"
+            for kind, encoding, text in database.execute(query, (_MOST_TOPICS,)):
+                texts[str(kind)] = str(encoding), str(text).encode()
+        channels, schemas = {}, {}
+        found: list[Any] = database.execute(
+            "SELECT id, name, type, serialization_format FROM topics LIMIT ?", (_MOST_TOPICS + 1,)
+        ).fetchall()
+        if len(found) > _MOST_TOPICS:
+            raise InputError(f"{self.path}: more than {_MOST_TOPICS} topics, which no recording of sensors has")
+        for i, (number, topic, kind, form) in enumerate(found):
+            encoding, text = texts.get(str(kind), ("ros2msg", b""))
+            schemas[i] = Schema(i, str(kind), encoding, text)
+            channels[int(number)] = Channel(int(number), str(topic), str(form), i)
+        return channels, schemas
+
+    def _counted(self, database: sqlite3.Connection) -> dict[int, int]:
+        """Messages of each channel; of a damaged file those that SQLite comes to."""
+        counts: dict[int, int] = {}
+        try:
+            for (number,) in database.execute("SELECT topic_id FROM messages ORDER BY rowid"):
+                counts[number] = counts.get(number, 0) + 1
+        except sqlite3.Error as error:
+            self.losses.append(DataLoss("damage", 0, 0, reason=f"SQLite says: {error}"))
+        undefined = sum(n for number, n in counts.items() if number not in self.channels)
+        if undefined:
+            self.losses.append(DataLoss("definition", 0, undefined, reason=f"{undefined} messages of unknown topics"))
+        return {number: n for number, n in counts.items() if number in self.channels}
+
+    def _lose(self, left: dict[int, int], reason: str) -> None:
+        for number, n in left.items():
+            if n:
+                self._lost[number] = n
+        self.losses.append(DataLoss("damage", 0, 0, reason=reason))
+        if self._strict:
+            self._refuse()
+
+    def _refuse(self) -> None:
+        if self.losses:
+            raise InputError(f"{self.path}: {'; '.join(self.notes(None))}: record again")
+        if not self.counts and not self.channels:
+            raise InputError(f"{self.path}: nothing in it can be read")

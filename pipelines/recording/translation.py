@@ -1,0 +1,169 @@
+"""Messages of protobuf and JSON as ROS 2 messages.
+
+Translated are messages whose fields have the names that they have in ROS, and Foxglove's own types, which differ from
+them in little: `timestamp` and `frame_id` instead of a header, a transform without a level of its own. What a message
+does not say is NaN; a covariance is zero, unknown.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+
+from pipelines.recording import messages
+from pipelines.recording.container import Schema
+from pipelines.recording.messages import Definition, MessageError
+
+_HEADER, _TIME = "std_msgs/msg/Header", "builtin_interfaces/msg/Time"
+_SAME_NAME = (
+    *(messages.IMU, messages.MAGNETIC_FIELD, messages.JOINT_STATE, messages.NAV_SAT_FIX, messages.CAMERA_INFO),
+    *(messages.COMPRESSED_IMAGE, messages.IMAGE, messages.VECTOR, messages.QUATERNION, messages.POSE),
+    *(messages.PLAIN_POSE, messages.TRANSFORM, messages.ODOMETRY, messages.TWIST, messages.ACCEL, messages.TF),
+    messages.TAG_DETECTIONS,
+)
+# Last part of a type's name -> ROS 2 type.
+_ROS = {name.rpartition("/")[2]: name for name in _SAME_NAME}
+_FOXGLOVE = {
+    "CompressedImage": messages.COMPRESSED_IMAGE,
+    "PoseInFrame": messages.PLAIN_POSE,
+    "FrameTransform": messages.TRANSFORM,
+    "FrameTransforms": messages.TF,
+    "CameraCalibration": messages.CAMERA_INFO,
+    "RawImage": messages.IMAGE,
+    "LocationFix": messages.NAV_SAT_FIX,
+}
+# Names of the two parts of a time.
+_SECONDS, _NANOSECONDS = ("sec", "seconds", "secs"), ("nanosec", "nsec", "nanos", "nsecs")
+
+
+def ros_type(name: str) -> str | None:
+    """The ROS 2 type that messages of a type are translated into, None if there is none."""
+    package, _, kind = name.replace(".", "/").rpartition("/")
+    return (_FOXGLOVE if package.startswith("foxglove") else _ROS).get(kind)
+
+
+class Translation:
+    """Translates messages defined by a schema into CDR of a ROS 2 type. Raises MessageError."""
+
+    def __init__(self, schema: Schema, definition: Definition) -> None:
+        self._definition = definition
+        self._parse = _protobuf(schema) if schema.encoding == "protobuf" else _json
+
+    def __call__(self, data: bytes) -> bytes:
+        """The CDR bytes of one message."""
+        try:
+            tree = self._parse(data)
+            return self._definition.encode(self._message(self._definition.name, tree))
+        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, MemoryError) as error:
+            reason = " ".join(str(error).split())[:200]
+            name = self._definition.name
+            raise MessageError(f"a message of {len(data)} bytes does not translate into {name} ({reason})") from error
+
+    def _message(self, kind: str, tree: Any) -> Any:
+        if kind == _TIME:
+            return self._definition.new(kind, sec=int(_any(tree, _SECONDS)), nanosec=int(_any(tree, _NANOSECONDS)))
+        values = {}
+        for name, what in self._definition.fields(kind):
+            found = _get(tree, name)
+            if what == (Nodetype.NAME, _HEADER) and found is None:
+                found = {
+                    "stamp": _get(tree, "timestamp"),
+                    "frame_id": _get(tree, "frame_id") or _get(tree, "parent_frame_id"),
+                }
+            elif kind == messages.TRANSFORM and name == "transform" and found is None:
+                found = tree
+            values[name] = self._value(what, found, name)
+        return self._definition.new(kind, **values)
+
+    def _value(self, kind: Any, found: Any, name: str) -> Any:
+        node, what = kind
+        if node == Nodetype.NAME:
+            return self._message(what, {} if found is None else found)
+        if node == Nodetype.BASE:
+            return _scalar(what[0], found)
+        (inner, element), count = what
+        count = count if node == Nodetype.ARRAY else 0
+        if inner == Nodetype.NAME:
+            return [self._message(element, one) for one in found or ()]
+        if element[0] == "string":
+            return [str(one) for one in found or ()]
+        dtype = "u1" if element[0] in ("bool", "byte", "char") else element[0]
+        if found is None or (count and not len(found)):
+            return np.full(count, 0.0 if "covariance" in name or dtype[0] != "f" else np.nan, dtype)
+        if isinstance(found, (str, bytes)):
+            return np.frombuffer(base64.b64decode(found, validate=True) if isinstance(found, str) else found, dtype)
+        values = np.array(found, float if dtype[0] == "f" else None).astype(dtype)
+        if values.ndim != 1 or count not in (0, len(values)):
+            raise ValueError(f"{name}: shape {values.shape} instead of {count or 'a list'}")
+        return values
+
+
+def _scalar(kind: str, found: Any) -> Any:
+    if kind == "string":
+        return "" if found is None else str(found)
+    if kind.startswith("float"):
+        return float("nan") if found is None else float(found)
+    return 0 if found is None else int(found)
+
+
+def _get(tree: Any, name: str) -> Any:
+    """A field by its ROS name, whatever the case of its letters; None if there is none."""
+    if isinstance(tree, Mapping):
+        found = tree.get(name)
+        return tree.get(name.upper()) if found is None else found
+    fields = tree.DESCRIPTOR.fields_by_name
+    field = fields.get(name) or fields.get(name.upper())
+    if field is None or (field.has_presence and not tree.HasField(field.name)):
+        return None
+    return getattr(tree, field.name)
+
+
+def _any(tree: Any, names: tuple[str, ...]) -> Any:
+    """The first of several fields that is there, else 0."""
+    return next((found for name in names if (found := _get(tree, name)) is not None), 0)
+
+
+def _json(data: bytes) -> Any:
+    tree = json.loads(data)
+    if not isinstance(tree, dict):
+        raise ValueError("it is no JSON object")
+    return tree
+
+
+def _protobuf(schema: Schema) -> Callable[[bytes], Any]:
+    """Parses messages of the type that a FileDescriptorSet defines."""
+    from google.protobuf import descriptor_pb2, descriptor_pool, message, message_factory
+
+    try:
+        files = {file.name: file for file in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file}
+        pool = descriptor_pool.DescriptorPool()
+        added: set[str] = set()
+
+        def add(name: str) -> None:
+            """A file after those it depends on."""
+            if name in added or name not in files:
+                return
+            added.add(name)
+            for needed in files[name].dependency:
+                add(needed)
+            pool.Add(files[name])
+
+        for name in files:
+            add(name)
+        kind = message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
+    except (message.Error, KeyError, TypeError, ValueError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise MessageError(f"the definition of message type {schema.name} cannot be read ({reason})") from error
+
+    def parse(data: bytes) -> Any:
+        try:
+            return kind.FromString(data)
+        except message.DecodeError as error:
+            raise ValueError(str(error)) from error
+
+    return parse

@@ -1,0 +1,254 @@
+"""A recording in the forms that people's recordings come in, written by others' writers."""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zstandard
+from mcap.reader import make_reader
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as Ros2Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from pipelines.recording.messages import TAG_DETECTIONS, definition_text
+
+# Topic, type, log time in ns, CDR.
+Message = tuple[str, str, int, bytes]
+
+
+def stores() -> tuple[Any, Any]:
+    """ROS 2's types and ROS 1's."""
+    ros2, ros1 = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
+    tags = get_types_from_msg(definition_text(TAG_DETECTIONS), TAG_DETECTIONS)
+    own = {name: fields for name, fields in tags.items() if name.startswith("apriltag_msgs")}
+    ros2.register(own)
+    ros1.register(own)
+    return ros2, ros1
+
+
+ROS2, ROS1 = stores()
+
+
+def raw_messages(path: Path) -> Iterator[Message]:
+    """The messages of an MCAP file."""
+    with path.open("rb") as stream:
+        for schema, channel, message in make_reader(stream).iter_messages():
+            assert schema is not None
+            yield channel.topic, schema.name, message.log_time, message.data
+
+
+def rosbag2(source: Path, path: Path, storage: StoragePlugin, mode: CompressionMode = CompressionMode.NONE) -> Path:
+    """A bag folder."""
+    writer = Ros2Writer(path, version=9, storage_plugin=storage)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connections: dict[str, Any] = {}
+        for topic, kind, log_ns, data in raw_messages(source):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=ROS2)
+            writer.write(connections[topic], log_ns, data)
+    return path
+
+
+def split(source: Path, path: Path, count: int = 3) -> Path:
+    """A bag folder of several MCAP files, with the metadata.yaml that names them."""
+    path.mkdir()
+    whole = list(raw_messages(source))
+    names = [f"{path.name}_{i}.mcap" for i in range(count)]
+    for i, name in enumerate(names):
+        part = whole[i * len(whole) // count : (i + 1) * len(whole) // count]
+        mcap(part, path / name, lambda _, data: data, "cdr", "ros2msg", _ros2_schema)
+    listed = "\n".join(f"    - {name}" for name in names)
+    (path / "metadata.yaml").write_text(
+        f"rosbag2_bagfile_information:\n  version: 9\n  relative_file_paths:\n{listed}\n"
+    )
+    return path
+
+
+def zstd(source: Path, path: Path) -> Path:
+    """A file compressed as a whole."""
+    path.write_bytes(zstandard.compress(source.read_bytes()))
+    return path
+
+
+def rosbag1(source: Path, path: Path, compression: Ros1Writer.CompressionFormat | None = None) -> Path:
+    """A ROS 1 bag."""
+    writer = Ros1Writer(path)
+    if compression is not None:
+        writer.set_compression(compression)
+    with writer:
+        connections: dict[str, Any] = {}
+        for topic, kind, log_ns, data in raw_messages(source):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=ROS1)
+            writer.write(connections[topic], log_ns, _to_ros1(kind, data))
+    return path
+
+
+def mcap(
+    messages: Any,
+    path: Path,
+    convert: Callable[[str, bytes], bytes],
+    encoding: str,
+    schema_encoding: str,
+    schema_of: Callable[[str], tuple[str, bytes]],
+) -> Path:
+    """An MCAP file of messages in another encoding."""
+    with path.open("wb") as stream:
+        writer = McapWriter(stream, compression=CompressionType.ZSTD, chunk_size=20_000)
+        writer.start("ros1" if encoding == "ros1" else "ros2" if encoding == "cdr" else "")
+        channels: dict[str, int] = {}
+        for topic, kind, log_ns, data in messages:
+            if topic not in channels:
+                name, text = schema_of(kind)
+                channels[topic] = writer.register_channel(
+                    topic, encoding, writer.register_schema(name, schema_encoding, text)
+                )
+            writer.add_message(channels[topic], log_ns, convert(kind, data), log_ns)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+def mcap_ros1(source: Path, path: Path) -> Path:
+    """MCAP with ROS 1 messages."""
+
+    def schema(kind: str) -> tuple[str, bytes]:
+        return kind.replace("/msg/", "/"), ROS1.generate_msgdef(kind, ros_version=1)[0].encode()
+
+    return mcap(raw_messages(source), path, _to_ros1, "ros1", "ros1msg", schema)
+
+
+def mcap_json(source: Path, path: Path) -> Path:
+    """MCAP with the messages as JSON."""
+
+    def convert(kind: str, data: bytes) -> bytes:
+        return json.dumps(_tree(ROS2.deserialize_cdr(data, kind))).encode()
+
+    def schema(kind: str) -> tuple[str, bytes]:
+        return kind.replace("/msg", ""), b"{}"
+
+    return mcap(raw_messages(source), path, convert, "json", "jsonschema", schema)
+
+
+def mcap_protobuf(source: Path, path: Path) -> Path:
+    """MCAP with the messages as protobuf types of the same fields."""
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+
+    made: dict[str, tuple[Any, bytes]] = {}
+
+    def kind_of(kind: str) -> tuple[Any, bytes]:
+        if kind not in made:
+            file = descriptor_pb2.FileDescriptorProto(name=f"{kind}.proto", package="ros", syntax="proto3")
+            _describe(kind, file, set())
+            pool = descriptor_pool.DescriptorPool()
+            pool.Add(file)
+            found = pool.FindMessageTypeByName(f"ros.{kind.rpartition('/')[2]}")
+            files = descriptor_pb2.FileDescriptorSet(file=[file])
+            made[kind] = message_factory.GetMessageClass(found), files.SerializeToString()
+        return made[kind]
+
+    def convert(kind: str, data: bytes) -> bytes:
+        message = kind_of(kind)[0]()
+        _fill(message, ROS2.deserialize_cdr(data, kind))
+        return bytes(message.SerializeToString())
+
+    def schema(kind: str) -> tuple[str, bytes]:
+        return f"ros.{kind.rpartition('/')[2]}", kind_of(kind)[1]
+
+    return mcap(raw_messages(source), path, convert, "protobuf", "protobuf", schema)
+
+
+def ulog(path: Path, topics: dict[str, dict[str, np.ndarray[Any, Any]]]) -> Path:
+    """A PX4 log by its specification: topics, name -> fields -> values; a field of two dimensions is an array."""
+    kinds = {"u8": "uint64_t", "f4": "float", "f8": "double", "u4": "uint32_t", "i4": "int32_t", "u1": "uint8_t"}
+
+    def record(kind: bytes, body: bytes) -> bytes:
+        return struct.pack("<Hc", len(body), kind) + body
+
+    out = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0), record(b"B", bytes(40))]
+    dtypes = {}
+    for name, columns in topics.items():
+        fields = [(key, values.dtype.str[1:], values.shape[1:]) for key, values in columns.items()]
+        dtypes[name] = np.dtype([(key, f"<{kind}" if kind != "u1" else kind, shape) for key, kind, shape in fields])
+        text = "".join(f"{kinds[kind]}{f'[{shape[0]}]' if shape else ''} {key};" for key, kind, shape in fields)
+        out.append(record(b"F", f"{name}:{text}".encode()))
+    for number, name in enumerate(topics):
+        out.append(record(b"A", struct.pack("<BH", 0, number) + name.encode()))
+    rows = []
+    for number, (name, columns) in enumerate(topics.items()):
+        table = np.zeros(len(columns["timestamp"]), dtypes[name])
+        for key, values in columns.items():
+            table[key] = values
+        head = struct.pack("<H", number)
+        rows += [
+            (int(t), record(b"D", head + row.tobytes())) for t, row in zip(columns["timestamp"], table, strict=True)
+        ]
+    path.write_bytes(b"".join([*out, *(data for _, data in sorted(rows, key=lambda row: row[0]))]))
+    return path
+
+
+def _ros2_schema(kind: str) -> tuple[str, bytes]:
+    return kind, definition_text(kind).encode()
+
+
+def _to_ros1(kind: str, data: bytes) -> bytes:
+    return bytes(ROS2.cdr_to_ros1(data, kind))
+
+
+def _tree(message: Any) -> Any:
+    """A message as JSON's objects."""
+    if hasattr(message, "__msgtype__"):
+        return {name: _tree(getattr(message, name)) for name, _ in ROS2.fielddefs[message.__msgtype__][1]}
+    if isinstance(message, np.ndarray):
+        return base64.b64encode(message.tobytes()).decode() if message.dtype == np.uint8 else message.tolist()
+    return [_tree(one) for one in message] if isinstance(message, list) else message
+
+
+def _describe(kind: str, file: Any, done: set[str]) -> None:
+    """Add the type, and those it holds, to a file of descriptors."""
+    from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
+
+    if kind in done:
+        return
+    done.add(kind)
+    described = file.message_type.add(name=kind.rpartition("/")[2])
+    scalars = {"float64": Field.TYPE_DOUBLE, "float32": Field.TYPE_FLOAT, "string": Field.TYPE_STRING}
+    for number, (name, (node, what)) in enumerate(ROS2.fielddefs[kind][1], start=1):
+        repeated = int(node) > 2
+        if repeated:
+            node, what = what[0]
+        field = described.field.add(name=name, number=number)
+        field.label = Field.LABEL_REPEATED if repeated else Field.LABEL_OPTIONAL
+        if int(node) == 2:
+            field.type, field.type_name = Field.TYPE_MESSAGE, f".ros.{what.rpartition('/')[2]}"
+            _describe(what, file, done)
+        elif repeated and what[0] == "uint8":
+            field.type, field.label = Field.TYPE_BYTES, Field.LABEL_OPTIONAL
+        else:
+            field.type = scalars.get(what[0], Field.TYPE_INT64)
+
+
+def _fill(target: Any, message: Any) -> None:
+    for name, _ in ROS2.fielddefs[message.__msgtype__][1]:
+        value = getattr(message, name)
+        if hasattr(value, "__msgtype__"):
+            getattr(target, name).SetInParent()
+            _fill(getattr(target, name), value)
+        elif isinstance(value, list) and value and hasattr(value[0], "__msgtype__"):
+            for one in value:
+                _fill(getattr(target, name).add(), one)
+        elif isinstance(value, np.ndarray) and value.dtype == np.uint8:
+            setattr(target, name, value.tobytes())
+        elif isinstance(value, (list, np.ndarray)):
+            getattr(target, name).extend(list(value))
+        else:
+            setattr(target, name, int(value) if isinstance(value, bool) else value)
