@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.recording.message_reader import ENCODING
 from pipelines.recording.message_reader import Topic as RecordedTopic
 from pipelines.recording.reading import Recording
 from pipelines.recording.topics import Need, Setting, Topic
@@ -99,9 +98,9 @@ def _lack(need: Topic | Setting, recording: Recording, config: Config) -> str:
     found = recording.topics.get(name)
     types = " or ".join(need.types)
     if found is None:
-        return f"{name} ({types})"
+        return f"{name} ({need.types[0]})"
     if found.type not in need.types:
         return f"{name} as {types}, not {found.type}"
-    if found.encoding != ENCODING:
-        return f"{name} in the encoding {ENCODING}, not {found.encoding}"
+    if not found.is_readable:
+        return f"{name} in an encoding that is read, not {found.encoding}"
     return "" if found.count else f"messages on {name}"

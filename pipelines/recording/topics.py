@@ -35,7 +35,7 @@ Need = Sequence[Sequence[Topic | Setting]]
 
 # Topics that several methods read.
 IMU = Topic("imu", "/imu", (messages.IMU,))
-IMAGE = Topic("image", "/camera/image/compressed", (messages.COMPRESSED_IMAGE,))
+IMAGE = Topic("image", "/camera/image/compressed", messages.PICTURES)
 CAMERA_INFO = Topic("camera_info", "/camera/camera_info", (messages.CAMERA_INFO,))
 
 

@@ -8,10 +8,10 @@ from pipelines.recording import messages
 from pipelines.recording.topics import CAMERA_INFO, IMAGE, Need, Setting, Topic
 from pipelines.settings import Board, MethodSection
 
-HEAD_IMU = Topic("head_imu", "/head/imu", (messages.IMU,))
-PLATFORM_IMU = Topic("platform_imu", "/platform/imu", (messages.IMU,))
-VISION_ATTITUDE = Topic("vision_attitude", "/vision/attitude", (messages.POSE, messages.QUATERNION))
-TRUTH_ATTITUDE = Topic("truth_attitude", "/truth/attitude", (messages.QUATERNION,))
+HEAD_IMU = Topic("head_imu", "/head/imu", messages.RATES)
+PLATFORM_IMU = Topic("platform_imu", "/platform/imu", messages.RATES)
+VISION_ATTITUDE = Topic("vision_attitude", "/vision/attitude", messages.ATTITUDES)
+TRUTH_ATTITUDE = Topic("truth_attitude", "/truth/attitude", messages.ATTITUDES)
 
 
 class HeadConfig(MethodSection):
