@@ -1,0 +1,136 @@
+"""Sinusoids in the noise of a sensor: vibration, mains, a beat of the sampling. Lines far above the floor of a spectrum.
+
+The spectrum is Welch's, "The use of fast Fourier transform for the estimation of power spectra", IEEE Trans. Audio
+Electroacoust. 1967: Hann windows that overlap by half.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.chi_square import quantile
+
+Array = NDArray[np.float64]
+
+# A record is cut into so many windows of at most and at least so many samples.
+_WINDOWS, _LONGEST, _SHORTEST = 8, 1 << 16, 128
+# Degrees of freedom a Hann window that overlaps by half adds.
+_DOF_PER_WINDOW = 1.06
+# The floor is the median over so many neighbours; a line stands at least so far above it, and above what chance does in
+# one record of so many.
+_NEIGHBOURS, _ABOVE, _CHANCE = 41, 4.0, 1e-4
+# A Hann window spreads a line over so many numbers on either side.
+_SPREAD = 2
+# The lowest numbers are the drift's.
+_FIRST = 8
+# The transform of the whole record spreads a line beyond these; left out is where it adds more than this part.
+_LEAST_ADDED = 0.01
+_MOST_LINES = 10
+
+
+@dataclass(frozen=True)
+class Line:
+    """A sinusoid: frequency, Hz, known to resolution_hz; amplitude (peak) in the sensor's unit; band_hz it spoils."""
+
+    hz: float
+    amplitude: float
+    resolution_hz: float
+    band_hz: tuple[float, float]
+
+
+def find_lines(pieces: Sequence[Array], interval_s: float) -> tuple[Line, ...]:
+    """The strongest sinusoids in pieces of a record at rest, by amplitude; none where the record is too short to tell.
+
+    Args:
+        pieces: samples, each piece evenly spaced by interval_s.
+        interval_s: s.
+    """
+    longest = max(len(piece) for piece in pieces)
+    size = min(_LONGEST, 1 << int(np.log2(max(1, longest // _WINDOWS))))
+    if size < _SHORTEST:
+        return ()
+    power, windows = _welch(pieces, size)
+    power *= interval_s
+    # Neither zero, nor what a drift leaks into, nor half the sampling rate.
+    inner, floor = power[_FIRST:-1], _floor(power)[_FIRST:-1]
+    dof = 2.0 * _DOF_PER_WINDOW * windows
+    enough = max(_ABOVE, quantile(1.0 - _CHANCE / len(inner), dof) / dof)
+    high = inner > enough * floor
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], high, [False]]).astype(int))).reshape(-1, 2)
+    resolution = 1.0 / (size * interval_s)
+    found = []
+    for start, stop in _merged(edges).tolist():
+        around = slice(max(0, start - _SPREAD), min(len(inner), stop + _SPREAD))
+        excess = np.maximum(inner[around] - floor[around], 0.0)
+        hz = float((_FIRST + np.arange(len(inner))[around]) @ excess / excess.sum()) * resolution
+        variance = float(excess.sum()) * resolution
+        density = 0.5 * float(floor[start:stop].min())  # two-sided
+        leak = np.sqrt(variance / (_LEAST_ADDED * density * longest * interval_s)) / np.pi
+        reach = max(leak, (0.5 * (stop - start) + _SPREAD) * resolution)
+        found.append(Line(hz, float(np.sqrt(2.0 * variance)), resolution, (hz - reach, hz + reach)))
+    return tuple(sorted(found, key=lambda line: -line.amplitude)[:_MOST_LINES])
+
+
+def without_lines(pieces: Sequence[Array], interval_s: float, lines: Sequence[Line]) -> list[Array]:
+    """The pieces less the steady part of each sinusoid: what keeps its frequency, phase and amplitude over a piece."""
+    out = []
+    for piece in pieces:
+        left = piece - piece.mean()
+        for line in lines:
+            left = _less(left, 2.0 * np.pi * line.hz * interval_s, 2.0 * np.pi * line.resolution_hz * interval_s)
+        out.append(left)
+    return out
+
+
+def _less(x: Array, rate: float, resolution: float) -> Array:
+    """x less the sinusoid that fits it best near a rate, all in rad a sample."""
+    # Turned down to nearly zero and averaged, the line is the peak of a short spectrum.
+    block = max(1, int(np.pi / (4.0 * resolution)))
+    count = len(x) // block
+    k = np.arange(len(x)) - 0.5 * len(x)
+    slow = (x * np.exp(-1j * rate * k))[: count * block].reshape(count, block).mean(axis=1)
+    spectrum = np.fft.fft(slow, 8 * count)
+    rate += 2.0 * np.pi * float(np.fft.fftfreq(8 * count, block)[np.argmax(np.abs(spectrum))])
+    for _ in range(3):
+        wave = np.exp(1j * rate * k)
+        amplitude = 2.0 * np.vdot(wave, x) / len(x)
+        carried = amplitude * wave
+        slope = -k * carried.imag
+        left = x - carried.real
+        rate += float(slope @ left / (slope @ slope))
+    return x - (2.0 * np.vdot(np.exp(1j * rate * k), x) / len(x) * np.exp(1j * rate * k)).real
+
+
+def _welch(pieces: Sequence[Array], size: int) -> tuple[Array, int]:
+    """One-sided density (size/2 + 1,), squares per cycle a sample, and the number of windows."""
+    window = np.hanning(size + 1)[:-1]
+    total, windows = np.zeros(size // 2 + 1), 0
+    for piece in pieces:
+        for start in range(0, len(piece) - size + 1, size // 2):
+            part = piece[start : start + size]
+            total += np.abs(np.fft.rfft(window * (part - part.mean()))) ** 2
+            windows += 1
+    return 2.0 * total / windows / (window @ window), windows
+
+
+def _floor(power: Array) -> Array:
+    """Median of the neighbours; fewer of them at both ends, so that a slope in frequency does not bias it."""
+    half = _NEIGHBOURS // 2
+    out = np.empty(len(power))
+    out[half : len(power) - half] = np.median(np.lib.stride_tricks.sliding_window_view(power, 2 * half + 1), axis=1)
+    for i in (*range(2 * half), *range(len(power) - half, len(power))):
+        reach = max(1, min(half, i // 2, len(power) - 1 - i))
+        out[i] = np.median(power[max(0, i - reach) : i + reach + 1])
+    return out
+
+
+def _merged(edges: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Ranges [start, stop) with those joined that a window's spread parts."""
+    if not len(edges):
+        return edges
+    apart = edges[1:, 0] - edges[:-1, 1] > 2 * _SPREAD
+    return np.stack([edges[np.append(True, apart), 0], edges[np.append(apart, True), 1]], axis=1)
