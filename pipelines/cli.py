@@ -219,6 +219,30 @@ def info(session: _Session, config: _ConfigFile = None, strict: _Strict = False,
 
 
 @app.command()
+def noise(
+    session: _Session,
+    out: Annotated[Path | None, typer.Option(help="Folder for noise.html and noise.json.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print noise.json and nothing else.")] = False,
+    strict: _Strict = False,
+    quiet: _Quiet = False,
+) -> None:
+    """The noise of gyros, accelerometers and magnetometers from their time at rest, and the config's section for it."""
+    from pipelines import progress, terminal
+    from pipelines.noise import noise_of
+    from pipelines.reports.noise import noise_json, write_noise
+
+    with progress.shown(quiet):
+        study = noise_of(session, strict)
+    written = () if out is None else write_noise(out, study)
+    if as_json:
+        print(noise_json(study), end="")
+        return
+    terminal.show_noise(study)
+    if out is not None:
+        terminal.say(f"Results in {out}: {', '.join(p.name for p in written)}")
+
+
+@app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the recording and its results.")] = Path("alidade-demo"),
     quiet: _Quiet = False,

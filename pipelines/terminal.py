@@ -13,6 +13,7 @@ from rich.table import Table
 from pipelines.errors import printable
 
 if TYPE_CHECKING:
+    from pipelines.noise import NoiseStudy
     from pipelines.planning import Plan
     from pipelines.recording.info import SessionFacts
     from pipelines.reports.result import Calibration, ParameterResult
@@ -135,6 +136,30 @@ def show_plan(plan: Plan) -> None:
         say(f"Still short: {', '.join(f'{name} by {ratio:.2g}' for name, ratio in plan.best.missing.items())}.")
     else:
         say(f"With that, {plan.best.duration:.0f} s tell everything as accurately as required.")
+
+
+def show_noise(study: NoiseStudy) -> None:
+    """A table a sensor, what to know beside it, and the section to paste."""
+    from pipelines.reports.noise import remarks, rows, section, title
+
+    for sensor in study.sensors:
+        say(title(sensor))
+        table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
+        table.add_column("noise", no_wrap=True)
+        table.add_column("unit", no_wrap=True)
+        for axis in sensor.axes:
+            table.add_column(axis, justify="right", no_wrap=True)
+        for row in rows(sensor):
+            table.add_row(row.name, row.unit, *map(escape, row.cells))
+            table.add_row("", row.si_unit, *map(escape, row.si_cells), style="dim")
+        console.print(table)
+        for remark in remarks(sensor):
+            say(f"  {remark}")
+        say("")
+    for note in study.notes:
+        say(f"note: {note}")
+    for line in section(study)[1].splitlines():
+        say(line)
 
 
 def _cell(parameter: ParameterResult, factor: float, error_sigmas: float | None, alone: bool) -> str:

@@ -68,7 +68,9 @@ def allan_curve(pieces: Sequence[Array], interval_s: float) -> AllanCurve:
     usable = terms > 0
     factors, squares, terms = factors[usable], squares[usable], terms[usable]
     deviation = np.sqrt(squares / (2.0 * terms)) / factors
-    return AllanCurve(factors * interval_s, deviation, terms, interval_s, tuple(len(piece) for piece in pieces))
+    return AllanCurve(
+        interval_s * factors.astype(float), deviation, terms, interval_s, tuple(len(piece) for piece in pieces)
+    )
 
 
 def allan_variance(tau: Array, squares: Array) -> Array:
@@ -117,7 +119,7 @@ def _degrees_of_freedom(curve: AllanCurve, tau: float, squares: Array) -> float:
         if terms <= 0:
             continue
         lags = np.arange(0, min(terms, _REACH * m + 1), step)
-        covariance = _second_difference_covariance(lags * curve.interval_s, tau, squares)
+        covariance = _second_difference_covariance(curve.interval_s * lags.astype(float), tau, squares)
         weights = (terms - lags) * np.where(lags > 0, 2.0, 1.0)
         weighted += float(weights @ (covariance / covariance[0]) ** 2) * step
         total += terms

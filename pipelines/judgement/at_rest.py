@@ -25,7 +25,8 @@ Mask = NDArray[np.bool_]
 _BLOCK, _LEAST = 0.5, 32
 # Scatter: the quietest share of blocks, and how many times theirs a block at rest may have.
 _QUIETEST, _LOUDER = 0.05, 2.0
-# Difference of neighbouring means, in units of what chance does and, at least and at most, of the scatter; a ramp has 3.5.
+# Difference of neighbouring means: in units of what chance does; at least and at most in units of the scatter, of
+# which a ramp has 3.5.
 _MOVED, _MOVED_LIMITS = 4.5, (1.0, 2.5)
 # Mean squared step over twice the variance: 1 in white noise, 0.1 behind a filter of a tenth of half the rate.
 _SMOOTH = 0.02
@@ -62,6 +63,7 @@ def stretches_at_rest(t: Array, sensors: Sequence[Array], gyro: Array | None = N
 
 def _quiet(blocks: Array) -> Mask:
     """Which blocks (count, size, k) are at rest as one sensor sees it."""
+    blocks = blocks - blocks[0, 0]  # readings that never change are exactly zero then
     means = blocks.mean(axis=1)
     variance = ((blocks - means[:, None]) ** 2).mean(axis=(1, 2))
     steps = (np.diff(blocks, axis=1) ** 2).mean(axis=(1, 2))

@@ -5,10 +5,10 @@ their variances are, for samples tau0 apart and k = 1 ... n-1,
 
     N^2 / tau0  +  K^2 tau0 / u  +  B^2 / sqrt(u)  +  Q^2 u / tau0^2
 
-White noise and random walk are split exactly (the basis is that of the walk's increments), the quantised integral but for
-its ends; the term of B is the flicker of Hosking, "Fractional differencing", Biometrika 1981, and agrees with
-B^2 / (2 pi f) of IEEE Std 952. So every number of the transform tells as much of the coefficients as it can, where slopes
-read from an Allan plot use a few of them; the likelihood is Whittle's (1953), exact for N and K.
+White noise and random walk are split exactly (the basis is that of the walk's increments), the quantised integral but
+for its ends; the term of B is the flicker of Hosking, "Fractional differencing", Biometrika 1981, and agrees with
+B^2 / (2 pi f) of IEEE Std 952. So every number of the transform tells as much of the coefficients as it can, where
+slopes read from an Allan plot use a few of them; the likelihood is Whittle's (1953), exact for N and K.
 """
 
 from __future__ import annotations
@@ -37,8 +37,9 @@ _SHOWS, _TOLD = 10.0, 3.0
 # 95 % of chi-square of one degree of freedom on one side.
 _BELOW = 2.706
 _CONFIDENCE = 0.95
-# An octave whose mean power is off by more than this part, and by so many of its sigmas, contradicts the model.
-_OFF, _OFF_SIGMAS = 0.1, 5.0
+# An octave contradicts the model when its mean power is off by more than this part, and by what chance does once in so
+# many octaves.
+_OFF, _ONCE_IN = 0.1, 3e6
 # The band that is fitted spans at least so many octaves.
 _LEAST_OCTAVES = 4.0
 # A noise counts as able to be told by a longer record up to this length, s.
@@ -74,7 +75,7 @@ class NoiseFit:
         coefficients: Q, N, B, K.
         squares: (4,) Q^2, N^2, B^2, K^2 of the model that fits best, zero for what is not in it.
         band_hz: the frequencies it holds for.
-        filtered: above the band the samples are smoother, or rougher, than the model: a filter of the sensor.
+        filtered: above the band the samples are smoother, or rougher, than any model: a filter in the sensor.
         misfit: factor between power found and power of the model in the octave where they differ most; 1 where they
             agree within chance.
         misfit_hz: that octave's middle.
@@ -90,7 +91,7 @@ class NoiseFit:
 
 @dataclass(frozen=True, eq=False)
 class _Bins:
-    """Mean power (n,) of bins of the transform, how many numbers are in each, and the mean variance per noise (n, 4)."""
+    """Bins of the transform: mean power (n,), how many numbers are in each, mean variance for each noise (n, 4)."""
 
     hz: Array
     power: Array
@@ -167,39 +168,46 @@ def _widest_band(bins: _Bins) -> tuple[_Bins, Array, Mask]:
     """The band up to the highest frequency at which some model fits; all of it where none does.
 
     A sensor's own low-pass filter takes away noise near half the sampling rate; what is below it is the density that
-    counts for an integral.
+    counts for an integral. Quantisation is what rises up to half the sampling rate; in a narrower band it has no place.
     """
-    found = []
+    whole = bins, *_select(bins, NOISES)
+    if _fits(*whole[:2]):
+        return whole
     edge = float(bins.hz[-1])
-    while edge >= bins.hz[0] * 2.0**_LEAST_OCTAVES or not found:
-        band = bins.below(edge)
-        squares, model = _select(band)
-        off, _ = _worst_octave(band, band.basis @ squares)
-        found.append((abs(np.log(off)), band, squares, model))
-        if off == 1.0:
-            break
+    while edge >= bins.hz[0] * 2.0**_LEAST_OCTAVES:
         edge /= 2.0**0.5
-    best = found[-1] if found[-1][0] == 0.0 else found[0]
-    return best[1:]
+        band = bins.below(edge)
+        part = band, *_select(band, NOISES[1:])
+        if _fits(*part[:2]):
+            # What a filter takes away falls to a quarter an octave, and was just too little to be seen.
+            lower = bins.below(max(0.5 * edge, bins.hz[0] * 2.0**_LEAST_OCTAVES))
+            return lower, *_select(lower, NOISES[1:])
+    return whole
 
 
-def _select(bins: _Bins) -> tuple[Array, Mask]:
-    """Squares of the coefficients (4,) and which of them the model has: one after the other while the next one shows."""
+def _fits(bins: _Bins, squares: Array) -> bool:
+    return _worst_octave(bins, bins.basis @ squares)[0] == 1.0
+
+
+def _select(bins: _Bins, candidates: Sequence[str]) -> tuple[Array, Mask]:
+    """Squares of the coefficients (4,) and which of them the model has: one after the other as long as one shows."""
+    left = {NOISES.index(name) for name in candidates} - {_N}
     model = np.zeros(4, dtype=bool)
     model[_N] = True
     squares = _maximise(bins, model)
     best = _likelihood(bins, squares)
-    while not model.all():
+    while left:
         trials = []
-        for i in np.flatnonzero(~model):
+        for i in left:
             wider = model.copy()
             wider[i] = True
             trial = _maximise(bins, wider)
-            trials.append((_likelihood(bins, trial), int(i), trial))
+            trials.append((_likelihood(bins, trial), i, trial))
         likelihood, i, trial = max(trials, key=lambda t: t[0])
         if likelihood - best < _SHOWS:
             break
         model[i] = True
+        left.remove(i)
         best, squares = likelihood, trial
     return squares, model
 
@@ -218,9 +226,8 @@ def _maximise(bins: _Bins, model: Mask, held: tuple[int, float] | None = None) -
     basis = bins.basis[:, model]
     rest = np.zeros(len(bins.hz)) if held is None else held[1] * bins.basis[:, held[0]]
     weight = np.sqrt(bins.count)
-    # Each noise could at most explain all there is where it is strongest.
-    theta = np.array([np.average(bins.power, weights=weight * b / b.max()) / np.average(b, weights=weight * b / b.max())
-                      for b in basis.T]) / basis.shape[1]
+    # To begin with each explains its part of the power where it is strongest.
+    theta = (weight * bins.power) @ basis / (weight @ basis**2) / basis.shape[1]
 
     def value(t: Array) -> float:
         s = basis @ t + rest
@@ -263,9 +270,9 @@ def _sigmas(bins: _Bins, squares: Array, model: Mask) -> Array:
 def _coefficient(i: int, bins: _Bins, squares: Array, model: Mask, samples: int, interval_s: float) -> Coefficient:
     sigma = _sigmas(bins, squares, model)[i]
     if model[i] and squares[i] >= _TOLD * sigma:
-        low, high = interval(_CONFIDENCE, 2.0 * (squares[i] / sigma) ** 2)
+        low, high = interval(_CONFIDENCE, float(2.0 * (squares[i] / sigma) ** 2))
         root = float(np.sqrt(squares[i]))
-        return Coefficient(NOISES[i], root, float(0.5 * sigma / root), root * low**0.5, root * high**0.5)
+        return Coefficient(NOISES[i], root, float(0.5 * sigma) / root, root * low**0.5, root * high**0.5)
     bound = _bound(i, bins, squares, model)
     needed = _needed(i, bins, squares, model, bound / 4.0, samples, interval_s)
     return Coefficient(NOISES[i], None, None, 0.0, float(np.sqrt(bound)), needed)
@@ -323,7 +330,7 @@ def _worst_octave(bins: _Bins, variance: Array) -> tuple[float, float]:
     for start, stop in pairwise(edges.tolist()):
         count = bins.count[start:stop]
         ratio = float(count @ (bins.power / variance)[start:stop] / count.sum())
-        low, high = (quantile(p, count.sum()) / count.sum() for p in (3e-7, 1.0 - 3e-7))
+        low, high = (quantile(p, count.sum()) / count.sum() for p in (1.0 / _ONCE_IN, 1.0 - 1.0 / _ONCE_IN))
         beyond = not low < ratio < high and abs(ratio - 1.0) > _OFF
         if beyond and abs(np.log(ratio)) > abs(np.log(worst)):
             worst, where = ratio, float(np.sqrt(bins.hz[start] * bins.hz[stop - 1]))

@@ -1,4 +1,4 @@
-"""Sinusoids in the noise of a sensor: vibration, mains, a beat of the sampling. Lines far above the floor of a spectrum.
+"""Sinusoids in the noise of a sensor (vibration, mains, a beat of the sampling): lines far above a spectrum's floor.
 
 The spectrum is Welch's, "The use of fast Fourier transform for the estimation of power spectra", IEEE Trans. Audio
 Electroacoust. 1967: Hann windows that overlap by half.

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# A step longer than this many intervals may be a loss; it is one if the stamps around it, so many on either side, agree.
+# A step longer than this many intervals may be a loss; it is one if so many stamps on either side agree.
 _STEP, _AROUND = 1.5, 8
 # So many samples lost in a row are filled in, if no more than this part of all is; otherwise a piece ends.
 _HOLE, _MOST_FILLED = 5, 0.02

@@ -1,0 +1,313 @@
+"""The noise of a recording as people and programs read it: a table, the `noise:` section, noise.json, noise.html."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import cycle
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pipelines.judgement.allan import allan_variance
+from pipelines.judgement.noise_fit import Coefficient
+from pipelines.noise import NoiseStudy, SensorNoise
+from pipelines.recording.topics import TOPICS
+from pipelines.reports.plots import COLORS, figure
+from pipelines.reports.result import software_versions
+from pipelines.reports.templating import environment
+from pipelines.reports.whole import write_whole
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
+
+FILES = ("noise.html", "noise.json")
+
+_TITLES = {"gyro": "gyro", "accel": "accelerometer", "mag": "magnetometer"}
+_COEFFICIENTS = {"N": "white noise", "B": "bias instability", "K": "random walk", "Q": "quantisation"}
+_KEYS = {"gyro": "gyro_density", "accel": "accel_density", "mag": "mag_density"}
+
+_DEG_H = math.degrees(3600.0)
+_UG = 1e6 / 9.80665
+# Kind and coefficient -> SI unit, the unit people use, and what to multiply SI by.
+_UNITS: dict[str, dict[str, tuple[str, str, float]]] = {
+    "gyro": {
+        "N": ("rad/s/sqrt(Hz)", "deg/sqrt(h)", math.degrees(60.0)),
+        "B": ("rad/s", "deg/h", _DEG_H),
+        "K": ("rad/s/sqrt(s)", "deg/h/sqrt(h)", 60.0 * _DEG_H),
+        "Q": ("rad", "arcsec", _DEG_H),
+    },
+    "accel": {
+        "N": ("m/s^2/sqrt(Hz)", "ug/sqrt(Hz)", _UG),
+        "B": ("m/s^2", "ug", _UG),
+        "K": ("m/s^2/sqrt(s)", "ug/sqrt(h)", 60.0 * _UG),
+        "Q": ("m/s", "mm/s", 1e3),
+    },
+    "mag": {
+        "N": ("T/sqrt(Hz)", "nT/sqrt(Hz)", 1e9),
+        "B": ("T", "nT", 1e9),
+        "K": ("T/sqrt(s)", "nT/sqrt(h)", 60e9),
+        "Q": ("T s", "nT s", 1e9),
+    },
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One coefficient of a sensor: name, unit people use, a cell for each axis; the same in SI."""
+
+    name: str
+    unit: str
+    cells: tuple[str, ...]
+    si_unit: str
+    si_cells: tuple[str, ...]
+
+
+def title(sensor: SensorNoise) -> str:
+    """Topic and kind, rate and time at rest of a sensor, in a line."""
+    count = len(sensor.rests)
+    longest = float(np.ptp(sensor.rests, axis=1).max())
+    rests = (
+        f"at rest from {sensor.rests[0, 0]:.1f} to {sensor.rests[0, 1]:.1f} s"
+        if count == 1
+        else f"{count} stretches at rest, {length(sensor.length_s)} in all, the longest {length(longest)}"
+    )
+    return f"{sensor.topic} {_TITLES[sensor.kind]}, {sensor.rate_hz:.4g} Hz, {rests}"
+
+
+def rows(sensor: SensorNoise) -> list[Row]:
+    """The coefficients of a sensor; quantisation only where it shows."""
+    out = []
+    for name, words in _COEFFICIENTS.items():
+        found = [_of(sensor, axis, name) for axis in sensor.axes]
+        if name == "Q" and all(c.value is None for c in found):
+            continue
+        si_unit, unit, factor = _UNITS[sensor.kind][name]
+        cells = tuple(_cell(c, factor) for c in found)
+        out.append(Row(f"{words} {name}", unit, cells, si_unit, tuple(_scientific(c) for c in found)))
+    return out
+
+
+def remarks(sensor: SensorNoise) -> list[str]:
+    """What a reader has to know beside the coefficients, one sentence each."""
+    out = []
+    for name, words in _COEFFICIENTS.items():
+        silent = [c for axis in sensor.axes if (c := _of(sensor, axis, name)).value is None]
+        if silent and name != "Q":
+            out.append(f"{words}: {length(sensor.length_s)} at rest do not tell {_needed(silent)}")
+    for axis, noise in sensor.axes.items():
+        out += [
+            f"{axis}: a sinusoid at {line.hz:.5g} Hz, amplitude {line.amplitude:.2g} {sensor.unit}, is not in the "
+            "coefficients"
+            for line in noise.lines
+        ]
+        if noise.fit.filtered:
+            out.append(
+                f"{axis}: white up to {noise.fit.band_hz[1]:.3g} Hz only, as behind a filter of the sensor; the "
+                "coefficients are those below"
+            )
+        if noise.fit.misfit != 1.0:
+            out.append(
+                f"{axis}: near {noise.fit.misfit_hz:.2g} Hz there is {noise.fit.misfit:.2g} times the power that these "
+                "noises have: vibration, temperature or interference; the coefficients are rough"
+            )
+        if noise.coarse is not None:
+            out.append(
+                f"{axis}: the readings come in steps of {noise.coarse:.2g} {sensor.unit}, larger than the noise, "
+                "which they hide"
+            )
+    if sensor.filled:
+        out.append(f"{sensor.filled} lost samples were filled in between their neighbours")
+    return out
+
+
+def section(study: NoiseStudy) -> tuple[dict[str, float], str]:
+    """The config's keys with their values, and the `noise:` section to paste, with comments.
+
+    A value is the root mean square over the axes. The first topic of a kind gives the keys, that of the platform its
+    own; what no key is for, or is not told, stands as a comment.
+    """
+    values: dict[str, float] = {}
+    lines = ["noise:"]
+    for sensor in study.sensors:
+        platform = sensor.topic == TOPICS["platform_imu"].name
+        density = f"platform_{_KEYS[sensor.kind]}" if platform else _KEYS[sensor.kind]
+        mine = density not in values and not (platform and sensor.kind != "gyro")
+        lines.append(_line(sensor, "N", density, values if mine else None))
+        if sensor.kind == "gyro" and not platform:
+            lines.append(_line(sensor, "K", "gyro_bias_walk", values if mine else None))
+    return values, "\n".join(lines) + "\n"
+
+
+def noise_json(study: NoiseStudy) -> str:
+    """noise.json: everything, SI; null where something is not told or has no bound."""
+    values, text = section(study)
+    content = {
+        "schema": "alidade.noise/1",
+        "recording": study.recording,
+        "duration_s": study.duration_s,
+        "noise": values,
+        "section": text,
+        "sensors": [_sensor_json(sensor) for sensor in study.sensors],
+        "notes": list(study.notes),
+        "software": software_versions(),
+    }
+    return json.dumps(content, indent=1, allow_nan=False) + "\n"
+
+
+def noise_html(study: NoiseStudy) -> str:
+    """The page as one HTML text that opens offline."""
+    sensors = [
+        (title(sensor), list(sensor.axes), rows(sensor), remarks(sensor), _div(sensor, first=i == 0))
+        for i, sensor in enumerate(study.sensors)
+    ]
+    return (
+        environment("pipelines.reports")
+        .get_template("noise.html")
+        .render(recording=study.recording, section=section(study)[1], sensors=sensors, notes=study.notes)
+    )
+
+
+def write_noise(out_dir: Path, study: NoiseStudy) -> tuple[Path, ...]:
+    """Write noise.html and noise.json, whole or not at all; returns their paths. Raises InputError as it cannot."""
+    return write_whole(out_dir, FILES, partial(_make, study=study))
+
+
+def length(seconds: float) -> str:
+    """A time as people say it."""
+    for unit, size, most in (("s", 1.0, 120.0), ("min", 60.0, 120.0), ("h", 3600.0, 48.0)):
+        if seconds < size * most:
+            return f"{seconds / size:.2g} {unit}" if seconds / size < 9.95 else f"{seconds / size:.0f} {unit}"
+    return f"{seconds / 86400.0:.0f} days"
+
+
+def _make(folder: Path, study: NoiseStudy) -> None:
+    (folder / "noise.html").write_text(noise_html(study), encoding="utf-8")
+    (folder / "noise.json").write_text(noise_json(study), encoding="utf-8")
+
+
+def _of(sensor: SensorNoise, axis: str, name: str) -> Coefficient:
+    return next(c for c in sensor.axes[axis].fit.coefficients if c.name == name)
+
+
+def _cell(c: Coefficient, factor: float) -> str:
+    if c.value is None or c.sigma is None:
+        return f"< {_digits(factor * c.high, 2)}"
+    return f"{_digits(factor * c.value, 3)} ±{_digits(100.0 * c.sigma / c.value, 2)}%"
+
+
+def _digits(x: float, count: int) -> str:
+    return np.format_float_positional(x, precision=count, fractional=False, trim="-")
+
+
+def _scientific(c: Coefficient) -> str:
+    return f"< {c.high:.1e}" if c.value is None else f"{c.value:.3e}"
+
+
+def _needed(silent: Sequence[Coefficient]) -> str:
+    """After 'do not tell': of what, and what would."""
+    times = [c.needed_s for c in silent if c.needed_s is not None]
+    bound = "it is below the numbers given (95 %)"
+    if not times:
+        return f"it; {bound}"
+    low, high = length(min(times)), length(max(times))
+    return f"it; {bound}; {low if low == high else f'{low} to {high}'} in one piece would tell half of them"
+
+
+def _line(sensor: SensorNoise, name: str, key: str, values: dict[str, float] | None) -> str:
+    """A line of the section; the value goes into `values`, None: it stands as a comment."""
+    found = {axis: _of(sensor, axis, name) for axis in sensor.axes}
+    told = [c.value for c in found.values() if c.value is not None]
+    each = ", ".join(f"{axis} {_scientific(c)}" for axis, c in found.items())
+    comment = f"{_UNITS[sensor.kind][name][0]}, {sensor.topic}: {each}"
+    if not told:
+        return f"  # {key}: {comment}"
+    value = float(f"{math.sqrt(sum(x * x for x in told) / len(told)):.3g}")
+    mantissa, exponent = f"{value:.2e}".split("e")
+    text = f"{key}: {mantissa}e{int(exponent)}"
+    if values is None:
+        return f"  # {text}  # {comment}"
+    values[key] = value
+    return f"  {text}  # {comment}"
+
+
+def _sensor_json(sensor: SensorNoise) -> dict[str, Any]:
+    return {
+        "topic": sensor.topic,
+        "sensor": sensor.kind,
+        "unit": sensor.unit,
+        "rate_hz": sensor.rate_hz,
+        "rests": [{"start_s": start, "end_s": end} for start, end in sensor.rests.tolist()],
+        "length_s": sensor.length_s,
+        "samples": sensor.samples,
+        "filled": sensor.filled,
+        "remarks": remarks(sensor),
+        "axes": [
+            {
+                "axis": axis,
+                "coefficients": [
+                    {
+                        "name": c.name,
+                        "meaning": _COEFFICIENTS[c.name],
+                        "unit": _UNITS[sensor.kind][c.name][0],
+                        "value": c.value,
+                        "sigma": c.sigma,
+                        "low": c.low,
+                        "high": c.high if math.isfinite(c.high) else None,
+                        "needed_s": c.needed_s,
+                    }
+                    for c in noise.fit.coefficients
+                ],
+                "band_hz": list(noise.fit.band_hz),
+                "misfit": noise.fit.misfit,
+                "lines": [
+                    {"hz": x.hz, "amplitude": x.amplitude, "resolution_hz": x.resolution_hz} for x in noise.lines
+                ],
+                "allan": [
+                    {"tau_s": tau, "deviation": d, "low": low, "high": high if math.isfinite(high) else None, "dof": n}
+                    for tau, d, low, high, n in zip(
+                        *(
+                            x.tolist()
+                            for x in (noise.curve.tau, noise.curve.deviation, noise.low, noise.high, noise.dof)
+                        ),
+                        strict=True,
+                    )
+                ],
+            }
+            for axis, noise in sensor.axes.items()
+        ],
+    }
+
+
+def _plot(sensor: SensorNoise) -> go.Figure:
+    """Allan deviation of each axis with its interval, and the model that was fitted, dotted."""
+    out = figure(f"Allan deviation, {sensor.unit}", height=420, x_title="averaging time, s")
+    for (axis, noise), color in zip(sensor.axes.items(), cycle(COLORS)):
+        tau = noise.curve.tau
+        # On a logarithmic axis a bound at infinity has no place.
+        high = np.where(np.isfinite(noise.high), noise.high, 10.0 * noise.curve.deviation)
+        out.add_scatter(
+            x=np.concatenate([tau, tau[::-1]]),
+            y=np.concatenate([noise.low, high[::-1]]),
+            fill="toself",
+            fillcolor=color,
+            opacity=0.18,
+            line={"width": 0},
+            hoverinfo="skip",
+            showlegend=False,
+        )
+        out.add_scatter(x=tau, y=noise.curve.deviation, mode="lines+markers", name=axis, line={"color": color})
+        model = np.sqrt(allan_variance(tau, noise.fit.squares))
+        out.add_scatter(x=tau, y=model, mode="lines", line={"color": color, "dash": "dot"}, showlegend=False)
+    out.update_xaxes(type="log", exponentformat="power")
+    out.update_yaxes(type="log", exponentformat="power")
+    return out
+
+
+def _div(sensor: SensorNoise, first: bool) -> str:
+    config = {"responsive": True, "displaylogo": False}
+    return str(_plot(sensor).to_html(full_html=False, include_plotlyjs=first, config=config))

@@ -1,0 +1,55 @@
+"""Files that belong together, written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from pipelines.errors import InputError
+
+
+def write_whole(out_dir: Path, names: Sequence[str], make: Callable[[Path], None]) -> tuple[Path, ...]:
+    """Files as `make` writes them into the folder it is given; returns their paths in out_dir.
+
+    They are made in a folder of their own and moved at the end. Files of earlier ones are replaced, or removed when
+    none of that name was made; others in out_dir stay.
+
+    Args:
+        out_dir: where they go.
+        names: in the order in which they take their places; the last, gone first and back last, says that the others
+            are its own, and is always made.
+        make: writes the files.
+
+    Raises:
+        InputError: out_dir is a file, or cannot be written to.
+    """
+    new = not out_dir.exists()
+    try:
+        out_dir.mkdir(parents=True, exist_ok=True)
+        part = Path(tempfile.mkdtemp(prefix=".alidade.", dir=out_dir))
+    except OSError as error:
+        raise InputError(f"{out_dir}: no folder to write results to ({error.strerror})") from error
+    try:
+        make(part)
+        return _move(part, out_dir, names)
+    except OSError as error:
+        raise InputError(f"{out_dir}: the results cannot be written ({error.strerror})") from error
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+        if new and not (out_dir / names[-1]).exists():
+            shutil.rmtree(out_dir, ignore_errors=True)
+
+
+def _move(part: Path, out_dir: Path, names: Sequence[str]) -> tuple[Path, ...]:
+    (out_dir / names[-1]).unlink(missing_ok=True)
+    written = []
+    for name in names:
+        if (part / name).exists():
+            os.replace(part / name, out_dir / name)
+            written.append(out_dir / name)
+        else:
+            (out_dir / name).unlink(missing_ok=True)
+    return tuple(written)
