@@ -16,7 +16,6 @@ import numpy as np
 from pipelines.judgement.allan import allan_variance
 from pipelines.judgement.noise_fit import Coefficient
 from pipelines.noise import NoiseStudy, SensorNoise
-from pipelines.recording.topics import TOPICS
 from pipelines.reports.plots import COLORS, figure
 from pipelines.reports.result import software_versions
 from pipelines.reports.templating import environment
@@ -29,6 +28,8 @@ FILES = ("noise.html", "noise.json")
 
 _TITLES = {"gyro": "gyro", "accel": "accelerometer", "mag": "magnetometer"}
 _COEFFICIENTS = {"N": "white noise", "B": "bias instability", "K": "random walk", "Q": "quantisation"}
+# Topics of the platform that the device moves on.
+_PLATFORM = "/platform/"
 _KEYS = {"gyro": "gyro_density", "accel": "accel_density", "mag": "mag_density"}
 
 _DEG_H = math.degrees(3600.0)
@@ -134,7 +135,7 @@ def section(study: NoiseStudy) -> tuple[dict[str, float], str]:
     values: dict[str, float] = {}
     lines = ["noise:"]
     for sensor in study.sensors:
-        platform = sensor.topic == TOPICS["platform_imu"].name
+        platform = sensor.topic.startswith(_PLATFORM)
         density = f"platform_{_KEYS[sensor.kind]}" if platform else _KEYS[sensor.kind]
         mine = density not in values and not (platform and sensor.kind != "gyro")
         lines.append(_line(sensor, "N", density, values if mine else None))
