@@ -17,9 +17,10 @@ slow: $(VENV)/installed
 lint: $(VENV)/installed
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
 
 types: $(VENV)/installed
-	$(BIN)/mypy factors pipelines datasets benchmarks tests
+	$(BIN)/mypy alidade factors pipelines datasets benchmarks tests
 
 bench: $(VENV)/installed
 	$(BIN)/python -m benchmarks

@@ -207,9 +207,10 @@ def plan(
 def info(session: _Session, config: _ConfigFile = None, strict: _Strict = False, quiet: _Quiet = False) -> None:
     """What is in a recording: topics, rates, gaps, and the methods it can serve."""
     from pipelines import progress, terminal
-    from pipelines.config import ATTACHMENT, load_config
+    from pipelines.config import load_config
     from pipelines.recording.reading import open_recording
     from pipelines.session import session_facts
+    from pipelines.settings import ATTACHMENT
 
     with progress.shown(quiet), progress.doing("reading"):
         recording = open_recording(session, strict)
@@ -355,10 +356,11 @@ def cube_layout(
 ) -> None:
     """Where the tags are on a cube, from pictures of it on all sides; the config gives their ids and sizes."""
     from pipelines import progress, terminal
-    from pipelines.config import ATTACHMENT, load_config
+    from pipelines.config import load_config
     from pipelines.methods.cube.layout import cube_layout as estimate
     from pipelines.methods.cube.layout import layout_yaml
     from pipelines.recording.reading import open_recording
+    from pipelines.settings import ATTACHMENT
 
     with progress.shown(quiet), progress.doing("finding where the tags are"):
         recording = open_recording(session)

@@ -17,24 +17,24 @@ from pydantic import BaseModel, ValidationError, create_model
 
 from pipelines import methods
 from pipelines.errors import InputError, nearest
-from pipelines.settings import Config
+from pipelines.settings import ATTACHMENT, Config
 
-ATTACHMENT = "alidade.yaml"
-TRUTH = "truth.json"
 _LONGEST = 1 << 20
 
 
-def load_config(attachment: bytes | None, override: Path | None = None) -> Config:
-    """The config in a recording's attachment, overridden key by key by a file. Raises InputError."""
+def load_config(attachment: bytes | None, override: Path | Config | None = None) -> Config:
+    """The config in a recording's attachment, overridden key by key by a file or another config. Raises InputError."""
     base = _read(attachment, f"attachment {ATTACHMENT}") if attachment is not None else {}
     more: dict[Any, Any] = {}
-    if override is not None:
+    if isinstance(override, Config):
+        more, override = override.model_dump(exclude_unset=True), Path("config")
+    elif override is not None:
         try:
             more = _read(override.read_bytes(), str(override))
         except OSError as error:
             raise InputError(f"{override}: cannot be opened ({error.strerror})") from error
     try:
-        config = _model().model_validate(_merge(base, more))
+        config = model().model_validate(_merge(base, more))
     except ValidationError as error:
         # An unknown key explains more than what follows from it.
         first = min(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
@@ -50,7 +50,7 @@ def load_config(attachment: bytes | None, override: Path | None = None) -> Confi
 
 
 @cache
-def _model() -> type[Config]:
+def model() -> type[Config]:
     """The config with the sections of all methods there are."""
     names = methods.names()
     sections = [section for name in names if (section := methods.method(name).section) is not None]
@@ -116,7 +116,7 @@ def _explain(path: tuple[int | str, ...], error: Any) -> str:
 
 def _known_at(path: tuple[int | str, ...]) -> list[str]:
     """The keys of the section at the path."""
-    section: type[BaseModel] = _model()
+    section: type[BaseModel] = model()
     for key in path:
         field = section.model_fields.get(str(key))
         found = _section_in(field.annotation) if field else None
@@ -144,4 +144,4 @@ def _sections() -> frozenset[str]:
                 found |= {key, *(inside(deeper) if deeper else ())}
         return found
 
-    return frozenset(inside(_model()))
+    return frozenset(inside(model()))

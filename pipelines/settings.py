@@ -16,6 +16,9 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from pipelines.errors import InputError, nearest
 from pipelines.recording.topics import Topic
 
+# Names of the attachments that hold a recording's config and, if simulated, its truth.
+ATTACHMENT = "alidade.yaml"
+TRUTH = "truth.json"
 _UNIT_TOLERANCE = 1e-3
 
 

@@ -9,6 +9,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from pipelines.errors import printable
 
@@ -44,7 +45,7 @@ def show(calibrations: Sequence[Calibration]) -> None:
 
     alone = len(calibrations) == 1
     errors = [truth_errors(c) for c in calibrations]
-    found = [{p.name: p for p in c.parameters} for c in calibrations]
+    found = [c.parameters for c in calibrations]
     table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
     table.add_column("parameter", no_wrap=True)
     table.add_column("unit", no_wrap=True)
@@ -73,6 +74,13 @@ def show(calibrations: Sequence[Calibration]) -> None:
         say("In brackets: error in sigmas.")
     for c in calibrations:
         _verdict(c, name=not alone)
+
+
+def as_text(calibrations: Sequence[Calibration]) -> str:
+    """What `show` prints, as plain text."""
+    with console.capture() as capture:
+        show(calibrations)
+    return Text.from_ansi(capture.get()).plain.rstrip()
 
 
 def show_facts(name: str, facts: SessionFacts) -> None:
@@ -181,7 +189,7 @@ def _verdict(calibration: Calibration, name: bool) -> None:
     headline = assessment.headline
     if published and assessment.directions:
         # What a recording lacks is told by the graph's solvers; these know their own model only.
-        short = [p.name for p in calibration.parameters if p.observability in ("weak", "unobservable")]
+        short = [p.name for p in calibration.parameters.values() if p.observability in ("weak", "unobservable")]
         headline = f"By its own sigmas less accurate than required: {', '.join(short)}."
     console.print(f"{solver}[bold {colour}]{assessment.status}.[/] {escape(headline)}", soft_wrap=True)
     for direction in () if published else assessment.directions:

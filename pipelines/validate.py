@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipelines.config import ATTACHMENT, load_config
+from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.judgement.validation import Validation
 from pipelines.methods import method
@@ -14,6 +14,7 @@ from pipelines.recording.reading import open_recording
 from pipelines.reports.calibration import SavedCalibration, load_calibration
 from pipelines.reports.validation import validation_html, validation_rows
 from pipelines.session import resolve_method
+from pipelines.settings import ATTACHMENT
 
 FILE = "validation.html"
 

@@ -43,7 +43,7 @@ def test_time_offset_is_found_and_agrees(scored: dict[str, tuple[Calibration, Sc
     """About 4.1 ms, later than stamped; the slow trial knows it to 0.16 ms only."""
     found = []
     for calibration, score in scored.values():
-        sigma = {p.name: p.sigma for p in calibration.parameters}["time_offset"]
+        sigma = calibration.parameters["time_offset"].sigma
         assert score.time_offset == pytest.approx(4.1e-3, abs=3.0 * sigma + 0.15e-3)
         found.append((score.time_offset, sigma))
     for a, sigma_a in found:

@@ -230,7 +230,7 @@ def test_independent_recordings_damaged_are_calibrated_rightly_or_not_at_all(
             (calibration,) = calibrate(tmp_path / "x.mcap", ["batch"])
         except InputError:
             continue
-        known = [p for p in calibration.parameters if isinstance(truth.get(p.name), float) and p.sigma > 0.0]
+        known = [p for p in calibration.parameters.values() if isinstance(truth.get(p.name), float) and p.sigma > 0.0]
         assert known
         errors = [abs(p.value - truth[p.name]) / p.sigma for p in known]
         assert calibration.assessment.status != "calibrated" or max(errors) < 4.0

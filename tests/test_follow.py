@@ -162,7 +162,7 @@ def test_live_killed_and_resumed_it_ends_as_batch_on_the_finished_file(whole: Pa
     assert result["session"]["sha256"] == batch.sha256
     found = {p["name"]: p["value"] for p in result["parameters"]}
     for finished, tolerance in ((batch, 0.1), (again, 0.02)):
-        for p in finished.parameters:
+        for p in finished.parameters.values():
             assert found[p.name] == pytest.approx(p.value, abs=tolerance * p.sigma), p.name
     assert {p.name for p in (out).iterdir()} >= {"result.json", "report.html", "calibration.yaml", "estimates.mcap"}
 

@@ -174,7 +174,7 @@ def _summary(calibration: Calibration) -> Result:
                 "require": p.require,
                 "verdict": p.observability,
             }
-            for p in calibration.parameters
+            for p in calibration.parameters.values()
         },
     }
 

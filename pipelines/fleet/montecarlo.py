@@ -246,7 +246,7 @@ def _numbers(calibration: Calibration) -> Result:
     from pipelines.reports.result import truth_errors
 
     errors = truth_errors(calibration)
-    judged = [p for p in calibration.parameters if p.name in errors and p.sigma > 0.0]
+    judged = [p for p in calibration.parameters.values() if p.name in errors and p.sigma > 0.0]
     numbers: Result = {
         "parameters": {
             p.name: {"error": errors[p.name].error, "sigma": p.sigma, "unit": p.unit, "require": p.require}

@@ -64,6 +64,11 @@ class Method(ABC):
 
     # -- from a recording to estimates
 
+    @property
+    @abstractmethod
+    def data(self) -> type:
+        """The class of its data: a frozen dataclass of arrays, with epoch_ns (Unix ns) the zero of all times."""
+
     @abstractmethod
     def read(self, recording: Recording, config: Config) -> Any:
         """The method's data. Raises InputError when the recording cannot be used."""

@@ -111,7 +111,7 @@ def saved(calibration: Calibration) -> SavedCalibration:
     method = calibration.problem.method
     parameters = {
         p.name: SavedParameter(value=_rounded(p.value), sigma=_rounded(p.sigma), unit=p.unit, verdict=p.observability)
-        for p in calibration.parameters
+        for p in calibration.parameters.values()
     }
     start = datetime.datetime.fromtimestamp(calibration.facts.epoch_ns // 1_000_000_000, datetime.UTC)
     return SavedCalibration(
@@ -148,7 +148,7 @@ def load_calibration(path: Path) -> SavedCalibration:
 
 def _rotations(calibration: Calibration) -> dict[str, SavedRotation]:
     """The parameters that are rotation vectors, as quaternions."""
-    values: Mapping[str, float] = {p.name: p.value for p in calibration.parameters}
+    values: Mapping[str, float] = {name: p.value for name, p in calibration.parameters.items()}
     known = calibration.method.rotations
     found = {}
     for parameter in calibration.problem.parameters:

@@ -74,7 +74,8 @@ def write_compare(
 
 def _found(calibration: Calibration, name: str) -> tuple[float, float] | None:
     """Value and sigma of a parameter, SI; None when the solver does not know it."""
-    return next(((p.value, p.sigma) for p in calibration.parameters if p.name == name), None)
+    found = calibration.parameters.get(name)
+    return None if found is None else (found.value, found.sigma)
 
 
 def _batch(calibrations: Sequence[Calibration]) -> Calibration | None:

@@ -46,7 +46,7 @@ def write_estimates(path: Path, calibration: Calibration, history: History) -> N
         writer.start(profile="ros2", library="alidade")
         schema = writer.register_schema(MESSAGE, "ros2msg", DEFINITION.encode())
         messages: list[tuple[int, int, bytes]] = []
-        for i, p in enumerate(calibration.parameters):
+        for i, p in enumerate(calibration.parameters.values()):
             known = {"estimate": history}
             if smoothed is not None and np.ptp(smoothed.values[:, i]) > 0.0:
                 known["smoothed"] = smoothed

@@ -57,11 +57,17 @@ def report_html(calibration: Calibration) -> str:
     )
 
 
+def notebook_html(calibration: Calibration) -> str:
+    """The parameters and the verdict as a fragment of HTML, for notebooks."""
+    template = environment("pipelines.reports").get_template("notebook.html")
+    return template.render(c=calibration, rows=_rows(calibration))
+
+
 def _rows(calibration: Calibration) -> list[_Row]:
     errors = truth_errors(calibration)
     rows = []
     quantities = quantities_of(calibration.problem, calibration.estimate)
-    for q, p in zip(quantities, calibration.parameters, strict=True):
+    for q, p in zip(quantities, calibration.parameters.values(), strict=True):
         unit, factor = human_unit(q)
         known = p.sigma < _MEANINGLESS * q.scale
         error = errors.get(p.name)

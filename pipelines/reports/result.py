@@ -11,11 +11,12 @@ import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
-from typing import TYPE_CHECKING, Annotated, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from pipelines.graph.problem import Estimate, Findings, Problem, Quantity, Residuals
+from pipelines.graph.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
 from pipelines.judgement.observability import Assessment, Fit, Innovations, Learning, Status, Verdict, learning
 from pipelines.judgement.robust import robust_sigma
 from pipelines.recording.info import SessionFacts
@@ -59,7 +60,7 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Calibration:
     """Everything the reports tell about one calibration.
 
@@ -97,13 +98,13 @@ class Calibration:
     findings: Findings = field(default_factory=dict)
 
     @property
-    def parameters(self) -> tuple[ParameterResult, ...]:
-        """The parameters as result.json lists them."""
+    def parameters(self) -> dict[str, ParameterResult]:
+        """Name -> parameter, as result.json lists them."""
         rows = zip(
             quantities_of(self.problem, self.estimate), self.estimate.values, self.assessment.sigmas, strict=True
         )
-        return tuple(
-            ParameterResult(
+        return {
+            q.name: ParameterResult(
                 name=q.name,
                 value=float(value),
                 sigma=float(sigma),
@@ -113,7 +114,77 @@ class Calibration:
                 observability=self.assessment.verdicts[q.name],
             )
             for q, value, sigma in rows
-        )
+        }
+
+    @property
+    def status(self) -> str:
+        """calibrated, weak, unobservable or inconsistent."""
+        return self.assessment.status
+
+    @property
+    def headline(self) -> str:
+        """The verdict in one sentence."""
+        return self.assessment.headline
+
+    @property
+    def covariance(self) -> Array:
+        """(n, n) joint covariance of the parameters, in their order, SI."""
+        return self.assessment.covariance
+
+    @property
+    def history(self) -> History | None:
+        """Values and sigmas from what was recorded until each moment."""
+        return self.estimate.history
+
+    @property
+    def residuals(self) -> Mapping[str, Residuals]:
+        """Family of measurements -> residuals at the estimate."""
+        return self.estimate.residuals
+
+    def write(self, folder: str | Path) -> tuple[Path, ...]:
+        """Write result.json, calibration.yaml, report.html and what else there is; returns their paths.
+
+        Raises:
+            InputError: the folder cannot be written to.
+        """
+        from pipelines.reports.write import write_results
+
+        return write_results(Path(folder), self)
+
+    def apply(self, **measured: Any) -> dict[str, Array]:
+        """The formulas of calibration.yaml, computed: everything that follows from what is measured.
+
+            calibration.apply(gyro=w)["w_iv"]
+
+        What the solver does not know counts as zero.
+
+        Args:
+            measured: by the names in the formulas: numbers, vectors (..., 3), quaternions w, x, y, z (..., 4); SI.
+
+        Raises:
+            InputError: something is given that no formula measures.
+        """
+        from pipelines.methods.formula import apply
+
+        unknown = dict.fromkeys((q.name for q in self.problem.quantities), 0.0)
+        values = {name: parameter.value for name, parameter in self.parameters.items()}
+        return apply(self.formulas, {**unknown, **values}, measured)
+
+    def __repr__(self) -> str:
+        """One line."""
+        return f"<Calibration {self.method.name}, {self.estimate.solver}, of {self.recording}: {self.status}>"
+
+    def __str__(self) -> str:
+        """The table and the verdict, as the command prints them."""
+        from pipelines.terminal import as_text
+
+        return as_text([self])
+
+    def _repr_html_(self) -> str:
+        """The table for notebooks."""
+        from pipelines.reports.html import notebook_html
+
+        return notebook_html(self)
 
     @property
     def config_text(self) -> str:
@@ -320,7 +391,7 @@ def result(calibration: Calibration) -> Result:
         method=c.problem.method,
         solver=c.estimate.solver,
         status=a.status,
-        parameters=list(c.parameters),
+        parameters=list(c.parameters.values()),
         covariance=CovarianceResult(order=list(c.estimate.names), matrix=a.covariance.tolist()),
         null_directions=[
             DirectionResult(sigma_ratio=d.sigma_ratio, weights=dict(d.weights), advice=d.advice) for d in a.directions
@@ -349,7 +420,7 @@ def truth_errors(calibration: Calibration) -> dict[str, TruthResult]:
     """Parameter -> truth and error, for those whose truth is known."""
     known = calibration.truth or {}
     found = {}
-    for p in calibration.parameters:
+    for p in calibration.parameters.values():
         truth = known.get(p.name)
         if isinstance(truth, int | float) and math.isfinite(truth):
             error = p.value - truth

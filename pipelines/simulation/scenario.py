@@ -33,7 +33,7 @@ def load_scenario(model: type[Model], name_or_path: str | Path) -> Model:
     except (OSError, UnicodeDecodeError, YAMLError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from error
     except ValidationError as error:
-        raise InputError(f"{path}: {_explain(error.errors()[0], model)}") from error
+        raise InputError(f"{path}: {explain(error.errors()[0], model)}") from error
 
 
 def _find(name_or_path: str | Path) -> Path:
@@ -46,8 +46,8 @@ def _find(name_or_path: str | Path) -> Path:
     raise InputError(f"no scenario file {name_or_path}; give a file or one of {', '.join(sorted(shipped))}")
 
 
-def _explain(error: ErrorDetails, model: type[BaseModel]) -> str:
-    """One line about the first thing pydantic rejected."""
+def explain(error: ErrorDetails, model: type[BaseModel]) -> str:
+    """One line about the first thing pydantic rejected of a scenario."""
     where = ".".join(str(part) for part in error["loc"])
     if error["type"] != "extra_forbidden":
         return f"{where or 'the scenario'}: {error['msg']} (got {reprlib.repr(error['input'])})"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,3 +22,7 @@ class Simulated:
     truth: Mapping[str, float]
     config: str
     pictures: Any = None
+
+    def __iter__(self) -> Iterator[Any]:
+        """Data and truth: `data, truth = simulate(...)`."""
+        return iter((self.data, self.truth))

@@ -34,6 +34,12 @@ class Cube(Method):
     section = CubeConfig
     rotations: ClassVar[Mapping[str, str]] = {"camera_mount": "correction of BRC"}
 
+    @property
+    def data(self) -> type[CubeData]:
+        from pipelines.methods.cube.recording import CubeData
+
+        return CubeData
+
     def read(self, recording: Recording, config: Config) -> CubeData:
         from pipelines.methods.cube.recording import read_cube
 

@@ -33,6 +33,12 @@ class Head(Method):
     section = HeadConfig
     rotations: ClassVar[Mapping[str, str]] = {"helmet_mount": "vRh", "camera_mount": "cRb"}
 
+    @property
+    def data(self) -> type[HeadData]:
+        from pipelines.methods.head.recording import HeadData
+
+        return HeadData
+
     def read(self, recording: Recording, config: Config) -> HeadData:
         from pipelines.methods.head.recording import read_head
 

@@ -32,6 +32,12 @@ class Indexer(Method):
     needs = NEEDS
     section = IndexerConfig
 
+    @property
+    def data(self) -> type[IndexerData]:
+        from pipelines.methods.indexer.recording import IndexerData
+
+        return IndexerData
+
     def read(self, recording: Recording, config: Config) -> IndexerData:
         from pipelines.methods.indexer.recording import read_indexer
 

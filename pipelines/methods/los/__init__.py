@@ -31,6 +31,12 @@ class Los(Method):
     topics = TOPICS
     needs = NEEDS
 
+    @property
+    def data(self) -> type[LosData]:
+        from pipelines.methods.los.recording import LosData
+
+        return LosData
+
     def read(self, recording: Recording, config: Config) -> LosData:
         from pipelines.methods.los.recording import read_los
 

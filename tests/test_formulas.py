@@ -1,0 +1,181 @@
+"""The formulas in calibration.yaml are right for what is free, and are what `Calibration.apply` computes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+
+import alidade
+from factors import so3
+from factors.indexer import base_from_platform, mounting
+from factors.los import LosDirectionFactor
+from pipelines.errors import InputError
+from pipelines.methods import method
+from pipelines.methods.formula import apply
+from pipelines.settings import Config
+
+Array = so3.Array
+
+
+class Rotation:
+    """A rotation matrix, with the products that formulas use."""
+
+    def __init__(self, matrix: Array) -> None:
+        self.matrix = matrix
+
+    def __mul__(self, other: Any) -> Any:
+        return Rotation(self.matrix @ other.matrix) if isinstance(other, Rotation) else self.matrix @ np.asarray(other)
+
+
+class Matrix(list[Any]):
+    """A matrix written out."""
+
+    def __mul__(self, other: Any) -> Any:
+        return np.array(self) @ np.asarray(other)
+
+
+def exp(vector: Array) -> Rotation:
+    return Rotation(so3.matrix(so3.exp(vector)))
+
+
+def passive(axis: int) -> Any:
+    return lambda angle: Rotation(exp(angle * np.eye(3)[axis]).matrix.T)
+
+
+def read(expression: str, known: Mapping[str, Any]) -> Any:
+    """The value of a formula's text, read as the text says, not by the code beside it."""
+    expression = re.sub(r"\bExp\((\w+) (e[xyz])\)", r"Exp(\1 * \2)", expression)
+    expression = re.sub(r"^\[\[.*?\]\]", lambda rows: f"Matrix({rows[0]})", expression)
+    axes = dict(zip(("ex", "ey", "ez"), np.eye(3), strict=True))
+    words = {
+        **axes,
+        "Exp": exp,
+        "Rx": passive(0),
+        "Ry": passive(1),
+        "Rz": passive(2),
+        "Matrix": Matrix,
+        "inverse": lambda rotation: Rotation(rotation.matrix.T),
+    }
+    return eval(expression, {"__builtins__": {}}, {**words, **known})
+
+
+def plain(value: Any) -> Array:
+    return value.matrix if isinstance(value, Rotation) else np.asarray(value)
+
+
+CASES: dict[str, tuple[str, Collection[str]]] = {
+    "los": ("los", ("delta_px", "delta_gx", "delta_gy", "delta_z", "gyro_bias_x", "gyro_bias_y", "gyro_bias_z")),
+    "los with options": (
+        "los",
+        (
+            *("delta_px", "delta_gx", "delta_gy", "delta_pz", "delta_gz", "camera_roll", "collimation"),
+            *("axis_nonperpendicularity", "gyro_bias_x", "gyro_bias_y", "gyro_bias_z", "time_offset"),
+        ),
+    ),
+    "indexer": ("indexer", tuple(f"{name}_{axis}" for name in ("theta", "gyro_bias") for axis in "xyz")),
+    "indexer with options": (
+        "indexer",
+        (
+            *(f"{name}_{axis}" for name in ("theta", "gyro_bias", "gyro_scale") for axis in "xyz"),
+            "axis_nonperpendicularity",
+        ),
+    ),
+    "head": (
+        "head",
+        (*(f"{n}_{axis}" for n in ("gyro_bias", "helmet_mount", "camera_mount") for axis in "xyz"), "time_offset"),
+    ),
+    "cube": (
+        "cube",
+        (
+            *(f"{s}_k{i}{j}" for s in ("accel", "gyro", "mag") for i in "123" for j in "123"),
+            *(f"{s}_b{i}" for s in ("accel", "gyro", "mag") for i in "123"),
+            *(f"{n}_{axis}" for n in ("camera_mount", "tag_17") for axis in "xyz"),
+            "reference_heading",
+        ),
+    ),
+}
+ROTATIONS = {"cRh", "nRm", "camera_rotation", "rotation_17", "nRB_said", "CRT", "bodyRtag"}
+NUMBERS = {"azimuth", "elevation", "outer", "inner", "stamp"}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_text_says_what_the_code_computes(case: str) -> None:
+    name, parameters = CASES[case]
+    rng = np.random.default_rng(0)
+    formulas = method(name).formulas(parameters)
+    values = {parameter: float(x) for parameter, x in zip(parameters, rng.normal(size=len(parameters)), strict=True)}
+    measured: dict[str, Any] = {}
+    for quantity in dict.fromkeys(m for formula in formulas for m in formula.measured):
+        if quantity in ROTATIONS:
+            measured[quantity] = so3.exp(rng.normal(size=3))
+        else:
+            measured[quantity] = rng.normal() if quantity in NUMBERS else rng.normal(size=3)
+    found = apply(formulas, values, measured)
+    assert list(found) == [formula.name for formula in formulas]
+    known: dict[str, Any] = dict(values)
+    for stem in {parameter[:-2] for parameter in parameters if parameter.endswith("_x")}:
+        known[stem] = np.array([values[f"{stem}_{axis}"] for axis in "xyz"])
+    known |= {k: Rotation(so3.matrix(v)) if k in ROTATIONS else v for k, v in measured.items()}
+    for formula in formulas:
+        known[formula.name] = read(formula.expression, known)
+        computed = found[formula.name]
+        computed = so3.matrix(computed) if isinstance(known[formula.name], Rotation) else computed
+        np.testing.assert_allclose(plain(known[formula.name]), computed, atol=1e-12, err_msg=formula.text)
+
+
+def test_los_formulas_are_those_of_the_graph_whatever_is_free() -> None:
+    """calibration.yaml once left out roll, collimation, the axes' tilt and the time offset."""
+    names = ("delta_px", "delta_gx", "delta_gy", "delta_z", "camera_roll", "collimation", "axis_nonperpendicularity")
+    rng = np.random.default_rng(1)
+    angles = 0.1 * rng.normal(size=len(names))
+    gimbal = rng.normal(size=(1, 2))
+    cRm = LosDirectionFactor(np.zeros(1), np.zeros((1, 2)), np.zeros((1, 2, 2)), gimbal, names).camera(angles[None])[0]
+    formulas = method("los").formulas(names)
+    values = dict(zip(names, angles.tolist(), strict=True))
+    found = apply(formulas, values, {"azimuth": gimbal[0, 0], "elevation": gimbal[0, 1]})
+    np.testing.assert_allclose(so3.log(so3.compose(found["lRb"], found["M"], so3.inverse(cRm))), 0.0, atol=1e-12)
+    text = " ".join(formula.text for formula in formulas)
+    assert all(name in text for name in names)
+    assert "time_offset" not in text
+    assert "time_offset" in method("los").formulas([*names, "time_offset"])[-1].text
+
+
+def test_indexer_formulas_scale_the_gyro_and_tilt_the_axes_where_these_are_free() -> None:
+    """calibration.yaml once said w_it = inverse(mRt) (gyro - gyro_bias) with gyro_scale free."""
+    free = [*(f"{name}_{axis}" for name in ("theta", "gyro_bias", "gyro_scale") for axis in "xyz")]
+    free.append("axis_nonperpendicularity")
+    rng = np.random.default_rng(2)
+    values = {name: float(x) for name, x in zip(free, 0.1 * rng.normal(size=len(free)), strict=True)}
+    theta, bias, scale = (np.array([values[f"{n}_{a}"] for a in "xyz"]) for n in ("theta", "gyro_bias", "gyro_scale"))
+    rate = rng.normal(size=3)
+    measured = (1.0 + scale) * so3.rotate(so3.inverse(mounting(theta)), rate) + bias
+    found = apply(method("indexer").formulas(free), values, {"gyro": measured, "outer": 0.3, "inner": 0.7})
+    np.testing.assert_allclose(found["w_it"], rate, atol=1e-12)
+    tilt = values["axis_nonperpendicularity"]
+    np.testing.assert_allclose(so3.matrix(found["bRt"]), so3.matrix(base_from_platform(0.3, 0.7, tilt)), atol=1e-12)
+
+
+def test_a_calibration_applies_itself() -> None:
+    data, truth = alidade.simulate("head", {"duration_s": 12.0, "time_offset_s": 0.02}, seed=1)
+    calibration = alidade.calibrate(data, method="head")
+    assert calibration.parameters["time_offset"].value == pytest.approx(truth["time_offset"], abs=5e-3)
+    found = calibration.apply(gyro=data.head_gyro[:5], cRh=data.vision_wxyz[:3], stamp=data.vision_t[:3])
+    bias = np.array([calibration.parameters[f"gyro_bias_{axis}"].value for axis in "xyz"])
+    np.testing.assert_allclose(found["w_iv"], data.head_gyro[:5] - bias)
+    assert found["bRv"].shape == (3, 4)
+    with pytest.raises(InputError, match="nothing is computed from giro; measurements are gyro, cRh, stamp"):
+        calibration.apply(giro=np.zeros(3))
+
+
+def test_what_the_published_solver_does_not_know_counts_as_zero() -> None:
+    config = Config()
+    calibration = alidade.open(alidade.simulate("los", {"duration_s": 10.0}, seed=1)).calibrate("published")
+    assert "gyro_bias_x" not in calibration.parameters
+    assert config.method is None
+    gyro = np.array([0.1, -0.2, 0.3])
+    M = calibration.apply()["M"]
+    np.testing.assert_allclose(calibration.apply(gyro=gyro)["w_b"], so3.rotate(M, gyro))
