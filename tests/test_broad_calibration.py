@@ -11,7 +11,7 @@ from datasets.broad import Score, read_trial, score_results
 from pipelines.reports.result import Calibration
 from pipelines.reports.write import write_results
 from pipelines.session import calibrate
-from tests.test_broad import TRIALS, converted
+from tests.broad_trials import TRIALS, converted
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ from factors.vectorized import VectorizedFactor
 from pipelines.errors import InputError
 from pipelines.graph.problem import Array, Factor, Problem, Step
 from pipelines.solvers.incremental import solve_incremental
-from tests.test_solvers import PARAMETER, Walk, state
+from tests.chain import PARAMETER, Walk, state
 
 
 def _with(problem: Problem, at: int, change: Callable[[Step], Step]) -> Problem:

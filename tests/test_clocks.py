@@ -14,7 +14,7 @@ from pipelines.errors import InputError
 from pipelines.recording import messages
 from pipelines.recording.clocks import find_step
 from pipelines.recording.reading import open_recording
-from tests.test_sessions_messages import STORE, T0, random_message, write_raw
+from tests.raw_messages import STORE, T0, random_message, write_raw
 
 Stamps = NDArray[np.int64]
 MS = 1_000_000

@@ -56,11 +56,16 @@ def test_commands_work(page: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("page", [p for p in PAGES if p.name not in _CLUSTER and _PYTHON.search(_text(p))], ids=_name)
-def test_python_works(page: Path) -> None:
+def test_python_works(page: Path, tmp_path: Path) -> None:
     """Block after block, as one program."""
     program = "\n".join(_PYTHON.findall(_text(page)))
     run = subprocess.run(
-        [sys.executable, "-"], input=program, env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True
+        [sys.executable, "-"],
+        input=program,
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
     )
     assert run.returncode == 0, run.stderr
 

@@ -12,7 +12,7 @@ import pytest
 from pipelines.fleet import consistency
 from pipelines.fleet.montecarlo import SOLVERS, run_study, simulate_and_solve
 from pipelines.methods import names
-from tests.test_fleet_recordings import alidade
+from tests.fleet_command import alidade
 
 distributed = pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
 

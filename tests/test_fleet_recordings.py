@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import re
-import sys
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,12 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines import cli
 from pipelines.fleet import engine
 from pipelines.fleet.fleet import Settings, calibrate_recording
 from pipelines.fleet.recordings import find
 from pipelines.methods.head.recording import write_head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from tests.fleet_command import alidade
 
 distributed = pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
 pytest.importorskip("arro3.io", reason="needs the extra alidade[fleet]")
@@ -71,15 +70,6 @@ def forty(tmp_path_factory: pytest.TempPathFactory) -> Path:
     content[third : 2 * third] = rng.bytes(third)
     corrupt.write_bytes(content)
     return folder
-
-
-def alidade(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["alidade", *map(str, arguments)])
-    try:
-        cli.main()
-    except SystemExit as stop:
-        return int(stop.code or 0)
-    return 0
 
 
 def failures(rows: dict[str, dict[str, str]]) -> dict[str, str]:

@@ -16,7 +16,7 @@ from pipelines.recording import messages
 from pipelines.recording.reading import open_recording
 from pipelines.settings import Config
 from tests.damage import Whole, check_sound, read, write_small
-from tests.test_sessions_messages import T0, read_any, write_raw
+from tests.raw_messages import T0, read_any, write_raw
 
 KINDS = [
     messages.IMU,

@@ -23,7 +23,7 @@ from pipelines.recording import messages
 from pipelines.recording.mcap_records import HEAD, MAGIC
 from pipelines.recording.reading import open_recording
 from pipelines.session import resolve_method, session_facts
-from tests.test_sessions_messages import STORE, T0, random_message
+from tests.raw_messages import STORE, T0, random_message
 
 MIB = 1 << 20
 

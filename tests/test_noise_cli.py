@@ -21,7 +21,7 @@ from pipelines.recording.writing import write_session
 from pipelines.reports.noise import length
 from tests import noises
 from tests.command import Command
-from tests.test_broad import TRIALS
+from tests.broad_trials import TRIALS
 
 Array = NDArray[np.float64]
 

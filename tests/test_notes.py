@@ -10,7 +10,7 @@ import numpy as np
 from pipelines.methods.los.recording import write_los
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from pipelines.session import calibrate
-from tests.test_reports_files import make_calibration
+from tests.builders import make_calibration
 
 
 def test_a_gyro_turned_by_90_degrees_is_found_and_told(tmp_path: Path) -> None:

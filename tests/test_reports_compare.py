@@ -14,8 +14,8 @@ from pipelines.reports.compare import compare_html, write_compare
 from pipelines.reports.plots import common_plots
 from pipelines.reports.result import Calibration
 from tests.browser import drawn, needs_browser
-from tests.test_reports_files import make_calibration
-from tests.test_reports_html import Page
+from tests.builders import make_calibration
+from tests.pages import Page
 
 
 def solvers(truth: dict[str, object] | None = None) -> list[Calibration]:

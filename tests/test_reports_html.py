@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from functools import partial
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
@@ -23,35 +22,8 @@ from pipelines.reports.result import Calibration, quantities_of
 from pipelines.reports.units import human_unit, to_digits_of
 from pipelines.settings import Config
 from tests.browser import drawn, needs_browser
-from tests.test_reports_files import make_calibration
-
-
-class Page(HTMLParser):
-    """Text and elements of a page, scripts and styles left out."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.words: list[str] = []
-        self.loaded: list[str] = []
-        self.scripts = 0
-        self._hidden = False
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.loaded += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data", "action")]
-        self._hidden = tag in ("script", "style")
-        self.scripts += tag == "script"
-
-    def handle_endtag(self, tag: str) -> None:
-        self._hidden = self._hidden and tag not in ("script", "style")
-
-    def handle_data(self, data: str) -> None:
-        if not self._hidden:
-            self.words += data.split()
-
-    @property
-    def text(self) -> str:
-        return " ".join(self.words)
+from tests.builders import make_calibration
+from tests.pages import Page
 
 
 def test_the_report_loads_nothing_and_has_plotly_once() -> None:
