@@ -18,7 +18,7 @@ from pipelines.recording import series
 from pipelines.recording.reading import Recording, open_recording
 from pipelines.recording.writing import write_session
 from tests import forms
-from tests.test_sessions_files import T0, assert_same, session
+from tests.recorded import T0, assert_same, session
 
 MCAP, SQLITE = StoragePlugin.MCAP, StoragePlugin.SQLITE3
 
