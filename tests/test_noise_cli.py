@@ -20,8 +20,8 @@ from pipelines.recording.even import even_pieces
 from pipelines.recording.writing import write_session
 from pipelines.reports.noise import length
 from tests import noises
-from tests.command import Command
 from tests.broad_trials import TRIALS
+from tests.command import Command
 
 Array = NDArray[np.float64]
 
