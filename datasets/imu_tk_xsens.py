@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from factors import so3
 from pipelines.errors import InputError
-from pipelines.methods.cube.recording import CubeData, write_cube
+from pipelines.methods.cube.data import CubeData
+from pipelines.methods.cube.writing import write_cube
 
 Array = NDArray[np.float64]
 

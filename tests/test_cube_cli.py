@@ -17,8 +17,9 @@ from ruamel.yaml import YAML
 from factors import so3
 from pipelines import cli
 from pipelines.methods import simulate
-from pipelines.methods.cube.recording import CubeData, Sightings, write_cube
+from pipelines.methods.cube.data import CubeData, Sightings
 from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.writing import write_cube
 from pipelines.vision.camera import Camera
 
 SCENARIO = CubeScenario(poses=8, static_s=1.5, turn_rad_s=1.5, camera_rate_hz=5.0)

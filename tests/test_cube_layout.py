@@ -13,9 +13,9 @@ from factors import so3
 from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.methods.cube.layout import cube_layout, layout_yaml
-from pipelines.methods.cube.recording import write_cube
 from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
 from pipelines.methods.cube.topics import CubeConfig
+from pipelines.methods.cube.writing import write_cube
 from pipelines.recording.reading import open_recording
 
 SCENARIO = CubeScenario(poses=16, static_s=1.0, turn_rad_s=1.5, camera_rate_hz=4.0, tag_mount=0.02, magnetometer=False)

@@ -19,11 +19,13 @@ from pipelines.graph.problem import Estimate, Problem
 from pipelines.judgement.observability import Assessment, assess
 from pipelines.judgement.validation import rms
 from pipelines.methods import simulate
+from pipelines.methods.cube.data import CubeData
 from pipelines.methods.cube.findings import findings
 from pipelines.methods.cube.graph import problem
 from pipelines.methods.cube.published import published_estimate
-from pipelines.methods.cube.recording import CubeData, read_cube, rests
+from pipelines.methods.cube.recording import read_cube
 from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.static_intervals import static_intervals
 from pipelines.methods.cube.topics import CubeConfig, Raw, RawConversion
 from pipelines.methods.cube.validation import validate
 from pipelines.recording.reading import open_recording
@@ -182,7 +184,7 @@ def _turned_with_camera(data: CubeData) -> CubeData:
     assert data.reference_t is not None
     assert data.reference_wxyz is not None
     config = _simulated(12, poses=12)[2]
-    edges = rests(data, config)[1:, 0] - 0.3
+    edges = static_intervals(data, config)[1:, 0] - 0.3
     turns = so3.exp(0.03 * np.random.default_rng(1).normal(size=(len(edges) + 1, 3)))
     drawn = config.section(CubeConfig).camera_rotation
     assert drawn is not None

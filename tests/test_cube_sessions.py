@@ -12,10 +12,13 @@ import pytest
 from factors import so3
 from pipelines.config import load_config
 from pipelines.errors import InputError
+from pipelines.methods.cube.data import CubeData, Sightings, local_field
 from pipelines.methods.cube.poses import static_poses
-from pipelines.methods.cube.recording import CubeData, Sightings, local_field, read_cube, rests, write_cube
+from pipelines.methods.cube.recording import read_cube
 from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.static_intervals import static_intervals
 from pipelines.methods.cube.topics import CubeConfig
+from pipelines.methods.cube.writing import write_cube
 from pipelines.recording.reading import open_recording
 from pipelines.settings import Config
 from pipelines.vision.camera import Camera
@@ -73,7 +76,7 @@ def test_what_is_missing_is_none(tmp_path: Path, session: CubeData, absent: dict
 
 
 def test_rests_lie_within_the_true_ones(session: CubeData) -> None:
-    found = rests(session, _config())
+    found = static_intervals(session, _config())
     assert len(found) == SCENARIO.poses
     assert np.all(np.diff(found[:, 0]) > SCENARIO.static_s)
     lengths = found[:, 1] - found[:, 0]
@@ -85,7 +88,7 @@ def test_a_steady_turn_is_no_rest() -> None:
     data, _ = simulate_cube(CubeScenario(poses=2, static_s=5.0, camera=False), 2)
     turning = (data.imu_t > 1.0) & (data.imu_t < 3.5)
     data = replace(data, gyro=data.gyro + 0.3 * turning[:, None])
-    found = rests(data, load_config(b""))
+    found = static_intervals(data, load_config(b""))
     middle = found.mean(axis=1)
     assert not ((middle > 1.0) & (middle < 3.5)).any()
 
@@ -153,7 +156,7 @@ def test_tags_not_given(tmp_path: Path, session: CubeData) -> None:
 def test_no_static_pose(session: CubeData) -> None:
     shaking = replace(session, gyro=session.gyro + np.random.default_rng(1).normal(size=session.gyro.shape))
     with pytest.raises(InputError, match="no static pose: in the quietest"):
-        rests(shaking, _config())
+        static_intervals(shaking, _config())
 
 
 def test_a_tag_that_is_not_where_the_config_says_is_named() -> None:
@@ -175,7 +178,7 @@ def test_date_outside_the_field_model(session: CubeData) -> None:
 def test_blurred_pictures_only(tmp_path: Path, session: CubeData) -> None:
     from pipelines.simulation.rendering import encode
 
-    t = rests(session, _config()).mean(axis=1)
+    t = static_intervals(session, _config()).mean(axis=1)
     nothing = Sightings(t, *(np.zeros(0, dtype=np.int64),) * 2, np.zeros((0, 4, 2)), None)
     grey = encode(np.full((960, 1280), 90, dtype=np.uint8), "jpeg")
     write_cube(tmp_path / "s.mcap", replace(session, sightings=nothing), None, cube_config(SCENARIO), [grey] * len(t))

@@ -11,9 +11,9 @@ from factors import so3
 from factors.earth import EARTH_RATE, earth_rate, gravity
 from pipelines.config import load_config
 from pipelines.errors import InputError
+from pipelines.methods.cube.data import CubeData, local_field
 from pipelines.methods.cube.graph import problem
 from pipelines.methods.cube.published import nominal_vectors, published_estimate, regression
-from pipelines.methods.cube.recording import CubeData, local_field
 from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
 
 RNG = np.random.default_rng(1)

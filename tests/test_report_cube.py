@@ -11,10 +11,10 @@ import pytest
 from factors import so3
 from pipelines.config import load_config
 from pipelines.graph.problem import Estimate, Findings
+from pipelines.methods.cube.data import CubeData
 from pipelines.methods.cube.figures import cube_plots
 from pipelines.methods.cube.findings import findings, parts_of, white_noise
 from pipelines.methods.cube.graph import problem
-from pipelines.methods.cube.recording import CubeData
 from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
 from pipelines.methods.cube.tables import described
 from pipelines.reports.result import Calibration, Plot, Table

@@ -14,8 +14,9 @@ from pipelines.errors import InputError
 from pipelines.methods import simulate
 from pipelines.methods.cube.faces import Resting
 from pipelines.methods.cube.poses import static_poses
-from pipelines.methods.cube.recording import read_cube, rests
+from pipelines.methods.cube.recording import read_cube
 from pipelines.methods.cube.simulation import YEAR, CubeNoise, CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.static_intervals import static_intervals
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.recording.reading import open_recording
 from pipelines.simulation.scenario import load_scenario
@@ -174,7 +175,7 @@ def test_pictures_show_the_tags_where_the_detections_have_them(tmp_path: Path) -
         recording = open_recording(tmp_path / file)
         config = load_config(recording.attachment("alidade.yaml"))
         data = read_cube(recording, config)
-        assert len(rests(data, config)) == 1
+        assert len(static_intervals(data, config)) == 1
         poses = static_poses(data, config)
         assert poses.tags[0] is not None
         seen.append(poses.tags[0])

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pipelines.judgement.checklist import ChecklistItem
     from pipelines.judgement.hypotheses import Hypotheses
     from pipelines.judgement.validation import Validation
-    from pipelines.methods.cube.recording import CubeData
+    from pipelines.methods.cube.data import CubeData
     from pipelines.methods.cube.simulation import CubeScenario
     from pipelines.methods.formula import Formula
     from pipelines.recording.reading import Recording
@@ -67,7 +67,7 @@ class Cube(Method):
         return simulated(scenario, seed, images)
 
     def write(self, path: Path, simulated: Simulated) -> None:
-        from pipelines.methods.cube.recording import write_cube
+        from pipelines.methods.cube.writing import write_cube
 
         write_cube(path, simulated.data, simulated.truth, simulated.config, simulated.pictures)
 

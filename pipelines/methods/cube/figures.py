@@ -12,9 +12,9 @@ from factors.earth import earth_rate, gravity
 from factors.preintegration import GyroPath
 from pipelines.graph.problem import Array
 from pipelines.methods.cube.coverage import coverage
-from pipelines.methods.cube.findings import calibrated, resting
-from pipelines.methods.cube.poses import StaticPoses, turn
-from pipelines.methods.cube.recording import CubeData, local_field, nominal
+from pipelines.methods.cube.data import CubeData, local_field, nominal
+from pipelines.methods.cube.findings import calibrated
+from pipelines.methods.cube.poses import StaticPoses, static_poses, turn
 from pipelines.methods.cube.tables import NAMES, cube_tables
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.reports.plots import COLORS, add_points, figure, thin
@@ -33,7 +33,7 @@ def cube_plots(data: CubeData, calibration: Calibration) -> list[Plot | Table]:
     """The method's own figures and tables; those that the recording has no data for are left out."""
     config = calibration.config
     values = dict(zip(calibration.estimate.names, calibration.estimate.values.tolist(), strict=True))
-    poses = resting(data, config)
+    poses = static_poses(data, config)
     found: list[Plot | Table | None] = [*cube_tables(calibration)]
     found += [_before_and_after(*rows) for rows in _errors(data, config, poses, calibration, values)]
     for name, strength in _strengths(data, values).items():

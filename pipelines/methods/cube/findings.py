@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
 from factors import so3
 from pipelines.graph.problem import Array, Estimate, Findings
+from pipelines.methods.cube.data import CubeData, noise_densities, nominal, recorded
 from pipelines.methods.cube.parameters import TRIADS, triad_names
 from pipelines.methods.cube.poses import StaticPoses, static_poses
-from pipelines.methods.cube.recording import CubeData, noise_densities, nominal, recorded
 from pipelines.methods.cube.topics import MAG, CubeConfig
 from pipelines.recording.topics import IMU
 from pipelines.settings import DEFAULT_NOISE, Config, first_given
@@ -34,18 +33,13 @@ def findings(data: CubeData, config: Config, estimate: Estimate) -> Findings:
     static_poses: beginning and end, s, the direction of up in the body, and the kinds of measurement that were used.
     """
     values = dict(zip(estimate.names, estimate.values.tolist(), strict=True))
-    poses = resting(data, config)
+    poses = static_poses(data, config)
     known = [name for name in TRIADS if f"{name}_k11" in values]
     return {
         "triads": [row for name in known if (row := _triad(name, config, estimate)) is not None],
         "noise": [_noise(name, data, config, poses, values) for name in known],
         "static_poses": _poses(poses, config, estimate, values),
     }
-
-
-def resting(data: CubeData, config: Config) -> StaticPoses:
-    """The static poses with their means, tags left aside."""
-    return static_poses(replace(data, camera=None, sightings=None), config)
 
 
 def calibrated(name: str, vectors: Array, config: Config, values: Mapping[str, float]) -> Array:

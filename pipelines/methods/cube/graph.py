@@ -36,6 +36,7 @@ from factors.triad import (
 from pipelines.errors import InputError
 from pipelines.graph.linear import linear_factor
 from pipelines.graph.problem import Array, Attitudes, Factor, Problem, Step
+from pipelines.methods.cube.data import CubeData, local_field, noise_densities, nominal
 from pipelines.methods.cube.parameters import (
     FIELD_KEY,
     HEADING_KEY,
@@ -47,7 +48,6 @@ from pipelines.methods.cube.parameters import (
     tag_key,
 )
 from pipelines.methods.cube.poses import SeenTags, StaticPoses, static_poses, turn
-from pipelines.methods.cube.recording import CubeData, local_field, noise_densities, nominal
 from pipelines.methods.cube.reference import Reference, cube_reference, from_vectors
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.recording.checks import count
@@ -110,6 +110,7 @@ class _Model:
     gyro_bias: Array  # (3,) first guess, in nominal units
     initial: Array  # (P, 4) nRb
     loss: TruncatedLoss
+    dropped: Mapping[str, int]  # reason -> measurements left out
 
 
 def problem(data: CubeData, config: Config) -> Problem:
@@ -128,7 +129,7 @@ def problem(data: CubeData, config: Config) -> Problem:
         attitudes=partial(_trajectory, model),
         attitude_name="nRb",
         advice=_advice,
-        dropped={**data.dropped, **model.poses.dropped},
+        dropped=model.dropped,
     )
 
 
@@ -139,9 +140,9 @@ def _prepare(data: CubeData, config: Config) -> _Model:
             "give latitude_deg in the config"
         )
     poses = static_poses(data, config)
-    field = None
+    field, dropped = None, {**data.dropped, **poses.dropped}
     if poses.mag is not None and data.longitude is None:
-        count(poses.dropped, "magnetometer: no position for the field model, not calibrated", 1)
+        count(dropped, "magnetometer: no position for the field model, not calibrated", 1)
     elif poses.mag is not None:
         field = local_field(data, config)
     # Else only the horizontal earth rate would show the heading, which no MEMS gyro feels: it is left out as noise.
@@ -170,6 +171,7 @@ def _prepare(data: CubeData, config: Config) -> _Model:
         gyro_bias=bias,
         initial=_attitudes(data, config, poses, reference, field, bias),
         loss=TruncatedLoss(gate(8)),
+        dropped=dropped,
     )
 
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from pipelines.graph.problem import Array
 from pipelines.judgement.checklist import ChecklistItem
+from pipelines.methods.cube.data import CubeData
 from pipelines.methods.cube.poses import static_poses
-from pipelines.methods.cube.recording import CubeData
 from pipelines.settings import Config
 
 # Poses that determine the twelve numbers of a triad, and those of published practice: each of six faces thrice.

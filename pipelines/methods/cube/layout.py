@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.errors import InputError
-from pipelines.methods.cube.recording import read_camera
+from pipelines.methods.cube.sightings import read_camera
 from pipelines.methods.cube.topics import TAG_DETECTIONS, CubeConfig
 from pipelines.recording.reading import Recording
 from pipelines.recording.topics import IMAGE

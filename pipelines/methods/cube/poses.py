@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from factors import so3
 from factors.preintegration import GyroPath
 from pipelines.errors import InputError
-from pipelines.methods.cube.recording import CubeData, nominal, rests
+from pipelines.methods.cube.data import CubeData, computed_once, nominal
+from pipelines.methods.cube.static_intervals import static_intervals
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.recording.checks import count
 from pipelines.settings import DEFAULT_NOISE, Config, first_given
@@ -74,6 +75,7 @@ class StaticPoses:
         return len(self.span)
 
 
+@computed_once
 def static_poses(data: CubeData, config: Config) -> StaticPoses:
     """Find the static poses and average over them.
 
@@ -81,7 +83,7 @@ def static_poses(data: CubeData, config: Config) -> StaticPoses:
         InputError: there is no static pose, no tag is seen in any though there is a camera, or a tag does not fit the
             others.
     """
-    span = rests(data, config)
+    span = static_intervals(data, config)
     raw = config.section(CubeConfig).raw
     gyro, duration = _means(data.imu_t, nominal(data.gyro, raw.gyro), span)
     accel, _ = _means(data.imu_t, nominal(data.accel, raw.accel), span)
@@ -119,7 +121,7 @@ def _seen_tags(
 
     assert data.sightings is not None
     body = TagBody.from_board(config.section(CubeConfig))
-    # The rates' median over the rests is the bias, near enough for what a pose is expected to be.
+    # The rates' median over the static intervals is the bias, near enough for what a pose is expected to be.
     path = GyroPath(data.imu_t, nominal(data.gyro, config.section(CubeConfig).raw.gyro), np.median(gyro, axis=0))
     found: list[SeenTags | None] = []
     last: tuple[float, Array] | None = None

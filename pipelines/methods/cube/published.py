@@ -21,8 +21,8 @@ from factors import so3
 from factors.earth import EARTH_RATE, earth_rate, gravity
 from pipelines.errors import InputError
 from pipelines.graph.problem import Attitudes, Estimate, Problem, Residuals
+from pipelines.methods.cube.data import CubeData, local_field, recorded
 from pipelines.methods.cube.poses import StaticPoses, static_poses
-from pipelines.methods.cube.recording import CubeData, local_field, recorded
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.settings import Config
 

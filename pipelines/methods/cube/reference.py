@@ -9,8 +9,8 @@ import numpy as np
 from factors import so3
 from pipelines.errors import InputError
 from pipelines.graph.problem import Array
+from pipelines.methods.cube.data import CubeData
 from pipelines.methods.cube.poses import StaticPoses
-from pipelines.methods.cube.recording import CubeData
 from pipelines.methods.cube.topics import REFERENCE_IMU, CubeConfig
 from pipelines.settings import Config
 

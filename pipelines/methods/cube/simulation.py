@@ -20,8 +20,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from factors import so3
 from factors.earth import earth_rate, gravity, magnetic_field
+from pipelines.methods.cube.data import CubeData, Sightings
 from pipelines.methods.cube.faces import FACES, Resting
-from pipelines.methods.cube.recording import CubeData, Sightings
 from pipelines.simulation.motion import sample_times
 from pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
 from pipelines.simulation.simulated import Simulated

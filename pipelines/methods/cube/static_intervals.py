@@ -1,4 +1,4 @@
-"""When a device stood still: a variance test on its gyro and accelerometer."""
+"""Static intervals, when a device stood still: a variance test on its gyro and accelerometer."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import InputError
-
-Array = NDArray[np.float64]
+from pipelines.methods.cube.data import Array, CubeData, computed_once, noise_densities, nominal
+from pipelines.methods.cube.topics import CubeConfig
+from pipelines.settings import Config
 
 # The test looks at this much time about each sample, s; half of it keeps a pose's ends clear of the motion.
 _SPAN = 0.5
-# Shorter rests, s, are turning points of a motion.
+# Shorter intervals, s, are turning points of a motion.
 _SHORTEST = 0.5
 # Quiet: the scatter over the span is below this many times the noise.
 _QUIET = 2.0
@@ -19,14 +20,24 @@ _QUIET = 2.0
 _MARGIN = 0.25
 # The noise is what the quietest twentieth of the recording shows, between these multiples of the stated one.
 _FLOOR_SHARE, _FLOOR_LIMITS = 0.05, (0.2, 10.0)
-# A steady turn is as quiet as a rest; its mean rate departs from that of the rests by more than this, rad/s.
+# A steady turn is as quiet; its mean rate departs from that of the static intervals by more than this, rad/s.
 _STEADY = 0.01
 # A pause between samples is a gap when longer than this many intervals.
 _GAP_SAMPLES = 5.0
 
 
-def find_rests(t: Array, gyro: Array, accel: Array, gyro_sigma: float, accel_sigma: float) -> Array:
-    """Beginnings and ends, (P, 2) s, of the times at rest, each at a sample's stamp.
+@computed_once
+def static_intervals(data: CubeData, config: Config) -> Array:
+    """Beginnings and ends, (P, 2) s, of the device's static intervals. Raises InputError when there is none."""
+    densities = noise_densities(data, config)
+    root_rate = float(np.median(np.diff(data.imu_t))) ** -0.5
+    raw = config.section(CubeConfig).raw
+    gyro, accel = nominal(data.gyro, raw.gyro), nominal(data.accel, raw.accel)
+    return find_static_intervals(data.imu_t, gyro, accel, densities[0] * root_rate, densities[1] * root_rate)
+
+
+def find_static_intervals(t: Array, gyro: Array, accel: Array, gyro_sigma: float, accel_sigma: float) -> Array:
+    """Beginnings and ends, (P, 2) s, of the static intervals, each at a sample's stamp.
 
     After Tedaldi, Pretto, Menegatti, "A robust and easy to implement method for IMU calibration without external
     equipments", ICRA 2014, which tests the accelerometer; a turn about the vertical shows in the gyro alone.
@@ -38,7 +49,7 @@ def find_rests(t: Array, gyro: Array, accel: Array, gyro_sigma: float, accel_sig
         gyro_sigma, accel_sigma: stated noise of one sample, per axis.
 
     Raises:
-        InputError: there is no rest.
+        InputError: there is none.
     """
     interval = float(np.median(np.diff(t)))
     half = max(2, round(0.5 * _SPAN / interval))

@@ -11,9 +11,9 @@ from factors.earth import gravity
 from factors.preintegration import GyroPath
 from pipelines.errors import InputError
 from pipelines.judgement.validation import Validation
+from pipelines.methods.cube.data import CubeData, local_field, nominal
 from pipelines.methods.cube.findings import calibrated
 from pipelines.methods.cube.poses import StaticPoses, static_poses, turn
-from pipelines.methods.cube.recording import CubeData, local_field, nominal
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.settings import Config
 

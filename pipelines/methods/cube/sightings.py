@@ -1,0 +1,127 @@
+"""The cube's tags in the pictures of a recording, and the camera that took them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.errors import InputError
+from pipelines.methods.cube.data import Array, CubeData, Sightings
+from pipelines.methods.cube.static_intervals import static_intervals
+from pipelines.methods.cube.topics import TAG_DETECTIONS, CubeConfig
+from pipelines.recording.checks import clean, count
+from pipelines.recording.reading import Recording
+from pipelines.recording.topics import IMAGE, wanted
+from pipelines.settings import Config
+from pipelines.vision.recorded import camera_of
+
+if TYPE_CHECKING:
+    from pipelines.vision.camera import Camera
+
+_FAMILIES = ("", "36h11", "tag36h11")
+# More pictures than this share with one id twice are two tags with one id, not a false detection.
+_TWICE = 0.1
+
+
+def read_camera(recording: Recording, config: Config) -> Camera:
+    """The camera that looks at the cube. Raises InputError when it, or the cube's tags, are not described."""
+    if not config.section(CubeConfig).tags:
+        raise InputError(
+            "the tags on the cube are not given: name them in the config as cube.tags {id: {size, rotation, position}}"
+        )
+    return camera_of(recording, config)
+
+
+def read_sightings(recording: Recording, data: CubeData, config: Config, dropped: dict[str, int]) -> Sightings:
+    """The cube's tags as recorded, or else found in the pictures of the device's static intervals.
+
+    Raises InputError when a topic is unusable, with pictures when there is no static interval, or no tag of the cube.
+    """
+    if IMAGE.key not in config.topics and wanted(recording, config, TAG_DETECTIONS):
+        return _detections(recording, config, data.epoch_ns, dropped)
+    return _pictures(recording, config, data, dropped)
+
+
+def _detections(recording: Recording, config: Config, epoch_ns: int, dropped: dict[str, int]) -> Sightings:
+    topic = config.topic(TAG_DETECTIONS)
+    found = recording.detections(topic)
+    count(dropped, f"{topic}: stamped by log time (kept)", found.stamped_by_log)
+    t, keep = clean(topic, found.t_ns, epoch_ns, np.zeros((len(found), 1)), dropped, least=1)
+    place = np.full(len(found), -1)
+    place[keep] = np.arange(len(keep))
+    good = (place[found.frame] >= 0) & np.isfinite(found.corners).all(axis=(1, 2))
+    good &= np.isin(found.family, _FAMILIES)
+    return _sightings(
+        topic, config, t, place[found.frame[good]], found.tag_id[good], found.corners[good], None, dropped
+    )
+
+
+def _pictures(recording: Recording, config: Config, data: CubeData, dropped: dict[str, int]) -> Sightings:
+    """Tags found in the pictures of the static intervals; the others are not looked at."""
+    from pipelines.vision.parallel import UNREADABLE, detections
+
+    assert data.camera is not None
+    epoch_ns, (start, stop) = data.epoch_ns, static_intervals(data, config).T
+    topic = config.topic(IMAGE)
+    stamps: list[int] = []
+    frame: list[int] = []
+    parts = []
+    at_rest = (
+        (t_ns, encoded)
+        for t_ns, encoded in recording.images(topic)
+        if ((start <= (t_ns - epoch_ns) / 1e9) & ((t_ns - epoch_ns) / 1e9 <= stop)).any()
+    )
+    for t_ns, seen in detections(at_rest, config.section(CubeConfig).tag_family, data.camera):
+        if seen is None:
+            count(dropped, f"{topic}: {UNREADABLE}", 1)
+            continue
+        sharp = np.isfinite(seen.covariance).all(axis=(1, 2, 3))
+        count(dropped, f"{topic}: tag with an edge that cannot be measured", int((~sharp).sum()))
+        frame += [len(stamps)] * int(sharp.sum())
+        stamps.append(t_ns)
+        parts.append((seen.ids[sharp], seen.corners[sharp], seen.covariance[sharp]))
+    if not frame:
+        raise InputError(
+            f"topic {topic}: no tag is seen sharply in any of the {len(stamps)} pictures of the static poses; are they "
+            "blurred, or the tags of another family?"
+        )
+    t, keep = clean(topic, np.array(stamps, dtype=np.int64), epoch_ns, np.zeros((len(stamps), 1)), dropped, least=1)
+    place = np.full(len(stamps), -1)
+    place[keep] = np.arange(len(keep))
+    frames = place[np.array(frame, dtype=np.int64)]
+    ids, corners, covariance = (np.concatenate(column) for column in zip(*parts, strict=True))
+    good = frames >= 0
+    return _sightings(topic, config, t, frames[good], ids[good], corners[good], covariance[good], dropped)
+
+
+def _sightings(
+    topic: str,
+    config: Config,
+    t: Array,
+    frame: NDArray[np.int64],
+    ids: NDArray[np.int64],
+    corners: Array,
+    covariance: Array | None,
+    dropped: dict[str, int],
+) -> Sightings:
+    """The cube's tags among those seen, each at most once in a picture."""
+    known = np.isin(ids, list(config.section(CubeConfig).tags))
+    if not known.any():
+        raise InputError(
+            f"topic {topic}: no tag of the cube in any of {len(t)} pictures: seen {np.unique(ids).tolist() or 'none'}, "
+            f"the config names {sorted(config.section(CubeConfig).tags)}"
+        )
+    count(dropped, f"{topic}: tag that is not on the cube", int((~known).sum()))
+    _, inverse, counts = np.unique(np.stack([frame, ids]), axis=1, return_inverse=True, return_counts=True)
+    once = counts[inverse.ravel()] == 1
+    for tag in np.unique(ids[known & ~once]):
+        pictures = len(np.unique(frame[(ids == tag) & ~once]))
+        if pictures > _TWICE * len(np.unique(frame[ids == tag])):
+            raise InputError(
+                f"topic {topic}: tag {tag} is seen twice in {pictures} pictures; every tag in sight needs its own id"
+            )
+    count(dropped, f"{topic}: tag seen twice in a picture", int((known & ~once).sum()))
+    good = known & once
+    return Sightings(t, frame[good], ids[good], corners[good], None if covariance is None else covariance[good])
