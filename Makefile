@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test slow lint types bench docs clean
+.PHONY: demo test slow lint types bench docs dist clean
 
 demo: $(VENV)/installed
 	$(BIN)/alidade demo
@@ -24,6 +24,17 @@ types: $(VENV)/installed
 
 bench: $(VENV)/installed
 	$(BIN)/python -m benchmarks
+
+# Wheel and sdist, each installed into an environment of its own, away from the checkout.
+dist: $(VENV)/installed
+	rm -rf build dist
+	$(BIN)/python -m build --outdir dist > build.log 2>&1 || { cat build.log; exit 1; }
+	rm build.log
+	for made in dist/*.whl dist/*.tar.gz; do \
+	  rm -rf build/smoke && $(PYTHON) -m venv build/smoke && \
+	  build/smoke/bin/python -m pip install --quiet --disable-pip-version-check $$made -c constraints.txt && \
+	  cp tests/smoke.py build/smoke/ && (cd build/smoke && bin/python smoke.py) || exit 1; \
+	done
 
 docs: $(VENV)/installed
 	$(BIN)/python -m pytest -q tests/test_docs.py
