@@ -207,14 +207,13 @@ def plan(
 def info(session: _Session, config: _ConfigFile = None, strict: _Strict = False, quiet: _Quiet = False) -> None:
     """What is in a recording: topics, rates, gaps, and the methods it can serve."""
     from pipelines import progress, terminal
-    from pipelines.config import load_config
+    from pipelines.config import recorded_config
     from pipelines.recording.reading import open_recording
     from pipelines.session import session_facts
-    from pipelines.settings import ATTACHMENT
 
     with progress.shown(quiet), progress.doing("reading"):
         recording = open_recording(session, strict)
-        settings = load_config(recording.attachment(ATTACHMENT, needed=config is None), config)
+        settings = recorded_config(recording, config)
         facts = session_facts(recording, settings)
     terminal.show_facts(session.name, facts)
 
@@ -356,15 +355,14 @@ def cube_layout(
 ) -> None:
     """Where the tags are on a cube, from pictures of it on all sides; the config gives their ids and sizes."""
     from pipelines import progress, terminal
-    from pipelines.config import load_config
+    from pipelines.config import recorded_config
     from pipelines.methods.cube.layout import cube_layout as estimate
     from pipelines.methods.cube.layout import layout_yaml
     from pipelines.recording.reading import open_recording
-    from pipelines.settings import ATTACHMENT
 
     with progress.shown(quiet), progress.doing("finding where the tags are"):
         recording = open_recording(session)
-        layout = estimate(recording, load_config(recording.attachment(ATTACHMENT), config))
+        layout = estimate(recording, recorded_config(recording, config))
     _write(out, layout_yaml(layout))
     terminal.say(f"Wrote {out}")
 

@@ -1,6 +1,6 @@
 """How the config of a session is read: an attachment of the recording, overridden key by key by a file.
 
-    config = load_config(recording.attachment("alidade.yaml"), Path("more.yaml"))
+    config = recorded_config(recording, Path("more.yaml"))
 
 Everything wrong in a config is an InputError that names the key and the source it stands in.
 """
@@ -11,7 +11,7 @@ import reprlib
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ValidationError, create_model
 
@@ -19,7 +19,20 @@ from pipelines import methods
 from pipelines.errors import InputError, nearest
 from pipelines.settings import ATTACHMENT, Config
 
+if TYPE_CHECKING:
+    from pipelines.recording.reading import Recording
+
 _LONGEST = 1 << 20
+
+
+def recorded_config(recording: Recording, override: Path | Config | None = None) -> Config:
+    """The config of a recording, overridden as below; the recording's topics are now what the config makes of them.
+
+    Raises InputError.
+    """
+    config = load_config(recording.attachment(ATTACHMENT, needed=override is None), override)
+    recording.use(config.topics.values(), config.columns)
+    return config
 
 
 def load_config(attachment: bytes | None, override: Path | Config | None = None) -> Config:

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from pipelines import methods, progress
-from pipelines.config import load_config
+from pipelines.config import load_config, recorded_config
 from pipelines.errors import InputError
 from pipelines.graph.problem import Estimate, Problem, Step
 from pipelines.judgement.causes import find_causes
@@ -30,7 +30,7 @@ from pipelines.recording.info import SessionFacts, facts_of, lacking
 from pipelines.recording.message_reader import ENCODING
 from pipelines.recording.reading import Recording, open_recording
 from pipelines.reports.result import Calibration
-from pipelines.settings import ATTACHMENT, TRUTH, Config
+from pipelines.settings import TRUTH, Config
 from pipelines.simulation.simulated import Simulated
 
 SOLVERS = ("batch", "incremental", "published")
@@ -143,7 +143,7 @@ class Session:
     @classmethod
     def read(cls, recording: Recording, method_name: str | None, config_file: Path | Config | None) -> Session:
         """Read and check a recording (arguments and exceptions as `calibrate` has them)."""
-        config = load_config(recording.attachment(ATTACHMENT, needed=config_file is None), config_file)
+        config = recorded_config(recording, config_file)
         chosen = methods.method(resolve_method(method_name, recording, config))
         return cls(chosen, chosen.read(recording, config), config, Recorded(recording))
 

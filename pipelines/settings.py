@@ -14,6 +14,8 @@ from typing import Annotated, ClassVar, TypeVar
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from pipelines.errors import InputError, nearest
+from pipelines.recording.sources import TopicSource
+from pipelines.recording.table_topics import TableTopic
 from pipelines.recording.topics import Topic
 
 # Names of the attachments that hold a recording's config and, if simulated, its truth.
@@ -110,7 +112,8 @@ class Config(Section):
     """A whole config; every key optional. Sections of methods are added where it is read, see pipelines.config."""
 
     method: str | None = None
-    topics: dict[str, str] = {}
+    topics: dict[str, TopicSource] = {}
+    columns: dict[str, TableTopic] = {}
     noise: Noise = Noise()
     priors: dict[str, SigmaOrZero | None] = {}
     require: dict[str, Sigma] = {}
@@ -119,7 +122,8 @@ class Config(Section):
 
     def topic(self, topic: Topic) -> str:
         """Name of a topic, renamed or default."""
-        return self.topics.get(topic.key, topic.name)
+        source = self.topics.get(topic.key)
+        return topic.name if source is None else source.name
 
     def section(self, kind: type[_Own]) -> _Own:
         """What it says for one method, by the model of that section; as by default where it says nothing."""

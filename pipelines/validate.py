@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipelines.config import load_config
+from pipelines.config import recorded_config
 from pipelines.errors import InputError
 from pipelines.judgement.validation import Validation
 from pipelines.methods import method
@@ -14,7 +14,6 @@ from pipelines.recording.reading import open_recording
 from pipelines.reports.calibration import SavedCalibration, load_calibration
 from pipelines.reports.validation import validation_html, validation_rows
 from pipelines.session import resolve_method
-from pipelines.settings import ATTACHMENT
 
 FILE = "validation.html"
 
@@ -69,7 +68,7 @@ def validate(
     """
     calibration = load_calibration(calibration_file)
     recording = open_recording(path, strict)
-    config = load_config(recording.attachment(ATTACHMENT, needed=config_file is None), config_file)
+    config = recorded_config(recording, config_file)
     name = resolve_method(method_name or calibration.method, recording, config)
     if name != calibration.method:
         raise InputError(f"{calibration_file}: is a calibration of {calibration.method}, not of {name}")

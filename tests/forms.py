@@ -66,7 +66,7 @@ def split(source: Path, path: Path, count: int = 3) -> Path:
     names = [f"{path.name}_{i}.mcap" for i in range(count)]
     for i, name in enumerate(names):
         part = whole[i * len(whole) // count : (i + 1) * len(whole) // count]
-        mcap(part, path / name, lambda _, data: data, "cdr", "ros2msg", _ros2_schema)
+        mcap(part, path / name, lambda _, data: data, "cdr", "ros2msg", ros2_schema)
     listed = "\n".join(f"    - {name}" for name in names)
     (path / "metadata.yaml").write_text(
         f"rosbag2_bagfile_information:\n  version: 9\n  relative_file_paths:\n{listed}\n"
@@ -196,7 +196,7 @@ def ulog(path: Path, topics: dict[str, dict[str, np.ndarray[Any, Any]]]) -> Path
     return path
 
 
-def _ros2_schema(kind: str) -> tuple[str, bytes]:
+def ros2_schema(kind: str) -> tuple[str, bytes]:
     return kind, definition_text(kind).encode()
 
 

@@ -15,6 +15,7 @@ from pipelines.methods import simulate
 from pipelines.methods.los.recording import LosData, read_los, write_los
 from pipelines.methods.los.simulation import LosCamera, LosScenario, los_config, simulate_los, simulate_pictures
 from pipelines.recording.reading import open_recording
+from pipelines.recording.sources import TopicSource
 from pipelines.settings import Config
 from pipelines.simulation.scenario import load_scenario
 
@@ -139,9 +140,9 @@ def test_pictures_without_camera_info(tmp_path: Path) -> None:
     path = tmp_path / "s.mcap"
     write_los(path, DATA, pictures=(info, images))
     with pytest.raises(InputError, match="no topic /camera/none"):
-        read_los(open_recording(path), Config(topics={"camera_info": "/camera/none"}))
+        read_los(open_recording(path), Config(topics={"camera_info": TopicSource(topic="/camera/none")}))
     with pytest.raises(InputError, match="no topic /los/error"):
-        read_los(open_recording(path), Config(topics={"los_error": "/los/error"}))
+        read_los(open_recording(path), Config(topics={"los_error": TopicSource(topic="/los/error")}))
 
 
 def test_simulate_writes_a_whole_session(tmp_path: Path) -> None:

@@ -10,12 +10,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gtsam import Rot3
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
+from pipelines.config import load_config
 from pipelines.errors import InputError
-from pipelines.recording import series
+from pipelines.methods.head.topics import VISION_ATTITUDE
+from pipelines.recording import messages, series
 from pipelines.recording.reading import Recording, open_recording
+from pipelines.recording.sources import TopicSource, inverted
+from pipelines.recording.topics import IMU
 from pipelines.recording.writing import write_session
 from tests import forms
 from tests.recorded import T0, assert_same, session
@@ -254,3 +259,418 @@ def _channels(module: Any, context: Any) -> dict[str, Any]:
             name: getattr(module, f"{kind}Channel")(name, context=context) for name, kind in kinds.items()
         }
     return _MADE[id(context)]
+
+
+# -- logs and tables
+
+
+def turning(n: int = 500) -> tuple[Any, Any, Any]:
+    """Stamps at 100 Hz, rates and unit quaternions of a body that turns."""
+    rng = np.random.default_rng(5)
+    t_ns = T0 + 10_000_000 * np.arange(n)
+    wxyz = rng.normal(size=(n, 4))
+    return t_ns, rng.normal(size=(n, 3)), wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)
+
+
+def test_euroc_folders(tmp_path: Path) -> None:
+    t_ns, gyro, wxyz = turning()
+    accel, position = gyro[::-1], gyro * 3.0
+    root = tmp_path / "MH_01" / "mav0"
+    for name in ("imu0", "cam0/data", "vicon0"):
+        (root / name).mkdir(parents=True)
+    axes = [f"w_RS_S_{a} [rad s^-1]" for a in "xyz"] + [f"a_RS_S_{a} [m s^-2]" for a in "xyz"]
+    rows = np.hstack([gyro, accel])
+    write_csv(root / "imu0" / "data.csv", ["#timestamp [ns]", *axes], t_ns, rows)
+    (root / "imu0" / "sensor.yaml").write_text(
+        "%YAML:1.0\nrate_hz: 100\ngyroscope_noise_density: 1.0e-3\naccelerometer_noise_density: 2e-2\n"
+    )
+    names = [f"p_RS_R_{a} [m]" for a in "xyz"] + [f"q_RS_{a} []" for a in "wxyz"]
+    write_csv(root / "vicon0" / "data.csv", ["#timestamp [ns]", *names], t_ns, np.hstack([position, wxyz]))
+    pictures = [bytes([i]) * 10 for i in range(3)]
+    for stamp, picture in zip(t_ns[:3].tolist(), pictures, strict=True):
+        (root / "cam0" / "data" / f"{stamp}.png").write_bytes(picture)
+    lines = "".join(f"{stamp},{stamp}.png\n" for stamp in t_ns[:3].tolist())
+    (root / "cam0" / "data.csv").write_text("#timestamp [ns],filename\r\n" + lines)
+    (root / "cam0" / "sensor.yaml").write_text(
+        "rate_hz: 20\nresolution: [752, 480]\nintrinsics: [458.6, 457.3, 367.2, 248.4]\n"
+        "distortion_model: radial-tangential\ndistortion_coefficients: [-0.28, 0.07, 0.0002, 1.8e-05]\n"
+    )
+    recording = open_recording(tmp_path / "MH_01")
+    assert set(recording.topics) == {"/imu0", "/vicon0", "/cam0/image", "/cam0/camera_info"}
+    imu = recording.imu("/imu0")
+    np.testing.assert_array_equal(imu.t_ns, t_ns)
+    np.testing.assert_array_equal(imu.gyro, gyro)
+    np.testing.assert_array_equal(imu.accel, accel)
+    np.testing.assert_allclose(imu.gyro_cov[0], 1e-6 * 100.0 * np.eye(3))
+    poses = recording.poses("/vicon0")
+    np.testing.assert_array_equal(poses.wxyz, wxyz)
+    np.testing.assert_array_equal(poses.position, position)
+    assert list(recording.images("/cam0/image")) == list(zip(t_ns[:3].tolist(), pictures, strict=True))
+    camera = recording.camera_info("/cam0/camera_info")
+    assert (camera.width, camera.distortion_model, len(camera.d)) == (752, "plumb_bob", 5)
+
+
+def write_csv(path: Path, names: list[str], t_ns: Any, rows: Any) -> Path:
+    lines = [",".join([str(t), *map(repr, row)]) for t, row in zip(t_ns.tolist(), rows.tolist(), strict=True)]
+    path.write_text("\r\n".join([",".join(names), *lines, ""]))
+    return path
+
+
+def test_tum_trajectories_keep_their_stamps_to_the_nanosecond(tmp_path: Path) -> None:
+    t_ns, position, wxyz = turning()
+    path = tmp_path / "groundtruth.txt"
+    rows = np.hstack([position, wxyz[:, [1, 2, 3, 0]]]).tolist()
+    seconds = [f"{t // 10**9}.{t % 10**9:09d}" for t in t_ns.tolist()]
+    lines = [f"{t} {' '.join(map(repr, row))}" for t, row in zip(seconds, rows, strict=True)]
+    path.write_text("# ground truth\n# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines))
+    poses = open_recording(path).poses("/trajectory")
+    np.testing.assert_array_equal(poses.t_ns, t_ns)
+    np.testing.assert_array_equal(poses.wxyz, wxyz)
+    np.testing.assert_array_equal(poses.position, position)
+    path.write_text("\n".join([*lines[:3], "1 2 3"]))
+    with pytest.raises(InputError, match="line 4 has 3 columns instead of 8"):
+        open_recording(path)
+
+
+CSV_CONFIG = b"""
+columns:
+  /imu: {file: imu.csv, time: t, unit: us, gyro: [wx, wy, wz], accel: [ax, ay, az], units: {gyro: deg/s}}
+  /pose: {file: pose.csv, time: t, unit: ns, wxyz: [qw, qx, qy, qz]}
+  /joints: {file: pose.csv, time: t, unit: ns, joints: {azimuth: az}, units: {joints: deg}}
+"""
+
+
+def test_csv_with_columns_from_the_config(tmp_path: Path) -> None:
+    t_ns, gyro, wxyz = turning()
+    write_csv(tmp_path / "imu.csv", ["t", "wx", "wy", "wz", "ax", "ay", "az"], t_ns // 1000, np.hstack([gyro, -gyro]))
+    rows = np.hstack([wxyz, gyro[:, :1]])
+    pose = write_csv(tmp_path / "pose.csv", ["t", "qw", "qx", "qy", "qz", "az"], t_ns, rows)
+    pose.write_text(pose.read_text() + f"{T0 + 10**10},,,,,3.5\r\n")
+    recording = open_recording(tmp_path / "*.csv")
+    assert not recording.topics
+    assert "a table with the columns t, wx, wy" in recording.notes[0]
+    config = load_config(CSV_CONFIG)
+    recording.use(config.topics.values(), config.columns)
+    imu = recording.imu("/imu")
+    np.testing.assert_array_equal(imu.t_ns, t_ns // 1000 * 1000)
+    np.testing.assert_array_equal(imu.gyro, gyro * (np.pi / 180.0))
+    np.testing.assert_array_equal(imu.accel, -gyro)
+    np.testing.assert_array_equal(recording.poses("/pose").wxyz, wxyz)
+    joints = recording.joints("/joints", ["azimuth"])
+    assert (len(joints), joints.position[-1, 0]) == (501, pytest.approx(np.deg2rad(3.5)))
+    assert recording.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ("{time: t, gyro: [a, b, c]}", r"columns./imu.file: which table is meant\?; tables there: imu.csv, pose.csv"),
+        ("{file: imu.cvs, time: t, gyro: [a, b, c]}", "no table imu.cvs; the nearest known key is imu.csv"),
+        ("{file: imu.csv, time: t, gyro: [a, wy, wz]}", "imu.csv: no column a; the columns are t, wx"),
+        ("{file: imu.csv, time: t, gyro: [note, wy, wz]}", "columns note, wy, wz: could not convert string"),
+        ("{file: imu.csv, time: note, gyro: [wx, wy, wz]}", "imu.csv: a time that is no number in s"),
+        ("{file: imu.csv, time: t}", "exactly one of gyro, wxyz, field, vector, latitude_deg, joints is needed"),
+        ("{file: imu.csv, time: t, gyro: [a, b, c], units: {gyro: rpm}}", "units.gyro: rpm is not one of rad/s"),
+        ("{file: imu.csv, time: t, gyro: [a, b]}", "columns./imu.gyro"),
+    ],
+)
+def test_columns_that_do_not_fit_are_one_line(columns: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "imu.csv").write_text("t,wx,wy,wz,note\n1,2,3,4,x\n2,2,3,4,y\n")
+    (tmp_path / "pose.csv").write_text("t,qw\n1,2\n")
+    recording = open_recording(tmp_path / "*.csv")
+
+    def use() -> None:
+        config = load_config(f"columns: {{/imu: {columns}}}".encode())
+        recording.use(config.topics.values(), config.columns)
+
+    with pytest.raises(InputError, match=message) as found:
+        use()
+    assert "\n" not in str(found.value)
+
+
+def test_px4_logs(tmp_path: Path) -> None:
+    n = 100
+    rng = np.random.default_rng(1)
+    us = 5_000_000 + 4000 * np.arange(n, dtype=np.uint64)
+    f4 = {name: rng.normal(size=(n, 3)).astype(np.float32) for name in ("gyro", "accel", "mag")}
+    q = rng.normal(size=(n, 4)).astype(np.float32)
+    path = forms.ulog(
+        tmp_path / "log.ulg",
+        {
+            "sensor_combined": {"timestamp": us, "gyro_rad": f4["gyro"], "accelerometer_m_s2": f4["accel"]},
+            "sensor_mag": {
+                "timestamp": us + np.uint64(300),
+                "timestamp_sample": us,
+                **{axis: f4["mag"][:, i] for i, axis in enumerate("xyz")},
+            },
+            "vehicle_attitude": {"timestamp": us, "q": q},
+            "vehicle_imu": {
+                "timestamp": us,
+                "timestamp_sample": us,
+                "delta_angle": f4["gyro"],
+                "delta_velocity": f4["accel"],
+                "delta_angle_dt": np.full(n, 4000, np.uint32),
+                "delta_velocity_dt": np.full(n, 4000, np.uint32),
+            },
+            "sensor_gyro_fifo": {
+                "timestamp": us[:3],
+                "timestamp_sample": us[:3],
+                "dt": np.full(3, 1000.0, np.float32),
+                "scale": np.full(3, 0.5, np.float32),
+                "samples": np.full(3, 2, np.uint8),
+                **{axis: np.arange(12, dtype=np.int32).reshape(3, 4) for axis in "xyz"},
+            },
+            "vehicle_gps_position": {
+                "timestamp": us[:5],
+                "time_utc_usec": us[:5] + np.uint64(T0 // 1000),
+                "lat": np.full(5, 470_000_000, np.int32),
+                "lon": np.full(5, 85_000_000, np.int32),
+                "alt": np.full(5, 400_000, np.int32),
+                "fix_type": np.full(5, 3, np.uint8),
+            },
+        },
+    )
+    recording = open_recording(path)
+    assert recording.notes == ()
+    t_ns = T0 // 1000 * 1000 + 1000 * us.astype(np.int64)
+    imu = recording.imu("/sensor_combined")
+    np.testing.assert_array_equal(imu.t_ns, t_ns)
+    np.testing.assert_array_equal(imu.gyro, f4["gyro"].astype(float))
+    np.testing.assert_array_equal(imu.accel, f4["accel"].astype(float))
+    magnetic = recording.magnetic("/sensor_mag")
+    np.testing.assert_array_equal(magnetic.t_ns, t_ns)
+    np.testing.assert_array_equal(magnetic.field, 1e-4 * f4["mag"].astype(float))
+    means = recording.imu("/vehicle_imu")
+    np.testing.assert_array_equal(means.t_ns, t_ns - 2_000_000)
+    np.testing.assert_allclose(means.gyro, f4["gyro"].astype(float) / 0.004, rtol=1e-12)
+    fifo = recording.vector("/sensor_gyro_fifo")
+    np.testing.assert_array_equal(fifo.vector[:, 0], [0.0, 0.5, 2.0, 2.5, 4.0, 4.5])
+    np.testing.assert_array_equal(fifo.t_ns[:2], [t_ns[0] - 1_000_000, t_ns[0]])
+    assert recording.fixes("/vehicle_gps_position").latitude_deg[0] == pytest.approx(47.0)
+    # A vehicle that is level and heads north points along North in East-North-Up: its forward axis is n's second.
+    level = forms.ulog(
+        tmp_path / "level.ulg",
+        {"vehicle_attitude": {"timestamp": us, "q": np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1))}},
+    )
+    found = open_recording(level)
+    assert "no fix says what time it was" in found.notes[0]
+    w, x, y, z = found.poses("/vehicle_attitude").wxyz[0]
+    forward = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
+    np.testing.assert_allclose(forward, [0.0, 1.0, 0.0], atol=1e-12)
+
+
+def test_an_ardupilot_log_names_the_converter(tmp_path: Path) -> None:
+    path = tmp_path / "1.bin"
+    path.write_bytes(b"\xa3\x95\x80\x80" + bytes(100))
+    with pytest.raises(InputError, match=r"an ArduPilot log; make CSV of it .*mavlogdump.*columns:"):
+        open_recording(path)
+
+
+# -- messages
+
+
+def ros2_recording(path: Path, topics: dict[str, list[tuple[int, Any]]]) -> Path:
+    """Messages, (log time, message) by topic, of rosbags' types."""
+    whole = [
+        (name, message.__msgtype__, log_ns, bytes(forms.ROS2.serialize_cdr(message, message.__msgtype__)))
+        for name, found in topics.items()
+        for log_ns, message in found
+    ]
+    return forms.mcap(whole, path, lambda _, data: data, "cdr", "ros2msg", forms.ros2_schema)
+
+
+def header(t_ns: int, frame: str = "") -> Any:
+    types = forms.ROS2.types
+    time = types["builtin_interfaces/msg/Time"](*divmod(t_ns, 10**9))
+    return types["std_msgs/msg/Header"](time, frame)
+
+
+def test_attitudes_of_all_types(tmp_path: Path) -> None:
+    types = forms.ROS2.types
+    t_ns, position, wxyz = turning(20)
+    cov = np.arange(36.0)
+
+    def each(make: Callable[[Any, Any, Any], Any]) -> list[tuple[int, Any]]:
+        made = []
+        for t, p, (w, x, y, z) in zip(t_ns.tolist(), position.tolist(), wxyz.tolist(), strict=True):
+            rotation = types["geometry_msgs/msg/Quaternion"](x, y, z, w)
+            made.append((t + 100, make(header(t, "camera"), p, rotation)))
+        return made
+
+    def pose(p: Any, q: Any) -> Any:
+        return types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](*p), q)
+
+    def transform(h: Any, p: Any, q: Any, child: str) -> Any:
+        moved = types["geometry_msgs/msg/Transform"](types["geometry_msgs/msg/Vector3"](*p), q)
+        return types["geometry_msgs/msg/TransformStamped"](h, child, moved)
+
+    def tf(h: Any, p: Any, q: Any) -> Any:
+        return types["tf2_msgs/msg/TFMessage"]([transform(h, [0, 0, 0], q, "other"), transform(h, p, q, "helmet")])
+
+    def odometry(h: Any, p: Any, q: Any) -> Any:
+        zero = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
+        twist = types["geometry_msgs/msg/TwistWithCovariance"](
+            types["geometry_msgs/msg/Twist"](zero, zero), np.zeros(36)
+        )
+        measured = types["geometry_msgs/msg/PoseWithCovariance"](pose(p, q), cov)
+        return types["nav_msgs/msg/Odometry"](h, "helmet", measured, twist)
+
+    path = ros2_recording(
+        tmp_path / "a.mcap",
+        {
+            "/pose": each(lambda h, p, q: types["geometry_msgs/msg/PoseStamped"](h, pose(p, q))),
+            "/transform": each(lambda h, p, q: transform(h, p, q, "helmet")),
+            "/odometry": each(odometry),
+            "/tf": each(tf),
+        },
+    )
+    recording = open_recording(path)
+    config = load_config(
+        b"topics:\n  vision_attitude: {topic: /tf, frames: [camera, helmet]}\n"
+        b"  truth_attitude: {topic: /odometry, invert: true}\n"
+    )
+    recording.use(config.topics.values(), config.columns)
+    assert config.topic(VISION_ATTITUDE) == "/tf (camera to helmet)"
+    for topic in ("/pose", "/transform", "/odometry", config.topic(VISION_ATTITUDE)):
+        found = recording.poses(topic)
+        np.testing.assert_array_equal(found.t_ns, t_ns)
+        np.testing.assert_array_equal(found.wxyz, wxyz)
+        np.testing.assert_array_equal(found.position, position)
+    np.testing.assert_array_equal(recording.poses("/odometry").cov[3].ravel(), cov)
+    assert recording.topics["/tf (camera to helmet)"].type == messages.POSE
+    source = TopicSource(topic="/tf", frames=("camera", "nose"))
+    recording.use([source], {})
+    with pytest.raises(InputError, match="no transform from camera to nose; there: camera to helmet, camera to other"):
+        recording.poses(source.name)
+
+
+def test_an_inverted_attitude_and_its_covariance() -> None:
+    """Against finite rotations of the pose itself."""
+    rng = np.random.default_rng(2)
+    t_ns, position, wxyz = turning(4)
+    root = rng.normal(size=(4, 6, 6))
+    poses = series.PoseSeries(t_ns, wxyz, position, root @ root.swapaxes(1, 2))
+    back = inverted(poses)
+    np.testing.assert_allclose(inverted(back).wxyz, wxyz, atol=1e-14)
+    np.testing.assert_allclose(inverted(back).position, position, atol=1e-14)
+    np.testing.assert_allclose(inverted(back).cov[:, 3:, 3:], poses.cov[:, 3:, 3:], atol=1e-12)
+    for i in range(4):
+        w, x, y, z = wxyz[i]
+        R = Rot3.Quaternion(w, x, y, z)
+        np.testing.assert_allclose(Rot3.Quaternion(*back.wxyz[i]).matrix(), R.matrix().T, atol=1e-12)
+        np.testing.assert_allclose(R.matrix() @ back.position[i] + position[i], 0.0, atol=1e-12)
+        delta = 1e-4 * rng.normal(size=3)
+        moved = Rot3.Logmap(R.compose(R.compose(Rot3.Expmap(delta)).inverse()))
+        np.testing.assert_allclose(moved, -R.matrix() @ delta, rtol=1e-3, atol=1e-9)
+
+
+def test_a_gyro_and_an_accelerometer_make_an_imu(tmp_path: Path) -> None:
+    t_ns, gyro, _ = turning()
+    later = t_ns[10:-10:2] + 5_000_000
+    accel = np.stack([(later - T0) * 1e-9, np.ones(len(later)), -(later - T0) * 1e-8], axis=1)
+    write_session(
+        tmp_path / "s.mcap",
+        {
+            "/gyro": series.VectorSeries(t_ns, gyro),
+            "/accel": series.VectorSeries(later, accel),
+            "/imu_accel": series.ImuSeries(later, np.zeros((len(later), 3)), accel),
+        },
+    )
+    for name in ("/accel", "/imu_accel"):
+        recording = open_recording(tmp_path / "s.mcap")
+        config = load_config(f"topics: {{imu: {{gyro: /gyro, accel: {name}}}}}".encode())
+        recording.use(config.topics.values(), config.columns)
+        imu = recording.imu(config.topic(IMU))
+        np.testing.assert_array_equal(imu.t_ns, t_ns)
+        np.testing.assert_array_equal(imu.gyro, gyro)
+        inside = (t_ns >= later[0]) & (t_ns <= later[-1])
+        np.testing.assert_allclose(imu.accel[inside, 0], (t_ns[inside] - T0) * 1e-9, atol=1e-9)
+        assert np.isnan(imu.accel[~inside]).all()
+        assert len(recording.times[config.topic(IMU)][0]) == len(t_ns)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("topics: {imu: {gyro: /g, topic: /x}}", "topics.imu: either a topic or a gyro is needed"),
+        ("topics: {imu: {accel: /g, topic: /x}}", "topics.imu: accel goes with a gyro"),
+        ("topics: {imu: {gyro: /g, invert: true}}", "topics.imu: frames and invert go with a topic"),
+        (
+            "topics: {imu: {topic: /g, framse: [a, b]}}",
+            r"unknown key topics\.imu\.framse; the nearest known key is frames",
+        ),
+    ],
+)
+def test_sources_that_make_no_sense_are_one_line(text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        load_config(text.encode())
+
+
+@pytest.mark.parametrize(
+    "encoding",
+    [
+        "mono8",
+        "mono16",
+        "rgb8",
+        "bgr8",
+        "rgba8",
+        "bgra8",
+        "bayer_rggb8",
+        "bayer_grbg8",
+        "bayer_bggr16",
+        "bayer_gbrg8",
+        "yuv422",
+        "yuv422_yuy2",
+    ],
+)
+def test_raw_pictures_of_every_encoding(encoding: str, tmp_path: Path) -> None:
+    """A scene of smooth colours comes out as it is, up to what the encoding loses."""
+    import cv2
+
+    height, width = 32, 48
+    v, u = np.mgrid[:height, :width]
+    rgb = np.stack([40 + 3 * u, 60 + 4 * v, 120 + u + v], axis=2).astype(np.uint8)
+    grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+    pixels = raw_pixels(encoding, rgb, grey)
+    step = pixels.shape[1] + 4  # rows may be padded
+    data = np.pad(pixels, ((0, 0), (0, 4))).ravel()
+    picture = forms.ROS2.types["sensor_msgs/msg/Image"](header(T0), height, width, encoding, 0, step, data)
+    recording = open_recording(ros2_recording(tmp_path / "i.mcap", {"/image": [(T0, picture)]}))
+    ((t_ns, file),) = recording.images("/image")
+    assert t_ns == T0
+    found = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert found is not None
+    inside = slice(2, -2)
+    # Bayer squares are filled in between neighbours.
+    np.testing.assert_allclose(
+        found[inside, inside].astype(float), grey[inside, inside], atol=3 if "bayer" in encoding else 1
+    )
+    bad = forms.ROS2.types["sensor_msgs/msg/Image"](header(T0), height, width, encoding, 0, step, data[:-1])
+    broken = open_recording(ros2_recording(tmp_path / "b.mcap", {"/image": [(T0, bad)]}))
+    with pytest.raises(InputError, match=r"topic /image: the messages have no usable field \(32 rows"):
+        list(broken.images("/image"))
+
+
+def raw_pixels(encoding: str, rgb: Any, grey: Any) -> Any:
+    """A picture as rows of bytes."""
+    height, width = grey.shape
+    if encoding.startswith("mono"):
+        return grey if encoding == "mono8" else (grey.astype("<u2") << 4).view(np.uint8)
+    if encoding.startswith("yuv"):
+        flat = np.full((height, 2 * width), 128, np.uint8)
+        flat[:, 0 if encoding.endswith("yuy2") else 1 :: 2] = grey
+        return flat
+    if encoding.startswith("bayer"):
+        mosaic = np.zeros_like(grey)
+        for i, colour in enumerate(encoding[6:10]):
+            mosaic[i // 2 :: 2, i % 2 :: 2] = rgb[i // 2 :: 2, i % 2 :: 2, "rgb".index(colour)]
+        return (mosaic.astype("<u2") << 8).view(np.uint8) if encoding.endswith("16") else mosaic
+    order = ["rgba".index(colour) for colour in encoding[:-1]]
+    return np.dstack([rgb, np.full_like(grey, 255)])[:, :, order].reshape(height, -1)
+
+
+def test_another_encoding_of_pictures_is_one_line(tmp_path: Path) -> None:
+    picture = forms.ROS2.types["sensor_msgs/msg/Image"](header(T0), 2, 2, "32FC1", 0, 8, np.zeros(16, np.uint8))
+    recording = open_recording(ros2_recording(tmp_path / "i.mcap", {"/image": [(T0, picture)]}))
+    with pytest.raises(InputError, match="the encoding '32FC1' is not one of mono, rgb"):
+        list(recording.images("/image"))

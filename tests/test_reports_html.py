@@ -16,6 +16,7 @@ from pipelines.judgement.observability import assess
 from pipelines.judgement.robust import robust_sigma
 from pipelines.methods.head.figures import head_plots
 from pipelines.methods.head.recording import HeadData
+from pipelines.recording.sources import TopicSource
 from pipelines.reports.html import report_html
 from pipelines.reports.plots import common_plots
 from pipelines.reports.result import Calibration, quantities_of
@@ -61,7 +62,7 @@ def test_free_and_undetermined_parameters_show_no_silly_number() -> None:
 
 def test_names_from_the_recording_are_escaped() -> None:
     calibration = make_calibration(
-        recording="<script>alert(1)</script>.mcap", config=Config(topics={"imu": "</pre><script>"})
+        recording="<script>alert(1)</script>.mcap", config=Config(topics={"imu": TopicSource(topic="</pre><script>")})
     )
     page = Page(report_html(calibration))
     assert page.scripts == Page(report_html(make_calibration())).scripts

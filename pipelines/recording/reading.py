@@ -11,8 +11,8 @@ damaged is left out, see `Recording.notes`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import TypeVar
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -26,6 +26,11 @@ from pipelines.recording.decoding import Times
 from pipelines.recording.message_reader import TIMED, MessageReader, Topic
 from pipelines.recording.netpbm import netpbm
 from pipelines.recording.opening import Where, open_container
+from pipelines.recording.sources import TopicSource, inverted, joined
+from pipelines.recording.table_topics import TableTopic, described
+
+# Pairs of frames an error lists.
+_MOST_PAIRS = 30
 
 AnySeries = TypeVar("AnySeries", bound=series.Series)
 
@@ -47,7 +52,24 @@ class Recording:
         self.path = container.path
         self._container = container
         self._reader = MessageReader(container, str(container.path))
-        self.topics: Mapping[str, Topic] = self._reader.topics
+        self._made: dict[str, TopicSource] = {}
+
+    @property
+    def topics(self) -> Mapping[str, Topic]:
+        """By name: those recorded, and those that `use` makes of them."""
+        recorded = self._reader.topics
+        made = {name: found for name, source in self._made.items() if (found := self._made_topic(name, source))}
+        return {**recorded, **made}
+
+    def use(self, sources: Iterable[TopicSource], columns: Mapping[str, TableTopic]) -> None:
+        """Take what the config says of topics that are made of others, and of the columns of tables.
+
+        Raises InputError when a table or a column is not there, or holds no numbers.
+        """
+        if columns:
+            self._container = described(self._container, columns)
+            self._reader = MessageReader(self._container, str(self.path))
+        self._made = {source.name: source for source in sources if source.is_made}
 
     def sha256(self) -> str:
         """SHA-256 of the file, hexadecimal."""
@@ -101,7 +123,9 @@ class Recording:
     @property
     def times(self) -> Mapping[str, Times]:
         """Topic -> stamps (log times where there is no header to be read) and log times."""
-        return self._reader.times
+        made = {name: source.topic or source.gyro or "" for name, source in self._made.items()}
+        times = self._reader.times
+        return {**times, **{name: times[base] for name, base in made.items() if base in times}}
 
     def there(self) -> str:
         """A phrase that lists the topics of the recording, and what is lost of it."""
@@ -115,10 +139,16 @@ class Recording:
         Args:
             topics: names, each with the joints wanted if it is a sensor_msgs/msg/JointState.
         """
-        self._reader.read_together(topics)
+        wanted = dict(topics)
+        for name in wanted.keys() & self._made.keys():
+            source = self._made[name]
+            wanted |= {part: () for part in (source.topic, source.gyro, source.accel) if part is not None}
+        self._reader.read_together(wanted)
 
     def imu(self, topic: str) -> series.ImuSeries:
         """A sensor_msgs/msg/Imu topic, or rates alone from a Vector3Stamped or TwistStamped one: accelerations NaN."""
+        if topic in self._made:
+            return self._made_imu(topic, self._made[topic])
         self._reader.require(topic, *messages.RATES)
         if self.topics[topic].type == messages.IMU:
             return self._series(series.ImuSeries, topic)
@@ -139,6 +169,8 @@ class Recording:
 
     def poses(self, topic: str) -> series.PoseSeries:
         """A topic of poses, or of attitudes alone, in any of the types of messages.ATTITUDES."""
+        if topic in self._made:
+            return self._made_poses(topic, self._made[topic])
         self._reader.require(topic, *messages.ATTITUDES)
         kind = self.topics[topic].type
         if kind == messages.IMU:
@@ -223,6 +255,59 @@ class Recording:
             np.array(family, dtype=np.str_),
             by_log,
         )
+
+    def _made_topic(self, name: str, source: TopicSource) -> Topic | None:
+        """What a made topic is; None if something that it is made of is not there."""
+        parts = [self._reader.topics.get(part) for part in (source.topic, source.gyro, source.accel) if part]
+        found = [part for part in parts if part is not None]
+        if len(found) < len(parts):
+            return None
+        kind = messages.POSE if source.topic else messages.IMU
+        is_readable = all(part.is_readable for part in found)
+        return Topic(name, kind, found[0].count, found[0].encoding, is_readable)
+
+    def _made_poses(self, name: str, source: TopicSource) -> series.PoseSeries:
+        if source.topic is None:
+            raise InputError(f"{self.path}: topic {name} is made of rates; it holds no attitude")
+        poses = self._transforms(source.topic, source.frames) if source.frames else self.poses(source.topic)
+        return inverted(poses) if source.invert else poses
+
+    def _made_imu(self, name: str, source: TopicSource) -> series.ImuSeries:
+        if source.gyro is None:
+            raise InputError(f"{self.path}: topic {name} is made of attitudes; it holds no rates")
+        accel = None if source.accel is None else self._part(source.accel, "accel")
+        return joined(self._part(source.gyro, "gyro"), accel)
+
+    def _part(self, topic: str, which: str) -> series.VectorSeries:
+        """The rates or accelerations on a topic that holds either."""
+        self._reader.require(topic, messages.IMU, messages.VECTOR, messages.TWIST, messages.ACCEL)
+        if self.topics[topic].type != messages.IMU:
+            return self._series(series.VectorSeries, topic)
+        imu = self._series(series.ImuSeries, topic)
+        return series.VectorSeries(imu.t_ns, getattr(imu, which), stamped_by_log=imu.stamped_by_log)
+
+    def _transforms(self, topic: str, frames: tuple[str, str]) -> series.PoseSeries:
+        """The transforms of a pair of frames, parent and child, in the messages of a TFMessage topic."""
+        pairs: set[tuple[str, str]] = set()
+        rows: list[tuple[int, bool, Any]] = []
+        for log_ns, _, message, definition in self._reader.decoded(topic, messages.TF):
+            with self._reader.fields(topic):
+                for one in message.transforms:
+                    pair = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
+                    if pair == (frames[0].lstrip("/"), frames[1].lstrip("/")):
+                        t_ns = one.header.stamp.sec * 1_000_000_000 + one.header.stamp.nanosec
+                        rows.append((t_ns or log_ns, not t_ns, definition.numbers(one.transform)))
+                    elif len(pairs) < _MOST_PAIRS:
+                        pairs.add(pair)
+        if not rows:
+            there = ", ".join(f"{parent} to {child}" for parent, child in sorted(pairs))
+            raise InputError(
+                f"{self.path}: topic {topic} has no transform from {frames[0]} to {frames[1]}; there: {there or 'none'}"
+            )
+        numbers = np.array([row for _, _, row in rows]).reshape(len(rows), 7)
+        t_ns = np.array([row[0] for row in rows], dtype=np.int64)
+        by_log = sum(row[1] for row in rows)
+        return series.PoseSeries(t_ns, numbers[:, [6, 3, 4, 5]], numbers[:, :3], stamped_by_log=by_log)
 
     def _attitudes(self, topic: str) -> series.PoseSeries:
         """The orientations of an Imu topic. Raises InputError where it has none."""

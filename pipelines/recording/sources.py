@@ -1,0 +1,113 @@
+"""Topics that are made of recorded ones, as the config says it under `topics:`.
+
+topics:
+  head_imu: /helmet/imu                                            # a name
+  vision_attitude: {topic: /tracker/pose, invert: true}            # the tracker gives the inverse
+  vision_attitude: {topic: /tf, frames: [camera, helmet]}          # one pair of frames of a TFMessage
+  imu: {gyro: /gyro, accel: /accelerometer}                        # two topics, of any type that holds them
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_serializer, model_validator
+
+from pipelines.recording import series
+
+Array = NDArray[np.float64]
+
+
+class TopicSource(BaseModel):
+    """Where a topic comes from: a recorded one as it is, one of its pairs of frames, its inverse, or two topics.
+
+    Attributes:
+        topic: recorded name.
+        frames: parent and child, of a tf2_msgs/msg/TFMessage.
+        invert: whether the recorded attitude is the inverse of the one meant.
+        gyro, accel: topics whose rates and accelerations make an IMU; without `accel` there are rates alone.
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+    topic: str | None = None
+    frames: Annotated[tuple[str, str], Field(strict=False)] | None = None
+    invert: bool = False
+    gyro: str | None = None
+    accel: str | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _named(cls, value: Any) -> Any:
+        return {"topic": value} if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _one_way(self) -> TopicSource:
+        if (self.topic is None) == (self.gyro is None):
+            raise ValueError("either a topic or a gyro is needed")
+        if self.gyro is None and self.accel is not None:
+            raise ValueError("accel goes with a gyro")
+        if self.gyro is not None and (self.frames or self.invert):
+            raise ValueError("frames and invert go with a topic")
+        return self
+
+    @model_serializer
+    def _plain(self) -> str | dict[str, Any]:
+        given = {name: value for name, value in self.__dict__.items() if value not in (None, False)}
+        return given["topic"] if given.keys() == {"topic"} else given
+
+    @property
+    def is_made(self) -> bool:
+        """Whether it is more than a name."""
+        return self.topic is None or self.frames is not None or self.invert
+
+    @property
+    def name(self) -> str:
+        """Of the topic recorded, or what is said of the one that is made."""
+        if self.topic is None:
+            return f"{self.gyro} with {self.accel}" if self.accel else f"{self.gyro} as gyro"
+        frames = f" ({' to '.join(self.frames)})" if self.frames else ""
+        return f"{self.topic}{frames}{' inverted' if self.invert else ''}"
+
+
+def inverted(poses: series.PoseSeries) -> series.PoseSeries:
+    """The inverse of every pose.
+
+    The covariance of the rotation is that of delta in R*Exp(delta) before and after: of R' = R^T it is R*cov*R^T.
+    Positions' covariances are left out, zero.
+    """
+    rotation = _matrices(poses.wxyz)
+    cov = np.zeros_like(poses.cov)
+    cov[:, 3:, 3:] = rotation @ poses.cov[:, 3:, 3:] @ rotation.swapaxes(1, 2)
+    position = -np.einsum("nji,nj->ni", rotation, poses.position)
+    wxyz = poses.wxyz * [1.0, -1.0, -1.0, -1.0]
+    return series.PoseSeries(poses.t_ns, wxyz, position, cov, stamped_by_log=poses.stamped_by_log)
+
+
+def joined(gyro: series.VectorSeries, accel: series.VectorSeries | None) -> series.ImuSeries:
+    """Rates with the accelerations at their stamps, between samples by straight lines; NaN outside of them."""
+    if accel is None or len(accel) == 0:
+        values: Array = np.full((len(gyro), 3), np.nan)
+    elif np.array_equal(gyro.t_ns, accel.t_ns):
+        values = accel.vector
+    else:
+        order = np.argsort(accel.t_ns, kind="stable")
+        start = min(int(gyro.t_ns[0]), int(accel.t_ns[order[0]]))
+        at, t = (gyro.t_ns - start) * 1e-9, (accel.t_ns[order] - start) * 1e-9
+        columns = [np.interp(at, t, column, np.nan, np.nan) for column in accel.vector[order].T]
+        values = np.stack(columns, axis=1)
+    by_log = gyro.stamped_by_log + (0 if accel is None else accel.stamped_by_log)
+    return series.ImuSeries(gyro.t_ns, gyro.vector, values, stamped_by_log=by_log)
+
+
+def _matrices(wxyz: Array) -> Array:
+    """Rotation matrices (N, 3, 3) of unit quaternions."""
+    w, x, y, z = wxyz.T
+    rows = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
