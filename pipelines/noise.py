@@ -18,7 +18,6 @@ from pipelines.recording import messages
 from pipelines.recording.checks import clean
 from pipelines.recording.even import even_pieces
 from pipelines.recording.faults import drop_faults
-from pipelines.recording.message_reader import ENCODING
 from pipelines.recording.reading import Recording, open_recording
 
 Array = NDArray[np.float64]
@@ -89,7 +88,7 @@ def noise_of(path: Path, strict: bool = False) -> NoiseStudy:
     names = [
         name
         for name, topic in recording.topics.items()
-        if topic.type in (messages.IMU, messages.MAGNETIC_FIELD) and topic.encoding == ENCODING and topic.count
+        if topic.type in (messages.IMU, messages.MAGNETIC_FIELD) and topic.is_readable and topic.count
     ]
     if not names:
         kinds = f"{messages.IMU} or {messages.MAGNETIC_FIELD}"
@@ -104,7 +103,7 @@ def noise_of(path: Path, strict: bool = False) -> NoiseStudy:
             troubles.append(str(error))
     if not found:
         raise InputError(
-            "; ".join([*troubles, *notes]) or f"{path}: {', '.join(names)}: no sensor, all values are zero"
+            "; ".join([*troubles, *notes]) or f"{path}: {', '.join(names)}: no sensor, all values are zero or NaN"
         )
     notes = [*recording.notes, *troubles, *notes]
     return NoiseStudy(path.name, recording.epoch_ns, recording.duration_s, tuple(found), tuple(notes))
@@ -156,7 +155,7 @@ def _device(recording: Recording, name: str) -> _Device:
         if imu.accel_cov[0, 0, 0] == -1.0:
             del sensors["accel"]
     # A field of the message that nobody filled in is no sensor.
-    return _Device(t_ns, {kind: values for kind, values in sensors.items() if np.any(values != 0.0)})
+    return _Device(t_ns, {kind: values for kind, values in sensors.items() if np.any(np.nan_to_num(values))})
 
 
 def _pieces(t: Array, values: Array, rests: Array) -> tuple[list[Array], float, int]:
