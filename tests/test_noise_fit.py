@@ -192,6 +192,15 @@ def test_a_sinusoid_is_named_and_leaves_the_density_alone(amplitude: float, hz: 
     assert found["K"].value is None
 
 
+def test_a_sinusoid_is_taken_out_of_short_pieces_too() -> None:
+    rng = np.random.default_rng(0)
+    t = 0.01 * np.arange(12_000)
+    x = rng.normal(size=len(t)) + 2.0 * np.sin(2.0 * np.pi * 12.3 * t)
+    noise = axis_noise([x[:9000], x[9000:9030], np.zeros(40), x[9030:9500], x[9500:]], 0.01)
+    assert noise.lines[0].hz == pytest.approx(12.3, abs=noise.lines[0].resolution_hz)
+    assert by_name(noise.fit.coefficients)["N"].value == pytest.approx(0.1, rel=0.03)
+
+
 def test_a_vibration_that_wanders_is_named() -> None:
     rng = np.random.default_rng(0)
     t = 0.01 * np.arange(60_000)

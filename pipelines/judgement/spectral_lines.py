@@ -30,6 +30,8 @@ _FIRST = 8
 # The transform of the whole record spreads a line beyond these; left out is where it adds more than this part.
 _LEAST_ADDED = 0.01
 _MOST_LINES = 10
+# Blocks of a piece, eight to a window, that make its own estimate of a line's frequency better than the spectrum's.
+_REFINED = 8
 
 
 @dataclass(frozen=True)
@@ -88,21 +90,28 @@ def without_lines(pieces: Sequence[Array], interval_s: float, lines: Sequence[Li
 
 def _less(x: Array, rate: float, resolution: float) -> Array:
     """x less the sinusoid that fits it best near a rate, all in rad a sample."""
-    # Turned down to nearly zero and averaged, the line is the peak of a short spectrum.
+    # Turned down to nearly zero and averaged in blocks, the line is the peak of a short spectrum.
     block = max(1, int(np.pi / (4.0 * resolution)))
-    count = len(x) // block
-    k = np.arange(len(x)) - 0.5 * len(x)
-    slow = (x * np.exp(-1j * rate * k))[: count * block].reshape(count, block).mean(axis=1)
-    spectrum = np.fft.fft(slow, 8 * count)
-    rate += 2.0 * np.pi * float(np.fft.fftfreq(8 * count, block)[np.argmax(np.abs(spectrum))])
-    for _ in range(3):
-        wave = np.exp(1j * rate * k)
-        amplitude = 2.0 * np.vdot(wave, x) / len(x)
-        carried = amplitude * wave
-        slope = -k * carried.imag
-        left = x - carried.real
-        rate += float(slope @ left / (slope @ slope))
-    return x - (2.0 * np.vdot(np.exp(1j * rate * k), x) / len(x) * np.exp(1j * rate * k)).real
+    count = -(-len(x) // block)
+    blocks = np.pad(x, (0, count * block - len(x))).reshape(count, block)
+    within, start = np.arange(block) - 0.5 * (block - 1), block * (np.arange(count) - 0.5 * (count - 1))
+    slow = (blocks @ np.cos(rate * within) - 1j * (blocks @ np.sin(rate * within))) * np.exp(-1j * rate * start)
+    slow /= np.append(np.full(count - 1, block), len(x) - block * (count - 1))
+    offset = 0.0
+    # A short piece cannot tell the rate better than it is known.
+    if count >= _REFINED and np.any(slow):
+        spectrum = np.fft.fft(slow, 8 * count)
+        offset = 2.0 * np.pi * float(np.fft.fftfreq(8 * count, block)[np.argmax(np.abs(spectrum))])
+        for _ in range(3):
+            turned = slow * np.exp(-1j * offset * start)
+            amplitude = turned.mean()
+            offset += float(start @ (turned * amplitude.conj()).imag) / (abs(amplitude) ** 2 * float(start @ start))
+    # The average over a block took away a little of it.
+    amplitude = 2.0 * (slow * np.exp(-1j * offset * start)).mean() / np.sinc(offset * block / (2.0 * np.pi))
+    rate += offset
+    slowly = amplitude * np.exp(1j * rate * start)
+    wave = np.stack([slowly.real, -slowly.imag], axis=1) @ np.stack([np.cos(rate * within), np.sin(rate * within)])
+    return (blocks - wave).ravel()[: len(x)]
 
 
 def _welch(pieces: Sequence[Array], size: int) -> tuple[Array, int]:
