@@ -16,6 +16,7 @@ from pipelines.methods.head.simulation import HeadScenario, head_config, simulat
 from pipelines.methods.los import graph as los
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from pipelines.simulation.motion import EulerMotion, Swing
+from pipelines.solvers.assembly import Assembly
 from pipelines.solvers.batch import CHUNK, Solution, optimize
 
 MOUNT = int(gtsam.symbol("M", 0))
@@ -55,12 +56,8 @@ def head_problem(frames: int) -> Problem:
 
 def build(problem: Problem, chunk: int) -> Graph:
     """The whole graph, `chunk` measurements in a factor."""
-    factors: list[Factor] = []
-    values = gtsam.Values()
-    for step in problem.steps(chunk):
-        factors.extend(step.factors)
-        values.insert(step.initial)
-    return factors, values
+    whole = Assembly.of(problem.steps(chunk))
+    return whole.factors, whole.initial
 
 
 def native(problem: Problem) -> Graph:
@@ -96,13 +93,11 @@ def solve(problem: Problem, graph: Graph) -> Solution:
     return optimize(*graph, shared, loss)
 
 
-def default_optimizer(problem: Problem, graph: Graph) -> int:
+def default_optimizer(graph: Graph) -> int:
     """By gtsam.LevenbergMarquardtOptimizer as it comes, plain least squares; returns its iterations."""
-    assert problem.loss is not None
-    problem.loss.mu = 0.0
     whole = gtsam.NonlinearFactorGraph()
     for f in graph[0]:
-        whole.add(f.factor)
+        whole.add(f.factor if f.measurement is None else f.measurement.under(None).factor)
     optimizer = gtsam.LevenbergMarquardtOptimizer(whole, graph[1])
     optimizer.optimize()
     return int(optimizer.iterations())
@@ -119,7 +114,7 @@ def against_default(keyframes: int) -> Ratio:
     """The default route's time over ours."""
     problem = los_problem(keyframes)
     single, chunks = build(problem, 1), build(problem, CHUNK)
-    a, b = costs([lambda: solve(problem, chunks), lambda: default_optimizer(problem, single)], 1, warm=False)
+    a, b = costs([lambda: solve(problem, chunks), lambda: default_optimizer(single)], 1, warm=False)
     compared = f"LevenbergMarquardtOptimizer with a CustomFactor a measurement over ours, {keyframes} keyframes"
     return Ratio(f"batch.default.{keyframes}", compared, b.seconds / a.seconds, "higher", 0.4, 20.0, a, b)
 

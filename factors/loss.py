@@ -9,14 +9,14 @@ import numpy as np
 from factors.model import Array
 
 
-@dataclass
+@dataclass(frozen=True)
 class TruncatedLoss:
-    """Truncated least squares on each measurement's whitened norm, with its graduated relaxation.
+    """Truncated least squares on each measurement's whitened norm, or a relaxation of it.
 
     Beyond `gate` a measurement costs gate**2 / 2, whatever its size: it has no pull. `mu` = inf is that loss; a small
-    mu is a convex surrogate, and raising mu from outside leads from one to the other; mu = 0 stands for plain least
-    squares. Yang, Antonante, Tzoumas,
-    Carlone, "Graduated non-convexity for robust spatial perception", RA-L 2020, eqs. 13 and 14.
+    mu is a convex surrogate, mu = 0 its limit, plain least squares. Solving for one mu after the other leads from the
+    one to the other. Yang, Antonante, Tzoumas, Carlone, "Graduated non-convexity for robust spatial perception",
+    RA-L 2020, eqs. 13 and 14.
     """
 
     gate: float

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
@@ -85,7 +86,7 @@ class VectorizedFactor:
         unknowns = sum(map(dimension, self.blocks))
         self._dim = unknowns + 1 if self.compress else len(self.model.time) * self.model.rows
         self._last: tuple[list[Any], _Evaluation] | None = None
-        self._given: _Evaluation | None = None
+        self._given: tuple[_Evaluation, TruncatedLoss | None] | None = None
 
     def _require_fit(self) -> None:
         """Raise ValueError unless model, blocks and keys belong together."""
@@ -127,9 +128,21 @@ class VectorizedFactor:
         return evaluation.residuals.ravel(), np.concatenate(jacobians, axis=1)
 
     def used(self, values: gtsam.Values) -> NDArray[np.bool_]:
-        """Which of the n measurements the loss lets count; all of them while it stands for plain least squares."""
-        square = (self.residuals(values) ** 2).sum(axis=1)
-        return np.ones(len(square), dtype=bool) if self.loss is None else self.loss.weight(square) > 0.5
+        """Which of the n measurements the loss lets count; all of them without one."""
+        square, loss = _squares(self.residuals(values)), self._loss_in_force
+        return np.ones(len(square), dtype=bool) if loss is None else loss.weight(square) > 0.5
+
+    def under(self, loss: TruncatedLoss | None) -> VectorizedFactor:
+        """The same factor with another loss, if it has one at all."""
+        if self.loss is None or self.loss == loss:
+            return self
+        other = copy(self)
+        other.loss = loss
+        return other
+
+    @property
+    def _loss_in_force(self) -> TruncatedLoss | None:
+        return self.loss if self._given is None else self._given[1]
 
     def _at(self, values: gtsam.Values) -> _Evaluation:
         """The model at the values.
@@ -138,7 +151,7 @@ class VectorizedFactor:
         smoother asks again and again while its linearisation point stays.
         """
         if self._given is not None:
-            return self._given
+            return self._given[0]
         variables = [
             variable
             for column, block in zip(self.columns, self.blocks, strict=True)
@@ -160,16 +173,16 @@ class VectorizedFactor:
 
     def _evaluate(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
         evaluation = self._at(values)
-        residuals = evaluation.residuals
+        residuals, loss = evaluation.residuals, self._loss_in_force
         if jacobians is None:
-            if self.loss is None and not self.compress:
+            if loss is None and not self.compress:
                 return residuals.ravel()
             error = np.zeros(self._dim)
-            error[0] = np.sqrt(_square(residuals) if self.loss is None else self.loss.cost(_squares(residuals)).sum())
+            error[0] = np.sqrt(_square(residuals) if loss is None else loss.cost(_squares(residuals)).sum())
             return error
         blocks = evaluation.jacobians()
-        if self.loss is not None:
-            root = np.sqrt(self.loss.weight(_squares(residuals)))[:, None]
+        if loss is not None:
+            root = np.sqrt(loss.weight(_squares(residuals)))[:, None]
             residuals = root * residuals
             blocks = tuple(root[..., None] * b for b in blocks)
         if self.compress:
@@ -237,15 +250,20 @@ class Ensemble:
         self._values: gtsam.Values | None = None
 
     @contextmanager
-    def at(self, values: gtsam.Values) -> Iterator[None]:
-        """Evaluated at the values, which nobody may change; within the block the factors answer for no others."""
+    def at(self, values: gtsam.Values, loss: TruncatedLoss | None = None) -> Iterator[None]:
+        """Evaluated at the values, which nobody may change; within the block the factors answer for no others.
+
+        Args:
+            values: of all variables.
+            loss: within the block it stands in place of the factors' own, where they have one; None weighs all in full.
+        """
         if values is not self._values:
             for group in self._groups:
                 group.evaluate(values)
             self._values = values
         try:
             for group in self._groups:
-                group.give()
+                group.give(loss)
             yield
         finally:
             for group in self._groups:
@@ -284,9 +302,9 @@ class _Group:
         whole = _Evaluation(*self._model(*blocks))
         self._parts = [whole.part(start, stop) for start, stop in self._spans]
 
-    def give(self) -> None:
+    def give(self, loss: TruncatedLoss | None) -> None:
         for factor, part in zip(self._factors, self._parts, strict=True):
-            factor._given = part
+            factor._given = part, None if factor.loss is None else loss
 
     def take(self) -> None:
         for factor in self._factors:

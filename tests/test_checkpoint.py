@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import pytest
 
 from pipelines.config import load_config
 from pipelines.errors import InputError
-from pipelines.graph.problem import Estimate, Problem
+from pipelines.graph.problem import Attitudes, Estimate, Problem
 from pipelines.methods.los.graph import problem
 from pipelines.methods.los.recording import read_los, write_los
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
@@ -22,7 +22,8 @@ from pipelines.recording.reading import open_recording
 from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
-from pipelines.solvers.incremental import Run
+from pipelines.solvers.incremental import Run, solve_incremental
+from pipelines.solvers.smoother import Smoother
 
 BRISK = EulerMotion(
     roll=[Swing(amplitude_deg=6, frequency_hz=0.31)],
@@ -46,7 +47,7 @@ made = problem(read_los(recording, config), config)
 run = load_checkpoint(Path(sys.argv[2]), made, {"recording": "first", "config": "{}"})
 for step in made.steps(1):
     if step.time > run.time:
-        run.take(step)
+        run.add_step(step)
 end = run.finish(0.0)
 chi = end.chi_square.value
 print(json.dumps([end.values.tolist(), end.sigmas.tolist(), chi, len(end.history.time), end.rejected]))
@@ -72,14 +73,14 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Saved:
     config = load_config(recording.attachment("alidade.yaml"))
     made = problem(read_los(recording, config), config)
     run = Run(made, 1.0)
-    folds = 0
+    times = 0
     for step in made.steps(1):
-        run.take(step)
-        if run.just_folded:
-            folds += 1
-            if folds == 1:
+        run.add_step(step)
+        if run.just_marginalized:
+            times += 1
+            if times == 1:
                 save_checkpoint(checkpoint, run, IDENTITY)
-    assert folds == 2, "the run has to be folded again after the one that is saved"
+    assert times == 2, "the past has to be marginalised out again after the one that is saved"
     return Saved(session, checkpoint, made, run.finish(0.0))
 
 
@@ -96,7 +97,7 @@ def test_a_new_process_ends_at_the_same_estimates(saved: Saved) -> None:
     assert (moments, rejected) == (len(end.history.time), end.rejected)
 
 
-def test_folding_loses_nothing(saved: Saved) -> None:
+def test_marginalizing_the_past_loses_nothing(saved: Saved) -> None:
     batch = solve_batch(saved.made)
     assert saved.end.rejected == batch.rejected == {"los": 0}
     assert np.abs((saved.end.values - batch.values) / batch.sigmas).max() < 0.02
@@ -154,20 +155,40 @@ def test_a_checkpoint_takes_the_place_of_the_old_one_whole_or_not_at_all(
 
 
 def test_a_smoother_that_throws_is_built_anew_from_what_is_known(saved: Saved, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pipelines.solvers import incremental
-
-    whole = incremental._Smoother.update
+    whole = Smoother.update
     calls = 0
 
     def update(*arguments: object) -> None:
         nonlocal calls
         calls += 1
-        if calls in (50, 450):  # before the first fold and after it
+        if calls in (50, 450):  # before the past is marginalised out first, and after it
             raise RuntimeError("indeterminate")
         whole(*arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(incremental._Smoother, "update", update)
-    end = incremental.solve_incremental(replace(saved.made))
+    monkeypatch.setattr(Smoother, "update", update)
+    end = solve_incremental(replace(saved.made))
     assert calls > 450
     assert np.abs((end.values - saved.end.values) / saved.end.sigmas).max() < 0.05
     assert end.attitudes is None
+
+
+def test_a_smoother_that_throws_late_loses_no_attitudes(saved: Saved, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those from before the past was marginalised out were recorded then, and only then."""
+    whole, calls = Smoother.update, 0
+
+    def update(*arguments: object) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 450:
+            raise RuntimeError("indeterminate")
+        whole(*arguments)  # type: ignore[arg-type]
+
+    def attitudes(keyframes: Sequence[int], _: object) -> Attitudes:
+        return Attitudes(np.array(keyframes, dtype=float), np.tile([1.0, 0.0, 0.0, 0.0], (len(keyframes), 1)))
+
+    monkeypatch.setattr(Smoother, "update", update)
+    end = solve_incremental(replace(saved.made, attitudes=attitudes))
+    assert calls > 450
+    assert end.attitudes is not None
+    np.testing.assert_array_equal(end.attitudes.time, np.arange(len(end.attitudes.time)))
+    assert len(end.attitudes.time) == sum(len(step.keyframes) for step in saved.made.steps(1))

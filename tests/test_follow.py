@@ -34,7 +34,7 @@ BRISK = EulerMotion(
     pitch=[Swing(amplitude_deg=5, frequency_hz=0.27)],
     yaw=[Swing(amplitude_deg=6, frequency_hz=0.23)],
 )
-# Longer than it takes the smoother to be folded for the first time, 40 s.
+# Longer than it takes until the past is marginalised out for the first time, 40 s.
 SCENARIO = LosScenario(duration_s=49.0, carrier=BRISK, image_rate_hz=6.0, gyro_rate_hz=50.0, gimbal_rate_hz=50.0)
 
 # Another process that records: what is in one file, into another, in pieces; from some time on it waits for a file.

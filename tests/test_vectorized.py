@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import FrozenInstanceError, dataclass
 from typing import ClassVar
 
 import gtsam
@@ -159,6 +159,25 @@ def test_an_ensemble_evaluates_what_its_factors_would() -> None:
             assert graph.error(values) == pytest.approx(error, rel=1e-14)
             np.testing.assert_allclose(graph.linearize(values).augmentedJacobian(), jacobian, rtol=1e-14)
     assert graph.error(others) != pytest.approx(error)
+
+
+def test_the_loss_in_force_is_that_of_the_evaluation() -> None:
+    """A factor's own elsewhere; a factor without one never gets one."""
+    line = _line(8)
+    spoilt = _Line(line.time, line.A, line.y + 5.0)
+    weighed, plain = spoilt.on(0, 1, loss=TruncatedLoss(1.0)), spoilt.on(0, 1)
+    values = _values(np.array([1.0, -2.0, 0.5]), np.zeros(2))
+    ensemble = Ensemble([weighed, plain])
+    full = plain.factor.error(values)
+    for loss, error in ((None, full), (TruncatedLoss(1.0), 8 * 0.5), (TruncatedLoss(1.0, mu=0.0), full)):
+        with ensemble.at(values, loss):
+            assert weighed.factor.error(values) == pytest.approx(error)
+            assert plain.factor.error(values) == pytest.approx(full)
+    assert weighed.factor.error(values) == pytest.approx(8 * 0.5)
+    assert weighed.under(None).factor.error(values) == pytest.approx(full)
+    assert plain.under(TruncatedLoss(1.0)) is plain
+    with pytest.raises(FrozenInstanceError):
+        weighed.loss.mu = 0.0  # type: ignore[misc, union-attr]
 
 
 def test_models_that_differ_in_more_than_measurements_are_evaluated_apart() -> None:

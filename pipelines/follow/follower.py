@@ -149,7 +149,7 @@ class Follower:
             self._say("what was recorded before now reads otherwise: beginning anew")
             self._run = Run(problem, self.settings.window)
             return problem.steps(1)
-        self._run.grown(problem)
+        self._run.update_problem(problem)
         return problem.steps_after(self._run.time)
 
     def _collect(self, session: Session) -> None:
@@ -160,8 +160,8 @@ class Follower:
         assert run is not None
         goes_on = problem.steps_after is not None
         for step in steps:
-            run.take(step)
-            if run.just_folded and goes_on:
+            run.add_step(step)
+            if run.just_marginalized and goes_on:
                 self._save(run)
             if goes_on and time.monotonic() - self._shown > _VIEW:
                 self._view()

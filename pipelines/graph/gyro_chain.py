@@ -99,7 +99,7 @@ class GyroChain:
         now = int(self.nodes[step.keyframes[-1]])
         if self.bias.nodes > 1:
             last = step.keyframes.stop == len(self.time)
-            step.stand_ins[self.bias.key(0)] = self.bias.mean_key(now) if last else self.bias.key(now)
+            step.current_keys[self.bias.key(0)] = self.bias.mean_key(now) if last else self.bias.key(now)
             before = max(nodes.start - 1, 0)
             self.bias.keep(step, range(before, now + 1), range(max(before - 1, 0), means.stop))
         for k in step.keyframes:

@@ -118,7 +118,7 @@ class Step:
         predict: the new variables from the current estimate (incremental); None means `initial` serves.
         timestamps: variable -> time of last use, s. A smoother with a window forgets a variable when its time leaves
             the window; one that is named in no step is kept for good. Repeat a key to keep it alive.
-        stand_ins: parameter key -> variable that from now on holds its value, for parameters that move along.
+        current_keys: parameter key -> variable that from now on holds its value, for parameters that move along.
         keyframes: index range of the states this step adds, for `Problem.attitudes`.
     """
 
@@ -127,7 +127,7 @@ class Step:
     factors: list[Factor] = field(default_factory=list)
     predict: Callable[[gtsam.Values], gtsam.Values] | None = None
     timestamps: dict[int, float] = field(default_factory=dict)
-    stand_ins: dict[int, int] = field(default_factory=dict)
+    current_keys: dict[int, int] = field(default_factory=dict)
     keyframes: range = range(0)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.graph.problem import Array, Factor, Problem
+from pipelines.graph.problem import Array, Problem
 from pipelines.judgement.outcome import outcome
 from pipelines.judgement.robust import robust_sigma
 from pipelines.settings import Config
@@ -79,25 +79,17 @@ def held_out(problem: Problem) -> dict[str, float]:
 
     One chunk in five is held out. 1 is as good as the noise; a little more is the uncertainty of the prediction.
     """
-    import gtsam
-
+    from pipelines.solvers.assembly import Assembly
     from pipelines.solvers.batch import CHUNK, optimize, residuals_of
 
-    if problem.loss is not None:
-        problem.loss.mu = np.inf
-    values = gtsam.Values()
-    stand_ins: dict[int, int] = {}
-    kept: list[Factor] = []
-    out: list[Factor] = []
-    for i, step in enumerate(problem.steps(CHUNK)):
-        values.insert(step.initial)
-        stand_ins.update(step.stand_ins)
-        for f in step.factors:
-            (out if f.measurement is not None and i % _HELD_OUT == _HELD_OUT - 1 else kept).append(f)
+    steps = list(problem.steps(CHUNK))
+    whole = Assembly.of(steps)
+    out = [f for step in steps[_HELD_OUT - 1 :: _HELD_OUT] for f in step.factors if f.measurement is not None]
+    left = {id(f) for f in out}
+    kept = [f for f in whole.factors if id(f) not in left]
     if not any(f.measurement is not None for f in kept):
         return {}
-    shared = [stand_ins.get(p.key, p.key) for p in problem.parameters]
-    solution = optimize(kept, values, shared, problem.loss)
+    solution = optimize(kept, whole.initial, whole.shared(problem), problem.loss)
     if not solution.converged:
         return {}
     return {family: robust_sigma(r.whitened) for family, r in residuals_of(out, solution.values).items()}

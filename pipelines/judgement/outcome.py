@@ -108,25 +108,16 @@ def quick_score(method: Method, data: Any, config: Config) -> float:
 
     Infinite when there is no solution.
     """
-    import gtsam
-
+    from pipelines.solvers.assembly import Assembly
     from pipelines.solvers.batch import CHUNK, optimize, residuals_of
 
     try:
         problem = method.problem(data, config)
     except InputError:
         return np.inf
-    if problem.loss is not None:
-        problem.loss.mu = 0.0
-    steps = list(problem.steps(CHUNK))
-    factors = [f for step in steps for f in step.factors]
-    values = gtsam.Values()
-    stand_ins: dict[int, int] = {}
-    for step in steps:
-        values.insert(step.initial)
-        stand_ins.update(step.stand_ins)
-    shared = [stand_ins.get(p.key, p.key) for p in problem.parameters]
-    values = optimize(factors, values, shared, None, _FEW, _MOST_DAMPING).values
+    whole = Assembly.of(problem.steps(CHUNK))
+    factors = whole.factors
+    values = optimize(factors, whole.initial, whole.shared(problem), None, _FEW, _MOST_DAMPING).values
     measured = np.concatenate([np.abs(r.whitened).ravel() for r in residuals_of(factors, values).values()])
     processes = [f.factor for f in factors if f.measurement is None and f.family not in ("prior", "definition")]
     sizes = [np.sqrt(2.0 * f.error(values) / f.dim()) for f in processes]

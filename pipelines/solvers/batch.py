@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -17,7 +18,8 @@ import numpy as np
 from factors.loss import TruncatedLoss
 from factors.vectorized import Ensemble
 from pipelines.graph.problem import Estimate, Factor, Problem, Residuals
-from pipelines.solvers.growth import Mark, growth
+from pipelines.solvers.assembly import Assembly
+from pipelines.solvers.history import sequential_history
 from pipelines.solvers.marginals import chi_square, joint_covariance, ordering_of, reported, smoothed
 
 # Frames in one vectorised factor: past this the Jacobians' zeros cost more than the Python calls they save.
@@ -38,28 +40,52 @@ _MILD_PULL = 0.5
 _FEWEST_USED = 0.5
 
 
+@dataclass(frozen=True)
 class System:
-    """A graph, the order in which its variables are eliminated, and its measurements evaluated all at once."""
+    """A graph, the order in which its variables are eliminated, and its measurements evaluated all at once.
 
-    def __init__(self, factors: Sequence[Factor], shared: Sequence[int]) -> None:
-        self.factors = factors
-        self.graph = graph_of(factors)
-        self.ordering = elimination_ordering(self.graph, shared)
-        self.measurements = Ensemble([f.measurement for f in factors if f.measurement is not None])
+    Attributes:
+        factors: of the graph.
+        graph: the same for gtsam.
+        ordering: of the elimination.
+        measurements: those among the factors.
+        loss: how those that may be outliers are weighed; None counts all in full.
+    """
+
+    factors: Sequence[Factor]
+    graph: gtsam.NonlinearFactorGraph
+    ordering: gtsam.Ordering
+    measurements: Ensemble
+    loss: TruncatedLoss | None
+
+    @classmethod
+    def of(cls, factors: Sequence[Factor], shared: Sequence[int], loss: TruncatedLoss | None) -> System:
+        """The system of some factors; the shared variables are eliminated last."""
+        graph = graph_of(factors)
+        ensemble = Ensemble([f.measurement for f in factors if f.measurement is not None])
+        return cls(factors, graph, elimination_ordering(graph, shared), ensemble, loss)
+
+    def under(self, loss: TruncatedLoss | None) -> System:
+        """The same system with another loss."""
+        return replace(self, loss=loss)
+
+    def at(self, values: gtsam.Values) -> AbstractContextManager[None]:
+        """Within the block the factors answer for these values, under the system's loss."""
+        return self.measurements.at(values, self.loss)
 
     def error(self, values: gtsam.Values) -> float:
         """Half the sum of squares."""
-        with self.measurements.at(values):
+        with self.at(values):
             return float(self.graph.error(values))
 
     def linearize(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
         """The linear system about the values."""
-        with self.measurements.at(values):
+        with self.at(values):
             return self.graph.linearize(values)
 
     def residuals(self, values: gtsam.Values) -> dict[str, Residuals]:
         """Residuals of all measurements, by family."""
-        with self.measurements.at(values):
+        with self.at(values):
             return residuals_of(self.factors, values)
 
 
@@ -84,45 +110,36 @@ def solve_batch(problem: Problem) -> Estimate:
         IndeterminateError: states other than the parameters are not determined; names the variable.
     """
     start = time.perf_counter()
-    factors: list[Factor] = []
-    values = gtsam.Values()
-    stand_ins: dict[int, int] = {}
-    marks: list[Mark] = []
-    keyframes: list[int] = []
-    for step in problem.steps(CHUNK):
-        factors.extend(step.factors)
-        values.insert(step.initial)
-        stand_ins.update(step.stand_ins)
-        marks.append(Mark(step.time, len(factors), dict(stand_ins)))
-        keyframes.extend(step.keyframes)
+    whole = Assembly.of(problem.steps(CHUNK))
     built = time.perf_counter()
-    shared = [stand_ins.get(p.key, p.key) for p in problem.parameters]
-    solution = optimize(factors, values, shared, problem.loss)
+    solution = optimize(whole.factors, whole.initial, whole.shared(problem), problem.loss)
     solved = time.perf_counter()
-    values = solution.values
-    system, ordering = solution.system, solution.system.ordering
+    values, system, ordering = solution.values, solution.system, solution.system.ordering
     linear = system.linearize(values)
-    grown = growth(problem, linear, ordering, values, marks)
-    marginal = grown[1] if grown else joint_covariance(problem, linear, ordering, values, stand_ins)
+    past = sequential_history(problem, linear, ordering, values, whole.boundaries)
+    marginal = past[1] if past else joint_covariance(problem, linear, ordering, values, whole.current_keys)
     residuals = system.residuals(values)
-    with system.measurements.at(values):
-        summary = chi_square(problem, factors, linear, ordering, values, marginal)
-    held = [(m.time, m.stand_ins) for i, m in enumerate(marks) if i == 0 or m.stand_ins != marks[i - 1].stand_ins]
-    # The last stand-ins are what the session reports; those before them held the parameters over time.
-    smooth = smoothed(problem, linear, ordering, values, held[:-1], marginal) if len(held) > 2 else None
+    with system.at(values):
+        summary = chi_square(problem, whole.factors, linear, ordering, values, marginal)
+    # Times from which on other variables held the parameters than before; after the last one they are those reported.
+    ends = whole.boundaries
+    changes = [
+        (b.time, b.current_keys) for i, b in enumerate(ends) if i == 0 or b.current_keys != ends[i - 1].current_keys
+    ]
+    smooth = smoothed(problem, linear, ordering, values, changes[:-1], marginal) if len(changes) > 2 else None
     done = time.perf_counter()
     return Estimate(
         solver="batch",
         names=tuple(q.name for q in problem.quantities),
-        values=reported(problem, values, stand_ins),
+        values=reported(problem, values, whole.current_keys),
         covariance=marginal,
         converged=solution.converged,
         message=solution.message,
         residuals=residuals,
         chi_square=summary,
-        history=grown[0] if grown else None,
+        history=past[0] if past else None,
         smoothed=smooth,
-        attitudes=problem.attitudes(keyframes, values) if problem.attitudes else None,
+        attitudes=problem.attitudes(whole.keyframes, values) if problem.attitudes else None,
         rejected={family: int((~r.used).sum()) for family, r in residuals.items()},
         seconds={"build": built - start, "solve": solved - built, "marginals": done - solved},
     )
@@ -162,27 +179,25 @@ def optimize(
     most_damping: float = _MOST_DAMPING,
 ) -> Solution:
     """Minimise; with a loss: plain least squares first, and the graduated relaxation only if it leaves outliers."""
-    system = System(factors, shared)
+    unweighed = System.of(factors, shared, None)
     if loss is None:
-        return _minimize(system, values, most=most, most_damping=most_damping)
-    loss.mu = 0.0
+        return _minimize(unweighed, values, most=most, most_damping=most_damping)
     measurements = sum(len(f.measurement.model.time) for f in factors if f.measurement is not None)
-    plain = _minimize(system, values, _ROUGH_TOLERANCE * measurements)
+    plain = _minimize(unweighed, values, _ROUGH_TOLERANCE * measurements)
     values, iterations = plain.values, plain.iterations
-    norms = np.concatenate([np.linalg.norm(r.whitened, axis=1) for r in system.residuals(values).values()])
+    norms = np.concatenate([np.linalg.norm(r.whitened, axis=1) for r in unweighed.residuals(values).values()])
     outlying = norms[norms > loss.gate]
     if outlying.sum() > _MILD_PULL * len(norms):
-        loss.mu = loss.gate**2 / (2.0 * float(outlying.max()) ** 2 - loss.gate**2)
-        while loss.mu < 1e3:
-            relaxed = _minimize(system, values, most=2)
+        mu = loss.gate**2 / (2.0 * float(outlying.max()) ** 2 - loss.gate**2)
+        while mu < 1e3:
+            relaxed = _minimize(unweighed.under(replace(loss, mu=mu)), values, most=2)
             values, iterations = relaxed.values, iterations + relaxed.iterations
-            loss.mu *= 4.0
-    loss.mu = np.inf
-    final = _minimize(system, values)
-    used = np.concatenate([r.used for r in system.residuals(final.values).values()])
+            mu *= 4.0
+    truncated = unweighed.under(loss)
+    final = _minimize(truncated, values)
+    used = np.concatenate([r.used for r in truncated.residuals(final.values).values()])
     if used.mean() < _FEWEST_USED:
-        loss.mu = 0.0
-        final = _minimize(system, plain.values)
+        final = _minimize(unweighed, plain.values)
     return replace(final, iterations=iterations + final.iterations)
 
 

@@ -1,8 +1,8 @@
 """A run of the incremental solver in a file, to be taken up again in another process.
 
-A run is saved where its smoother was just folded: the Gaussian it goes on from, in gtsam's own text, which keeps every
-digit, and the rows it has gathered. The steps after it come from the recording again. The run that wrote the file went
-on from the very same numbers, so both end at the same estimates.
+A run is saved where the past was just marginalised out: the Gaussian it goes on from, in gtsam's own text, which keeps
+every digit, and the rows it has gathered. The steps after it come from the recording again. The run that wrote the file
+went on from the very same numbers, so both end at the same estimates.
 """
 
 from __future__ import annotations
@@ -20,19 +20,20 @@ import numpy as np
 from pipelines.errors import InputError
 from pipelines.graph.problem import Problem
 from pipelines.solvers.incremental import Run
+from pipelines.solvers.innovations import Innovations
 from pipelines.solvers.rows import Rows
 from pipelines.solvers.state import State
 
-_SCHEMA = "alidade.checkpoint/1"
+_SCHEMA = "alidade.checkpoint/2"
 _INNOVATIONS = "innovations/"
 
 
 def save_checkpoint(path: Path, run: Run, identity: Mapping[str, str]) -> None:
-    """Write a run that was just folded; the file is replaced whole or not at all.
+    """Write a run whose past was just marginalised out; the file is replaced whole or not at all.
 
     Args:
         path: the file.
-        run: with run.just_folded.
+        run: with run.just_marginalized.
         identity: what the run belongs to, in words: recording, config, versions. Only a run of the same is resumed.
 
     Raises:
@@ -40,21 +41,21 @@ def save_checkpoint(path: Path, run: Run, identity: Mapping[str, str]) -> None:
     """
     state = run.base
     if state is None or run.past:
-        raise ValueError("a run can be saved only where it was just folded")
+        raise ValueError("a run can be saved only where its past was just marginalised out")
     head = {
         "schema": _SCHEMA,
         "identity": dict(identity),
         "window": run.window,
         "time": state.time,
         "stamps": list(state.stamps.items()),
-        "stand_ins": list(run.stand_ins.items()),
+        "current_keys": list(run.current_keys.items()),
         "keyframes": run.keyframes,
-        "unusable": run.unusable,
-        "rejected_in_a_row": run.rejected_in_a_row,
+        "unusable": run.innovations.unusable,
+        "rejected_in_a_row": run.innovations.rejected_in_a_row,
         "values": state.values.serialize(),
         "linear": state.linear.serialize(),
     }
-    rows: dict[str, Any] = {_INNOVATIONS + family: rows.array for family, rows in run.innovations.items()}
+    rows: dict[str, Any] = {_INNOVATIONS + family: rows.array for family, rows in run.innovations.families.items()}
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with part.open("wb") as stream:
@@ -97,12 +98,11 @@ def load_checkpoint(path: Path, problem: Problem, identity: Mapping[str, str]) -
         linear.deserialize(head["linear"])
         stamps = {int(key): float(stamp) for key, stamp in head["stamps"]}
         run = Run.resumed(problem, head["window"], State(head["time"], values, linear, stamps))
-        run.stand_ins = {int(key): int(held) for key, held in head["stand_ins"]}
+        run.current_keys = {int(key): int(held) for key, held in head["current_keys"]}
         run.keyframes = head["keyframes"]
-        run.unusable = head["unusable"]
-        run.rejected_in_a_row = head["rejected_in_a_row"]
         run.history, run.attitudes = Rows(arrays.pop("history")), Rows(arrays.pop("attitudes"))
-        run.innovations = {name.removeprefix(_INNOVATIONS): Rows(array) for name, array in arrays.items()}
+        families = {name.removeprefix(_INNOVATIONS): Rows(array) for name, array in arrays.items()}
+        run.innovations = Innovations(families, head["unusable"], head["rejected_in_a_row"])
     except OSError as error:
         raise InputError(f"{path}: the checkpoint cannot be read ({error.strerror or error}); delete it") from error
     except (zipfile.BadZipFile, KeyError, ValueError, TypeError, EOFError, RuntimeError) as error:

@@ -22,9 +22,9 @@ class IndeterminateError(Exception):
     """States other than the calibration parameters are not determined by the recording."""
 
 
-def reported(problem: Problem, values: gtsam.Values, stand_ins: Mapping[int, int]) -> Array:
+def reported(problem: Problem, values: gtsam.Values, current_keys: Mapping[int, int]) -> Array:
     """The numbers of all parameters at the values."""
-    return np.concatenate([p.coordinates(values, stand_ins.get(p.key, p.key))[0] for p in problem.parameters])
+    return np.concatenate([p.coordinates(values, current_keys.get(p.key, p.key))[0] for p in problem.parameters])
 
 
 def ordering_of(keys: Iterable[int]) -> gtsam.Ordering:
@@ -40,14 +40,14 @@ def joint_covariance(
     linear: gtsam.GaussianFactorGraph,
     ordering: gtsam.Ordering,
     values: gtsam.Values,
-    stand_ins: Mapping[int, int],
+    current_keys: Mapping[int, int],
 ) -> Array:
     """Covariance (n, n) of the reported numbers, everything else marginalised out; works for singular systems.
 
     Raises:
         IndeterminateError: another variable is undetermined.
     """
-    keys = [stand_ins.get(p.key, p.key) for p in problem.parameters]
+    keys = [current_keys.get(p.key, p.key) for p in problem.parameters]
     rest = [ordering.at(i) for i in range(ordering.size()) if ordering.at(i) not in set(keys)]
     remaining = linear
     if rest:
@@ -77,7 +77,7 @@ def smoothed(
     """
     try:
         tree = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
-        sigmas = [_sigmas_of(problem, tree, values, stand_ins, covariance) for _, stand_ins in held]
+        sigmas = [_sigmas_of(problem, tree, values, current_keys, covariance) for _, current_keys in held]
     except RuntimeError:
         return None
     times = np.array([time for time, _ in held])
@@ -88,16 +88,16 @@ def _sigmas_of(
     problem: Problem,
     tree: gtsam.GaussianBayesTree,
     values: gtsam.Values,
-    stand_ins: Mapping[int, int],
+    current_keys: Mapping[int, int],
     covariance: Array,
 ) -> Array:
-    """(n,) sigmas, of the stand-ins where there are any, else from the covariance."""
+    """(n,) sigmas, of the current keys where there are others, else from the covariance."""
     sigmas = np.sqrt(np.diag(covariance))
     start = 0
     for p in problem.parameters:
         stop = start + len(p.quantities)
-        if p.key in stand_ins:
-            key = stand_ins[p.key]
+        if p.key in current_keys:
+            key = current_keys[p.key]
             moving = reported_covariance([p], tree.marginalInformation(key), values, [key])
             sigmas[start:stop] = np.sqrt(np.diag(moving))
         start = stop

@@ -468,7 +468,7 @@ def _add_bias(model: _Model, i: int, step: Step) -> None:
     alive = range(max(0, i + 1 - _KEPT), i + 1)
     bias.keep(step, alive, alive)
     if i > 0:
-        step.stand_ins[bias.key(0)] = bias.mean_key(i)
+        step.current_keys[bias.key(0)] = bias.mean_key(i)
 
 
 def _add_measurement(model: _Model, i: int, seen: set[tuple[str, int]], step: Step, compress: bool) -> None:

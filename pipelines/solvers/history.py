@@ -1,4 +1,4 @@
-"""How the batch estimate grew: what the recording told until each of some moments, from one elimination in time order.
+"""Sequential history of the batch estimate: what was determined until each of some moments, by one elimination.
 
 The system is linearised at the final estimate. States are eliminated as soon as no later factor holds them; what stays,
 the parameters and the states at the moment, is solved there, and carried on to the next moment.
@@ -7,42 +7,34 @@ the parameters and the states at the moment, is solved there, and carried on to 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.graph.problem import Array, History, Problem
+from pipelines.solvers.assembly import StepBoundary
 from pipelines.solvers.marginals import coordinate_inverse, ordering_of, reported, reported_covariance
 
 # Moments at which the recording is looked back upon.
 _MOMENTS = 50
 
 
-class Mark(NamedTuple):
-    """The end of a step: its time, the number of factors until then, and the variables that hold the parameters."""
-
-    time: float
-    factors: int
-    stand_ins: Mapping[int, int]
-
-
-def growth(
+def sequential_history(
     problem: Problem,
     linear: gtsam.GaussianFactorGraph,
     ordering: gtsam.Ordering,
     values: gtsam.Values,
-    marks: Sequence[Mark],
+    boundaries: Sequence[StepBoundary],
 ) -> tuple[History, Array] | None:
-    """Values and sigmas from what was recorded until some of the marks, and the joint covariance (n, n) at the last.
+    """Values and sigmas from what was recorded until some of the boundaries; joint covariance (n, n) at the last.
 
     Args:
         problem: the graph's.
         linear: its factors linearised at the values, in their order.
         ordering: of the whole; states are eliminated in this order.
         values: the final estimate.
-        marks: ends of all steps, in time order.
+        boundaries: ends of all steps, in time order.
 
     Returns None when states are not determined until a later step, or there is but one moment.
     """
@@ -51,32 +43,32 @@ def growth(
     last = {key: i for i, own in enumerate(keys) for key in own}
     carried, begin = gtsam.GaussianFactorGraph(), 0
     rows: list[tuple[float, Array, Array]] = []
-    moments = _moments(marks)
+    moments = _moments(boundaries)
     if len(moments) < 2:
         return None
-    for mark in moments:
-        held = [mark.stand_ins.get(p.key, p.key) for p in problem.parameters]
-        for i in range(begin, mark.factors):
+    for boundary in moments:
+        held = [boundary.current_keys.get(p.key, p.key) for p in problem.parameters]
+        for i in range(begin, boundary.factors):
             carried.push_back(linear.at(i))
-        begin = mark.factors
+        begin = boundary.factors
         try:
             past = sorted({k for k in _keys(carried) if last[k] < begin} - set(held), key=place.__getitem__)
             carried = _without(carried, past)
             now = _without(carried, sorted(set(_keys(carried)) - set(held), key=place.__getitem__))
         except RuntimeError:
             return None
-        numbers, covariance = _solved(problem, now, values, mark.stand_ins, held)
-        rows.append((mark.time, numbers, np.sqrt(np.diag(covariance))))
+        numbers, covariance = _solved(problem, now, values, boundary.current_keys, held)
+        rows.append((boundary.time, numbers, np.sqrt(np.diag(covariance))))
     history = History(*(np.array(column) for column in zip(*rows, strict=True)))
     return history, covariance
 
 
-def _moments(marks: Sequence[Mark]) -> list[Mark]:
-    """Marks spread over the recording, the last one among them."""
-    times = np.array([mark.time for mark in marks])
+def _moments(boundaries: Sequence[StepBoundary]) -> list[StepBoundary]:
+    """Boundaries spread over the recording, the last one among them."""
+    times = np.array([boundary.time for boundary in boundaries])
     wanted = np.linspace(times[0], times[-1], _MOMENTS + 1)[1:]
-    chosen: NDArray[np.intp] = np.unique(np.searchsorted(times, wanted).clip(max=len(marks) - 1))
-    return [marks[i] for i in chosen]
+    chosen: NDArray[np.intp] = np.unique(np.searchsorted(times, wanted).clip(max=len(boundaries) - 1))
+    return [boundaries[i] for i in chosen]
 
 
 def _keys(graph: gtsam.GaussianFactorGraph) -> list[int]:
@@ -92,7 +84,7 @@ def _solved(
     problem: Problem,
     graph: gtsam.GaussianFactorGraph,
     values: gtsam.Values,
-    stand_ins: Mapping[int, int],
+    current_keys: Mapping[int, int],
     held: Sequence[int],
 ) -> tuple[Array, Array]:
     """Reported numbers and their covariance from a graph of nothing but the parameters."""
@@ -101,4 +93,4 @@ def _solved(
     inverse = coordinate_inverse(problem.parameters, values, held)
     extra = np.array([0.0 if q.prior_sigma == 0.0 else q.extra_sigma**2 for q in problem.quantities])
     move = (covariance - np.diag(extra)) @ inverse.T @ slope
-    return reported(problem, values, stand_ins) + move, covariance
+    return reported(problem, values, current_keys) + move, covariance

@@ -1,4 +1,4 @@
-"""What the batch solver says of the past agrees with solving only the past."""
+"""The sequential history of the batch solver agrees with solving only the past."""
 
 from __future__ import annotations
 

@@ -1,0 +1,132 @@
+"""Innovations: measurements against what is predicted of them, and the gate that they must pass."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.chi_square import gate
+from pipelines.graph.problem import Array, ChiSquare, Factor, Residuals
+from pipelines.solvers.batch import graph_of
+from pipelines.solvers.marginals import ordering_of
+from pipelines.solvers.rows import Rows
+from pipelines.solvers.smoother import Smoother
+
+# After so many rejections in a row it is the prediction that is wrong: take the measurement.
+_MOST_REJECTED = 10
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The new variables of a step as its processes predict them from the old ones.
+
+    Attributes:
+        smoother: what is known of the old ones.
+        processes: factors that are no measurements.
+        values: of all variables.
+        new: those of the new ones.
+    """
+
+    smoother: Smoother
+    processes: Sequence[Factor]
+    values: gtsam.Values
+    new: gtsam.Values
+
+    def covariance(self, keys: Sequence[int]) -> Array:
+        """Joint covariance of variables, old and new."""
+        dims = self.values.dims()
+        fresh = list(self.new.keys())
+        involved = set(self._process.keyVector())
+        held = [k for k in dict.fromkeys([*keys, *involved]) if k not in fresh]
+        P = self.smoother.covariance(held)
+        where = _slices(held + fresh, dims)
+        if fresh:
+            order = [k for k in held if k in involved] + fresh
+            A = self._process.jacobian(ordering_of(order))[0]
+            columns = _slices(order, dims)
+            inverse = np.linalg.pinv(A[:, columns[fresh[0]].start :])
+            carry = np.zeros((inverse.shape[0], P.shape[0]))
+            for key in order[: -len(fresh)]:
+                carry[:, where[key]] = -inverse @ A[:, columns[key]]
+            across = carry @ P
+            P = np.block([[P, across.T], [across, across @ carry.T + inverse @ inverse.T]])
+        pick = np.concatenate([np.arange(P.shape[0])[where[key]] for key in keys])
+        return P[np.ix_(pick, pick)]
+
+    @cached_property
+    def _process(self) -> gtsam.GaussianFactorGraph:
+        return graph_of(self.processes).linearize(self.values)
+
+
+@dataclass
+class Innovations:
+    """The innovations of a run, and which measurements were used.
+
+    Attributes:
+        families: family -> rows of time, 1 if used, and the innovation whitened by its own covariance, whose norm
+            squared is the NIS.
+        unusable: family -> number of measurements left out because they gave no finite numbers.
+        rejected_in_a_row: until now.
+    """
+
+    families: dict[str, Rows] = field(default_factory=dict)
+    unusable: dict[str, int] = field(default_factory=dict)
+    rejected_in_a_row: int = 0
+
+    def accept(self, factor: Factor, prediction: Prediction, gated: bool) -> bool:
+        """Whether a measurement is to be used: its innovation lies within the gate, if there is one; notes it."""
+        measurement = factor.measurement
+        assert measurement is not None
+        error, A = measurement.rows(prediction.values)
+        if not (np.isfinite(error).all() and np.isfinite(A).all()):
+            self.unusable[factor.family] = self.unusable.get(factor.family, 0) + len(measurement.model.time)
+            return False
+        S = A @ prediction.covariance(measurement.keys) @ A.T + np.eye(len(error))
+        whitened = np.linalg.solve(np.linalg.cholesky(S), error)
+        accepted = not gated or bool(whitened @ whitened < gate(len(error)) ** 2)
+        self.rejected_in_a_row = 0 if accepted else self.rejected_in_a_row + 1
+        if self.rejected_in_a_row > _MOST_REJECTED:
+            accepted, self.rejected_in_a_row = True, 0
+        rows = whitened.reshape(-1, measurement.model.rows)
+        self.note(factor, rows, np.full(len(rows), accepted))
+        return accepted
+
+    def note(self, factor: Factor, whitened: Array, used: NDArray[np.bool_]) -> None:
+        """Add the innovations (n, m) of a measurement."""
+        assert factor.measurement is not None
+        time = factor.measurement.model.time
+        rows = self.families.setdefault(factor.family, Rows())
+        rows.add(np.column_stack([time, used, whitened.reshape(len(time), -1)]))
+
+    def chi_square(self) -> ChiSquare:
+        """The sum of the squared innovations of the measurements used."""
+        families = {}
+        for family, rows in self.families.items():
+            used = rows.array[rows.array[:, 1] > 0.0, 2:]
+            families[family] = float((used**2).sum()), float(used.size)
+        return ChiSquare(sum(v for v, _ in families.values()), sum(d for _, d in families.values()), families)
+
+    def residuals(self) -> dict[str, Residuals]:
+        """Family -> the innovations."""
+        return {
+            family: Residuals(rows.array[:, 0].copy(), rows.array[:, 2:].copy(), rows.array[:, 1] > 0.0)
+            for family, rows in self.families.items()
+        }
+
+    def rejected(self) -> dict[str, int]:
+        """Family -> number of measurements left out."""
+        return {
+            family: int((rows.array[:, 1] == 0.0).sum()) + self.unusable.get(family, 0)
+            for family, rows in self.families.items()
+        }
+
+
+def _slices(keys: Sequence[int], dims: Mapping[int, int]) -> dict[int, slice]:
+    """Where each variable stands when they are stacked in this order."""
+    ends = np.cumsum([dims[key] for key in keys])
+    return {key: slice(int(end) - dims[key], int(end)) for key, end in zip(keys, ends, strict=True)}
