@@ -1,0 +1,131 @@
+"""The influence of every measurement on every parameter, and from it the uncertainty budget by source.
+
+At the minimum a small change r of the whitened residuals moves the reported numbers by L r, with
+
+    L = J N^-1 A^T,    N = A^T A
+
+A the linearised, whitened system, J the Jacobian of the reported numbers. Residuals of unit variance give the
+covariance L L^T = J N^-1 J^T: the squares of a row of L are the parts that each residual has in a parameter's variance.
+One solution of N x = J_j^T for each parameter is kept, two back-substitutions with the triangular factor of A; rows of
+L come one factor after the other as A x, so that no matrix of all rows is ever there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from pipelines.graph.problem import Array, Factor, Problem
+from pipelines.solvers.marginals import IndeterminateError, explain
+
+# Family of the priors, which are told one by one.
+_PRIOR = "prior"
+
+
+@dataclass(frozen=True, eq=False)
+class Influence:
+    """What every whitened residual of a graph does to the reported numbers.
+
+    Attributes:
+        names: (n,) of the numbers, fixed ones left out.
+        factors: of the graph, in its order.
+        linear: the factors linearised.
+        solutions: variable -> (d, n), its rows of N^-1 J^T.
+        covariance: (n, n) of the numbers, errors that the graph does not model left out.
+    """
+
+    names: tuple[str, ...]
+    factors: Sequence[Factor]
+    linear: gtsam.GaussianFactorGraph
+    solutions: Mapping[int, Array]
+    covariance: Array
+
+    def rows(self) -> Iterator[tuple[int, Array]]:
+        """Index of a factor and the derivative (n, m) of the numbers by its m whitened residuals, factor by factor."""
+        for i in range(self.linear.size()):
+            factor = self.linear.at(i)
+            A, _ = factor.jacobian()
+            yield i, (A @ np.concatenate([self.solutions[key] for key in factor.keys()])).T
+
+
+def influence(
+    problem: Problem,
+    factors: Sequence[Factor],
+    linear: gtsam.GaussianFactorGraph,
+    ordering: gtsam.Ordering,
+    values: gtsam.Values,
+    stand_ins: Mapping[int, int],
+) -> Influence:
+    """The influence of a graph's residuals at an estimate.
+
+    Args:
+        problem: names the reported numbers.
+        factors: of the graph.
+        linear: the same, linearised and whitened.
+        ordering: of the elimination.
+        values: the estimate.
+        stand_ins: parameter key -> variable that holds its value, for parameters that move along.
+
+    Raises:
+        IndeterminateError: a variable is not determined.
+    """
+    try:
+        bayes_net = linear.eliminateSequential(ordering, gtsam.EliminateQR)
+        zero = bayes_net.optimize()
+    except RuntimeError as error:
+        raise IndeterminateError(explain(str(error))) from None
+    keys = [ordering.at(i) for i in range(ordering.size())]
+    sizes = {key: len(zero.at(key)) for key in keys}
+    names: list[str] = []
+    solved: list[gtsam.VectorValues] = []
+    gradients: list[tuple[int, Array]] = []
+    for p in problem.parameters:
+        key = stand_ins.get(p.key, p.key)
+        for quantity, gradient in zip(p.quantities, p.coordinates(values, key)[1], strict=True):
+            if quantity.prior_sigma == 0.0:
+                continue
+            right = gtsam.VectorValues()
+            for other in keys:
+                right.insert(other, gradient if other == key else np.zeros(sizes[other]))
+            solved.append(bayes_net.backSubstitute(bayes_net.backSubstituteTranspose(right)))
+            names.append(quantity.name)
+            gradients.append((key, gradient))
+    solutions = {key: np.array([x.at(key) for x in solved]).T.reshape(sizes[key], -1) for key in keys}
+    covariance = np.array([gradient @ solutions[key] for key, gradient in gradients]).reshape(len(names), -1)
+    return Influence(tuple(names), factors, linear, solutions, 0.5 * (covariance + covariance.T))
+
+
+def uncertainty_budget(problem: Problem, found: Influence) -> dict[str, dict[str, float]]:
+    """Number -> source -> its share of the number's variance, the largest first; shares sum to one.
+
+    Sources are the families of the noise, every prior of the problem by itself ("prior of NAME"), and what the graph
+    does not model ("not modelled").
+    """
+    by_key = {p.key: p for p in problem.parameters}
+    variances: dict[str, Array] = {}
+    for i, rows in found.rows():
+        factor = found.factors[i]
+        keys = found.linear.at(i).keys()
+        parameter = by_key.get(keys[0]) if factor.family == _PRIOR and len(keys) == 1 else None
+        squares = rows**2
+        if parameter is not None and squares.shape[1] == len(parameter.quantities):
+            parts = [(f"prior of {q.name}", squares[:, k]) for k, q in enumerate(parameter.quantities)]
+        else:
+            parts = [(factor.family, squares.sum(axis=1))]
+        for source, part in parts:
+            variances[source] = variances.get(source, np.zeros(len(found.names))) + part
+    extra = {q.name: q.extra_sigma**2 for q in problem.quantities}
+    variances["not modelled"] = np.array([extra[name] for name in found.names])
+    total = np.sum(list(variances.values()), axis=0)
+    return {
+        name: dict(
+            sorted(
+                ((source, float(v[j] / total[j])) for source, v in variances.items() if v[j] > 0.0),
+                key=lambda share: -share[1],
+            )
+        )
+        for j, name in enumerate(found.names)
+    }
