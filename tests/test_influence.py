@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from pipelines.graph.problem import Array, Factor, Parameter, Problem, Quantity
+from pipelines.solvers.assembly import Assembly
 from pipelines.solvers.batch import System, graph_of, optimize
 from pipelines.solvers.influence import Influence, influence, uncertainty_budget
 from pipelines.solvers.marginals import IndeterminateError, joint_covariance, ordering_of
-from tests.test_growth import _head, _los
+from tests.short_problems import head_problem, los_problem
 
 A, B, S = gtsam.symbol("a", 0), gtsam.symbol("b", 0), gtsam.symbol("s", 0)
 
@@ -23,26 +24,21 @@ class Solved:
     problem: Problem
     system: System
     values: gtsam.Values
-    stand_ins: dict[int, int]
+    current_keys: dict[int, int]
     linear: gtsam.GaussianFactorGraph
     found: Influence
 
 
 def solved(problem: Problem) -> Solved:
-    factors: list[Factor] = []
-    values, stand_ins = gtsam.Values(), {}
-    for step in problem.steps(20):
-        factors.extend(step.factors)
-        values.insert(step.initial)
-        stand_ins.update(step.stand_ins)
-    shared = [stand_ins.get(p.key, p.key) for p in problem.parameters]
-    solution = optimize(factors, values, shared, problem.loss)
+    whole = Assembly.of(problem.steps(20))
+    solution = optimize(whole.factors, whole.initial, whole.shared(problem), problem.loss)
     linear = solution.system.linearize(solution.values)
-    found = influence(problem, factors, linear, solution.system.ordering, solution.values, stand_ins)
-    return Solved(problem, solution.system, solution.values, stand_ins, linear, found)
+    ordering = solution.system.ordering
+    found = influence(problem, whole.factors, linear, ordering, solution.values, whole.current_keys)
+    return Solved(problem, solution.system, solution.values, whole.current_keys, linear, found)
 
 
-@pytest.fixture(scope="module", params=[_los, _head])
+@pytest.fixture(scope="module", params=[los_problem, head_problem])
 def case(request: pytest.FixtureRequest) -> Solved:
     make: Callable[[], Problem] = request.param
     return solved(make())
@@ -54,7 +50,7 @@ def test_squares_sum_to_the_covariance(case: Solved) -> None:
     scale = np.sqrt(np.outer(np.diag(found.covariance), np.diag(found.covariance)))
     np.testing.assert_allclose(total / scale, found.covariance / scale, atol=1e-9)
     ordering = case.system.ordering
-    whole = joint_covariance(case.problem, case.linear, ordering, case.values, case.stand_ins)
+    whole = joint_covariance(case.problem, case.linear, ordering, case.values, case.current_keys)
     quantities = case.problem.quantities
     free = [i for i, q in enumerate(quantities) if q.prior_sigma != 0.0]
     assert found.names == tuple(quantities[i].name for i in free)
@@ -74,16 +70,14 @@ def test_rows_are_those_of_the_dense_system(case: Solved) -> None:
         size = len(case.found.solutions[key])
         place[key] = slice(start, start + size)
         start += size
-    expected = np.concatenate(
-        [
-            (jacobian @ inverse[place[case.stand_ins.get(p.key, p.key)]])[[q.prior_sigma != 0.0 for q in p.quantities]]
-            for p in case.problem.parameters
-            for jacobian in [p.coordinates(case.values, case.stand_ins.get(p.key, p.key))[1]]
-        ]
-    )
+    expected = []
+    for p in case.problem.parameters:
+        key = case.current_keys.get(p.key, p.key)
+        free = [q.prior_sigma != 0.0 for q in p.quantities]
+        expected.append((p.coordinates(case.values, key)[1] @ inverse[place[key]])[free])
     streamed = np.concatenate([rows for _, rows in case.found.rows()], axis=1)
     sigmas = np.sqrt(np.diag(case.found.covariance))[:, None]
-    np.testing.assert_allclose(streamed / sigmas, expected / sigmas, atol=1e-6)
+    np.testing.assert_allclose(streamed / sigmas, np.concatenate(expected) / sigmas, atol=1e-6)
 
 
 def test_budget_sums_to_one_and_names_its_sources(case: Solved) -> None:

@@ -10,40 +10,18 @@ import pytest
 
 from pipelines.config import load_config
 from pipelines.graph.problem import Problem
-from pipelines.methods.head import graph as head
-from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from pipelines.methods.indexer import graph as indexer
 from pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
-from pipelines.methods.los import graph as los
-from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.simulation.scenario import load_scenario
 from pipelines.solvers.batch import solve_batch
-
-LOS = LosScenario(duration_s=30.0, image_rate_hz=20.0, gyro_rate_hz=200.0, gimbal_rate_hz=100.0)
-SWAY = EulerMotion(
-    yaw=[Swing(amplitude_deg=20, frequency_hz=0.05)],
-    pitch=[Swing(amplitude_deg=8, frequency_hz=0.11)],
-    roll=[Swing(amplitude_deg=12, frequency_hz=0.07)],
-)
-HEAD = HeadScenario(
-    duration_s=30.0, platform=SWAY, helmet_mount_deg=(3.0, -4.0, 2.0), gyro_rate_hz=100.0, vision_rate_hz=20.0
-)
-
-
-def _los() -> Problem:
-    return los.problem(simulate_los(LOS, 3)[0], load_config(los_config(LOS).encode()))
-
-
-def _head() -> Problem:
-    return head.problem(simulate_head(HEAD, 3)[0], load_config(head_config(HEAD).encode()))
+from tests.short_problems import head_problem, los_problem
 
 
 def _until(problem: Problem, stop: float) -> Problem:
     return replace(problem, steps=lambda chunk: (step for step in problem.steps(chunk) if step.time <= stop))
 
 
-@pytest.mark.parametrize("make", [_los, _head])
+@pytest.mark.parametrize("make", [los_problem, head_problem])
 def test_history_agrees_with_solving_the_past_alone(make: Callable[[], Problem]) -> None:
     problem = make()
     whole = solve_batch(problem)

@@ -57,7 +57,7 @@ def influence(
     linear: gtsam.GaussianFactorGraph,
     ordering: gtsam.Ordering,
     values: gtsam.Values,
-    stand_ins: Mapping[int, int],
+    current_keys: Mapping[int, int],
 ) -> Influence:
     """The influence of a graph's residuals at an estimate.
 
@@ -67,7 +67,7 @@ def influence(
         linear: the same, linearised and whitened.
         ordering: of the elimination.
         values: the estimate.
-        stand_ins: parameter key -> variable that holds its value, for parameters that move along.
+        current_keys: parameter key -> variable that holds its value, for parameters that move along.
 
     Raises:
         IndeterminateError: a variable is not determined.
@@ -83,7 +83,7 @@ def influence(
     solved: list[gtsam.VectorValues] = []
     gradients: list[tuple[int, Array]] = []
     for p in problem.parameters:
-        key = stand_ins.get(p.key, p.key)
+        key = current_keys.get(p.key, p.key)
         for quantity, gradient in zip(p.quantities, p.coordinates(values, key)[1], strict=True):
             if quantity.prior_sigma == 0.0:
                 continue
