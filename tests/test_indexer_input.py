@@ -9,7 +9,7 @@ import pytest
 
 from pipelines.config import load_config
 from pipelines.errors import InputError
-from pipelines.methods.indexer.graph import problem, validate
+from pipelines.methods.indexer.graph import problem
 from pipelines.methods.indexer.recording import IndexerData
 from pipelines.methods.indexer.runs import axis_motion
 from pipelines.methods.indexer.simulation import (
@@ -19,6 +19,7 @@ from pipelines.methods.indexer.simulation import (
     indexer_config,
     simulate_indexer,
 )
+from pipelines.methods.indexer.validation import validate
 from pipelines.settings import Config
 from pipelines.solvers.batch import solve_batch
 

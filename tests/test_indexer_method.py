@@ -15,10 +15,11 @@ from factors.indexer import mounting
 from pipelines.config import load_config
 from pipelines.graph.problem import Estimate
 from pipelines.judgement.validation import rms
-from pipelines.methods.indexer.graph import problem, validate
+from pipelines.methods.indexer.graph import problem
 from pipelines.methods.indexer.published import published_estimate, thin_shell
 from pipelines.methods.indexer.recording import read_indexer
 from pipelines.methods.indexer.simulation import ARCSEC, IndexerScenario, indexer_config, simulate_indexer
+from pipelines.methods.indexer.validation import validate
 from pipelines.recording.reading import open_recording
 from pipelines.simulation.scenario import load_scenario
 from pipelines.solvers.batch import solve_batch

@@ -36,7 +36,7 @@ class Cube(Method):
 
     @property
     def data(self) -> type[CubeData]:
-        from pipelines.methods.cube.recording import CubeData
+        from pipelines.methods.cube.data import CubeData
 
         return CubeData
 

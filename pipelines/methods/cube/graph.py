@@ -53,9 +53,9 @@ from pipelines.methods.cube.topics import CubeConfig
 from pipelines.recording.checks import count
 from pipelines.settings import DEFAULT_NOISE, Config, first_given
 
-# Nothing is known of the cube's place in the camera beforehand, m, nor of an attitude that no gyro leads to, rad: these
-# only make the new variables of a step determined without its measurements.
-_ANYWHERE, _ANYHOW = 10.0, np.pi
+# Sigmas of priors as good as none, m on the cube's place in the camera and rad on an attitude that no gyro leads to:
+# these only make the new variables of a step determined without its measurements.
+_POSITION_PRIOR_SIGMA, _ATTITUDE_PRIOR_SIGMA = 10.0, np.pi
 # A gyro bias that does not walk still does so by this much, rad/s, for the sake of the arithmetic.
 _STEADY = 1e-8
 # A pause of the gyro's record in a turn longer than this, s, breaks the chain of turns.
@@ -63,32 +63,32 @@ _LONGEST_GAP = 0.1
 
 
 @dataclass(frozen=True)
-class _Wander:
-    """How the gyro's offset departs from its mean over the session: a random walk that stays bounded.
+class _GaussMarkovDeviation:
+    """How the gyro's offset deviates from its mean over the session: a random walk that stays bounded.
 
-    An Ornstein-Uhlenbeck process: over short times the walk, over the session the departure that a walk has from its
-    own mean, whose variance is walk^2 times a sixth of the session.
+    A first-order Gauss-Markov process: over short times the walk, over the session the deviation that a walk has from
+    its own mean, whose variance is walk^2 times a sixth of the session.
 
     Attributes:
-        sigma: (P,) of each pose's departure, given the one before it; of the first alone.
-        kept: (P,) what a departure keeps of the one before it; 0 for the first.
+        sigma: (P,) of each pose's deviation, given the one before it; of the first alone.
+        correlation: (P,) with the one before it; 0 for the first.
         weights: (P,) share of the session that a pose stands for.
     """
 
     sigma: Array
-    kept: Array
+    correlation: Array
     weights: Array
 
     @classmethod
-    def over(cls, poses: StaticPoses, walk: float) -> _Wander:
+    def over(cls, poses: StaticPoses, walk: float) -> _GaussMarkovDeviation:
         """For a walk in rad/s/sqrt(s)."""
         start, stop = poses.span.T
         middle = 0.5 * (start + stop)
         length = float(stop[-1] - start[0])
-        departure = max(walk * float(np.sqrt(length / 6.0)), _STEADY)
-        kept = np.append(0.0, np.exp(-np.diff(middle) / (length / 3.0)))
+        stationary = max(walk * float(np.sqrt(length / 6.0)), _STEADY)
+        correlation = np.append(0.0, np.exp(-np.diff(middle) / (length / 3.0)))
         edges = np.concatenate([start[:1], 0.5 * (middle[1:] + middle[:-1]), stop[-1:]])
-        return cls(departure * np.sqrt(1.0 - kept**2), kept, np.diff(edges) / length)
+        return cls(stationary * np.sqrt(1.0 - correlation**2), correlation, np.diff(edges) / length)
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class _Model:
     unknown_rate: float  # rad/s per axis, what of the earth rate that leaves out
     field: Array | None  # (3,) T in n, by the model
     density: tuple[float, float, float]  # of gyro, accelerometer and magnetometer
-    wander: _Wander
+    deviation: _GaussMarkovDeviation
     scale_error: float  # sigma of a turn per angle turned
     gyro_bias: Array  # (3,) first guess, in nominal units
     initial: Array  # (P, 4) nRb
@@ -166,7 +166,9 @@ def _prepare(data: CubeData, config: Config) -> _Model:
         unknown_rate=0.0 if heading_known else float(np.hypot(*earth[:2]) * np.sqrt(0.5)),
         field=field,
         density=noise_densities(data, config),
-        wander=_Wander.over(poses, first_given(config.noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk)),
+        deviation=_GaussMarkovDeviation.over(
+            poses, first_given(config.noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk)
+        ),
         scale_error=first_given(config.noise.gyro_scale, DEFAULT_NOISE.gyro_scale),
         gyro_bias=bias,
         initial=_attitudes(data, config, poses, reference, field, bias),
@@ -210,7 +212,7 @@ def _place_key(k: int) -> int:
     return int(gtsam.symbol("p", k))
 
 
-def _wandered_key(k: int) -> int:
+def _deviation_key(k: int) -> int:
     return int(gtsam.symbol("d", k))
 
 
@@ -233,13 +235,13 @@ def _step(model: _Model, k: int) -> Step:
         initial.insert(model.parameters.initial(model.gyro_bias))
         factors += first_priors(model.parameters)
     initial.insert(_pose_key(k), so3.to_gtsam(model.initial[k]))
-    initial.insert(_wandered_key(k), np.zeros(3))
-    factors += [*_wander_factors(model, k), *_process(model, k)]
+    initial.insert(_deviation_key(k), np.zeros(3))
+    factors += [*_deviation_factors(model, k), *_process(model, k)]
     seen = model.poses.tags[k]
     if seen is not None:
         initial.insert(_place_key(k), seen.pose.position)
-        anywhere = gtsam.noiseModel.Isotropic.Sigma(3, _ANYWHERE)
-        factors.append(Factor("prior", gtsam.PriorFactorVector(_place_key(k), seen.pose.position, anywhere)))
+        prior = gtsam.noiseModel.Isotropic.Sigma(3, _POSITION_PRIOR_SIGMA)
+        factors.append(Factor("prior", gtsam.PriorFactorVector(_place_key(k), seen.pose.position, prior)))
     if model.data.camera is not None and (seen is not None if model.reference.moves else k == 0):
         initial.insert(_reference_key(k), so3.to_gtsam(model.reference.nRB[k]))
         if model.reference.covariance is not None:
@@ -278,26 +280,26 @@ def _process(model: _Model, k: int) -> list[Factor]:
     """What leads to the attitude of pose k: the turn before it, or nothing."""
     if k > 0 and _turn_known(model, k):
         measurement = _rotation_model(model, k).on(
-            _pose_key(k - 1), _pose_key(k), TRIAD_KEYS["gyro"], _wandered_key(k - 1), _wandered_key(k)
+            _pose_key(k - 1), _pose_key(k), TRIAD_KEYS["gyro"], _deviation_key(k - 1), _deviation_key(k)
         )
         return [Factor("gyro turns", measurement.factor)]
     attitude = so3.to_gtsam(model.initial[k])
-    anyhow = gtsam.noiseModel.Isotropic.Sigma(3, _ANYHOW)
-    return [Factor("prior", gtsam.PriorFactorRot3(_pose_key(k), attitude, anyhow))]
+    prior = gtsam.noiseModel.Isotropic.Sigma(3, _ATTITUDE_PRIOR_SIGMA)
+    return [Factor("prior", gtsam.PriorFactorRot3(_pose_key(k), attitude, prior))]
 
 
-def _wander_factors(model: _Model, k: int) -> list[Factor]:
+def _deviation_factors(model: _Model, k: int) -> list[Factor]:
     """How the offset of the gyro came to where it is in pose k; after the last, that c is its mean over the session."""
-    wander, key = model.wander, _wandered_key(k)
-    sigma = float(wander.sigma[k])
+    deviation, key = model.deviation, _deviation_key(k)
+    sigma = float(deviation.sigma[k])
     if k == 0:
         noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
         return [Factor("bias walk", gtsam.PriorFactorVector(key, np.zeros(3), noise))]
-    blocks = {key: np.eye(3), _wandered_key(k - 1): -wander.kept[k] * np.eye(3)}
+    blocks = {key: np.eye(3), _deviation_key(k - 1): -deviation.correlation[k] * np.eye(3)}
     factors = [Factor("bias walk", linear_factor(blocks, dict.fromkeys(blocks, np.zeros(3)), sigma))]
     if k == len(model.poses) - 1:
-        mean = WeightedSumFactor(model.poses.span[-1:, 1], wander.weights, _STEADY)
-        factors.append(Factor("definition", mean.on(*(_wandered_key(i) for i in range(k + 1))).factor))
+        mean = WeightedSumFactor(model.poses.span[-1:, 1], deviation.weights, _STEADY)
+        factors.append(Factor("definition", mean.on(*(_deviation_key(i) for i in range(k + 1))).factor))
     return factors
 
 
@@ -322,7 +324,7 @@ def _sensor_factors(model: _Model, k: int) -> list[Factor]:
     gyro = GyroStaticFactor(time, poses.gyro[row], gyro_sigma, model.earth_rate)
     factors = [
         Factor.of("accelerometer", accel.on(_pose_key(k), TRIAD_KEYS["accel"])),
-        Factor.of("gyro at rest", gyro.on(_pose_key(k), TRIAD_KEYS["gyro"], _wandered_key(k))),
+        Factor.of("gyro at rest", gyro.on(_pose_key(k), TRIAD_KEYS["gyro"], _deviation_key(k))),
     ]
     if model.field is not None and poses.mag is not None and poses.mag_duration[k] > 0.0:
         mag = MagFactor(time, poses.mag[row], mag_density / np.sqrt(poses.mag_duration[row]))
@@ -373,9 +375,9 @@ def _predict(model: _Model, k: int, initial: gtsam.Values, current: gtsam.Values
     samples = _turn(model, k)
     A, c = parts(current.atVector(TRIAD_KEYS["gyro"]))
     raw = nominal(model.data.gyro[samples], model.config.section(CubeConfig).raw.gyro)
-    wandered = current.atVector(_wandered_key(k - 1))
-    out.update(_wandered_key(k), model.wander.kept[k] * wandered)
-    path = GyroPath(model.data.imu_t[samples], (raw - c - wandered) @ np.linalg.inv(A).T)
+    deviation = current.atVector(_deviation_key(k - 1))
+    out.update(_deviation_key(k), model.deviation.correlation[k] * deviation)
+    path = GyroPath(model.data.imu_t[samples], (raw - c - deviation) @ np.linalg.inv(A).T)
     before = so3.from_gtsam([current.atRot3(_pose_key(k - 1))])[0]
     earth = so3.exp(-model.earth_rate * (path.t[-1] - path.t[0]))
     out.update(_pose_key(k), so3.to_gtsam(so3.compose(earth, before, path.attitude(path.t[-1:])[0])))

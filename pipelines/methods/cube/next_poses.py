@@ -19,13 +19,13 @@ from pipelines.methods.cube.faces import SIDES, Resting
 from pipelines.methods.cube.simulation import YEAR, CubeScenario, attitudes
 
 _LEANS = (0.0, 45.0)
-# What is known before any pose, small beside what one tells.
-_LITTLE = 1e-3
+# Fisher information before any pose, small beside what one adds: makes the sum invertible.
+_REGULARISER = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class _Told:
-    """Information of accelerometer, magnetometer (if any) and turns, and the attitude rested in last."""
+class _FisherInformation:
+    """Of accelerometer, magnetometer (if any) and turns, and the attitude rested in last."""
 
     accel: Array
     mag: Array | None
@@ -40,9 +40,11 @@ def next_poses(scenario: CubeScenario, seed: int, together: int) -> tuple[list[R
         place = np.deg2rad([scenario.latitude_deg, scenario.longitude_deg])
         field = magnetic_field(float(place[0]), float(place[1]), scenario.height, YEAR)
         field = field / np.linalg.norm(field)
-    told = _Told(_LITTLE * np.eye(4), None if field is None else _LITTLE * np.eye(4), _LITTLE * np.eye(3), None)
+    known = _FisherInformation(
+        _REGULARISER * np.eye(4), None if field is None else _REGULARISER * np.eye(4), _REGULARISER * np.eye(3), None
+    )
     for nRb in attitudes(scenario, seed):
-        told = _after(told, nRb, field)
+        known = _after(known, nRb, field)
     choices = [
         Resting(up=up, north=north, lean_deg=lean)
         for up in SIDES
@@ -50,35 +52,35 @@ def next_poses(scenario: CubeScenario, seed: int, together: int) -> tuple[list[R
         for lean in _LEANS
         if up[1] != north[1]
     ]
-    gains = _gains(told, choices, field)
+    gains = _gains(known, choices, field)
     single = [choices[int(np.argmax(column))] for column in [gains.sum(axis=1), *gains.T]]
     series: list[Resting] = []
     for _ in range(together):
-        series.append(choices[int(np.argmax(_gains(told, choices, field).sum(axis=1)))])
-        told = _after(told, series[-1].nRb, field)
+        series.append(choices[int(np.argmax(_gains(known, choices, field).sum(axis=1)))])
+        known = _after(known, series[-1].nRb, field)
     return list(dict.fromkeys(single)), series
 
 
-def _rows(told: _Told, nRb: Array, field: Array | None) -> list[tuple[Array, Array]]:
+def _rows(known: _FisherInformation, nRb: Array, field: Array | None) -> list[tuple[Array, Array]]:
     """Information so far and the row that resting in nRb next adds to it, of each sensor."""
     bRn = so3.inverse(nRb)
-    found = [(told.accel, np.append(so3.rotate(bRn, [0.0, 0.0, 1.0]), 1.0))]
-    if field is not None and told.mag is not None:
-        found.append((told.mag, np.append(so3.rotate(bRn, field), 1.0)))
-    turned = np.zeros(3) if told.last is None else so3.log(so3.multiply(so3.inverse(told.last), nRb))
-    return [*found, (told.turns, turned)]
+    found = [(known.accel, np.append(so3.rotate(bRn, [0.0, 0.0, 1.0]), 1.0))]
+    if field is not None and known.mag is not None:
+        found.append((known.mag, np.append(so3.rotate(bRn, field), 1.0)))
+    turned = np.zeros(3) if known.last is None else so3.log(so3.multiply(so3.inverse(known.last), nRb))
+    return [*found, (known.turns, turned)]
 
 
-def _after(told: _Told, nRb: Array, field: Array | None) -> _Told:
-    known = [information + np.outer(row, row) for information, row in _rows(told, nRb, field)]
-    return _Told(known[0], known[1] if len(known) > 2 else None, known[-1], nRb)
+def _after(known: _FisherInformation, nRb: Array, field: Array | None) -> _FisherInformation:
+    sums = [information + np.outer(row, row) for information, row in _rows(known, nRb, field)]
+    return _FisherInformation(sums[0], sums[1] if len(sums) > 2 else None, sums[-1], nRb)
 
 
-def _gains(told: _Told, choices: Sequence[Resting], field: Array | None) -> Array:
+def _gains(known: _FisherInformation, choices: Sequence[Resting], field: Array | None) -> Array:
     """(choices, sensors)"""
     return np.array(
         [
-            [np.log1p(row @ np.linalg.solve(information, row)) for information, row in _rows(told, each.nRb, field)]
+            [np.log1p(row @ np.linalg.solve(information, row)) for information, row in _rows(known, each.nRb, field)]
             for each in choices
         ]
     )

@@ -80,7 +80,7 @@ class Indexer(Method):
         return HYPOTHESES
 
     def validate(self, data: IndexerData, config: Config, values: Mapping[str, float]) -> Sequence[Validation]:
-        from pipelines.methods.indexer.graph import validate
+        from pipelines.methods.indexer.validation import validate
 
         return validate(data, config, values)
 

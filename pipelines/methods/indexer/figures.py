@@ -8,10 +8,12 @@ from factors import so3
 from factors.indexer import IndexerAverageFactor, mounting
 from pipelines.errors import InputError
 from pipelines.graph.problem import Array
-from pipelines.methods.indexer.graph import BIAS, THETA, Group, groups_of, misfit, validate
+from pipelines.methods.indexer.groups import Group, groups_of
+from pipelines.methods.indexer.parameters import BIAS, THETA
 from pipelines.methods.indexer.published import half_differences
 from pipelines.methods.indexer.recording import IndexerData
 from pipelines.methods.indexer.runs import axis_motion
+from pipelines.methods.indexer.validation import misfit, validate
 from pipelines.reports.plots import COLORS, add_line, add_points, figure
 from pipelines.reports.result import Calibration, Plot
 from pipelines.settings import Config

@@ -162,3 +162,23 @@ def _run(t: Array, angles: Array, moving: Array, begin: int, end: int) -> Run:
     net = {"none": 0.0, "outer": turned[0], "inner": turned[1], "both": turned.sum()}[axis]
     other = {"outer": mean[1], "inner": mean[0]}.get(axis, 0.0)
     return Run(axis, float(t[begin]), float(t[end]), float(net), float(other))
+
+
+def encoder_scatter(motion: AxisMotion) -> float:
+    """Noise from encoder sample to encoder sample while the axes rest, rad; 0 if they never do."""
+    spread = []
+    for run in motion.runs:
+        if run.axis == "none":
+            rows = slice(*np.searchsorted(motion.t, [run.start, run.stop]))
+            second = np.diff(motion.angles[rows], n=2, axis=0)[3:-3]
+            if len(second):
+                spread.append(np.sqrt((second**2).mean() / 6.0))
+    return float(np.median(spread)) if spread else 0.0
+
+
+def cut_turns(motion: AxisMotion) -> int:
+    """Number of gaps during which an axis turned."""
+    return sum(
+        any(run.axis != "none" and (run.stop in (start,) or run.start in (stop,)) for run in motion.runs)
+        for start, stop in motion.gaps
+    )

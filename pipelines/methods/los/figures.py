@@ -13,8 +13,9 @@ from factors.los import SMOOTHING, GimbalPath
 from factors.preintegration import GyroPath
 from pipelines.graph.problem import Array
 from pipelines.judgement.robust import robust_sigma
-from pipelines.methods.los.graph import ANGLES, select_pictures
 from pipelines.methods.los.guess import camera, carried_errors
+from pipelines.methods.los.parameters import ANGLES
+from pipelines.methods.los.pictures import select_pictures
 from pipelines.methods.los.recording import LosData
 from pipelines.reports.plots import COLORS, add_line, add_points, figure
 from pipelines.reports.result import Calibration, Plot

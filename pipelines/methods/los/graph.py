@@ -20,37 +20,18 @@ from factors.chi_square import gate
 from factors.los import SMOOTHING, GimbalPath, LocalMotion, LosDirectionFactor
 from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
-from pipelines.errors import InputError
 from pipelines.graph.gyro_chain import GyroChain, state
 from pipelines.graph.priors import vector_prior
-from pipelines.graph.problem import Array, Factor, Parameter, Problem, Quantity, Step
-from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
+from pipelines.graph.problem import Array, Factor, Parameter, Problem, Step
 from pipelines.methods.los.guess import camera, guess, initial_attitudes, seen
+from pipelines.methods.los.parameters import ANGLES_KEY, BIAS, OFFSET, OFFSET_KEY, SPLIT, los_parameters
+from pipelines.methods.los.pictures import select_pictures
 from pipelines.methods.los.recording import LosData
-from pipelines.settings import DEFAULT_NOISE, Config, check_names, first_given
+from pipelines.settings import DEFAULT_NOISE, Config, first_given
 
-_ANGLES = ("delta_px", "delta_gx", "delta_gy")
-_SPLIT = ("delta_pz", "delta_gz")
-_OPTIONS = ("camera_roll", "collimation", "axis_nonperpendicularity")
-_BIAS = ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")
-_OFFSET = "time_offset"
-# Everything but gyro bias and time offset: the angles by which gyro, gimbal axes and camera are mounted.
-ANGLES = (*_ANGLES, "delta_z", *_SPLIT, *_OPTIONS)
-NAMES = (*ANGLES, *_BIAS, _OFFSET)
-
-_ANGLES_KEY, _OFFSET_KEY = int(gtsam.symbol("a", 0)), int(gtsam.symbol("T", 0))
-_PRIOR_ANGLE, _PRIOR_BIAS, _PRIOR_OFFSET = 0.1, 0.02, 0.05
-
-# After a gap longer than this, s, the camera may hold on to another target.
-_LOST = 0.5
-# A gap in gyro or gimbal longer than so many sample intervals is no sampling jitter.
-_GAP = 5.0
-_FEWEST_PICTURES = 10
 # Sigmas, rad, of a chain's first attitude about t's axes: wide where pictures tell. Its turn about the line of sight is
 # free when no picture tells the camera's roll (it only turns t), and held for the sake of the arithmetic.
 _WIDE, _HELD = 0.3, 1e-3
-# Pictures that a target's first one has to agree with.
-_FOLLOWERS = 5
 
 
 @dataclass(frozen=True)
@@ -92,7 +73,7 @@ def problem(data: LosData, config: Config) -> Problem:
 
 
 def _prepare(data: LosData, config: Config) -> tuple[_Model, dict[str, int]]:
-    parameters = _parameters(config)
+    parameters = los_parameters(config)
     noise = config.noise
     density = first_given(noise.gyro_density, data.gyro_density, DEFAULT_NOISE.gyro_density)
     gimbal, gyro = GimbalPath(data.gimbal_t, data.gimbal), GyroPath(data.gyro_t, data.gyro)
@@ -159,99 +140,6 @@ def _sqrt_information(covariance: Array) -> Array:
     return out
 
 
-def select_pictures(
-    data: LosData, sigma: Array, margin: float
-) -> tuple[NDArray[np.intp], NDArray[np.bool_], dict[str, int]]:
-    """The pictures used, which of them are the first of their target, and what was left out.
-
-    `margin`, s, is left out on either side of a gap in which the gimbal may have turned to another target.
-    """
-    t = data.image_t
-    outside = (t < max(data.gyro_t[0], data.gimbal_t[0])) | (t > min(data.gyro_t[-1], data.gimbal_t[-1]))
-    blind = ~outside & (_in_gap(data.gimbal_t, t) | _in_gap(data.gyro_t, t))
-    rows = np.flatnonzero(~outside & ~blind)
-    chains = np.split(rows, np.flatnonzero(_first_of_target(data, rows))[1:])
-    close, early, lone = (np.zeros(len(t), dtype=bool) for _ in range(3))
-    starts = np.zeros(len(t), dtype=bool)
-    for i, chain in enumerate(chains):
-        after = t[chain] - t[chain[0]] if i > 0 else np.inf
-        before = t[chain[-1]] - t[chain] if i < len(chains) - 1 else np.inf
-        close[chain] = np.minimum(after, before) < margin
-        left = chain[~close[chain]]
-        wrong = _wrong_before_followers(data.error[left, :2], sigma[left])
-        early[left[:wrong]] = True
-        if len(left) - wrong < 2:
-            lone[left[wrong:]] = True
-        else:
-            starts[left[wrong]] = True
-    keep = rows[~(close | early | lone)[rows]]
-    if len(keep) < _FEWEST_PICTURES:
-        raise InputError(
-            f"only {len(keep)} of {len(t)} LOS errors can be used, at least {_FEWEST_PICTURES} are needed: "
-            f"{int(outside.sum())} lie outside the records of gyro and gimbal, {int(blind.sum())} in their gaps, "
-            f"{int(lone.sum())} stand alone; check the topics and their clocks"
-        )
-    reasons = {
-        "LOS error outside the records of gyro and gimbal": outside,
-        "LOS error in a gap of gyro or gimbal": blind,
-        "LOS error beside a gap, where the time offset cannot be followed": close,
-        "LOS error disagrees with those after it where a target is found": early,
-        "LOS error alone between gaps": lone,
-    }
-    return keep, starts[keep], {reason: int(mask.sum()) for reason, mask in reasons.items() if mask.any()}
-
-
-def _in_gap(t: Array, at: Array) -> NDArray[np.bool_]:
-    """Whether times lie between two samples that are too far apart."""
-    step = np.diff(t)
-    i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(step) - 1)
-    return np.asarray(step[i] > _GAP * np.median(step))
-
-
-def _first_of_target(data: LosData, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-    """Where a chain starts: after a gap in which the target may have changed, and after a gap of the gyro."""
-    starts = np.ones(len(rows), dtype=bool)
-    if len(rows) < 2:
-        return starts
-    step = np.diff(data.image_t[rows])
-    gyro_step = np.diff(data.gyro_t)
-    gaps = data.gyro_t[:-1][gyro_step > _GAP * np.median(gyro_step)]
-    gaps_before = np.searchsorted(gaps, data.image_t[rows])
-    starts[1:] = (step > max(_LOST, _GAP * float(np.median(step)))) | (np.diff(gaps_before) > 0)
-    return starts
-
-
-def _wrong_before_followers(error: Array, sigma: Array) -> int:
-    """How many LOS errors at the start of a chain disagree with the median of those that follow."""
-    for i in range(len(error) - _FOLLOWERS):
-        after = error[i + 1 : i + 1 + _FOLLOWERS]
-        drift = np.median(np.abs(np.diff(after, axis=0)), axis=0)
-        if np.all(np.abs(error[i] - np.median(after, axis=0)) < 6.0 * sigma[i] + _FOLLOWERS * drift):
-            return i
-    return 0
-
-
-def _parameters(config: Config) -> tuple[Parameter, ...]:
-    """The method's parameters with their priors; options only where the config gives them a prior other than 0."""
-    check_names(config.priors, NAMES, "priors")
-    check_names(config.require, NAMES, "require")
-    given = [name for name in _SPLIT if name in config.priors]
-    if len(given) == 1:
-        raise InputError(f"priors: {given[0]} alone; delta_pz and delta_gz are given both, or neither for delta_z")
-
-    def quantity(name: str, unit: str, scale: float) -> Quantity:
-        return Quantity(name, unit, config.priors.get(name, scale), scale, config.require.get(name, 1e-3))
-
-    names = (*_ANGLES, *(_SPLIT if given else ("delta_z",)), *(n for n in _OPTIONS if config.priors.get(n, 0.0) != 0.0))
-    parameters = [
-        Parameter(_ANGLES_KEY, tuple(quantity(name, "rad", _PRIOR_ANGLE) for name in names)),
-        Parameter(FIRST_BIAS, tuple(quantity(name, "rad/s", _PRIOR_BIAS) for name in _BIAS)),
-    ]
-    if config.priors.get(_OFFSET, 0.0) != 0.0:
-        parameters.append(Parameter(_OFFSET_KEY, (quantity(_OFFSET, "s", _PRIOR_OFFSET),)))
-    return tuple(parameters)
-
-
 def _steps(model: _Model, chunk: int, after: float = -np.inf) -> Iterator[Step]:
     """`chunk` keyframes at a time; the first step brings the calibration variables and their priors too."""
     time = model.chain.time
@@ -267,9 +155,9 @@ def _step(model: _Model, keyframes: range) -> Step:
         keyframes=keyframes,
     )
     if keyframes.start == 0:
-        step.initial.insert(_ANGLES_KEY, model.mount)
+        step.initial.insert(ANGLES_KEY, model.mount)
         if model.motion is not None:
-            step.initial.insert(_OFFSET_KEY, np.zeros(1))
+            step.initial.insert(OFFSET_KEY, np.zeros(1))
         step.factors.extend(vector_prior(p, np.zeros(len(p.quantities))) for p in model.parameters)
     step.factors.extend(_start_factor(model, k) for k in keyframes if chain.starts[k])
     chain.add(step)
@@ -279,7 +167,7 @@ def _step(model: _Model, keyframes: range) -> Step:
 
 def _found(model: _Model, k: int, current: gtsam.Values) -> Array:
     """tRm (4,) where a target is found, with the mounting angles as estimated by now."""
-    cRm = camera(model.angles[k : k + 1], current.atVector(_ANGLES_KEY), model.names)
+    cRm = camera(model.angles[k : k + 1], current.atVector(ANGLES_KEY), model.names)
     return seen(cRm, model.measured[k : k + 1])[0]
 
 
@@ -312,21 +200,21 @@ def _picture_factor(model: _Model, k: NDArray[np.intp], rows: int, family: str) 
         model.names,
         None if model.motion is None else model.motion[k],
     )
-    columns: list[int | list[int]] = [[state(i) for i in k], _ANGLES_KEY]
+    columns: list[int | list[int]] = [[state(i) for i in k], ANGLES_KEY]
     if model.motion is not None:
-        columns += [model.chain.bias_keys(k), _OFFSET_KEY]
+        columns += [model.chain.bias_keys(k), OFFSET_KEY]
     return Factor.of(family, rows_model.on(*columns, loss=model.loss))
 
 
 def _advice(weights: Mapping[str, float]) -> str:
     """What would make a weak direction observable."""
     strong = {name for name, weight in weights.items() if abs(weight) > 0.3}
-    if set(_SPLIT) <= strong:
+    if set(SPLIT) <= strong:
         return (
             "delta_pz and delta_gz can never be told apart, turning the carrier's frame about the azimuth axis changes "
             "both alike: ask for delta_z = delta_pz - delta_gz instead"
         )
-    if _OFFSET in strong:
+    if OFFSET in strong:
         return "the time offset needs faster sway: turn the carrier back and forth within a second or two"
     if "camera_roll" in strong:
         return "the camera's roll needs the target to move across the picture: offset the gimbal while recording"
@@ -337,6 +225,6 @@ def _advice(weights: Mapping[str, float]) -> str:
             "delta_px trades against delta_gx and delta_gy: sway the carrier in azimuth too, or record targets at "
             "other azimuths and elevations"
         )
-    if set(_BIAS) & strong and not strong - set(_BIAS):
+    if set(BIAS) & strong and not strong - set(BIAS):
         return "the gyro bias needs a longer recording with the target in sight, and sway across the line of sight"
     return "the mounting angles need sway of the carrier about all three axes while the target is in sight"

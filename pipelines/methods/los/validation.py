@@ -20,8 +20,8 @@ from factors import so3
 from factors.los import GimbalPath
 from pipelines.graph.problem import Array
 from pipelines.judgement.validation import Validation
-from pipelines.methods.los.graph import select_pictures
 from pipelines.methods.los.guess import los_direction, los_error
+from pipelines.methods.los.pictures import select_pictures
 from pipelines.methods.los.recording import LosData
 from pipelines.settings import DEFAULT_NOISE, Config, first_given
 

@@ -1,0 +1,69 @@
+"""What an indexer calibration is worth: the attitude put out, and the mean rates of the turns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from factors import so3
+from factors.indexer import mounting
+from pipelines.graph.problem import Array
+from pipelines.judgement.validation import Validation
+from pipelines.methods.indexer.attitude import carrier
+from pipelines.methods.indexer.groups import Group, groups_of
+from pipelines.methods.indexer.parameters import BIAS, EPSILON, SCALE, THETA, several
+from pipelines.methods.indexer.recording import IndexerData
+from pipelines.methods.indexer.runs import axis_motion
+from pipelines.methods.indexer.topics import IndexerConfig
+from pipelines.settings import Config
+
+
+def validate(data: IndexerData, config: Config, values: Mapping[str, float]) -> list[Validation]:
+    """Errors without and with a calibration: of the attitude put out, where there is one, and of the turns' mean rates.
+
+    The carrier's attitude is nRb = nRm mRt tRb(outer, inner), without calibration mRt = identity and perpendicular
+    axes; the carrier is the indexer's base and stands still at the config's `indexer.base_attitude`.
+
+    Args:
+        data: the session, with the attitude nRm that the INS puts out, or without.
+        config: of the session.
+        values: calibrated parameters by name; those not named are zero.
+
+    Raises:
+        InputError: the axes hardly turn.
+    """
+    motion = axis_motion(data)
+    turning = [g for g in groups_of(data, config, motion) if g.position is not None]
+    time, before = misfit(turning, {})
+    after = misfit(turning, values)[1]
+    found = [Validation("axis by mean rates, turn by turn", "rad", time, before, after)]
+    if data.attitude is not None:
+        rows = np.flatnonzero((data.gyro_t >= motion.t[0]) & (data.gyro_t <= motion.t[-1]))
+        bRn = so3.inverse(np.array(config.section(IndexerConfig).base_attitude))
+        errors = [
+            so3.log(so3.multiply(bRn, carrier(data, motion, rows, several(some, THETA), *several(some, EPSILON))))
+            for some in ({}, values)
+        ]
+        claim = "the publication claims 0.005 deg over an hour"
+        found.insert(0, Validation("attitude put out", "rad", data.gyro_t[rows], errors[0], errors[1], claim))
+    return found
+
+
+def misfit(groups: Sequence[Group], values: Mapping[str, float]) -> tuple[Array, Array]:
+    """Ends (n,) of the groups, s, and their mean rates less what encoders and earth say, over the rate, (n, 3) in t.
+
+    Args:
+        groups: in which an axis turns.
+        values: parameters by name; those not named are zero.
+    """
+    tRm, bias, gain = mounting(several(values, THETA)), several(values, BIAS), 1.0 + several(values, SCALE)
+    epsilon = several(values, EPSILON)
+    errors = []
+    for group in groups:
+        share = np.diff(group.rates.edges) / group.duration
+        rates = group.rates.fixed + np.cos(epsilon) * group.rates.cosine + np.sin(epsilon) * group.rates.sine
+        expected = share @ rates
+        found = so3.rotate(tRm, (group.mean_gyro - bias) / gain)
+        errors.append((found - expected) / np.linalg.norm(expected))
+    return np.array([float(g.rates.edges[-1]) for g in groups]), np.array(errors).reshape(-1, 3)
