@@ -24,7 +24,7 @@ from pipelines.graph.problem import Estimate, Problem, Step
 from pipelines.judgement.causes import find_causes
 from pipelines.judgement.halves import Halves, held_out, split_halves
 from pipelines.judgement.observability import Cause, assess
-from pipelines.judgement.outcome import mostly_rejected
+from pipelines.judgement.rejection import rejection_sentence, too_many_rejected
 from pipelines.methods import Method
 from pipelines.recording.info import SessionFacts, facts_of, lacking
 from pipelines.recording.message_reader import ENCODING
@@ -195,11 +195,16 @@ class Session:
             ours = estimate.solver != "published"
             if ours and not estimate.converged:
                 assessment = assessment.unsolved(estimate.message)
-            elif ours and (assessment.status == "inconsistent" or mostly_rejected(estimate)):
+            elif ours and (assessment.status == "inconsistent" or too_many_rejected(estimate.residuals)):
+                assessment = assessment.misfit(rejection_sentence(estimate.residuals))
                 with progress.doing("looking for causes"):
                     if causes is None:
                         causes = find_causes(self.method, self.data, self.config, estimate)
                 assessment = assessment.explained(causes)
+            elif ours:
+                assessment = assessment.remarked(rejection_sentence(estimate.residuals))
+            if ours:
+                assessment = assessment.remarked(*problem.premises)
             found.append(
                 Calibration(
                     method=self.method,

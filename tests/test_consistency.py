@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from factors import so3
 from pipelines.cli import app
 from pipelines.config import load_config
 from pipelines.graph.problem import Estimate, Residuals
 from pipelines.judgement.causes import find_causes
 from pipelines.judgement.halves import cut, held_out, split_halves
-from pipelines.judgement.outcome import mostly_rejected
+from pipelines.judgement.rejection import rejection_sentence, too_many_rejected
 from pipelines.methods import Method, method
 from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
 from pipelines.methods.cube.topics import CubeConfig
@@ -127,7 +128,7 @@ def test_delay_of_20_ms_of_the_los_pictures() -> None:
 @pytest.mark.parametrize("key", [pytest.param("los_error", marks=pytest.mark.slow), "gyro_density"])
 def test_the_noise_that_is_too_small_is_told_from_the_others(los: Case, key: str) -> None:
     find, data, config = los
-    assert first_cause((find, data, with_noise(config, **{key: 0.2}))).startswith(f"the noise {key} is stated ")
+    assert first_cause((find, data, with_noise(config, **{key: 0.35}))).startswith(f"the noise {key} is stated ")
 
 
 @pytest.mark.slow
@@ -186,14 +187,17 @@ def test_a_cut_keeps_stamps_and_readings_together(head: Case) -> None:
     np.testing.assert_array_equal(part.vision_cov, data.vision_cov[rows])
 
 
-def test_mostly_rejected(head: Case) -> None:
+def test_a_tenth_rejected_is_told_and_a_quarter_is_too_much(head: Case) -> None:
     def estimate(share: float) -> Estimate:
         used = np.arange(100) < 100 * share
         residuals = {"vision": Residuals(np.arange(100.0), np.zeros((100, 3)), used)}
         return Estimate("batch", (), np.zeros(0), np.zeros((0, 0)), True, "", residuals)
 
-    assert mostly_rejected(estimate(0.5))
-    assert not mostly_rejected(estimate(0.95))
+    assert too_many_rejected(estimate(0.5).residuals)
+    assert too_many_rejected(estimate(0.74).residuals)
+    assert not too_many_rejected(estimate(0.76).residuals)
+    assert rejection_sentence(estimate(0.88).residuals).startswith("12 % of the vision measurements were rejected")
+    assert rejection_sentence(estimate(0.95).residuals) == ""
     find, data, config = head
     assert find_causes(find, data, config, estimate(0.95)) == ()
 
@@ -230,3 +234,37 @@ def test_a_flipped_axis_ends_inconsistent_with_that_first(head: Case, tmp_path: 
     assert saved["headline"].startswith("The sign of the helmet gyro's y is wrong: with that changed chi-square falls")
     assert saved["causes"][0]["label"] == "the sign of the helmet gyro's y is wrong"
     assert "Causes that were tried" in (out / "report.html").read_text()
+
+
+def test_a_trial_that_raises_ends_alone(head: Case, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three of twelve inconsistent recordings once ended in a RuntimeError of a trial's graph."""
+    method_, data, config = head
+    flipped = replace(data, head_gyro=data.head_gyro * [1.0, -1.0, 1.0])
+    real = type(method_).problem
+
+    def fragile(self: Method, data: Any, config: Config) -> Any:
+        if config.priors.get("time_offset"):
+            raise RuntimeError("no such key")
+        return real(self, data, config)
+
+    monkeypatch.setattr(type(method_), "problem", fragile)
+    causes = find_causes(method_, flipped, config)
+    assert causes
+    assert causes[0].label == "the sign of the helmet gyro's y is wrong"
+
+
+def test_a_noise_many_times_larger_is_never_an_explanation(head: Case) -> None:
+    """Following such advice once ended in `calibrated` with an error of 157 sigmas."""
+    method_, data, config = head
+    rng = np.random.default_rng(0)
+    noisy = replace(
+        data, vision_wxyz=so3.multiply(data.vision_wxyz, so3.exp(0.1 * rng.normal(size=(len(data.vision_t), 3))))
+    )
+    assert not [cause for cause in find_causes(method_, noisy, config) if "noise" in cause.label]
+
+
+def test_a_platform_taken_for_at_rest_is_told_in_the_headline() -> None:
+    import alidade
+
+    calibration = alidade.open(alidade.simulate("head", {"duration_s": 10.0}, seed=1)).calibrate()
+    assert calibration.headline.endswith("No platform IMU: the platform counts as at rest.")

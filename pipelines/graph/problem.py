@@ -153,6 +153,7 @@ class Problem:
         attitude_name: what the trajectory is, e.g. "bRv".
         advice: sentence for a weak direction, given its weights by parameter name.
         dropped: measurements left out before solving, reason -> count.
+        premises: what is taken for granted and a reader has to know, sentences.
         steps_after: the steps of one measurement each that are later than a time, s, for graphs whose steps stay
             as they are while the recording grows, but for those of its last second. None: all may change.
     """
@@ -165,6 +166,7 @@ class Problem:
     attitude_name: str = ""
     advice: Callable[[Mapping[str, float]], str] | None = None
     dropped: Mapping[str, int] = field(default_factory=dict)
+    premises: tuple[str, ...] = ()
     steps_after: Callable[[float], Iterator[Step]] | None = None
 
     @property

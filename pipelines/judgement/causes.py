@@ -19,7 +19,8 @@ from pipelines.graph.problem import Estimate, Residuals
 from pipelines.judgement.halves import cut
 from pipelines.judgement.hypotheses import Hypotheses
 from pipelines.judgement.observability import Cause
-from pipelines.judgement.outcome import Outcome, mostly_rejected, outcome, quick_score
+from pipelines.judgement.outcome import Outcome, outcome, quick_score
+from pipelines.judgement.rejection import too_many_rejected
 from pipelines.judgement.trials import OFFSET, Trial, trials
 from pipelines.settings import DEFAULT_NOISE, Config
 
@@ -34,6 +35,8 @@ _SIGNIFICANT = 5.0
 _BETTER = 0.8
 _NOISE_STEPS = 5
 _NOISE_ACCURACY = 0.02
+# Noise so many times larger explains anything, and is never offered.
+_MOST_NOISE = 4.0
 _MOST_NAMED = 3
 # How far the typical residual has to fall for a change to be looked at closely.
 _PROMISING = 0.97
@@ -57,7 +60,7 @@ def find_causes(method: Method, data: Any, config: Config, estimate: Estimate | 
         if estimate is not None and hypotheses.cut:
             data = cut(hypotheses, data, *_worst_stretch(estimate.residuals, _STRETCH))
         before = outcome(method, data, config)
-    if before is None or (before.fits and not mostly_rejected(before.estimate)):
+    if before is None or (before.fits and not too_many_rejected(before.estimate.residuals)):
         return ()
     found: list[tuple[Outcome, str]] = []
     for label, changed, changed_config in _screened(method, data, config, before):
@@ -123,7 +126,7 @@ def _noise(
     found = []
     for key in hypotheses.noise:
         scaled = _scaled_to_fit(method, hypotheses, data, config, key, before)
-        if scaled is not None and scaled[1] > _NOTABLE:
+        if scaled is not None and _NOTABLE < scaled[1] <= _MOST_NOISE:
             found.append((scaled[0], f"the noise {key} is stated {scaled[1]:.2g} times too small"))
     return sorted(found, key=lambda each: each[0].imbalance)[:1]
 

@@ -269,6 +269,17 @@ class Assessment:
         status: Status = "unobservable" if self.status == "unobservable" else "inconsistent"
         return replace(self, status=status, causes=tuple(causes), headline=headline)
 
+    def misfit(self, reason: str) -> Assessment:
+        """The same, inconsistent, for a reason other than chi-square (a sentence; empty: chi-square was it)."""
+        if not reason or self.status == "unobservable":
+            return self.remarked(reason)
+        headline = self.headline if self.status == "inconsistent" else "The recording does not fit the model:"
+        return replace(self, status="inconsistent", headline=f"{headline} {reason}")
+
+    def remarked(self, *remarks: str) -> Assessment:
+        """The same with more sentences at the end of the headline, those that are not empty."""
+        return replace(self, headline=" ".join([self.headline, *filter(None, remarks)]))
+
     def unsolved(self, message: str) -> Assessment:
         """The same for an estimate that is no solution: its numbers are not to be used, however small their sigmas."""
         headline = f"The solver did not converge ({message}): the numbers are no solution, do not use them."

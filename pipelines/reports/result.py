@@ -18,7 +18,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from pipelines.graph.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
 from pipelines.judgement.observability import Assessment, Fit, Innovations, Learning, Status, Verdict, learning
-from pipelines.judgement.robust import robust_sigma
 from pipelines.recording.info import SessionFacts
 from pipelines.settings import Config
 
@@ -28,8 +27,6 @@ if TYPE_CHECKING:
     from pipelines.methods import Method
     from pipelines.methods.formula import Formula
 
-# Share of a family's measurements rejected that the reader is told of.
-_MANY_REJECTED = 0.2
 # Beyond so many of its prior's sigmas a parameter is not where it was said to be.
 _FAR_FROM_PRIOR = 5.0
 _PACKAGES = ("alidade", "gtsam", "numpy", "opencv-contrib-python-headless", "pycolmap")
@@ -235,9 +232,10 @@ class Calibration:
     def notes(self) -> tuple[str, ...]:
         """What a reader has to know beside the headline."""
         trouble = () if self.estimate.converged else (f"the solver did not converge: {self.estimate.message}",)
-        many = (_rejection(family, r) for family, r in self.estimate.residuals.items())
         far = _beyond_priors(self)
-        return (*trouble, *self.facts.notes, *self.assessment.warnings, *far, *(note for note in many if note))
+        told = rejection_sentence(self.residuals).removesuffix(".")
+        rejected = (told,) if told and told not in self.headline else ()
+        return (*trouble, *self.facts.notes, *self.assessment.warnings, *far, *rejected)
 
 
 def _beyond_priors(calibration: Calibration) -> tuple[str, ...]:
@@ -257,18 +255,6 @@ def _beyond_priors(calibration: Calibration) -> tuple[str, ...]:
     return (
         f"more than {_FAR_FROM_PRIOR:g} sigmas of its prior away: {named}; is a sensor turned or are its axes in "
         "another order? if it is meant to be there, widen the prior",
-    )
-
-
-def _rejection(family: str, residuals: Residuals) -> str | None:
-    """A sentence when so many measurements were rejected that they can hardly be outliers."""
-    share = 1.0 - float(residuals.used.mean()) if len(residuals.used) else 0.0
-    if share < _MANY_REJECTED:
-        return None
-    spread = robust_sigma(residuals.whitened)
-    return (
-        f"{100.0 * share:.0f} % of the {family} measurements were rejected as outliers; all of them together would "
-        f"fit a noise {spread:.2g} times the one stated"
     )
 
 

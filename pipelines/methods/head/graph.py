@@ -45,6 +45,9 @@ _LONGEST_INCREMENT = 1.0
 _GUESS_SPAN = 0.3
 _FEWEST_FRAMES = 10
 
+# Said where it is taken for granted.
+_AT_REST = "No platform IMU: the platform counts as at rest."
+
 _BIAS, _HELMET, _CAMERA, _OFFSET = "gyro_bias", "helmet_mount", "camera_mount", "time_offset"
 _HELMET_KEY, _CAMERA_KEY, _OFFSET_KEY = (int(gtsam.symbol(c, 0)) for c in "HCT")
 
@@ -80,6 +83,7 @@ def problem(data: HeadData, config: Config) -> Problem:
         attitude_name="bRv",
         advice=_advice,
         dropped=data.dropped,
+        premises=() if data.platform_t is not None else (_AT_REST,),
     )
 
 
