@@ -100,15 +100,18 @@ def outcome(method: Method, data: Any, config: Config) -> Outcome | None:
 def quick_score(method: Method, data: Any, config: Config) -> float:
     """Typical residual of the measurements plus that of the processes near the least-squares solution, sigmas.
 
-    Infinite when there is no solution.
+    Infinite when there is no solution, whatever a trial raises.
     """
+    try:
+        return _score(method.problem(data, config))
+    except Exception:
+        return np.inf
+
+
+def _score(problem: Problem) -> float:
     from pipelines.solvers.assembly import Assembly
     from pipelines.solvers.batch import CHUNK, optimize, residuals_of
 
-    try:
-        problem = method.problem(data, config)
-    except InputError:
-        return np.inf
     whole = Assembly.of(problem.steps(CHUNK))
     factors = whole.factors
     values = optimize(factors, whole.initial, whole.shared(problem), None, _FEW, _MOST_DAMPING).values

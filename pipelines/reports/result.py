@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from pipelines.graph.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
 from pipelines.judgement.observability import Assessment, Fit, Innovations, Learning, Status, Verdict, learning
+from pipelines.judgement.rejection import rejection_sentence
 from pipelines.recording.info import SessionFacts
 from pipelines.settings import Config
 
