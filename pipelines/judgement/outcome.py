@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.errors import InputError
 from pipelines.graph.problem import ChiSquare, Estimate, Problem
 from pipelines.judgement.observability import Fit
 from pipelines.judgement.robust import robust_sigma
