@@ -37,7 +37,8 @@ class Solver(StrEnum):
 
 
 _Session = Annotated[Path, typer.Argument(metavar="SESSION.mcap", help="The recording.")]
-_MethodName = Annotated[str | None, typer.Option("--method", help="los, indexer, head or cube; by default what fits.")]
+_METHODS = "los, indexer, head, cube or one installed"
+_MethodName = Annotated[str | None, typer.Option("--method", help=f"{_METHODS}; by default what fits.")]
 _ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML that overrides the recording's own config.")]
 _Scheduler = Annotated[str | None, typer.Option(help="Of a dask cluster, tcp://host:8786; default: this machine.")]
 _Jobs = Annotated[int | None, typer.Option(help="Local worker processes; default: one a core.")]
@@ -163,9 +164,9 @@ def validate(
 
 @app.command()
 def simulate(
-    method: Annotated[str, typer.Argument(help="los, indexer, head or cube.")],
+    method: Annotated[str, typer.Argument(help=f"{_METHODS}.")],
     out: Annotated[Path, typer.Option(help="The recording to write.")],
-    scenario: Annotated[str | None, typer.Option(help="YAML file or the name of one in datasets/scenarios.")] = None,
+    scenario: Annotated[str | None, typer.Option(help="YAML file or the name of a shipped one.")] = None,
     seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
     images: Annotated[bool, typer.Option("--images", help="Pictures instead of what is measured in them.")] = False,
     quiet: _Quiet = False,
@@ -181,7 +182,7 @@ def simulate(
 
 @app.command()
 def plan(
-    method: Annotated[str, typer.Argument(help="los, indexer, head or cube.")],
+    method: Annotated[str, typer.Argument(help=f"{_METHODS}.")],
     scenario: Annotated[
         str | None, typer.Option(help="The planned motion: YAML file or a name, as simulate has.")
     ] = None,
@@ -267,7 +268,7 @@ def demo(
 
 @app.command()
 def montecarlo(
-    method: Annotated[str, typer.Argument(help="los, indexer, head or cube.")],
+    method: Annotated[str, typer.Argument(help=f"{_METHODS}.")],
     runs: Annotated[int, typer.Option(help="How many recordings to simulate, one a seed.")] = 200,
     scenario: Annotated[str | None, typer.Option(help="YAML file or name; default: the method's nominal one.")] = None,
     seed: Annotated[int, typer.Option(help="Of the first run; the others follow.")] = 0,

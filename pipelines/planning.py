@@ -112,11 +112,9 @@ def make_plan(
     Raises:
         InputError: no such method, scenario or parameter, or a scenario without usable data.
     """
-    from pipelines.simulation.scenario import load_scenario
-
     wanted = dict(require or {})
     method = methods.method(method_name)
-    settings = load_scenario(method.scenario, scenario or method.nominal()).model_dump()
+    settings = method.settings(scenario).model_dump()
     with progress.doing("predicting"):
         now = predict(method_name, settings, config_file, wanted)
     steps: list[Step] = []

@@ -44,7 +44,10 @@ class Killed:
 
 @cache
 def source_version() -> str:
-    """alidade's version with a hash of its source, `0.1.0+1c9f3b2a`: two checkouts may bear the same number."""
+    """alidade's version with a hash of its source and that of methods installed beside it, `0.1.0+1c9f3b2a`.
+
+    Two checkouts may bear the same number.
+    """
     return _source_version()()
 
 
@@ -217,7 +220,8 @@ def _source_version() -> Callable[[], str]:
 
     def version() -> str:
         digest = hashlib.sha256()
-        for package in ("factors", "pipelines"):
+        brought = {entry.module.partition(".")[0] for entry in metadata.entry_points(group="alidade.methods")}
+        for package in ("factors", "pipelines", *sorted(brought)):
             spec = importlib.util.find_spec(package)
             if spec is None or not spec.submodule_search_locations:
                 return ""

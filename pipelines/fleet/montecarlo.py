@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines import progress
+from pipelines import methods, progress
 from pipelines.errors import InputError
 from pipelines.fleet import require_extra, statistics
 from pipelines.fleet.attempt import attempt, set_aside
@@ -142,7 +142,7 @@ def run_study(
         raise InputError(f"no solver {', '.join(unknown)!r}; the solvers are {', '.join(SOLVERS)}, or all")
     if not seeds:
         raise InputError("--runs: at least one run is needed")
-    scenario = scenario or f"{method}_nominal"
+    scenario = scenario or methods.method(method).nominal()
     file = Path(scenario)
     text = file.read_text(encoding="utf-8") if file.is_file() else None
     # The first recording tells this scenario and simulator from others; and a bad scenario is refused here.
@@ -177,8 +177,6 @@ def simulate_and_solve(
     method: str, scenario: str, text: str | None, seed: int, solvers: Sequence[str], window: float | None
 ) -> dict[str, Result]:
     """On the worker: solver -> numbers of one seed. `text` is the scenario file's, which the worker may not see."""
-    from pipelines import methods
-
     with TemporaryDirectory(prefix="alidade.") as folder:
         if text is not None:
             scenario = str(Path(folder) / "scenario.yaml")
@@ -232,8 +230,6 @@ def _coverage_cells(shares: tuple[float, float, float]) -> dict[str, Cell]:
 
 
 def _fingerprint(method: str, scenario: str, seed: int) -> str:
-    from pipelines import methods
-
     with TemporaryDirectory(prefix="alidade.") as folder:
         session = Path(folder) / "session.mcap"
         methods.simulate(method, scenario, seed, session)

@@ -53,6 +53,7 @@ class Method(ABC):
         needs: what it cannot do without.
         section: the model of its own section of the config, if it has one.
         rotations: parameters that are rotation vectors, without their _x, _y, _z -> the rotation each is.
+        scenarios: folder with scenarios that come with the method, if it brings its own.
     """
 
     name: ClassVar[str]
@@ -61,6 +62,7 @@ class Method(ABC):
     needs: ClassVar[tuple[Need, ...]]
     section: ClassVar[type[MethodSection] | None] = None
     rotations: ClassVar[Mapping[str, str]] = {}
+    scenarios: ClassVar[Path | None] = None
 
     # -- from a recording to estimates
 
@@ -98,6 +100,15 @@ class Method(ABC):
     def nominal(self, images: bool = False) -> str:  # noqa: ARG002
         """Name of the scenario that is simulated where none is named."""
         return f"{self.name}_nominal"
+
+    def settings(self, scenario: str | None = None, images: bool = False) -> Any:
+        """The simulator's settings of a scenario, by name or file (None: the nominal one).
+
+        Raises InputError when there is no such scenario, or it does not fit the model.
+        """
+        from pipelines.simulation.scenario import load_scenario
+
+        return load_scenario(self.scenario, scenario or self.nominal(images), self.scenarios)
 
     @abstractmethod
     def write(self, path: Path, simulated: Simulated) -> None:
@@ -173,11 +184,8 @@ def simulate(name: str, scenario: str | None, seed: int, out: Path, images: bool
 
     Raises InputError when there is no such method or scenario, or the recording cannot be written.
     """
-    from pipelines.simulation.scenario import load_scenario
-
     chosen = method(name)
-    settings = load_scenario(chosen.scenario, scenario or chosen.nominal(images))
-    chosen.write(out, chosen.simulate(settings, seed, images))
+    chosen.write(out, chosen.simulate(chosen.settings(scenario, images), seed, images))
 
 
 @cache

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -17,8 +18,13 @@ Model = TypeVar("Model", bound=BaseModel)
 _FOLDERS = (Path(__file__).parent / "scenarios", Path(__file__).parents[2] / "datasets" / "scenarios")
 
 
-def load_scenario(model: type[Model], name_or_path: str | Path) -> Model:
+def load_scenario(model: type[Model], name_or_path: str | Path, folder: Path | None = None) -> Model:
     """The scenario of that name (a shipped one, `head_nominal`) or in that file, as the simulator's model.
+
+    Args:
+        model: to be filled.
+        name_or_path: of the scenario.
+        folder: where more scenarios are found by name.
 
     Raises:
         InputError: no such scenario, unreadable YAML, an unknown key or a value that does not fit.
@@ -26,7 +32,7 @@ def load_scenario(model: type[Model], name_or_path: str | Path) -> Model:
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
-    path = _find(name_or_path)
+    path = _find(name_or_path, _FOLDERS if folder is None else (*_FOLDERS, folder))
     try:
         content = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
         return model.model_validate({} if content is None else content)
@@ -36,11 +42,11 @@ def load_scenario(model: type[Model], name_or_path: str | Path) -> Model:
         raise InputError(f"{path}: {explain(error.errors()[0], model)}") from error
 
 
-def _find(name_or_path: str | Path) -> Path:
+def _find(name_or_path: str | Path, folders: Sequence[Path]) -> Path:
     path = Path(name_or_path)
     if path.is_file():
         return path
-    shipped = {p.stem: p for folder in _FOLDERS for p in sorted(folder.glob("*.yaml"))}
+    shipped = {p.stem: p for folder in folders for p in sorted(folder.glob("*.yaml"))}
     if str(name_or_path) in shipped:
         return shipped[str(name_or_path)]
     raise InputError(f"no scenario file {name_or_path}; give a file or one of {', '.join(sorted(shipped))}")

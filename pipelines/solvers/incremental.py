@@ -302,10 +302,11 @@ class Run:
             raise IndeterminateError(explained(error)) from None
 
     def _alive(self, values: gtsam.Values, stamps: Mapping[int, float]) -> list[int] | None:
-        """The variables that later steps may refer to, if there are others to forget.
+        """The variables that later steps may refer to, None where everything is kept.
 
         Those are the ones used in the last moment and those that never age.
         """
+        if self.window is None:
+            return None
         latest = max(stamps.values(), default=-np.inf)
-        alive = [key for key in values.keys() if stamps.get(key, np.inf) >= latest]
-        return alive if self.window is not None and len(alive) < values.size() else None
+        return [key for key in values.keys() if stamps.get(key, np.inf) >= latest]
