@@ -20,7 +20,7 @@ lint: $(VENV)/installed
 	$(BIN)/lint-imports
 
 types: $(VENV)/installed
-	$(BIN)/mypy alidade factors pipelines datasets benchmarks tests
+	$(BIN)/mypy alidade factors pipelines datasets benchmarks tests docs/examples/gyro_pair
 
 bench: $(VENV)/installed
 	$(BIN)/python -m benchmarks

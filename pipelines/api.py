@@ -151,7 +151,7 @@ def follow(
 
 
 def _scenario(method: Method, given: str | Path | Mapping[str, Any] | BaseModel | None, images: bool) -> BaseModel:
-    from pipelines.simulation.scenario import explain, load_scenario
+    from pipelines.simulation.scenario import explain
 
     if isinstance(given, BaseModel):
         return given
@@ -160,7 +160,7 @@ def _scenario(method: Method, given: str | Path | Mapping[str, Any] | BaseModel 
             return method.scenario.model_validate(dict(given))
         except ValidationError as error:
             raise InputError(f"scenario: {explain(error.errors()[0], method.scenario)}") from error
-    return load_scenario(method.scenario, given or method.nominal(images))
+    return method.settings(None if given is None else str(given), images)
 
 
 def _data(method: Method, given: Mapping[str, Any]) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -23,6 +24,16 @@ def shared_data() -> Path:
     if not _SHARED.is_dir():
         pytest.skip("needs the recordings in ../shared/data, which are not part of the project")
     return _SHARED
+
+
+@pytest.fixture(scope="session")
+def example_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which the example distribution is installed, to be put on the path of a command."""
+    site = tmp_path_factory.mktemp("site")
+    options = ("--quiet", "--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check")
+    example = Path(__file__).parents[1] / "docs" / "examples" / "gyro_pair"
+    subprocess.run([sys.executable, "-m", "pip", "install", *options, "--target", site, example], check=True)
+    return site
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import subprocess
@@ -13,16 +14,18 @@ import pytest
 from pipelines.config import load_config
 
 ROOT = Path(__file__).parents[1]
+EXAMPLE = ROOT / "docs" / "examples" / "gyro_pair"
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 _BLOCK = re.compile(r"^```(sh|yaml file=(\S+))\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+_CODE = re.compile(r"^```python file=(\S+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"\]\((?!https?://)([^)#]+)")
 
 
 # Their Python needs the scheduler of a cluster.
 _CLUSTER = ("fleet.md",)
 # Their commands are those of other tests, on longer recordings.
-_LONG = ("cube.md", "fleet.md", "trust.md")
+_LONG = ("cube.md", "fleet.md", "trust.md", "write-your-own-method.md")
 
 
 def _text(page: Path) -> str:
@@ -36,7 +39,10 @@ def _name(page: Path) -> str:
 @pytest.mark.parametrize(
     "page", [pytest.param(p, marks=[pytest.mark.slow] * (p.name in _LONG), id=p.name) for p in PAGES]
 )
-def test_commands_work(page: Path, tmp_path: Path) -> None:
+def test_commands_work(page: Path, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    path = [str(ROOT)]
+    if page.name == "write-your-own-method.md":
+        path.append(str(request.getfixturevalue("example_site")))
     for kind, file, text in _BLOCK.findall(page.read_text(encoding="utf-8")):
         if kind != "sh":
             (tmp_path / file).write_text(text, encoding="utf-8")
@@ -48,7 +54,7 @@ def test_commands_work(page: Path, tmp_path: Path) -> None:
             run = subprocess.run(
                 command,
                 cwd=tmp_path,
-                env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin"},
+                env={"PYTHONPATH": os.pathsep.join(path), "PATH": "/usr/bin:/bin"},
                 capture_output=True,
                 text=True,
             )
@@ -76,6 +82,16 @@ def test_python_works(page: Path, tmp_path: Path) -> None:
 def test_links_lead_somewhere(page: Path) -> None:
     for target in _LINK.findall(page.read_text(encoding="utf-8")):
         assert (page.parent / target).exists(), target
+
+
+def test_code_of_the_example_is_that_of_its_files() -> None:
+    page = (ROOT / "docs" / "write-your-own-method.md").read_text(encoding="utf-8")
+    blocks = _CODE.findall(page)
+    assert blocks
+    for file, text in blocks:
+        # A line of dots stands for what is left out.
+        for part in re.split(r"^ *\.\.\.\n", text, flags=re.MULTILINE):
+            assert part in (EXAMPLE / file).read_text(encoding="utf-8"), f"{file}:\n{part}"
 
 
 def test_readme_names_no_dependency_that_is_not_there() -> None:

@@ -1,0 +1,27 @@
+"""Figures of the report: both gyros' rates in one frame, and their difference."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gyro_pair.recording import GyroPairData
+from gyro_pair.validation import rates
+from pipelines.judgement.validation import rms
+from pipelines.reports.plots import COLORS, add_line, add_points, figure
+from pipelines.reports.result import Calibration, Plot
+
+
+def figures(data: GyroPairData, calibration: Calibration) -> list[Plot]:
+    """With the estimate applied."""
+    estimate = calibration.estimate
+    start, by_b, predicted = rates(data, dict(zip(estimate.names, estimate.values.tolist(), strict=True)))
+    both, left = figure("rate in b, deg/s"), figure("rate of b less a's, deg/s")
+    for i, axis in enumerate("xyz"):
+        add_points(both, start, np.rad2deg(by_b[:, i]), f"gyro b {axis}", COLORS[i], 3)
+        add_line(both, start, np.rad2deg(predicted[:, i]), f"from gyro a {axis}", COLORS[i])
+        add_points(left, start, np.rad2deg(by_b - predicted)[:, i], axis, COLORS[i], 3)
+    said = "Gyro b less gyro a, turned, shifted in time and by the bias difference"
+    return [
+        Plot("Both gyros in one frame", "Mean rates over windows: points by gyro b, lines by gyro a, turned.", both),
+        Plot("What is left between the gyros", f"{said}: {np.rad2deg(rms(by_b - predicted)):.3g} deg/s RMS.", left),
+    ]

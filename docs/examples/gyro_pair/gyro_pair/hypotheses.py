@@ -1,0 +1,12 @@
+"""What can be wrong with the data of two gyros."""
+
+from __future__ import annotations
+
+from pipelines.judgement.hypotheses import AXES, Hypotheses
+
+HYPOTHESES = Hypotheses(
+    streams={"a_t": ("a_gyro",), "b_t": ("b_gyro",)},
+    signs={"a_gyro": ("gyro a", AXES), "b_gyro": ("gyro b", AXES)},
+    noise={"gyro_density": ("a_density", ("increment",))},
+    offset=True,
+)
