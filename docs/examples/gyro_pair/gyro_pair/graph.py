@@ -115,8 +115,8 @@ def _steps(
         step = Step(time=float(measured.time[rows[-1]]), keyframes=rows)
         if begin == 0:
             step.initial.insert(initial)
-            step.factors += [rotation_prior(rotation), vector_prior(offset, np.zeros(1))]
-            step.factors += [vector_prior(difference, np.zeros(3))]
+            step.factors.append(rotation_prior(rotation))
+            step.factors.extend([vector_prior(offset, np.zeros(1)), vector_prior(difference, np.zeros(3))])
         step.factors.append(_factor(measured, slice(rows.start, rows.stop)))
         yield step
 
