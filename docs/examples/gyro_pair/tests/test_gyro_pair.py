@@ -115,7 +115,7 @@ def test_the_smoother_forgets_though_all_variables_stay() -> None:
     graph = problem(simulated(duration_s=44, gyro_a=slow, gyro_b=slow).data, Config())
     run = Run(graph, window=1.0)
     for step in graph.steps(1):
-        run.take(step)
+        run.add_step(step)
     assert run.base is not None
     assert len(run.past) < 15
     batch = solve_batch(graph)
