@@ -1,7 +1,7 @@
 """The graph of two gyros on one body: rotations over short windows, three variables shared by all of them.
 
 The factor predicts gyro b from gyro a's readings, whose noise looks like motion: about an axis without any the rotation
-is reported with a sigma of a few degrees, not with that of its prior.
+is reported with a sigma of a few degrees after a minute, less after longer, not with that of its prior.
 """
 
 from __future__ import annotations
