@@ -76,7 +76,11 @@ def split(source: Path, path: Path, count: int = 3) -> Path:
 
 def zstd(source: Path, path: Path) -> Path:
     """A file compressed as a whole."""
-    path.write_bytes(zstandard.compress(source.read_bytes()))
+    packer, data = zstandard.ZstdCompressor().compressobj(), source.read_bytes()
+    with path.open("wb") as stream:
+        for at in range(0, len(data), 4096):  # in small blocks, as a long file has many
+            stream.write(packer.compress(data[at : at + 4096]) + packer.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK))
+        stream.write(packer.flush())
     return path
 
 
