@@ -1,0 +1,189 @@
+"""Which of a recording's topics could serve what a method needs, found by type, content and name.
+
+Nothing is taken silently: what is found is a suggestion, with its reasons, for people to put into the config.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pipelines import methods
+from pipelines.errors import InputError
+from pipelines.recording import messages
+from pipelines.recording.info import lacking
+from pipelines.recording.pairing import Pairing, pair
+from pipelines.recording.reading import Recording
+from pipelines.recording.sources import TopicSource
+from pipelines.recording.topics import Setting, Topic
+from pipelines.settings import Config
+
+# Rates and attitudes belong together above this correlation of their norms.
+_BELONGS = 0.7
+# Delays worth a word, s.
+_DELAY = 0.005
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """What a method could read.
+
+    Attributes:
+        method: its name.
+        topics: key in the config -> where it could come from; the keys that are lacking alone.
+        reasons: sentences about why.
+        missing: what would still be lacking.
+    """
+
+    method: str
+    topics: dict[str, TopicSource]
+    reasons: tuple[str, ...]
+    missing: tuple[str, ...]
+
+    @property
+    def yaml(self) -> str:
+        """The `topics:` section to paste."""
+        given = {key: source.model_dump() for key, source in self.topics.items()}
+        return "\n".join(["topics:", *(f"  {key}: {_flow(value)}" for key, value in given.items())])
+
+
+def suggestions(recording: Recording, config: Config, only: Sequence[str] | None = None) -> tuple[Suggestion, ...]:
+    """One for each method (of `only`) that lacks something and could have topics of the recording."""
+    found = []
+    pairings: dict[tuple[str, str], Pairing | None] = {}
+    for name in methods.names() if only is None else only:
+        if lacking(methods.method(name).needs, recording, config):
+            made = _suggestion(name, recording, config, pairings)
+            if made.topics:
+                found.append(made)
+    return tuple(found)
+
+
+def with_suggested(recording: Recording, config: Config, suggestion: Suggestion) -> Config:
+    """The config with the suggested topics; the recording has them from now on."""
+    more = config.model_copy(update={"topics": {**config.topics, **suggestion.topics}, "method": suggestion.method})
+    recording.use(more.topics.values(), {})
+    return more
+
+
+def unused(recording: Recording, config: Config) -> tuple[str, ...]:
+    """Topics of sensors that no method reads under this config."""
+    read = {config.topic(topic) for name in methods.names() for topic in methods.method(name).topics}
+    kinds = {kind for name in methods.names() for topic in methods.method(name).topics for kind in topic.types}
+    return tuple(
+        name for name, topic in recording.topics.items() if topic.type in kinds and topic.count and name not in read
+    )
+
+
+def _suggestion(
+    method: str, recording: Recording, config: Config, pairings: dict[tuple[str, str], Pairing | None]
+) -> Suggestion:
+    chosen = methods.method(method)
+    needed = [one for need in chosen.needs for group in need for one in group if not isinstance(one, Setting)]
+    taken = {config.topic(topic) for topic in chosen.topics if config.topic(topic) in recording.topics}
+    topics: dict[str, TopicSource] = {}
+    reasons: list[str] = []
+    attitudes = [topic for topic in needed if _is_attitude(topic)]
+    gyros = [topic for topic in needed if messages.IMU in topic.types and not _is_attitude(topic)]
+    for attitude in attitudes:
+        for gyro in gyros:
+            _pair_up(recording, config, attitude, gyro, pairings, topics, reasons)
+    for topic in dict.fromkeys([*needed, *chosen.topics]):
+        if topic.key in topics or config.topic(topic) in recording.topics or topic.key in config.topics:
+            continue
+        if topic not in needed and not topics:
+            continue
+        used = taken | {source.name for source in topics.values()}
+        named = _by_name(recording, topic, used, is_needed=topic in needed)
+        if named is not None:
+            topics[topic.key] = TopicSource(topic=named)
+            reasons.append(f"{named} is a {_short(recording, named)}; it can serve as {topic.key}")
+    more = config.model_copy(update={"topics": {**config.topics, **topics}})
+    before = tuple(config.topics.values())
+    recording.use(more.topics.values(), {})
+    missing = lacking(chosen.needs, recording, more)
+    recording.use(before, {})
+    return Suggestion(method, topics, tuple(reasons), missing)
+
+
+def _is_attitude(topic: Topic) -> bool:
+    return messages.POSE in topic.types
+
+
+def _pair_up(
+    recording: Recording,
+    config: Config,
+    attitude: Topic,
+    gyro: Topic,
+    pairings: dict[tuple[str, str], Pairing | None],
+    topics: dict[str, TopicSource],
+    reasons: list[str],
+) -> None:
+    """The gyro and the attitude that turn together most alike, of those that may serve."""
+    best: tuple[float, str, str, Pairing] | None = None
+    for a in _candidates(recording, config, attitude):
+        for g in _candidates(recording, config, gyro):
+            if a == g:
+                continue
+            if (g, a) not in pairings:
+                pairings[g, a] = _paired(recording, g, a)
+            found = pairings[g, a]
+            if found is not None and found.correlation > _BELONGS and (best is None or found.correlation > best[0]):
+                best = found.correlation, g, a, found
+    if best is None:
+        return
+    _, g, a, found = best
+    if config.topic(gyro) != g:
+        topics[gyro.key] = TopicSource(topic=g)
+    if config.topic(attitude) != a or found.inverted:
+        topics[attitude.key] = TopicSource(topic=a, invert=found.inverted)
+    way = ", as the inverse of the attitude meant" if found.inverted else ""
+    delay = f", {1e3 * abs(found.offset_s):.0f} ms {'early' if found.offset_s > 0.0 else 'late'}"
+    late = delay if abs(found.offset_s) > _DELAY else ""
+    reasons.append(f"{a} turns with {g} (correlation {found.correlation:.2f}{late}){way}")
+
+
+def _candidates(recording: Recording, config: Config, topic: Topic) -> list[str]:
+    """Recorded topics that have a type of the topic: the one that the config names, if it is there."""
+    own = config.topic(topic)
+    if own in recording.topics:
+        return [own]
+    return [n for n, t in recording.topics.items() if t.type in topic.types and t.count and t.is_readable]
+
+
+def _paired(recording: Recording, gyro: str, attitude: str) -> Pairing | None:
+    try:
+        rates, poses = recording.imu(gyro), recording.poses(attitude)
+    except InputError:
+        return None
+    return pair(rates.t_ns, rates.gyro, poses.t_ns, poses.wxyz)
+
+
+def _by_name(recording: Recording, topic: Topic, used: set[str], is_needed: bool) -> str | None:
+    """The topic of the first type that is there: of several the one whose name is most alike; an optional one if it is.
+
+    An attitude of an Imu is left to its content, which pairs it.
+    """
+    there = [
+        name
+        for name, found in recording.topics.items()
+        if found.type in topic.types and found.count and found.is_readable and name not in used
+        if not (_is_attitude(topic) and found.type == messages.IMU)
+    ]
+    words = topic.key.replace("_", " ")
+    alike = {name: difflib.SequenceMatcher(None, words, name.strip("/").replace("/", " ")).ratio() for name in there}
+    best = max(there, key=lambda name: alike[name], default=None)
+    return best if best is not None and (is_needed or alike[best] > 0.6) else None
+
+
+def _flow(value: object) -> str:
+    """A name, or a mapping in one line of YAML."""
+    if not isinstance(value, dict):
+        return str(value)
+    return f"{{{', '.join(f'{key}: {str(one).lower() if one is True else one}' for key, one in value.items())}}}"
+
+
+def _short(recording: Recording, name: str) -> str:
+    found = recording.topics[name]
+    return f"{found.type.rpartition('/')[2]} of {found.count} messages"
