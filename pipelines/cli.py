@@ -36,7 +36,7 @@ class Solver(StrEnum):
     published = "published"
 
 
-_Session = Annotated[Path, typer.Argument(metavar="SESSION.mcap", help="The recording.")]
+_Session = Annotated[Path, typer.Argument(metavar="RECORDING", help="A file, a bag folder, or a pattern in quotes.")]
 _METHODS = "los, indexer, head, cube or one installed"
 _MethodName = Annotated[str | None, typer.Option("--method", help=f"{_METHODS}; by default what fits.")]
 _ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML that overrides the recording's own config.")]
@@ -45,6 +45,8 @@ _Jobs = Annotated[int | None, typer.Option(help="Local worker processes; default
 _PictureJobs = Annotated[int | None, typer.Option("--jobs", help="Processes for many pictures; default: one a core.")]
 _Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars.")]
 _Strict = Annotated[bool, typer.Option("--strict", help="Refuse a recording of which anything is lost.")]
+_AutoTopics = Annotated[bool, typer.Option("--auto-topics", help="Take the topics that `info` suggests.")]
+_Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")]
 _Window = Annotated[str, typer.Option(help="Of the incremental solver: seconds kept, or 'all'.")]
 
 
@@ -71,7 +73,9 @@ def calibrate(
     window: _Window = "1",
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: SESSION-SOLVER.")] = None,
     strict: _Strict = False,
+    auto_topics: _AutoTopics = False,
     jobs: _PictureJobs = None,
+    as_json: _Json = False,
     quiet: _Quiet = False,
 ) -> None:
     """Calibrate a recording. Exit code 0 calibrated, 2 unusable input, 3 weak or unobservable, 4 inconsistent."""
@@ -80,12 +84,12 @@ def calibrate(
     from pipelines.session import calibrate as run
     from pipelines.vision import parallel
 
-    folder = out or session.with_name(f"{session.stem}-{solver.value}")
-    with progress.shown(quiet), parallel.processes(jobs):
-        (calibration,) = run(session, [solver.value], method, config, _seconds(window), strict)
+    folder = out or _beside(session, solver.value)
+    with progress.shown(quiet or as_json), parallel.processes(jobs):
+        (calibration,) = run(session, [solver.value], method, config, _seconds(window), strict, auto_topics)
         with progress.doing("writing"):
             written = write_results(folder, calibration)
-    _tell(calibration, folder, written)
+    _tell(calibration, folder, written, as_json)
 
 
 @app.command()
@@ -96,6 +100,8 @@ def compare(
     window: _Window = "1",
     out: Annotated[Path | None, typer.Option(help="Folder for compare.html, which also splits the recording.")] = None,
     strict: _Strict = False,
+    auto_topics: _AutoTopics = False,
+    as_json: _Json = False,
     quiet: _Quiet = False,
 ) -> None:
     """The published, batch and incremental solvers side by side, with errors where the truth is known."""
@@ -104,13 +110,18 @@ def compare(
     from pipelines.session import calibrate as run
     from pipelines.session import self_agreement
 
-    with progress.shown(quiet):
-        calibrations = run(session, ["published", "batch", "incremental"], method, config, _seconds(window), strict)
-    terminal.show(calibrations)
+    solvers = ["published", "batch", "incremental"]
+    with progress.shown(quiet or as_json):
+        calibrations = run(session, solvers, method, config, _seconds(window), strict, auto_topics)
+    if as_json:
+        terminal.show_json(calibrations)
+    else:
+        terminal.show(calibrations)
     if out is not None:
         with progress.shown(quiet), progress.doing("solving parts of the recording"):
             written = write_compare(out, calibrations, *self_agreement(session, method, config))
-        terminal.say(f"Comparison in {written}")
+        if not as_json:
+            terminal.say(f"Comparison in {written}")
 
 
 @app.command()
@@ -132,7 +143,7 @@ def follow(
 
     settings = Settings(session, method, config, _seconds(window), patience, checkpoint)
     calibration = run(settings, port if serve else None)
-    folder = out or session.with_name(f"{session.stem}-incremental")
+    folder = out or _beside(session, "incremental")
     written = write_results(folder, calibration)
     _tell(calibration, folder, written)
 
@@ -154,7 +165,7 @@ def validate(
 
     with progress.shown(quiet), progress.doing("validating"):
         validated = run(session, calibration, method, config, strict)
-        written = write_validation(out or session.with_name(f"{session.stem}-validation"), validated)
+        written = write_validation(out or _beside(session, "validation"), validated)
     for line in table(validated):
         terminal.say(line)
     for note in validated.notes:
@@ -205,10 +216,17 @@ def plan(
 
 
 @app.command()
-def info(session: _Session, config: _ConfigFile = None, strict: _Strict = False, quiet: _Quiet = False) -> None:
-    """What is in a recording: topics, rates, gaps, and the methods it can serve."""
+def info(
+    session: _Session,
+    config: _ConfigFile = None,
+    strict: _Strict = False,
+    as_json: _Json = False,
+    quiet: _Quiet = False,
+) -> None:
+    """What can be calibrated from a recording, with which topics, what is missing, and what is in it."""
     from pipelines import progress, terminal
     from pipelines.config import recorded_config
+    from pipelines.discovery import suggestions, unused
     from pipelines.recording.reading import open_recording
     from pipelines.session import session_facts
 
@@ -216,7 +234,11 @@ def info(session: _Session, config: _ConfigFile = None, strict: _Strict = False,
         recording = open_recording(session, strict)
         settings = recorded_config(recording, config)
         facts = session_facts(recording, settings)
-    terminal.show_facts(session.name, facts)
+        found, left = suggestions(recording, settings), unused(recording, settings)
+    if as_json:
+        print(terminal.facts_json(facts, found, left))
+    else:
+        terminal.show_facts(session.name, facts, found, left)
 
 
 @app.command()
@@ -382,12 +404,22 @@ def cube_print(
     terminal.say(f"Wrote {out}: print at 100 % and check the ruler")
 
 
-def _tell(calibration: Calibration, folder: Path, written: Sequence[Path]) -> NoReturn:
+def _beside(session: Path, what: str) -> Path:
+    """The folder for results where none is named: beside the recording, under its name."""
+    session = session if session.name else session.resolve()
+    name = "".join(letter for letter in session.stem if letter not in "*?[]").rstrip("_-.") or "recording"
+    return session.with_name(f"{name}-{what}")
+
+
+def _tell(calibration: Calibration, folder: Path, written: Sequence[Path], as_json: bool = False) -> NoReturn:
     """Show a calibration and where its results are; its status is the exit code."""
     from pipelines import terminal
 
-    terminal.show([calibration])
-    terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
+    if as_json:
+        terminal.show_json([calibration])
+    else:
+        terminal.show([calibration])
+        terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
     raise typer.Exit(exit_codes.OF_STATUS[calibration.assessment.status])
 
 

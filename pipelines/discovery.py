@@ -21,6 +21,8 @@ from pipelines.settings import Config
 
 # Rates and attitudes belong together above this correlation of their norms.
 _BELONGS = 0.7
+# Names are alike above this ratio of difflib.
+_ALIKE = 0.6
 # Delays worth a word, s.
 _DELAY = 0.005
 
@@ -60,16 +62,42 @@ def suggestions(recording: Recording, config: Config, only: Sequence[str] | None
     return tuple(found)
 
 
-def with_suggested(recording: Recording, config: Config, suggestion: Suggestion) -> Config:
-    """The config with the suggested topics; the recording has them from now on."""
-    more = config.model_copy(update={"topics": {**config.topics, **suggestion.topics}, "method": suggestion.method})
+def with_suggested(recording: Recording, config: Config, method: str | None = None) -> Config:
+    """The config with the topics suggested for a method, or for the only one that they would serve.
+
+    As it is where nothing is lacking. What is taken is remarked in the recording, which has the topics from now on.
+    Raises InputError when no method could be served, or several.
+    """
+    wanted = method or config.method
+    served = [name for name in methods.names() if not lacking(methods.method(name).needs, recording, config)]
+    if wanted in served or (wanted is None and served):
+        return config
+    found = suggestions(recording, config, [wanted] if wanted else None)
+    whole = [suggestion for suggestion in found if not suggestion.missing]
+    if len(whole) != 1:
+        which = " and ".join(suggestion.method for suggestion in whole)
+        what = f"topics could be found for {which}; choose with --method" if whole else nearest_suggestion(found)
+        raise InputError(f"{recording.path}: {what or 'no topics for any method were found'}; {recording.there()}")
+    more = config.model_copy(update={"topics": {**config.topics, **whole[0].topics}, "method": whole[0].method})
     recording.use(more.topics.values(), {})
+    recording.remark(f"topics taken as suggested for {whole[0].method}: {'; '.join(whole[0].reasons)}")
     return more
+
+
+def nearest_suggestion(found: Sequence[Suggestion]) -> str:
+    """What there is for the method that lacks least, as a phrase; empty if there is nothing."""
+    if not found:
+        return ""
+    best = min(found, key=lambda suggestion: len(suggestion.missing))
+    lacks = f"; still lacking: {'; '.join(best.missing)}" if best.missing else ", which `--auto-topics` takes"
+    topics = best.yaml.replace("\n  ", ", ").replace("topics:,", "topics: {", 1).replace("{ ", "{") + "}"
+    return f"for {best.method}: {'; '.join(best.reasons)}: `{topics}`{lacks}"
 
 
 def unused(recording: Recording, config: Config) -> tuple[str, ...]:
     """Topics of sensors that no method reads under this config."""
     read = {config.topic(topic) for name in methods.names() for topic in methods.method(name).topics}
+    read |= {part for source in config.topics.values() for part in source.parts}
     kinds = {kind for name in methods.names() for topic in methods.method(name).topics for kind in topic.types}
     return tuple(
         name for name, topic in recording.topics.items() if topic.type in kinds and topic.count and name not in read
@@ -88,7 +116,8 @@ def _suggestion(
     gyros = [topic for topic in needed if messages.IMU in topic.types and not _is_attitude(topic)]
     for attitude in attitudes:
         for gyro in gyros:
-            _pair_up(recording, config, attitude, gyro, pairings, topics, reasons)
+            free = [_candidates(recording, config, topic, taken) for topic in (attitude, gyro)]
+            _pair_up(recording, config, (attitude, gyro), free, pairings, topics, reasons)
     for topic in dict.fromkeys([*needed, *chosen.topics]):
         if topic.key in topics or config.topic(topic) in recording.topics or topic.key in config.topics:
             continue
@@ -98,7 +127,7 @@ def _suggestion(
         named = _by_name(recording, topic, used, is_needed=topic in needed)
         if named is not None:
             topics[topic.key] = TopicSource(topic=named)
-            reasons.append(f"{named} is a {_short(recording, named)}; it can serve as {topic.key}")
+            reasons.append(f"{named} ({_short(recording, named)}) can serve as {topic.key}")
     more = config.model_copy(update={"topics": {**config.topics, **topics}})
     before = tuple(config.topics.values())
     recording.use(more.topics.values(), {})
@@ -114,16 +143,17 @@ def _is_attitude(topic: Topic) -> bool:
 def _pair_up(
     recording: Recording,
     config: Config,
-    attitude: Topic,
-    gyro: Topic,
+    pair_of: tuple[Topic, Topic],
+    free: list[list[str]],
     pairings: dict[tuple[str, str], Pairing | None],
     topics: dict[str, TopicSource],
     reasons: list[str],
 ) -> None:
     """The gyro and the attitude that turn together most alike, of those that may serve."""
+    attitude, gyro = pair_of
     best: tuple[float, str, str, Pairing] | None = None
-    for a in _candidates(recording, config, attitude):
-        for g in _candidates(recording, config, gyro):
+    for a in free[0]:
+        for g in free[1]:
             if a == g:
                 continue
             if (g, a) not in pairings:
@@ -144,12 +174,13 @@ def _pair_up(
     reasons.append(f"{a} turns with {g} (correlation {found.correlation:.2f}{late}){way}")
 
 
-def _candidates(recording: Recording, config: Config, topic: Topic) -> list[str]:
-    """Recorded topics that have a type of the topic: the one that the config names, if it is there."""
+def _candidates(recording: Recording, config: Config, topic: Topic, taken: set[str]) -> list[str]:
+    """Recorded topics of a type of the topic that serve nothing else: the one the config names, if it is there."""
     own = config.topic(topic)
     if own in recording.topics:
         return [own]
-    return [n for n, t in recording.topics.items() if t.type in topic.types and t.count and t.is_readable]
+    there = recording.topics.items()
+    return [n for n, t in there if t.type in topic.types and t.count and t.is_readable and n not in taken]
 
 
 def _paired(recording: Recording, gyro: str, attitude: str) -> Pairing | None:
@@ -174,7 +205,12 @@ def _by_name(recording: Recording, topic: Topic, used: set[str], is_needed: bool
     words = topic.key.replace("_", " ")
     alike = {name: difflib.SequenceMatcher(None, words, name.strip("/").replace("/", " ")).ratio() for name in there}
     best = max(there, key=lambda name: alike[name], default=None)
-    return best if best is not None and (is_needed or alike[best] > 0.6) else None
+    return best if best is not None and (is_needed or alike[best] > _ALIKE or _is_other_gyro(topic, there)) else None
+
+
+def _is_other_gyro(topic: Topic, there: list[str]) -> bool:
+    """Whether a topic of a gyro has but one that is left to serve."""
+    return len(there) == 1 and messages.IMU in topic.types and not _is_attitude(topic)
 
 
 def _flow(value: object) -> str:
@@ -186,4 +222,4 @@ def _flow(value: object) -> str:
 
 def _short(recording: Recording, name: str) -> str:
     found = recording.topics[name]
-    return f"{found.type.rpartition('/')[2]} of {found.count} messages"
+    return f"{found.type.rpartition('/')[2]}, {found.count} messages"

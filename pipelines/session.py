@@ -19,6 +19,7 @@ import numpy as np
 
 from pipelines import methods, progress
 from pipelines.config import load_config, recorded_config
+from pipelines.discovery import nearest_suggestion, suggestions, with_suggested
 from pipelines.errors import InputError
 from pipelines.graph.problem import Estimate, Problem, Step
 from pipelines.judgement.causes import find_causes
@@ -141,11 +142,26 @@ class Session:
     origin: Origin
 
     @classmethod
-    def read(cls, recording: Recording, method_name: str | None, config_file: Path | Config | None) -> Session:
+    def read(
+        cls,
+        recording: Recording,
+        method_name: str | None,
+        config_file: Path | Config | None,
+        auto_topics: bool = False,
+    ) -> Session:
         """Read and check a recording (arguments and exceptions as `calibrate` has them)."""
         config = recorded_config(recording, config_file)
+        if auto_topics:
+            config = with_suggested(recording, config, method_name)
         chosen = methods.method(resolve_method(method_name, recording, config))
-        return cls(chosen, chosen.read(recording, config), config, Recorded(recording))
+        try:
+            data = chosen.read(recording, config)
+        except InputError as error:
+            if not lacking(chosen.needs, recording, config):
+                raise
+            nearest = nearest_suggestion(suggestions(recording, config, [chosen.name]))
+            raise InputError(f"{error}{f'; nearest is {nearest}' if nearest else ''}") from error
+        return cls(chosen, data, config, Recorded(recording))
 
     @classmethod
     def of(cls, method: Method, simulated: Simulated, config_file: Path | None = None) -> Session:
@@ -253,16 +269,18 @@ def calibrate(
     config_file: Path | None = None,
     window: float | None = 1.0,
     strict: bool = False,
+    auto_topics: bool = False,
 ) -> list[Calibration]:
     """One calibration a solver, from one reading of the recording.
 
     Args:
-        path: the recording.
+        path: the recording: a file, a folder of parts, or a pattern.
         solvers: of SOLVERS.
         method_name: overrides the config's.
         config_file: overrides the recording's own config key by key.
         window: s, of the incremental solver; None keeps the whole history.
         strict: refuse a recording of which anything is lost.
+        auto_topics: take the topics that `alidade info` suggests where those of the method are not there.
 
     Raises:
         InputError: recording or config cannot be used, or there is no such solver.
@@ -270,7 +288,7 @@ def calibrate(
     """
     start = time.perf_counter()
     with progress.doing("reading"):
-        session = Session.read(open_recording(path, strict), method_name, config_file)
+        session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics)
     return session.calibrations(solvers, window, {"read": time.perf_counter() - start})
 
 
@@ -306,9 +324,11 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
         return able[0]
     if able:
         raise InputError(f"{recording.path}: the topics serve {' and '.join(able)}; choose with --method")
+    nearest = nearest_suggestion(suggestions(recording, config))
     raise InputError(
         f"{recording.path}: no usable topics for any method; {recording.there()}; needed are ROS 2 messages "
         f"({ENCODING}): `alidade info` tells which for each method, `topics:` in the config can rename"
+        + (f"; nearest is {nearest}" if nearest else "")
     )
 
 

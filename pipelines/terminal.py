@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -14,6 +16,7 @@ from rich.text import Text
 from pipelines.errors import printable
 
 if TYPE_CHECKING:
+    from pipelines.discovery import Suggestion
     from pipelines.noise import NoiseStudy
     from pipelines.planning import Plan
     from pipelines.recording.info import SessionFacts
@@ -83,9 +86,41 @@ def as_text(calibrations: Sequence[Calibration]) -> str:
     return Text.from_ansi(capture.get()).plain.rstrip()
 
 
-def show_facts(name: str, facts: SessionFacts) -> None:
-    """The topics of a recording and the methods it can serve."""
+def show_json(calibrations: Sequence[Calibration]) -> None:
+    """The result of a calibration as result.json has it; of several a list of them."""
+    from pipelines.reports.result import result_json
+
+    texts = [result_json(calibration).rstrip() for calibration in calibrations]
+    print(texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]")
+
+
+def facts_json(facts: SessionFacts, found: Sequence[Suggestion], unused: Sequence[str]) -> str:
+    """What `info` tells, as JSON."""
+    suggested = {suggestion.method: suggestion for suggestion in found}
+    told = dataclasses.asdict(facts)
+    told["methods"] = {
+        name: {
+            "served": not missing,
+            "missing": missing,
+            "suggested": {key: source.model_dump() for key, source in suggested[name].topics.items()}
+            if name in suggested
+            else {},
+            "reasons": suggested[name].reasons if name in suggested else (),
+            "still_missing": suggested[name].missing if name in suggested else missing,
+        }
+        for name, missing in told.pop("missing").items()
+    }
+    return json.dumps(told | {"unused": list(unused)}, indent=1)
+
+
+def show_facts(name: str, facts: SessionFacts, found: Sequence[Suggestion] = (), unused: Sequence[str] = ()) -> None:
+    """What a recording can calibrate and with which topics, what each method lacks, then what there is."""
     say(f"{name}, {facts.duration_s:.1f} s")
+    _show_methods(facts, found)
+    if unused:
+        say(f"used by no method: {', '.join(unused)}")
+    for note in facts.notes:
+        say(f"note: {note}")
     table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
     table.add_column("topic", no_wrap=True)
     table.add_column("type", overflow="fold")
@@ -104,15 +139,26 @@ def show_facts(name: str, facts: SessionFacts) -> None:
     console.print(table)
     if any(t.duplicates or t.out_of_order for t in facts.topics):
         say("twice: stamps that occur again; back: stamps before the one ahead of them")
-    for note in facts.notes:
-        say(f"note: {note}")
     if facts.attachments:
         say(f"attachments: {', '.join(facts.attachments)}")
+
+
+def _show_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:
+    """Methods that are served, those that could be with other topics, and what the others lack."""
     for method, missing in facts.missing.items():
-        if missing:
-            say(f"{method}: no, it lacks {'; '.join(missing)}")
-        else:
+        if not missing:
             console.print(f"[green]{method}: yes[/]")
+    for suggestion in found:
+        if not suggestion.missing:
+            console.print(f"[yellow]{suggestion.method}: with these topics (calibrate --auto-topics takes them)[/]")
+            for reason in suggestion.reasons:
+                say(f"  {reason}")
+            for line in suggestion.yaml.split("\n"):
+                say(f"  {line}")
+    whole = {suggestion.method for suggestion in found if not suggestion.missing}
+    for method, missing in facts.missing.items():
+        if missing and method not in whole:
+            say(f"{method}: no, it lacks {'; '.join(missing)}")
 
 
 def show_plan(plan: Plan) -> None:

@@ -61,6 +61,10 @@ class Recording:
         made = {name: found for name, source in self._made.items() if (found := self._made_topic(name, source))}
         return {**recorded, **made}
 
+    def remark(self, sentence: str) -> None:
+        """Note something that was assumed about the recording."""
+        self._container.remarks = (*self._container.remarks, sentence)
+
     def use(self, sources: Iterable[TopicSource], columns: Mapping[str, TableTopic]) -> None:
         """Take what the config says of topics that are made of others, and of the columns of tables.
 
@@ -123,7 +127,7 @@ class Recording:
     @property
     def times(self) -> Mapping[str, Times]:
         """Topic -> stamps (log times where there is no header to be read) and log times."""
-        made = {name: source.topic or source.gyro or "" for name, source in self._made.items()}
+        made = {name: source.parts[0] for name, source in self._made.items()}
         times = self._reader.times
         return {**times, **{name: times[base] for name, base in made.items() if base in times}}
 
@@ -141,8 +145,7 @@ class Recording:
         """
         wanted = dict(topics)
         for name in wanted.keys() & self._made.keys():
-            source = self._made[name]
-            wanted |= {part: () for part in (source.topic, source.gyro, source.accel) if part is not None}
+            wanted |= dict.fromkeys(self._made[name].parts, ())
         self._reader.read_together(wanted)
 
     def imu(self, topic: str) -> series.ImuSeries:
@@ -258,7 +261,7 @@ class Recording:
 
     def _made_topic(self, name: str, source: TopicSource) -> Topic | None:
         """What a made topic is; None if something that it is made of is not there."""
-        parts = [self._reader.topics.get(part) for part in (source.topic, source.gyro, source.accel) if part]
+        parts = [self._reader.topics.get(part) for part in source.parts]
         found = [part for part in parts if part is not None]
         if len(found) < len(parts):
             return None

@@ -64,6 +64,11 @@ class TopicSource(BaseModel):
         return self.topic is None or self.frames is not None or self.invert
 
     @property
+    def parts(self) -> tuple[str, ...]:
+        """The recorded topics it is made of."""
+        return tuple(part for part in (self.topic, self.gyro, self.accel) if part is not None)
+
+    @property
     def name(self) -> str:
         """Of the topic recorded, or what is said of the one that is made."""
         if self.topic is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import reprlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -49,7 +50,8 @@ def _find(name_or_path: str | Path, folders: Sequence[Path]) -> Path:
     shipped = {p.stem: p for folder in folders for p in sorted(folder.glob("*.yaml"))}
     if str(name_or_path) in shipped:
         return shipped[str(name_or_path)]
-    raise InputError(f"no scenario file {name_or_path}; give a file or one of {', '.join(sorted(shipped))}")
+    near = difflib.get_close_matches(str(name_or_path), sorted(shipped), n=3, cutoff=0.0)
+    raise InputError(f"no scenario file {name_or_path}; the nearest are {', '.join(near)}")
 
 
 def explain(error: ErrorDetails, model: type[BaseModel]) -> str:

@@ -1,0 +1,124 @@
+"""Topics found by what they measured: which gyro with which attitude, delays, inverses; what a command makes of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.config import load_config
+from pipelines.discovery import suggestions, unused, with_suggested
+from pipelines.errors import InputError
+from pipelines.methods import simulate
+from pipelines.methods.head.recording import read_head
+from pipelines.recording import series
+from pipelines.recording.pairing import pair
+from pipelines.recording.reading import Recording, open_recording
+from pipelines.recording.sources import inverted
+from pipelines.recording.writing import write_session
+from tests.command import Command
+
+NONE = load_config(None)
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("discovery") / "head.mcap"
+    simulate("head", "head_mounts", 3, path)
+    return path
+
+
+def renamed(source: Path, path: Path, invert: bool = False, late_ns: int = 0) -> Recording:
+    """The recording under a tracker's and drivers' names, without config."""
+    whole = open_recording(source)
+    poses = whole.poses("/vision/attitude")
+    late = series.PoseSeries(poses.t_ns + late_ns, poses.wxyz, poses.position, poses.cov)
+    write_session(
+        path,
+        {
+            "/xsens/data": whole.imu("/head/imu"),
+            "/tracker/pose": inverted(late) if invert else late,
+            "/vehicle/imu": whole.imu("/platform/imu"),
+        },
+    )
+    return open_recording(path)
+
+
+@pytest.mark.parametrize("invert", [False, True])
+def test_the_gyro_that_turns_with_an_attitude_is_found(invert: bool, simulated: Path, tmp_path: Path) -> None:
+    recording = renamed(simulated, tmp_path / "s.mcap", invert, 40_000_000)
+    poses = recording.poses("/tracker/pose")
+    found: dict[str, Any] = {}
+    for name in ("/xsens/data", "/vehicle/imu"):
+        imu = recording.imu(name)
+        found[name] = pair(imu.t_ns, imu.gyro, poses.t_ns, poses.wxyz)
+    ours, other = found["/xsens/data"], found["/vehicle/imu"]
+    assert ours.correlation > 0.85
+    assert ours.inverted == invert
+    assert other is None or other.correlation < 0.5
+    # The scenario's camera is stamped 12 ms late; the ends of a finite difference blur it by some ms.
+    assert ours.offset_s == pytest.approx(-0.04 + 0.012, abs=0.006)
+
+
+def test_nothing_is_said_of_sensors_at_rest() -> None:
+    rng = np.random.default_rng(1)
+    t_ns = 10_000_000 * np.arange(3000)
+    wxyz = np.tile([1.0, 0.0, 0.0, 0.0], (3000, 1))
+    assert pair(t_ns, 1e-3 * rng.normal(size=(3000, 3)), t_ns, wxyz) is None
+    assert pair(t_ns[:5], np.ones((5, 3)), t_ns, wxyz) is None
+    assert pair(t_ns[:0], np.ones((0, 3)), t_ns, wxyz) is None
+
+
+def test_what_is_suggested_reads_as_the_recording_did_under_its_own_names(simulated: Path, tmp_path: Path) -> None:
+    recording = renamed(simulated, tmp_path / "s.mcap", invert=True)
+    (head,) = (found for found in suggestions(recording, NONE) if found.method == "head")
+    assert head.missing == ()
+    assert head.yaml.split("\n") == [
+        "topics:",
+        "  head_imu: /xsens/data",
+        "  vision_attitude: {topic: /tracker/pose, invert: true}",
+        "  platform_imu: /vehicle/imu",
+    ]
+    assert "as the inverse of the attitude meant" in head.reasons[0]
+    assert unused(recording, NONE) == ("/tracker/pose", "/vehicle/imu", "/xsens/data")
+    assert load_config(head.yaml.encode()).topics == head.topics
+    config = with_suggested(recording, NONE)
+    assert config.method == "head"
+    assert recording.notes[0].startswith("topics taken as suggested for head: /tracker/pose turns with /xsens/data")
+    data, expected = read_head(recording, config), read_head(open_recording(simulated), NONE)
+    np.testing.assert_array_equal(data.head_gyro, expected.head_gyro)
+    np.testing.assert_allclose(data.vision_wxyz, expected.vision_wxyz, atol=1e-15)
+    assert unused(recording, config) == ()
+
+
+def test_a_recording_that_is_served_is_left_alone(simulated: Path) -> None:
+    recording = open_recording(simulated)
+    assert with_suggested(recording, NONE) == NONE
+    assert "head" not in {found.method for found in suggestions(recording, NONE)}
+
+
+def test_the_commands_suggest_and_say_what_is_nearest(simulated: Path, tmp_path: Path, alidade: Command) -> None:
+    path = tmp_path / "s.mcap"
+    renamed(simulated, path)
+    shown = alidade("info", path, "--quiet").out
+    assert shown.index("head: with these topics") < shown.index("head_imu: /xsens/data") < shown.index("los: no")
+    assert "used by no method: /tracker/pose, /vehicle/imu, /xsens/data" in shown
+    told = json.loads(alidade("info", path, "--json").out)
+    assert told["methods"]["head"]["suggested"]["platform_imu"] == "/vehicle/imu"
+    assert told["methods"]["head"]["still_missing"] == []
+    assert not told["methods"]["los"]["served"]
+    for method in ([], ["--method", "head"]):
+        refused = alidade("calibrate", path, *method)
+        assert refused.code == 2
+        assert "nearest is for head: /tracker/pose turns with /xsens/data" in refused.err
+        assert "`topics: {head_imu: /xsens/data, vision_attitude: /tracker/pose" in refused.err
+
+
+def test_a_recording_without_anything_is_one_line(tmp_path: Path) -> None:
+    write_session(tmp_path / "s.mcap", {"/v": series.VectorSeries(np.arange(5), np.zeros((5, 3)))})
+    named = r"/v \(Vector3Stamped, 5 messages\) can serve as head_imu.*still lacking: /vision"
+    with pytest.raises(InputError, match=named):
+        with_suggested(open_recording(tmp_path / "s.mcap"), NONE)
