@@ -115,7 +115,7 @@ def plan(
     config: str | Path | None = None,
     require: Mapping[str, float] | None = None,
 ) -> Plan:
-    """How well a planned motion would tell each parameter, and a better one: `.now.sigmas`, `.steps`, `.best`.
+    """How well a planned motion would determine each parameter, and a better one: `.now.sigmas`, `.steps`, `.best`.
 
     Raises:
         InputError: no such method, scenario or parameter.

@@ -202,7 +202,7 @@ def plan(
     out: Annotated[Path | None, typer.Option(help="File for the better motion, as a scenario.")] = None,
     quiet: _Quiet = False,
 ) -> None:
-    """How well a planned motion would tell each parameter, and a better one. Exit code 3 if less than required."""
+    """How well a planned motion would determine each parameter, and a better one. Exit code 3 if less than required."""
     from pipelines import progress, terminal
     from pipelines.planning import make_plan, requirements, write_scenario
 

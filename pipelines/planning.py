@@ -1,4 +1,4 @@
-"""Before recording: what a planned motion would tell, what it would leave weak, and a motion that tells more.
+"""Before recording: what a planned motion would determine, what it would leave weak, and a motion that determines more.
 
     plan = make_plan("los", "my_sway.yaml", None, {"delta_px": 1e-4})
     plan.now.assessment.status, [step.change for step in plan.steps]
@@ -22,7 +22,7 @@ from pipelines.judgement.observability import Assessment, assess
 from pipelines.methods import Method, Scenario
 
 _MOST_STEPS = 3
-# A change that tells less than this about what is missing, nats, is not worth the trouble.
+# A change that brings less information than this on what is missing, nats, is not worth the trouble.
 _LEAST_GAIN = 0.1
 # Of all simulations.
 _SEED = 0
@@ -30,7 +30,7 @@ _SEED = 0
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a recording of a motion would tell.
+    """What a recording of a motion would determine.
 
     Attributes:
         scenario: the motion.
@@ -75,7 +75,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Plan:
-    """A planned motion and the changes that would make it tell more, the most telling first."""
+    """A planned motion and the changes that would make it determine more, the most informative first."""
 
     method: str
     now: Prediction

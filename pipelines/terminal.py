@@ -181,15 +181,15 @@ def show_plan(plan: Plan) -> None:
     for direction in plan.now.assessment.directions:
         say(f"  {direction.verdict}: {direction.label}: {direction.advice}")
     if not plan.now.missing:
-        say(f"This motion, {plan.now.duration:.0f} s of it, tells everything as accurately as required.")
+        say(f"This motion, {plan.now.duration:.0f} s of it, determines everything as accurately as required.")
         return
-    say("Better:" if plan.steps else "None of the changes tried tells what is missing.")
+    say("Better:" if plan.steps else "None of the changes tried determines what is missing.")
     for step in plan.steps:
         say(f"  {step.change} ({step.gain:.1f} nats of what is missing)")
     if plan.best.missing:
         say(f"Still short: {', '.join(f'{name} by {ratio:.2g}' for name, ratio in plan.best.missing.items())}.")
     else:
-        say(f"With that, {plan.best.duration:.0f} s tell everything as accurately as required.")
+        say(f"With that, {plan.best.duration:.0f} s determine everything as accurately as required.")
 
 
 def show_noise(study: NoiseStudy) -> None:

@@ -13,6 +13,7 @@ from pipelines.methods import method
 from pipelines.recording.reading import open_recording
 from pipelines.reports.calibration import SavedCalibration, load_calibration
 from pipelines.reports.validation import validation_html, validation_rows
+from pipelines.reports.whole import write_page
 from pipelines.session import resolve_method
 
 FILE = "validation.html"
@@ -41,7 +42,7 @@ class Validated:
         """What a reader has to know beside the numbers."""
         out = [*self.lost, *(f"{v.name}: {v.note}" for v in self.validations if v.note)]
         if self.same_recording:
-            out.append("this is the recording it was calibrated on; another one tells more")
+            out.append("this is the recording it was calibrated on; another one says more")
         if self.calibration.status != "calibrated":
             out.append(f"the calibration's own verdict is {self.calibration.status}")
         return out
@@ -91,10 +92,4 @@ def table(validated: Validated) -> list[str]:
 
 def write_validation(out_dir: Path, validated: Validated) -> Path:
     """Write validation.html; returns its path. Raises InputError when it cannot be written."""
-    text = validation_html(validated.validations, validated.calibration, validated.recording)
-    try:
-        out_dir.mkdir(parents=True, exist_ok=True)
-        (out_dir / FILE).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{out_dir}: the validation cannot be written ({error.strerror})") from error
-    return out_dir / FILE
+    return write_page(out_dir, FILE, validation_html(validated.validations, validated.calibration, validated.recording))

@@ -132,7 +132,7 @@ def test_kalibr_loads_and_holds_the_noise_measured() -> None:
     }
     assert all(isinstance(v, int | float) for name, v in values.items() if name != "rostopic")
     assert "accelerometer_random_walk: 3.0000e-05 # m/s^2/s/sqrt(Hz), upper bound" in text
-    with pytest.raises(InputError, match="does not tell the noise of accelerometer and gyro"):
+    with pytest.raises(InputError, match="does not hold the noise of accelerometer and gyro"):
         exported(_calibration(eye, zero), "kalibr")
 
 

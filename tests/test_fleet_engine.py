@@ -159,7 +159,7 @@ def test_a_recording_that_kills_workers_is_set_aside(
     bad = {name for name, result in outcome.results.items() if result["exit_code"] != 0}
     assert {Path(name).name for name in bad} == {"U03.mcap"}
     assert len(outcome.results) == COUNT
-    assert any("set aside" in line and "U03.mcap" in line for line in outcome.summary)
+    assert any("quarantined" in line and "U03.mcap" in line for line in outcome.summary)
     assert outcome.results[bad.pop()]["exit_code"] == 137
     assert len(finished(tmp_path / "out")) == COUNT - 1
 

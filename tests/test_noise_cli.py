@@ -81,7 +81,7 @@ def test_table_section_and_files(static: Path, alidade: Command, tmp_path: Path)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["noise.html", "noise.json"]
     page = (tmp_path / "out" / "noise.html").read_text(encoding="utf-8")
     assert "gyro_bias_walk: " in page
-    assert "random walk: 20 min at rest do not tell it" in page  # of the accelerometer
+    assert "random walk: 20 min at rest do not determine it" in page  # of the accelerometer
 
 
 def test_json_is_all_there_is_on_stdout(static: Path, alidade: Command) -> None:

@@ -56,7 +56,7 @@ def test_ellipses_are_drawn_of_correlated_pairs_only() -> None:
 def test_what_cannot_be_written_is_bad_input(tmp_path: Path) -> None:
     assert write_compare(tmp_path / "new", solvers(), {}, {}).read_text().startswith("<!doctype html>")
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(InputError, match="no folder to write results to"):
         write_compare(tmp_path / "file", solvers(), {}, {})
 
 

@@ -5,7 +5,7 @@
             ...
 
 A task whose worker dies is done again by another. Dask gives a task up after several deaths, but it may only have
-waited on a worker that another one killed: so each is tried once more alone, and set aside if that kills too.
+waited on a worker that another one killed: so each is tried once more alone, and quarantined if that kills too.
 """
 
 from __future__ import annotations

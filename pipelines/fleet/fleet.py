@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 from pipelines import exit_codes, methods, progress
 from pipelines.config import load_config
 from pipelines.errors import InputError
-from pipelines.fleet.attempt import attempt, failure, set_aside
 from pipelines.fleet.engine import Killed, cluster, completed, source_version
+from pipelines.fleet.isolated import failure, quarantined, run_isolated
 from pipelines.fleet.recordings import as_date, from_metadata, from_name, local
 from pipelines.fleet.store import Result, Store, settings_key
 
@@ -73,12 +73,12 @@ class Outcome:
 
     @property
     def summary(self) -> list[str]:
-        """In a few lines: how many, with what verdicts, and what was set aside."""
+        """In a few lines: how many, with what verdicts, and what was quarantined."""
         statuses = [result["status"] for result in self.results.values()]
         verdicts = ", ".join(f"{statuses.count(status)} {status}" for status in sorted(set(statuses)))
         lines = [f"{len(self.results)} of {self.recordings} recordings, {self.kept} from an earlier run: {verdicts}"]
         aside = [name for name, result in self.results.items() if result["exit_code"] == exit_codes.KILLED]
-        lines += [f"set aside, it kills workers: {name}" for name in aside]
+        lines += [f"quarantined, it kills workers: {name}" for name in aside]
         return [*lines, "interrupted; the same command continues"] if self.interrupted else lines
 
 
@@ -117,7 +117,7 @@ def calibrate_fleet(
                 completed(client, calibrate_recording, tasks), "calibrating", len(tasks)
             ):
                 if isinstance(result, Killed):
-                    fresh[name] = set_aside()
+                    fresh[name] = quarantined()
                 elif result is None:
                     kept.append(name)
                 elif "sha256" in result:
@@ -157,7 +157,7 @@ def _calibrated(path: Path, settings: Settings) -> Result:
         if settings.config is not None:
             config = Path(folder) / "config.yaml"
             config.write_text(settings.config, encoding="utf-8")
-        return attempt(_summary, path, settings.solver, settings.method, config, settings.window)
+        return run_isolated(_summary, path, settings.solver, settings.method, config, settings.window)
 
 
 def _summary(calibration: Calibration) -> Result:

@@ -21,8 +21,8 @@ import numpy as np
 from pipelines import methods, progress
 from pipelines.errors import InputError
 from pipelines.fleet import require_extra, statistics
-from pipelines.fleet.attempt import attempt, set_aside
 from pipelines.fleet.engine import Killed, cluster, completed, source_version
+from pipelines.fleet.isolated import quarantined, run_isolated
 from pipelines.fleet.store import Result, Store, settings_key
 from pipelines.fleet.tables import Cell, Row
 
@@ -162,7 +162,7 @@ def run_study(
                     completed(client, simulate_and_solve, tasks), "simulating and solving", len(tasks)
                 ):
                     if isinstance(result, Killed):
-                        killed[name] = dict.fromkeys(solvers, set_aside())
+                        killed[name] = dict.fromkeys(solvers, quarantined())
                     else:
                         store.add(name, result)
             except KeyboardInterrupt:
@@ -183,7 +183,7 @@ def simulate_and_solve(
             Path(scenario).write_text(text, encoding="utf-8")
         session = Path(folder) / "session.mcap"
         methods.simulate(method, scenario, seed, session)
-        return {solver: attempt(_numbers, session, solver, method, None, window) for solver in solvers}
+        return {solver: run_isolated(_numbers, session, solver, method, None, window) for solver in solvers}
 
 
 def run_table(study: Study) -> list[Row]:

@@ -10,8 +10,8 @@ from pipelines.graph.problem import Array, Factor, Parameter
 
 # A fixed quantity is held by a prior this much tighter than the accuracy wanted of it.
 _PINNED = 1e-6
-# A free quantity is held by a prior this much wider than the default one. It tells nothing, but without it a smoother
-# could not even begin where the data do not determine the quantity, or not yet.
+# A free quantity is held by a prior this much wider than the default one. It adds next to no information, but without
+# it a smoother could not even begin where the data do not determine the quantity, or not yet.
 _FREE = 10.0
 
 

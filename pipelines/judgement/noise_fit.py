@@ -52,11 +52,11 @@ class Coefficient:
 
     Attributes:
         name: Q, N, B or K.
-        value: its estimate; None when the record does not tell it.
+        value: its estimate; None when the record does not determine it.
         sigma: of the value, one standard deviation.
         low, high: 95 % interval; of a noise that is not told, 0 and what it is below with 95 % confidence.
-        needed_s: length of a record, s, that would tell a noise of half that bound; None where the value is told, or no
-            record of a month would.
+        needed_s: length of a record, s, that would determine a noise of half that bound; None where the value is told,
+            or no record of a month would.
     """
 
     name: str

@@ -115,7 +115,7 @@ class Method(ABC):
         """Write data as a recording, with truth and config attached. Raises InputError when it cannot be written."""
 
     def candidates(self, scenario: Scenario) -> Iterator[tuple[str, Scenario]]:  # noqa: ARG002
-        """Changes of a motion that may tell more: in words, and the changed motion."""
+        """Changes of a motion that may determine more: in words, and the changed motion."""
         return iter(())
 
     # -- judgement

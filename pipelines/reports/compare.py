@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.errors import InputError
 from pipelines.graph.problem import Quantity
 from pipelines.judgement.halves import Halves
 from pipelines.reports.plots import COLORS, add_line, band, figure
 from pipelines.reports.result import Calibration, Plot, truth_errors
 from pipelines.reports.templating import environment
 from pipelines.reports.units import human_unit, to_digits_of
+from pipelines.reports.whole import write_page
 
 FILE = "compare.html"
 # Lines of the solvers, the exact ones over the published.
@@ -63,13 +63,7 @@ def write_compare(
     out_dir: Path, calibrations: Sequence[Calibration], halves: Mapping[str, Halves], predicted: Mapping[str, float]
 ) -> Path:
     """Write compare.html; returns its path. Raises InputError when it cannot be written."""
-    text = compare_html(calibrations, halves, predicted)
-    try:
-        out_dir.mkdir(parents=True, exist_ok=True)
-        (out_dir / FILE).write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{out_dir}: the comparison cannot be written ({error.strerror})") from error
-    return out_dir / FILE
+    return write_page(out_dir, FILE, compare_html(calibrations, halves, predicted))
 
 
 def _found(calibration: Calibration, name: str) -> tuple[float, float] | None:

@@ -99,7 +99,7 @@ def remarks(sensor: SensorNoise) -> list[str]:
     for name, words in _COEFFICIENTS.items():
         silent = [c for axis in sensor.axes if (c := _of(sensor, axis, name)).value is None]
         if silent and name != "Q":
-            out.append(f"{words}: {length(sensor.length_s)} at rest do not tell {_needed(silent)}")
+            out.append(f"{words}: {length(sensor.length_s)} at rest do not determine {_needed(silent)}")
     for axis, noise in sensor.axes.items():
         out += [
             f"{axis}: a sinusoid at {line.hz:.5g} Hz, amplitude {line.amplitude:.2g} {sensor.unit}, is not in the "
@@ -210,13 +210,13 @@ def _scientific(c: Coefficient) -> str:
 
 
 def _needed(silent: Sequence[Coefficient]) -> str:
-    """After 'do not tell': of what, and what would."""
+    """After 'do not determine': of what, and what would."""
     times = [c.needed_s for c in silent if c.needed_s is not None]
     bound = "it is below the numbers given (95 %)"
     if not times:
         return f"it; {bound}"
     low, high = length(min(times)), length(max(times))
-    return f"it; {bound}; {low if low == high else f'{low} to {high}'} in one piece would tell half of them"
+    return f"it; {bound}; {low if low == high else f'{low} to {high}'} in one piece would determine half of them"
 
 
 def _line(sensor: SensorNoise, name: str, key: str, values: dict[str, float] | None) -> str:

@@ -43,6 +43,16 @@ def write_whole(out_dir: Path, names: Sequence[str], make: Callable[[Path], None
             shutil.rmtree(out_dir, ignore_errors=True)
 
 
+def write_page(out_dir: Path, name: str, text: str) -> Path:
+    """One page of text; returns its path. Raises InputError when it cannot be written."""
+    (path,) = write_whole(out_dir, [name], lambda folder: _write_text(folder / name, text))
+    return path
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+
+
 def _move(part: Path, out_dir: Path, names: Sequence[str]) -> tuple[Path, ...]:
     (out_dir / names[-1]).unlink(missing_ok=True)
     written = []

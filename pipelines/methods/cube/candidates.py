@@ -1,4 +1,4 @@
-"""Changes of a planned cube recording that may tell more."""
+"""Changes of a planned cube recording that may determine more."""
 
 from __future__ import annotations
 

@@ -124,12 +124,12 @@ def _ros2(saved: SavedCalibration) -> str:
 def _kalibr(saved: SavedCalibration) -> str:
     """Kalibr's imu.yaml: noise of the calibrated sensors, one number for three axes.
 
-    Raises InputError when the calibration does not tell the noise.
+    Raises InputError when the calibration does not hold the noise.
     """
     noise: dict[str, Any] = {str(row.get("sensor")): row for row in saved.findings.get("noise", [])}
     if not all(min(noise.get(name, {}).get("density", [0.0])) > 0.0 for name in ("accel", "gyro")):
         raise InputError(
-            "the calibration does not tell the noise of accelerometer and gyro: let the device rest longer"
+            "the calibration does not hold the noise of accelerometer and gyro: let the device rest longer"
         )
     lines = [
         "# Noise with K and b applied. Densities are measured at rest, root mean squares of the axes. Walks are not",

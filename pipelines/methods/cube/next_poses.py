@@ -1,4 +1,4 @@
-"""Attitudes to rest a cube in next: those that tell most beyond the poses there are.
+"""Attitudes to rest a cube in next: those that add most information beyond the poses there are.
 
 What a pose adds is judged sensor by sensor. Accelerometer and magnetometer at rest tell of a triad's twelve numbers by
 x = (n, 1), n the direction of gravity or field in the body: a pose adds log(1 + x' N^-1 x), N the sum of xx' so far

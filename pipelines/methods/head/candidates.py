@@ -1,4 +1,4 @@
-"""Changes of a planned head recording that may tell more."""
+"""Changes of a planned head recording that may determine more."""
 
 from __future__ import annotations
 

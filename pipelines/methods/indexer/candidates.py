@@ -1,4 +1,4 @@
-"""Changes of a planned indexer recording that may tell more."""
+"""Changes of a planned indexer recording that may determine more."""
 
 from __future__ import annotations
 

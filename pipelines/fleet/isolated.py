@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pipelines.reports.result import Calibration
 
 
-def attempt(
+def run_isolated(
     summarise: Callable[[Calibration], Result],
     path: Path,
     solver: str,
@@ -52,6 +52,6 @@ def failure(exit_code: int, reason: str) -> Result:
     return {"status": "failed", "exit_code": exit_code, "reason": " ".join(reason.split()), "parameters": {}}
 
 
-def set_aside() -> Result:
+def quarantined() -> Result:
     """The result of what killed its workers."""
-    return failure(exit_codes.KILLED, "killed its worker each time it was tried, at last alone; set aside")
+    return failure(exit_codes.KILLED, "killed its worker each time it was tried, at last alone; quarantined")
