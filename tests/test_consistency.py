@@ -19,7 +19,7 @@ from pipelines.judgement.causes import find_causes
 from pipelines.judgement.halves import cut, held_out, split_halves
 from pipelines.judgement.rejection import rejection_sentence, too_many_rejected
 from pipelines.methods import Method, method
-from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.simulation import CubeCamera, CubeScenario, cube_config, simulate_cube
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.methods.head.recording import write_head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
@@ -167,7 +167,7 @@ def test_late_encoders(indexer: Case) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 4])
 def test_size_of_the_cubes_tags(seed: int) -> None:
-    scenario = CubeScenario(poses=8, static_s=2, imu_rate_hz=50, camera_rate_hz=5)
+    scenario = CubeScenario(poses=8, static_s=2, imu_rate_hz=50, camera=CubeCamera(rate_hz=5))
     data, _ = simulate_cube(scenario, seed)
     config = load_config(cube_config(scenario).encode())
     tags = {i: tag.model_copy(update={"size": 1.03 * tag.size}) for i, tag in config.section(CubeConfig).tags.items()}

@@ -18,11 +18,11 @@ from factors import so3
 from pipelines import cli
 from pipelines.methods import simulate
 from pipelines.methods.cube.data import CubeData, Sightings
-from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.simulation import CubeCamera, CubeScenario, cube_config, simulate_cube
 from pipelines.methods.cube.writing import write_cube
 from pipelines.vision.camera import Camera
 
-SCENARIO = CubeScenario(poses=8, static_s=1.5, turn_rad_s=1.5, camera_rate_hz=5.0)
+SCENARIO = CubeScenario(poses=8, static_s=1.5, turn_rad_s=1.5, camera=CubeCamera(rate_hz=5.0))
 CONFIG = cube_config(SCENARIO)
 Command = Callable[..., tuple[int, str, str]]
 
@@ -133,7 +133,9 @@ def test_a_cube_that_is_not_rigid_names_the_tag(alidade: Command, tmp_path: Path
 
 
 def test_blurred_pictures_only(alidade: Command, tmp_path: Path) -> None:
-    (tmp_path / "blurred.yaml").write_text("{poses: 1, static_s: 1.5, picture_rate_hz: 1.0, blur_px: 25.0}")
+    (tmp_path / "blurred.yaml").write_text(
+        "{poses: 1, static_s: 1.5, camera: {pictures: {rate_hz: 1.0, blur_px: 25.0}}}"
+    )
     simulate("cube", str(tmp_path / "blurred.yaml"), 1, tmp_path / "s.mcap", images=True)
     (tmp_path / "blurred.yaml").unlink()
     _refused(alidade, tmp_path, "no tag is seen sharply in any of the .* are they blurred")

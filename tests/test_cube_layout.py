@@ -13,12 +13,19 @@ from factors import so3
 from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.methods.cube.layout import cube_layout, layout_yaml
-from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.simulation import CubeCamera, CubeScenario, Errors, TagCube, cube_config, simulate_cube
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.methods.cube.writing import write_cube
 from pipelines.recording.reading import open_recording
 
-SCENARIO = CubeScenario(poses=16, static_s=1.0, turn_rad_s=1.5, camera_rate_hz=4.0, tag_mount=0.02, magnetometer=False)
+SCENARIO = CubeScenario(
+    poses=16,
+    static_s=1.0,
+    turn_rad_s=1.5,
+    camera=CubeCamera(rate_hz=4.0),
+    errors=Errors(tag_mount=0.02),
+    magnetometer=None,
+)
 
 
 def _session(path: Path, seed: int, scenario: CubeScenario = SCENARIO) -> dict[str, float]:
@@ -62,7 +69,7 @@ def test_layout_as_a_config_reads_back(tmp_path: Path) -> None:
 
 
 def test_a_tag_never_seen_is_not_placed(tmp_path: Path) -> None:
-    _session(tmp_path / "s.mcap", 5, SCENARIO.model_copy(update={"faces_hidden": [19]}))
+    _session(tmp_path / "s.mcap", 5, SCENARIO.model_copy(update={"cube": TagCube(hidden=(19,))}))
     recording = open_recording(tmp_path / "s.mcap")
     layout = cube_layout(recording, load_config(recording.attachment("alidade.yaml")))
     assert layout.unplaced == (19,)

@@ -24,7 +24,17 @@ from pipelines.methods.cube.findings import findings
 from pipelines.methods.cube.graph import problem
 from pipelines.methods.cube.published import published_estimate
 from pipelines.methods.cube.recording import read_cube
-from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.simulation import (
+    CubeCamera,
+    CubeScenario,
+    Errors,
+    FieldErrors,
+    Magnetometer,
+    ReferenceAttitude,
+    TagCube,
+    cube_config,
+    simulate_cube,
+)
 from pipelines.methods.cube.static_intervals import static_intervals
 from pipelines.methods.cube.topics import CubeConfig, Raw, RawConversion
 from pipelines.methods.cube.validation import validate
@@ -35,12 +45,12 @@ from pipelines.solvers.incremental import solve_incremental
 
 # The default field prior leaves the magnetometer's scale at one per cent; here the field is known better, and is so.
 FIELD = {"field_e": 1e-8, "field_n": 1e-8, "field_u": 1e-8}
-NEAR_MODEL = {"field_direction": 1e-8, "field_strength": 1e-8}
-ONE_DEGREE = {"reference_heading_deg": 1.0, "reference_heading_error_deg": 0.0}
+NEAR_MODEL = {"field": FieldErrors(direction=1e-8, strength=1e-8)}
+ONE_DEGREE = {"reference": ReferenceAttitude(heading_deg=1.0, heading_error_deg=0.0)}
 
 # Enough for everything to be calibrated; a third as long as the nominal scenario.
-NOMINAL: dict[str, Any] = {"poses": 24, "static_s": 4.0, "turn_rad_s": 0.8, "camera_rate_hz": 10.0}
-SHORT: dict[str, Any] = {"poses": 16, "static_s": 2.0, "turn_rad_s": 1.6, "camera_rate_hz": 5.0}
+NOMINAL: dict[str, Any] = {"poses": 24, "static_s": 4.0, "turn_rad_s": 0.8, "camera": CubeCamera(rate_hz=10.0)}
+SHORT: dict[str, Any] = {"poses": 16, "static_s": 2.0, "turn_rad_s": 1.6, "camera": CubeCamera(rate_hz=5.0)}
 
 
 @cache
@@ -73,7 +83,7 @@ def _sigmas_off(estimate: Estimate, truth: dict[str, float], names: str = "") ->
 @pytest.mark.parametrize("missing", [[], ["magnetometer"], ["reference"], ["reference", "magnetometer"]], ids=str)
 def test_every_mode_with_a_camera(missing: list[str]) -> None:
     if missing:
-        data, truth, config = _simulated(4, **NEAR_MODEL, **dict.fromkeys(missing, False))
+        data, truth, config = _simulated(4, **NEAR_MODEL, **dict.fromkeys(missing))
         priors = {} if "magnetometer" in missing else FIELD
         built, estimate, judged = _solved(data, config.model_copy(update={"priors": priors}))
     else:
@@ -89,7 +99,7 @@ def test_every_mode_with_a_camera(missing: list[str]) -> None:
 
 
 def test_without_a_camera_the_accelerometer_defines_the_body() -> None:
-    data, truth, config = _simulated(5, camera=False, reference=False, magnetometer=False, poses=30)
+    data, truth, config = _simulated(5, camera=None, reference=None, magnetometer=None, poses=30)
     _, estimate, judged = _solved(data, config)
     assert judged.status == "calibrated", judged.headline
     assert max(_sigmas_off(estimate, truth).values()) < 4.0
@@ -130,7 +140,7 @@ def test_axes_never_turned_are_named() -> None:
 
 
 def test_a_face_never_seen_is_known_by_its_prior_alone() -> None:
-    data, _, config = _simulated(9, **NEAR_MODEL, faces_hidden=(19,))
+    data, _, config = _simulated(9, **NEAR_MODEL, cube=TagCube(hidden=(19,)))
     _, _, judged = _solved(data, config.model_copy(update={"priors": FIELD}))
     assert judged.verdicts["tag_19_x"] == "prior"
     assert "tag_19_x" in judged.headline
@@ -139,7 +149,7 @@ def test_a_face_never_seen_is_known_by_its_prior_alone() -> None:
 def test_wrong_heading_is_found_from_the_magnetometer() -> None:
     """With mount and field known well the heading is all that is left: 1 degree is found within 3 sigma."""
     priors = FIELD | dict.fromkeys(("camera_mount_x", "camera_mount_y", "camera_mount_z"), 1e-3)
-    data, truth, config = _simulated(10, **NEAR_MODEL, **ONE_DEGREE, camera_mount=1e-3)
+    data, truth, config = _simulated(10, **NEAR_MODEL, **ONE_DEGREE, errors=Errors(camera_mount=1e-3))
     _, estimate, judged = _solved(data, config.model_copy(update={"priors": priors | {"reference_heading": 0.1}}))
     heading = estimate.names.index("reference_heading")
     assert truth["reference_heading"] == pytest.approx(np.deg2rad(1.0))
@@ -161,7 +171,7 @@ def test_wrong_heading_is_absorbed_and_reported() -> None:
 
 
 def test_poses_near_iron_are_left_out() -> None:
-    data, truth, config = _simulated(11, disturbed=0.1)
+    data, truth, config = _simulated(11, magnetometer=Magnetometer(disturbed=0.1))
     _, estimate, _ = _solved(data, config)
     assert estimate.rejected["magnetometer"] > 0
     assert max(_sigmas_off(estimate, truth, "mag").values()) < 4.0
@@ -219,7 +229,7 @@ def test_graph_is_better_than_the_published_regression() -> None:
 
 def test_counts_are_calibrated_as_recorded() -> None:
     """The same session in counts: K and b are for the counts, sigmas and verdicts follow."""
-    data, truth, config = _simulated(14, poses=12, magnetometer=False)
+    data, truth, config = _simulated(14, poses=12, magnetometer=None)
     scale, offset = 2e-3, 30000.0
     counts = replace(data, accel=data.accel / scale + offset)
     raw = Raw(accel=RawConversion(scale=scale, offset=offset))
@@ -349,12 +359,12 @@ def _assert_as_good_from_pictures(folder: Path, scenario: str, corner_px: float)
 
 
 def test_from_a_few_pictures_as_good_as_from_corners_of_a_tenth_of_a_pixel(tmp_path: Path) -> None:
-    scenario = "poses: 6, static_s: 2.0, turn_rad_s: 4.0, camera_rate_hz: 1.0, picture_rate_hz: 1.0"
-    _assert_as_good_from_pictures(tmp_path, f"{scenario}, magnetometer: false", 0.1)
+    scenario = "poses: 6, static_s: 2.0, turn_rad_s: 4.0, camera: {rate_hz: 1.0, pictures: {rate_hz: 1.0}}"
+    _assert_as_good_from_pictures(tmp_path, f"{scenario}, magnetometer: null", 0.1)
 
 
 @pytest.mark.slow
 def test_from_pictures_as_good_as_from_perfect_corners(tmp_path: Path) -> None:
     """24 poses, 5 pictures a second."""
-    scenario = "poses: 24, static_s: 2.0, turn_rad_s: 2.0, camera_rate_hz: 5.0, picture_rate_hz: 5.0"
+    scenario = "poses: 24, static_s: 2.0, turn_rad_s: 2.0, camera: {rate_hz: 5.0, pictures: {rate_hz: 5.0}}"
     _assert_as_good_from_pictures(tmp_path, scenario, 1e-3)

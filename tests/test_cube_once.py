@@ -15,7 +15,7 @@ from pipelines.session import calibrate
 from pipelines.vision import pose
 
 POSES = 6
-SCENARIO = f"{{poses: {POSES}, static_s: 2.0, turn_rad_s: 4.0, camera_rate_hz: 1.0, picture_rate_hz: 1.0}}"
+SCENARIO = f"{{poses: {POSES}, static_s: 2.0, turn_rad_s: 4.0, camera: {{rate_hz: 1.0, pictures: {{rate_hz: 1.0}}}}}}"
 
 
 @pytest.mark.parametrize("images", [False, True], ids=["detections", "pictures"])

@@ -15,7 +15,7 @@ from pipelines.errors import InputError
 from pipelines.methods.cube.data import CubeData, Sightings, local_field
 from pipelines.methods.cube.poses import static_poses
 from pipelines.methods.cube.recording import read_cube
-from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.simulation import CubeCamera, CubeScenario, cube_config, simulate_cube
 from pipelines.methods.cube.static_intervals import static_intervals
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.methods.cube.writing import write_cube
@@ -23,7 +23,7 @@ from pipelines.recording.reading import open_recording
 from pipelines.settings import Config
 from pipelines.vision.camera import Camera
 
-SCENARIO = CubeScenario(poses=4, static_s=2.0, camera_rate_hz=5.0)
+SCENARIO = CubeScenario(poses=4, static_s=2.0, camera=CubeCamera(rate_hz=5.0))
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def test_rests_lie_within_the_true_ones(session: CubeData) -> None:
 
 def test_a_steady_turn_is_no_rest() -> None:
     """Constant rate about the vertical: as quiet as a rest, in gyro and accelerometer."""
-    data, _ = simulate_cube(CubeScenario(poses=2, static_s=5.0, camera=False), 2)
+    data, _ = simulate_cube(CubeScenario(poses=2, static_s=5.0, camera=None), 2)
     turning = (data.imu_t > 1.0) & (data.imu_t < 3.5)
     data = replace(data, gyro=data.gyro + 0.3 * turning[:, None])
     found = static_intervals(data, load_config(b""))
@@ -160,7 +160,7 @@ def test_no_static_pose(session: CubeData) -> None:
 
 
 def test_a_tag_that_is_not_where_the_config_says_is_named() -> None:
-    scenario = CubeScenario(poses=12, static_s=2.0, camera_rate_hz=5.0, magnetometer=False)
+    scenario = CubeScenario(poses=12, static_s=2.0, camera=CubeCamera(rate_hz=5.0), magnetometer=None)
     session, config = simulate_cube(scenario, 3)[0], load_config(cube_config(scenario).encode())
     tags = dict(config.section(CubeConfig).tags)
     turned = so3.multiply(tags[18].rotation, so3.exp([0.0, 0.0, np.pi / 2]))

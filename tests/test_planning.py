@@ -106,7 +106,9 @@ def test_what_no_motion_can_tell_gets_no_change(tmp_path: Path) -> None:
 
 def test_the_next_best_poses_of_a_cube_are_named_and_mend_the_plan(tmp_path: Path) -> None:
     """Three poses tell little; the scenario written holds the poses named, and simulates to what was foreseen."""
-    few = scenario_file(tmp_path, "{poses: 3, static_s: 1.5, turn_rad_s: 1.5, camera_rate_hz: 2, magnetometer: false}")
+    few = scenario_file(
+        tmp_path, "{poses: 3, static_s: 1.5, turn_rad_s: 1.5, camera: {rate_hz: 2}, magnetometer: null}"
+    )
     plan = make_plan("cube", few, most_steps=1)
     assert plan.now.assessment.status == "unobservable"
     (step,) = plan.steps
@@ -130,7 +132,7 @@ def test_the_next_pose_fills_the_gap() -> None:
         ("+z", "-y"),
     ]
     others = 3 * [Resting(up=up, north=north) for up, north in sides]
-    scenario = CubeScenario(poses=0, attitudes=others, magnetometer=False)
+    scenario = CubeScenario(poses=0, attitudes=others, magnetometer=None)
     single, series = next_poses(scenario, 0, 2)
     assert {"-z"} <= {pose.up for pose in single}
     assert series[0] in single

@@ -14,7 +14,7 @@ from pipelines.errors import InputError
 from pipelines.methods.cube.data import CubeData, local_field
 from pipelines.methods.cube.graph import problem
 from pipelines.methods.cube.published import nominal_vectors, published_estimate, regression
-from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.simulation import CubeCamera, CubeScenario, Errors, cube_config, simulate_cube
 
 RNG = np.random.default_rng(1)
 K = np.eye(3) + 0.05 * RNG.normal(size=(3, 3))
@@ -78,7 +78,7 @@ def test_nominal_vectors_are_those_of_the_local_level_frame() -> None:
 
 def test_static_gyro_regression_returns_no_gain() -> None:
     """The defect that the graph is there for: earth rate alone, under MEMS noise."""
-    scenario = CubeScenario(poses=18, gain_error=0.0, camera_rate_hz=5.0)
+    scenario = CubeScenario(poses=18, errors=Errors(gain=0.0), camera=CubeCamera(rate_hz=5.0))
     data, _ = simulate_cube(scenario, 2)
     config = load_config(cube_config(scenario).encode())
     estimate = published_estimate(data, config, problem(data, config))
@@ -90,7 +90,7 @@ def test_static_gyro_regression_returns_no_gain() -> None:
 
 
 def test_needs_camera_and_reference() -> None:
-    scenario = CubeScenario(poses=4, camera=False)
+    scenario = CubeScenario(poses=4, camera=None)
     data, _ = simulate_cube(scenario, 2)
     config = load_config(cube_config(scenario).encode())
     with pytest.raises(InputError, match="needs a camera and a reference"):

@@ -15,13 +15,13 @@ from pipelines.methods.cube.data import CubeData
 from pipelines.methods.cube.figures import cube_plots
 from pipelines.methods.cube.findings import findings, parts_of, white_noise
 from pipelines.methods.cube.graph import problem
-from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.simulation import CubeCamera, CubeScenario, cube_config, simulate_cube
 from pipelines.methods.cube.tables import described
 from pipelines.reports.result import Calibration, Plot, Table
 from pipelines.settings import Config
 from pipelines.solvers.batch import solve_batch
 
-SCENARIO = CubeScenario(poses=10, static_s=3.0, turn_rad_s=1.2, camera_rate_hz=5.0)
+SCENARIO = CubeScenario(poses=10, static_s=3.0, turn_rad_s=1.2, camera=CubeCamera(rate_hz=5.0))
 Solved = tuple[CubeData, Config, Estimate, Findings, dict[str, float]]
 
 
@@ -131,7 +131,7 @@ def test_figures_and_tables(solved: Solved) -> None:
 
 
 def test_without_camera_and_magnetometer_there_is_less_to_show() -> None:
-    scenario = SCENARIO.model_copy(update={"camera": False, "reference": False, "magnetometer": False, "poses": 8})
+    scenario = SCENARIO.model_copy(update={"camera": None, "reference": None, "magnetometer": None, "poses": 8})
     data, truth = simulate_cube(scenario, 2)
     config = load_config(cube_config(scenario).encode())
     estimate = solve_batch(problem(data, config))

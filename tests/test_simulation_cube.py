@@ -15,7 +15,17 @@ from pipelines.methods import simulate
 from pipelines.methods.cube.faces import Resting
 from pipelines.methods.cube.poses import static_poses
 from pipelines.methods.cube.recording import read_cube
-from pipelines.methods.cube.simulation import YEAR, CubeNoise, CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.simulation import (
+    YEAR,
+    CubeCamera,
+    CubeNoise,
+    CubeScenario,
+    Errors,
+    FieldErrors,
+    ReferenceAttitude,
+    cube_config,
+    simulate_cube,
+)
 from pipelines.methods.cube.static_intervals import static_intervals
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.recording.reading import open_recording
@@ -26,15 +36,10 @@ EXACT = CubeScenario(
     poses=5,
     static_s=2.0,
     noise=QUIET,
-    reference_level_deg=1e-9,
-    reference_heading_noise_deg=1e-9,
-    camera_mount=0.0,
-    tag_mount=0.0,
-    field_direction=0.0,
-    field_strength=0.0,
-    reference_heading_error_deg=0.0,
-    occluded=0.0,
-    camera_rate_hz=5.0,
+    errors=Errors(camera_mount=0.0, tag_mount=0.0),
+    field=FieldErrors(direction=0.0, strength=0.0),
+    reference=ReferenceAttitude(level_noise_deg=1e-9, heading_noise_deg=1e-9, heading_error_deg=0.0),
+    camera=CubeCamera(rate_hz=5.0, occluded=0.0),
 )
 
 
@@ -53,8 +58,12 @@ def test_at_rest_every_sensor_says_what_the_attitude_seen_by_the_camera_predicts
     assert BRC is not None
     nRC = so3.multiply(data.reference_wxyz[0], BRC)
     field = np.array([truth[f"field_{axis}"] for axis in "enu"])
-    latitude = float(np.deg2rad(EXACT.latitude_deg))
-    vectors = {"accel": np.array([0, 0, gravity(latitude, EXACT.height)]), "gyro": earth_rate(latitude), "mag": field}
+    latitude = float(np.deg2rad(EXACT.place.latitude_deg))
+    vectors = {
+        "accel": np.array([0, 0, gravity(latitude, EXACT.place.height)]),
+        "gyro": earth_rate(latitude),
+        "mag": field,
+    }
     means = {"accel": poses.accel, "gyro": poses.gyro, "mag": poses.mag}
     for k, seen in enumerate(poses.tags):
         assert seen is not None
@@ -83,7 +92,7 @@ def test_the_gyro_leads_from_pose_to_pose() -> None:
     weights[[0, -1]] *= 0.5
     for rate, weight in zip(data.gyro[start : stop + 1], weights, strict=True):
         attitude = so3.multiply(attitude, so3.exp((K @ rate + b) * weight))
-    turned = earth_rate(float(np.deg2rad(EXACT.latitude_deg))) * (poses.span[-1, 0] - poses.span[0, 0])
+    turned = earth_rate(float(np.deg2rad(EXACT.place.latitude_deg))) * (poses.span[-1, 0] - poses.span[0, 0])
     attitude = so3.multiply(so3.exp(-turned), attitude)
     expected = so3.multiply(_nRC(data.reference_wxyz[0], config), last.pose.cRb)  # type: ignore[index]
     assert np.linalg.norm(so3.log(so3.multiply(so3.inverse(attitude), expected))) < 2e-4
@@ -94,7 +103,7 @@ def _nRC(nRB: np.ndarray, config: object) -> np.ndarray:
 
 
 def test_noise_is_as_stated() -> None:
-    scenario = CubeScenario(poses=1, static_s=60.0, magnetometer=True)
+    scenario = CubeScenario(poses=1, static_s=60.0)
     data, _ = simulate_cube(scenario, 3)
     noise = scenario.noise
     assert data.gyro.std(axis=0) == pytest.approx(noise.gyro_density * 10.0, rel=0.05)
@@ -107,7 +116,7 @@ def test_field_and_heading_are_drawn_as_their_priors_have_them() -> None:
     """Sigmas over seeds: 500 nT each way across the model's field, 133 nT along it, 10 mrad of heading."""
     truths = [simulate_cube(CubeScenario(poses=1, static_s=0.5), seed)[1] for seed in range(60)]
     field = np.array([[truth[f"field_{axis}"] for axis in "enu"] for truth in truths])
-    place = CubeScenario()
+    place = CubeScenario().place
     latitude, longitude = np.deg2rad([place.latitude_deg, place.longitude_deg])
     model = magnetic_field(latitude, longitude, place.height, YEAR)
     along = (field - model) @ model / np.linalg.norm(model)
@@ -120,7 +129,7 @@ def test_field_and_heading_are_drawn_as_their_priors_have_them() -> None:
 
 
 def test_same_seed_same_session_and_another_one_differs() -> None:
-    scenario = CubeScenario(poses=2, camera_rate_hz=2.0)
+    scenario = CubeScenario(poses=2, camera=CubeCamera(rate_hz=2.0))
     (a, truth_a), (b, truth_b), (c, _) = (simulate_cube(scenario, seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(a.gyro, b.gyro)
     assert truth_a == truth_b
@@ -130,7 +139,7 @@ def test_same_seed_same_session_and_another_one_differs() -> None:
 def test_given_attitudes_come_after_the_random_ones() -> None:
     """A side up, one to the north, the top leaned to the east; what the sensors say at rest follows."""
     given = [Resting(up="-x", north="+z"), Resting(up="+y", north="-x", lean_deg=30.0)]
-    scenario = EXACT.model_copy(update={"poses": 1, "attitudes": given, "gain_error": 0.0, "accel_bias": 0.0})
+    scenario = EXACT.model_copy(update={"poses": 1, "attitudes": given, "errors": Errors(gain=0.0, accel_bias=0.0)})
     east, north, up = np.eye(3)
     np.testing.assert_allclose(so3.rotate(given[0].nRb, [[-1, 0, 0], [0, 0, 1]]), [up, north], atol=1e-12)
     lean = np.deg2rad(30.0)
@@ -139,7 +148,7 @@ def test_given_attitudes_come_after_the_random_ones() -> None:
     assert str(given[1]) == "+y (tag 18) up, -x to the north, leaned by 30 deg to the east"
     data, _ = simulate_cube(scenario, 4)
     poses = static_poses(data, load_config(cube_config(scenario.model_copy(update={"noise": CubeNoise()})).encode()))
-    g = float(gravity(np.deg2rad(scenario.latitude_deg), scenario.height))
+    g = float(gravity(np.deg2rad(scenario.place.latitude_deg), scenario.place.height))
     np.testing.assert_allclose(poses.accel[1] / g, [-1, 0, 0], atol=1e-5)
     np.testing.assert_allclose(poses.accel[2] / g, so3.rotate(so3.inverse(given[1].nRb), up), atol=1e-5)
 
@@ -150,6 +159,9 @@ def test_given_attitudes_come_after_the_random_ones() -> None:
         ("{attitudes: [{up: +x, north: -x}]}", r"attitudes\.0: .*sides across each other are needed"),
         ("{attitudes: [{up: +w, north: -x}]}", r"attitudes\.0\.up"),
         ("{poses: 0}", "poses or attitudes are needed"),
+        ("{camera_rate_hz: 5.0}", "unknown key camera_rate_hz"),
+        ("{camera: {rate_hz: 5.0, ocluded: 0.1}}", r"unknown key camera\.ocluded; the nearest known key is occluded"),
+        ("{reference: false}", r"reference: .*ReferenceAttitude"),
     ],
 )
 def test_attitudes_that_are_none(tmp_path: Path, text: str, message: str) -> None:
@@ -167,7 +179,9 @@ def test_scenarios_are_valid(name: str) -> None:
 
 def test_pictures_show_the_tags_where_the_detections_have_them(tmp_path: Path) -> None:
     scenario = tmp_path / "short.yaml"
-    scenario.write_text("{poses: 1, static_s: 2.0, occluded: 0.0, tag_mount: 0.002, picture_rate_hz: 1.0}")
+    scenario.write_text(
+        "{poses: 1, static_s: 2.0, camera: {occluded: 0.0, pictures: {rate_hz: 1.0}}, errors: {tag_mount: 0.002}}"
+    )
     simulate("cube", str(scenario), 5, tmp_path / "p.mcap", images=True)
     simulate("cube", str(scenario), 5, tmp_path / "d.mcap", images=False)
     seen = []

@@ -22,8 +22,8 @@ def candidates(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
             f"{'one more pose' if len(poses) == 1 else f'{len(poses)} more poses'}: {words}",
             {**scenario, "attitudes": more},
         )
-    yield "rests twice as long", {**scenario, "static_s": 2.0 * scenario["static_s"]}
+    yield "each pose held twice as long", {**scenario, "static_s": 2.0 * scenario["static_s"]}
     if scenario["turn_axes"]:
         yield "turns about any axis", {**scenario, "turn_axes": []}
-    if scenario["faces_hidden"]:
-        yield "every face shown", {**scenario, "faces_hidden": []}
+    if scenario["cube"]["hidden"]:
+        yield "every face shown", {**scenario, "cube": {**scenario["cube"], "hidden": []}}

@@ -37,8 +37,8 @@ def next_poses(scenario: CubeScenario, seed: int, together: int) -> tuple[list[R
     """Single poses that tell most, of one sensor or of all, and the best so many to rest in one after the other."""
     field = None
     if scenario.magnetometer:
-        place = np.deg2rad([scenario.latitude_deg, scenario.longitude_deg])
-        field = magnetic_field(float(place[0]), float(place[1]), scenario.height, YEAR)
+        place = np.deg2rad([scenario.place.latitude_deg, scenario.place.longitude_deg])
+        field = magnetic_field(float(place[0]), float(place[1]), scenario.place.height, YEAR)
         field = field / np.linalg.norm(field)
     known = _FisherInformation(
         _REGULARISER * np.eye(4), None if field is None else _REGULARISER * np.eye(4), _REGULARISER * np.eye(3), None

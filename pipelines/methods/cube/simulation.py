@@ -20,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from factors import so3
 from factors.earth import earth_rate, gravity, magnetic_field
+from pipelines.errors import InputError
 from pipelines.methods.cube.data import CubeData, Sightings
 from pipelines.methods.cube.faces import FACES, Resting
 from pipelines.simulation.motion import sample_times
@@ -45,10 +46,12 @@ _LEAST_COSINE = 0.3
 _FORWARD = (-0.5, 0.5, -0.5, 0.5)  # BRC of a camera that looks along x of the reference, z up
 
 
-class CubeNoise(BaseModel):
-    """Noise of the sensors, under the names the recording's config gives them."""
-
+class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class CubeNoise(_Part):
+    """Noise of the sensors, under the names the recording's config gives them."""
 
     gyro_density: Positive = 1.2e-4  # rad/s/sqrt(Hz)
     gyro_bias_walk: NotNegative = 2e-6  # rad/s/sqrt(s)
@@ -57,53 +60,94 @@ class CubeNoise(BaseModel):
     corner_px: Positive = 0.2  # of the detections; pictures have their own
 
 
-class CubeScenario(BaseModel):
-    """What the `cube` simulator is asked for; every key has a default."""
+class Errors(_Part):
+    """Sigmas of what is to be found."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    gain: NotNegative = 0.02  # of each entry of K - 1
+    accel_bias: NotNegative = 0.3  # m/s^2
+    gyro_bias: NotNegative = 0.01  # rad/s
+    mag_bias: NotNegative = 1e-5  # T
+    camera_mount: NotNegative = 5e-3  # rad
+    tag_mount: NotNegative = 3e-3  # rad
+
+
+class FieldErrors(_Part):
+    """Sigmas of the earth's field against its model, T."""
+
+    direction: NotNegative = 5e-7  # each way across the model's field
+    strength: NotNegative = 1.33e-7  # along it
+
+
+class Place(_Part):
+    """Where on the earth."""
+
+    latitude_deg: float = 40.0
+    longitude_deg: float = 116.3
+    height: float = 50.0
+
+
+class TagCube(_Part):
+    """The cube that the device is in, m."""
+
+    edge: Positive = 0.16
+    tag_size: Positive = 0.12
+    hidden: tuple[int, ...] = ()  # ids of tags that are never seen
+
+
+class Pictures(_Part):
+    """Of the camera, where they are drawn in place of detections."""
+
+    rate_hz: Positive = 5.0
+    blur_px: NotNegative = 0.7
+    grey_noise: NotNegative = 2.0
+    exposure_s: Positive = 4e-3
+
+
+class CubeCamera(_Part):
+    """The camera that looks at the cube."""
+
+    rate_hz: Positive = 20.0
+    distortion: tuple[float, ...] = (-0.12, 0.05, 4e-4, -3e-4, 0.0)
+    occluded: Share = 0.05  # of the tags in a picture, by a finger
+    pictures: Pictures = Pictures()
+
+
+class Magnetometer(_Part):
+    """The device's magnetometer, and iron about it."""
+
+    rate_hz: Positive = 50.0
+    disturbed: Share = 0.0  # of the poses stand near iron
+    disturbance: NotNegative = 2e-6  # T, sigma per axis
+
+
+class ReferenceAttitude(_Part):
+    """The attitude reference that carries the camera."""
+
+    rate_hz: Positive = 10.0
+    heading_deg: float = 0.0  # correction that its heading needs, and the sigma about it
+    heading_error_deg: NotNegative = 0.573
+    level_noise_deg: Positive = 0.02  # of roll and pitch, of a message
+    heading_noise_deg: Positive = 0.05
+
+
+class CubeScenario(_Part):
+    """What the `cube` simulator is asked for; every key has a default, `null` leaves a sensor out."""
 
     poses: Annotated[int, Field(ge=0)] = 24  # in random attitudes
     attitudes: list[Resting] = []  # of more poses, after those
     static_s: Positive = 4.0
     turn_rad_s: Positive = 0.8  # mean rate of the turns between poses
     turn_axes: list[tuple[float, float, float]] = []  # in b; turns about these only, in turn; none: any attitude
-    noise: CubeNoise = CubeNoise()
-    # Sigmas of what is to be found: K - 1, and b of accelerometer, gyro and magnetometer.
-    gain_error: NotNegative = 0.02
-    accel_bias: NotNegative = 0.3  # m/s^2
-    gyro_bias: NotNegative = 0.01  # rad/s
-    mag_bias: NotNegative = 1e-5  # T
-    camera_mount: NotNegative = 5e-3  # rad
-    tag_mount: NotNegative = 3e-3  # rad
-    field_direction: NotNegative = 5e-7  # T, each way across the model's field
-    field_strength: NotNegative = 1.33e-7  # T, along it
-    reference_heading_deg: float = 0.0  # correction that the reference's heading needs, and the sigma about it
-    reference_heading_error_deg: NotNegative = 0.573
-    reference_level_deg: Positive = 0.02  # noise of roll and pitch, of a message
-    reference_heading_noise_deg: Positive = 0.05
-    magnetometer: bool = True
-    reference: bool = True
-    camera: bool = True
-    faces_hidden: list[int] = []  # ids of tags that are never seen
-    occluded: Share = 0.05  # of the tags in a picture, by a finger
-    disturbed: Share = 0.0  # of the poses stand near iron
-    disturbance: NotNegative = 2e-6  # T, sigma per axis
-    latitude_deg: float = 40.0
-    longitude_deg: float = 116.3
-    height: float = 50.0
+    distance: Positive = 0.7  # m, of the cube from the camera
     imu_rate_hz: Positive = 100.0
-    mag_rate_hz: Positive = 50.0
-    camera_rate_hz: Positive = 20.0
-    picture_rate_hz: Positive = 5.0
-    reference_rate_hz: Positive = 10.0
-    fix_rate_hz: Positive = 1.0
-    edge: Positive = 0.16  # m
-    tag_size: Positive = 0.12  # m
-    distance: Positive = 0.7  # m
-    distortion: list[float] = [-0.12, 0.05, 4e-4, -3e-4, 0.0]
-    blur_px: NotNegative = 0.7  # of pictures
-    grey_noise: NotNegative = 2.0
-    exposure_s: Positive = 4e-3
+    noise: CubeNoise = CubeNoise()
+    errors: Errors = Errors()
+    field: FieldErrors = FieldErrors()
+    place: Place = Place()
+    cube: TagCube = TagCube()
+    camera: CubeCamera | None = CubeCamera()
+    magnetometer: Magnetometer | None = Magnetometer()
+    reference: ReferenceAttitude | None = ReferenceAttitude()
     priors: dict[str, float | None] = {}  # passed on to the recording's config
 
     @model_validator(mode="after")
@@ -163,11 +207,13 @@ def simulated(scenario: CubeScenario, seed: int, images: bool = False) -> Simula
     """A session in memory; with pictures in place of the detections if asked for."""
     if not images:
         return Simulated(*simulate_cube(scenario, seed), cube_config(scenario))
+    if scenario.camera is None:
+        raise InputError("pictures are asked for, but the scenario has no camera: take `camera: null` out of it")
     world = _World(scenario, seed)
-    t = sample_times(world.duration, scenario.picture_rate_hz, 0.5)
+    t = sample_times(world.duration, scenario.camera.pictures.rate_hz, 0.5)
     nothing = Sightings(t, *(np.zeros(0, dtype=np.int64),) * 2, np.zeros((0, 4, 2)), None)
     data = replace(world.data(), sightings=nothing)
-    return Simulated(data, world.truth, cube_config(scenario, images=True), world.pictures(t))
+    return Simulated(data, world.truth, cube_config(scenario, images=True), world.pictures(t, scenario.camera.pictures))
 
 
 def cube_config(scenario: CubeScenario, images: bool = False) -> str:
@@ -181,9 +227,9 @@ def cube_config(scenario: CubeScenario, images: bool = False) -> str:
     if scenario.camera:
         tags = {
             i: {
-                "size": scenario.tag_size,
+                "size": scenario.cube.tag_size,
                 "rotation": list(wxyz),
-                "position": [0.5 * scenario.edge * x for x in normal],
+                "position": [0.5 * scenario.cube.edge * x for x in normal],
             }
             for i, (wxyz, normal) in FACES.items()
         }
@@ -220,32 +266,33 @@ class _World:
     def __init__(self, scenario: CubeScenario, seed: int) -> None:
         self.scenario = scenario
         self.rng = np.random.default_rng(seed)
-        self.place_rad = np.deg2rad([scenario.latitude_deg, scenario.longitude_deg])
+        self.place_rad = np.deg2rad([scenario.place.latitude_deg, scenario.place.longitude_deg])
         latitude, longitude = self.place_rad
-        self.field, self.heading = self._surroundings(magnetic_field(latitude, longitude, scenario.height, YEAR))
+        self.field, self.heading = self._surroundings(magnetic_field(latitude, longitude, scenario.place.height, YEAR))
         self.camera = Camera(
             1280,
             960,
             np.array([[1150.0, 0, 641.3], [0, 1150.0, 477.8], [0, 0, 1.0]]),
             "plumb_bob",
-            np.array(scenario.distortion),
+            np.array((scenario.camera or CubeCamera()).distortion),
         )
         self.nRB = so3.compose(
             so3.exp([0.0, 0.0, self.rng.uniform(-np.pi, np.pi)]), so3.exp(0.02 * self.rng.standard_normal(3))
         )
-        self.mount = scenario.camera_mount * self.rng.standard_normal(3)
+        self.mount = scenario.errors.camera_mount * self.rng.standard_normal(3)
         self.nRC = so3.compose(self.nRB, _FORWARD, so3.exp(self.mount))
         # The lowest id defines the body frame.
-        self.tags = {i: scenario.tag_mount * self.rng.standard_normal(3) * (i != min(FACES)) for i in FACES}
+        self.tags = {i: scenario.errors.tag_mount * self.rng.standard_normal(3) * (i != min(FACES)) for i in FACES}
         self.K = {
-            name: np.eye(3) + scenario.gain_error * self.rng.standard_normal((3, 3))
+            name: np.eye(3) + scenario.errors.gain * self.rng.standard_normal((3, 3))
             for name in ("accel", "gyro", "mag")
         }
         if not scenario.camera:
             # The accelerometer's own axes define the body frame: its K is upper triangular.
             upper = np.linalg.qr(self.K["accel"])[1]
             self.K["accel"] = np.sign(np.diag(upper))[:, None] * upper
-        sigmas = {"accel": scenario.accel_bias, "gyro": scenario.gyro_bias, "mag": scenario.mag_bias}
+        errors = scenario.errors
+        sigmas = {"accel": errors.accel_bias, "gyro": errors.gyro_bias, "mag": errors.mag_bias}
         self.b = {name: sigma * self.rng.standard_normal(3) for name, sigma in sigmas.items()}
         self.motion = self._motion()
         self.duration = float(self.motion.stop[-1])
@@ -259,11 +306,12 @@ class _World:
         """
         s, (rng,) = self.scenario, self.rng.spawn(1)
         along = model / np.linalg.norm(model)
-        error = s.field_direction * rng.standard_normal(3)
-        error += along * (s.field_strength * rng.standard_normal() - along @ error)
-        return model + error, float(
-            np.deg2rad(s.reference_heading_deg + s.reference_heading_error_deg * rng.standard_normal())
-        )
+        error = s.field.direction * rng.standard_normal(3)
+        error += along * (s.field.strength * rng.standard_normal() - along @ error)
+        if s.reference is None:
+            return model + error, 0.0
+        heading_deg = s.reference.heading_deg + s.reference.heading_error_deg * rng.standard_normal()
+        return model + error, float(np.deg2rad(heading_deg))
 
     def _motion(self) -> Motion:
         s, rng = self.scenario, self.rng
@@ -287,17 +335,17 @@ class _World:
             accel,
             latitude=float(self.place_rad[0]),
             longitude=float(self.place_rad[1]),
-            height=s.height,
+            height=s.place.height,
             gyro_density=s.noise.gyro_density,
             accel_density=s.noise.accel_density,
         )
-        if s.magnetometer:
-            mag_t, mag = self._mag()
+        if s.magnetometer is not None:
+            mag_t, mag = self._mag(s.magnetometer)
             data = replace(data, mag_t=mag_t, mag=mag, mag_density=s.noise.mag_density)
-        if s.camera:
-            data = replace(data, camera=self.camera, sightings=self._sightings())
-        if s.reference:
-            t, wxyz, covariance = self._reference()
+        if s.camera is not None:
+            data = replace(data, camera=self.camera, sightings=self._sightings(s.camera))
+        if s.reference is not None:
+            t, wxyz, covariance = self._reference(s.reference)
             data = replace(data, reference_t=t, reference_wxyz=wxyz, reference_cov=covariance)
         self.truth = self._truth()
         return data
@@ -321,27 +369,26 @@ class _World:
         rates = arcs.reshape(-1, _PARTS, 3).sum(axis=1) * rate
         moments = self._moments(t, rate)
         force = so3.rotate(self.nRC, self.motion.position(moments, 2))
-        force = force + [0.0, 0.0, float(gravity(self.place_rad[0], s.height))]
+        force = force + [0.0, 0.0, float(gravity(self.place_rad[0], s.place.height))]
         accel = so3.rotate(so3.inverse(self.motion.attitude(moments)), force).reshape(-1, _PARTS, 3).mean(axis=1)
         walk = np.cumsum(s.noise.gyro_bias_walk / np.sqrt(rate) * self.rng.standard_normal(rates.shape), axis=0)
         gyro = self._raw("gyro", rates, s.noise.gyro_density, rate, walk)
         self.b["gyro"] = self.b["gyro"] - self.K["gyro"] @ walk.mean(axis=0)
         return t, gyro, self._raw("accel", accel, s.noise.accel_density, rate)
 
-    def _mag(self) -> tuple[Array, Array]:
-        s, rate = self.scenario, self.scenario.mag_rate_hz
+    def _mag(self, sensor: Magnetometer) -> tuple[Array, Array]:
+        rate = sensor.rate_hz
         t = sample_times(self.duration, rate, 0.25)
         moments = self._moments(t, rate)
-        iron = s.disturbance * self.rng.standard_normal((len(self.motion.start), 3))
-        iron *= self.rng.random((len(self.motion.start), 1)) < s.disturbed
+        iron = sensor.disturbance * self.rng.standard_normal((len(self.motion.start), 3))
+        iron *= self.rng.random((len(self.motion.start), 1)) < sensor.disturbed
         nearest = np.argmin(np.abs(moments[:, None] - 0.5 * (self.motion.start + self.motion.stop)), axis=1)
         field = so3.rotate(so3.inverse(self.motion.attitude(moments)), self.field + iron[nearest])
-        return t, self._raw("mag", field.reshape(-1, _PARTS, 3).mean(axis=1), s.noise.mag_density, rate)
+        return t, self._raw("mag", field.reshape(-1, _PARTS, 3).mean(axis=1), self.scenario.noise.mag_density, rate)
 
-    def _reference(self) -> tuple[Array, Array, Array]:
-        s = self.scenario
-        t = sample_times(self.duration, s.reference_rate_hz, 0.4)
-        sigma = np.deg2rad([s.reference_level_deg, s.reference_level_deg, s.reference_heading_noise_deg])
+    def _reference(self, sensor: ReferenceAttitude) -> tuple[Array, Array, Array]:
+        t = sample_times(self.duration, sensor.rate_hz, 0.4)
+        sigma = np.deg2rad([sensor.level_noise_deg, sensor.level_noise_deg, sensor.heading_noise_deg])
         heading = so3.exp([0.0, 0.0, -self.heading])
         wxyz = so3.compose(so3.exp(sigma * self.rng.standard_normal((len(t), 3))), heading, self.nRB)
         return t, wxyz, np.tile(np.diag(sigma**2), (len(t), 1, 1))
@@ -351,21 +398,21 @@ class _World:
         wxyz, normal = FACES[tag]
         cRb = so3.multiply(so3.inverse(self.nRC), self.motion.attitude(t))
         cRt = so3.compose(cRb, wxyz, so3.exp(self.tags[tag]))
-        centre = self.motion.position(t) + so3.rotate(cRb, 0.5 * self.scenario.edge * np.array(normal))
+        centre = self.motion.position(t) + so3.rotate(cRb, 0.5 * self.scenario.cube.edge * np.array(normal))
         facing = -(so3.rotate(cRt, [0.0, 0.0, 1.0]) * centre).sum(axis=1) / np.linalg.norm(centre, axis=1)
         return cRt, centre, facing
 
     def _shown(self) -> list[int]:
-        return [i for i in FACES if i not in self.scenario.faces_hidden]
+        return [i for i in FACES if i not in self.scenario.cube.hidden]
 
-    def _sightings(self) -> Sightings:
+    def _sightings(self, sensor: CubeCamera) -> Sightings:
         s, size = self.scenario, np.array([self.camera.width, self.camera.height])
-        times = sample_times(self.duration, s.camera_rate_hz, 0.3)
+        times = sample_times(self.duration, sensor.rate_hz, 0.3)
         frames, ids, corners = [], [], []
         for i in self._shown():
             cRt, centre, facing = self._tag(i, times)
-            rows = np.flatnonzero((facing > _LEAST_COSINE) & (self.rng.random(len(times)) >= s.occluded))
-            seen = self.camera.project(centre[rows, None] + so3.rotate(cRt[rows, None], s.tag_size * _SQUARE))
+            rows = np.flatnonzero((facing > _LEAST_COSINE) & (self.rng.random(len(times)) >= sensor.occluded))
+            seen = self.camera.project(centre[rows, None] + so3.rotate(cRt[rows, None], s.cube.tag_size * _SQUARE))
             inside = ((seen > 5.0) & (seen < size - 6.0)).all(axis=(1, 2))
             frames.append(rows[inside])
             ids.append(np.full(int(inside.sum()), i))
@@ -374,15 +421,15 @@ class _World:
         order = np.argsort(frame, kind="stable")
         return Sightings(times, frame[order], np.concatenate(ids)[order], np.concatenate(corners)[order], None)
 
-    def pictures(self, times: Array) -> Iterator[bytes]:
+    def pictures(self, times: Array, kind: Pictures) -> Iterator[bytes]:
         """JPEG files of what the camera sees at the times, blurred by the motion while the shutter is open."""
-        s, renderer = self.scenario, Renderer(self.camera)
+        renderer = Renderer(self.camera)
         for t in times:
             finger = self._finger(float(t))
             still = bool(((self.motion.start <= t) & (t <= self.motion.stop)).any())
-            moments = [t] if still else t + s.exposure_s * np.array([-0.25, 0.25])
+            moments = [t] if still else t + kind.exposure_s * np.array([-0.25, 0.25])
             light = np.mean([renderer.radiance(self._quads(float(m), finger)) for m in moments], axis=0)
-            yield encode(expose(light, s.blur_px, s.grey_noise, self.rng), "jpeg", 95)
+            yield encode(expose(light, kind.blur_px, kind.grey_noise, self.rng), "jpeg", 95)
 
     def _tags_at(self, t: float) -> dict[int, tuple[Array, Array]]:
         """Attitude cRt and place (3,) m of the tags that face the camera."""
@@ -391,15 +438,15 @@ class _World:
 
     def _quads(self, t: float, others: list[Quad]) -> list[Quad]:
         tags = self._tags_at(t).items()
-        return [*others, *(tag_quad(i, self.scenario.tag_size, cRt, centre) for i, (cRt, centre) in tags)]
+        return [*others, *(tag_quad(i, self.scenario.cube.tag_size, cRt, centre) for i, (cRt, centre) in tags)]
 
     def _finger(self, t: float) -> list[Quad]:
         """At times a finger lies on the edge of a tag."""
-        tags = list(self._tags_at(t).values())
-        if not tags or self.rng.random() > self.scenario.occluded * len(tags):
+        tags, camera = list(self._tags_at(t).values()), self.scenario.camera
+        if not tags or camera is None or self.rng.random() > camera.occluded * len(tags):
             return []
         cRt, centre = tags[self.rng.integers(len(tags))]
-        on_edge = so3.rotate(cRt, self.scenario.tag_size * np.array([0.5, self.rng.uniform(-0.4, 0.4), 0.02]))
+        on_edge = so3.rotate(cRt, self.scenario.cube.tag_size * np.array([0.5, self.rng.uniform(-0.4, 0.4), 0.02]))
         return [Quad(np.full((1, 1), 120.0), (0.05, 0.018), cRt, (centre + on_edge) * 0.99)]
 
     def _truth(self) -> dict[str, float]:
