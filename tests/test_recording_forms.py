@@ -16,12 +16,15 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from pipelines.config import load_config
 from pipelines.errors import InputError
+from pipelines.methods import simulate
 from pipelines.methods.head.topics import VISION_ATTITUDE
 from pipelines.recording import messages, series
+from pipelines.recording.gyro import read_gyro
 from pipelines.recording.reading import Recording, open_recording
 from pipelines.recording.sources import TopicSource, inverted
 from pipelines.recording.topics import IMU
 from pipelines.recording.writing import write_session
+from pipelines.session import calibrate
 from tests import forms
 from tests.recorded import T0, assert_same, session
 
@@ -674,3 +677,39 @@ def test_another_encoding_of_pictures_is_one_line(tmp_path: Path) -> None:
     recording = open_recording(ros2_recording(tmp_path / "i.mcap", {"/image": [(T0, picture)]}))
     with pytest.raises(InputError, match="the encoding '32FC1' is not one of mono, rgb"):
         list(recording.images("/image"))
+
+
+def test_messages_without_a_stamp_are_told_with_the_jitter_of_what_stands_in(tmp_path: Path) -> None:
+    types = forms.ROS2.types
+    rng = np.random.default_rng(4)
+    logged = T0 + 10_000_000 * np.arange(400) + rng.normal(0.0, 400_000.0, 400).astype(int)
+    vector = types["geometry_msgs/msg/Vector3"](1.0, 2.0, 3.0)
+    made = [(t, types["geometry_msgs/msg/Vector3Stamped"](header(0), vector)) for t in logged.tolist()]
+    recording = open_recording(ros2_recording(tmp_path / "v.mcap", {"/v": made}))
+    assert recording.vector("/v").stamped_by_log == 400
+    recording.vector("/v")
+    (note,) = recording.notes
+    assert note.startswith("topic /v: 400 of 400 messages have no stamp; the log times stand in")
+    assert 0.3 < float(note.split("jitter by ")[1].split(" ms")[0]) < 0.5
+
+
+def test_a_covariance_no_gyro_has_is_not_believed(tmp_path: Path) -> None:
+    t_ns, gyro, _ = turning()
+    for variance, believed in ((1e-12, None), (1e-6, 1e-4), (0.0, None), (-1.0, None)):
+        imu = series.ImuSeries(t_ns, gyro, gyro_cov=variance * np.eye(3))
+        write_session(tmp_path / "s.mcap", {"/imu": imu})
+        dropped: dict[str, int] = {}
+        _, _, density = read_gyro(open_recording(tmp_path / "s.mcap"), "/imu", T0, dropped)
+        assert density == (None if believed is None else pytest.approx(believed))
+        assert (500 in dropped.values()) == (variance == 1e-12)
+
+
+def test_the_same_calibration_out_of_another_form(tmp_path: Path) -> None:
+    simulate("head", "head_mounts", 2, tmp_path / "s.mcap")
+    config = tmp_path / "c.yaml"
+    config.write_bytes(open_recording(tmp_path / "s.mcap").attachment("alidade.yaml") or b"")
+    bag = forms.rosbag1(tmp_path / "s.mcap", tmp_path / "s.bag")
+    ours, theirs = (calibrate(path, ["batch"], None, config)[0] for path in (tmp_path / "s.mcap", bag))
+    assert ours.assessment.status == theirs.assessment.status == "calibrated"
+    np.testing.assert_equal(ours.estimate.values, theirs.estimate.values)
+    np.testing.assert_array_equal(ours.estimate.covariance, theirs.estimate.covariance)

@@ -12,6 +12,9 @@ from pipelines.recording.series import ImuSeries
 
 Array = NDArray[np.float64]
 
+# rad/s/sqrt(Hz); the best gyros there are have three times as much. Drivers that know nothing write 1e-12, say.
+_LEAST_DENSITY = 1e-7
+
 
 def read_gyro(
     recording: Recording, topic: str, epoch_ns: int, dropped: dict[str, int]
@@ -22,7 +25,11 @@ def read_gyro(
     """
     imu = recording.imu(topic)
     t, keep = usable(topic, imu, epoch_ns, dropped)
-    return t, imu.gyro[keep], gyro_density(t, imu.gyro_cov[keep])
+    density = gyro_density(t, imu.gyro_cov[keep])
+    if density is not None and density < _LEAST_DENSITY:
+        count(dropped, f"{topic}: covariance too small for any gyro, not believed (kept)", len(t))
+        density = None
+    return t, imu.gyro[keep], density
 
 
 def usable(

@@ -117,7 +117,7 @@ def _unpacked(path: Path, strict: bool) -> Container:
     if damaged and (strict or whole.tell() == 0):
         raise InputError(f"{path}: {damaged}: record again")
     container = _by_content(path, Path(whole.name), strict)
-    container.unpacked = whole
+    container.unpacked = (container.unpacked, whole)
     if damaged:
         container.remarks = (*container.remarks, damaged)
     return container

@@ -15,6 +15,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines import progress
 from pipelines.errors import InputError
@@ -199,6 +200,7 @@ class Recording:
             )
         check_clock(topic, *table.times(), self.epoch_ns)
         t_ns, by_log, numbers = table.sorted()
+        self._tell_unstamped(topic, t_ns, by_log)
         without = table.taken - int(np.count_nonzero(table.filled))
         return series.JointSeries(t_ns, numbers["position"], tuple(names), by_log, without)
 
@@ -329,4 +331,18 @@ class Recording:
         if self.topics[topic].type in TIMED:
             check_clock(topic, *table.times(), self.epoch_ns)
         t_ns, by_log, columns = table.sorted()
+        self._tell_unstamped(topic, t_ns, by_log)
         return kind(t_ns, stamped_by_log=by_log, **columns)
+
+    def _tell_unstamped(self, topic: str, t_ns: NDArray[np.int64], by_log: int) -> None:
+        """Remark that log times stand in for stamps, and by how much they jitter."""
+        if not by_log:
+            return
+        steps = np.diff(t_ns)
+        jitter = 1.4826 / np.sqrt(2.0) * float(np.median(np.abs(steps - np.median(steps)))) if len(steps) else 0.0
+        sentence = (
+            f"topic {topic}: {by_log} of {len(t_ns)} messages have no stamp; the log times stand in, which are "
+            f"late by a delay that nobody knows and jitter by {jitter * 1e-6:.2g} ms (sigma)"
+        )
+        if sentence not in self._container.remarks:
+            self.remark(sentence)

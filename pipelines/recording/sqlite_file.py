@@ -7,6 +7,7 @@ that is noted; a byte that is damaged within a message is not found.
 from __future__ import annotations
 
 import sqlite3
+import tempfile
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -38,6 +39,7 @@ class SqliteFile(Container):
         self.path, self.data, self._strict = path, data or path, strict
         self.profile = "ros2"
         self.losses: list[DataLoss] = []
+        self._keep_whole_pages()
         self._lost: dict[int, int] = {}
         try:
             with self._open() as database:
@@ -114,6 +116,31 @@ class SqliteFile(Container):
                 yield database
             return
         raise InputError(f"{self.path}: cannot be opened (SQLite says: {last})")
+
+    def _keep_whole_pages(self) -> None:
+        """Of a file that is cut read a copy with its whole pages, and their number in its head.
+
+        As it is, SQLite would refuse it, or take what is missing of the last page for zeros.
+        """
+        size = self.data.stat().st_size
+        with self.data.open("rb") as stream:
+            head = stream.read(100)
+        page = int.from_bytes(head[16:18], "big")
+        page = 1 << 16 if page == 1 else page
+        whole, stated = size // page if page >= 512 else 0, int.from_bytes(head[28:32], "big")
+        if self.data.with_name(f"{self.data.name}-wal").exists():  # SQLite puts the two together
+            return
+        if not whole or (size % page == 0 and stated <= whole):
+            return
+        copy = tempfile.NamedTemporaryFile(prefix="alidade-", suffix=".whole-pages")  # noqa: SIM115
+        with self.data.open("rb") as stream:
+            for _ in range(whole):
+                copy.write(stream.read(page))
+        copy.seek(28)
+        copy.write(whole.to_bytes(4, "big"))
+        copy.flush()
+        self.data, self.unpacked = Path(copy.name), copy
+        self.losses.append(DataLoss("cut", whole * page, size - whole * page, reason="it is cut short"))
 
     def _check_tables(self, database: sqlite3.Connection) -> None:
         """Real tables alone: a view could be anything, and last for ever."""
