@@ -91,6 +91,8 @@ class Follower:
             IndeterminateError: states other than the parameters are not determined.
         """
         path, patience = self.settings.path, self.settings.patience
+        if path.is_dir():
+            raise InputError(f"{path}: a folder; follow the file that is being written in it")
         size, grown, due = -1, time.monotonic(), 0.0
         while True:
             now = time.monotonic()
