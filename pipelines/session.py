@@ -21,20 +21,25 @@ from pipelines import methods, progress
 from pipelines.config import load_config, recorded_config
 from pipelines.discovery import nearest_suggestion, suggestions, with_suggested
 from pipelines.errors import InputError
-from pipelines.graph.problem import Estimate, Problem, Step
+from pipelines.graph.problem import Estimate, Problem, Quantity, Step
 from pipelines.judgement.causes import find_causes
-from pipelines.judgement.halves import Halves, held_out, split_halves
+from pipelines.judgement.halves import Halves, held_out, split_at, split_halves
 from pipelines.judgement.observability import Cause, assess
 from pipelines.judgement.rejection import rejection_sentence, too_many_rejected
+from pipelines.judgement.stability import Stability, stability
 from pipelines.methods import Method
 from pipelines.recording.info import SessionFacts, facts_of, lacking
 from pipelines.recording.message_reader import ENCODING
 from pipelines.recording.reading import Recording, open_recording
 from pipelines.reports.result import Calibration
+from pipelines.reports.units import human_unit
 from pipelines.settings import TRUTH, Config
 from pipelines.simulation.simulated import Simulated
 
 SOLVERS = ("batch", "incremental", "published")
+
+# Steps between the two sides of a change that are told: so many, of so many sigmas.
+_MOST_NAMED, _TOLD = 3, 3.0
 
 
 class Origin(Protocol):
@@ -219,6 +224,10 @@ class Session:
                 assessment = assessment.explained(causes)
             elif ours:
                 assessment = assessment.remarked(rejection_sentence(estimate.residuals))
+            change = stability(estimate, quantities) if ours and estimate.converged else None
+            if change is not None and change.changed:
+                with progress.doing("looking at both sides of a change"):
+                    assessment = assessment.misfit(f"{change.sentence}{self._step(change, quantities)}")
             if ours:
                 assessment = assessment.remarked(*problem.premises)
             found.append(
@@ -235,10 +244,26 @@ class Session:
                     seconds=seconds,
                     plots=partial(self.method.figures, self.data),
                     beside=cache(self._published) if estimate.solver == "incremental" else None,
+                    stability=change,
                     findings=self.method.findings(self.data, self.config, estimate),
                 )
             )
         return found
+
+    def _step(self, change: Stability, quantities: Sequence[Quantity]) -> str:
+        """From before a change to after it, of the parameters that both parts determine; empty where none can be."""
+        if not self.method.hypotheses().cut:
+            return ""
+        parts = split_at(self.method, self.data, self.config, change.time_s)
+        moved = sorted(parts.items(), key=lambda each: -abs(each[1].difference_sigmas))[:_MOST_NAMED]
+        known = {q.name: human_unit(q) for q in quantities}
+        told = [
+            f"{name} by {known[name][1] * (p.second - p.first):.2g} ± "
+            f"{known[name][1] * float(np.hypot(p.first_sigma, p.second_sigma)):.1g} {known[name][0]}"
+            for name, p in moved
+            if abs(p.difference_sigmas) > _TOLD
+        ]
+        return f" From before to after: {', '.join(told)}." if told else ""
 
     def _solve(self, solver: str, window: float | None) -> tuple[Estimate, Problem]:
         problem = self.problem()

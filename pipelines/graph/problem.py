@@ -201,11 +201,19 @@ class ChiSquare:
 
 @dataclass(frozen=True)
 class History:
-    """Estimates over time: times (k,), values and sigmas (k, n) in the order of Estimate.names."""
+    """Estimates over time: times (k,), values and sigmas (k, n) in the order of Estimate.names.
+
+    Attributes:
+        time, values, sigmas: as above.
+        covariance: (k, n, n) joint, where they are all linearised at the final estimate; None where they are not.
+        steady: (n,) which quantities are the same number at all times; the others walk.
+    """
 
     time: Array
     values: Array
     sigmas: Array
+    covariance: Array | None = None
+    steady: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)

@@ -51,15 +51,19 @@ class Halves:
 
 
 def split_halves(method: Method, data: Any, config: Config) -> dict[str, Halves]:
-    """The parameters that each half of a recording determines by itself; none when a half cannot be solved.
+    """What either half of a recording determines by itself, see `split_at`."""
+    start, stop = _span(method, data)
+    return split_at(method, data, config, 0.5 * (start + stop))
 
-    Those that a prior holds in either half are left out: they would agree whatever was recorded. A bias that walks
-    differs between halves by its walk too.
+
+def split_at(method: Method, data: Any, config: Config, middle: float) -> dict[str, Halves]:
+    """The parameters that a recording determines both before and after a time (s); none when a part cannot be solved.
+
+    Those that a prior holds in either part are left out: they would agree whatever was recorded. A bias that walks
+    differs between the parts by its walk too.
     """
     hypotheses = method.hypotheses()
-    times = [time for stamps in hypotheses.streams if (time := getattr(data, stamps)) is not None]
-    start, stop = min(t[0] for t in times), max(t[-1] for t in times)
-    middle = 0.5 * (start + stop)
+    start, stop = _span(method, data)
     first, second = (
         outcome(method, cut(hypotheses, data, *span), config) for span in ((start, middle), (middle, stop + 1.0))
     )
@@ -72,6 +76,12 @@ def split_halves(method: Method, data: Any, config: Config) -> dict[str, Halves]
         if 0.0 < max(sigmas) < _DETERMINED * q.scale:
             found[q.name] = Halves(float(a.values[i]), sigmas[0], float(b.values[i]), sigmas[1])
     return found
+
+
+def _span(method: Method, data: Any) -> tuple[float, float]:
+    """First and last stamp, s."""
+    times = [time for stamps in method.hypotheses().streams if (time := getattr(data, stamps)) is not None]
+    return float(min(t[0] for t in times)), float(max(t[-1] for t in times))
 
 
 def held_out(problem: Problem) -> dict[str, float]:

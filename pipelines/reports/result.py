@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from pipelines.graph.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
 from pipelines.judgement.observability import Assessment, Fit, Innovations, Learning, Status, Verdict, learning
 from pipelines.judgement.rejection import rejection_sentence
+from pipelines.judgement.stability import Stability
 from pipelines.recording.info import SessionFacts
 from pipelines.settings import Config
 
@@ -77,6 +78,7 @@ class Calibration:
         plots: makes the method's own figures and tables.
         beside: tells the published solver's estimate of the same recording, where the report shows it too; None when
             that solver cannot serve the recording.
+        stability: whether what was calibrated stayed as it was; None where that cannot be said.
         findings: what the method found beside its parameters.
     """
 
@@ -93,6 +95,7 @@ class Calibration:
     seconds: Mapping[str, float] = field(default_factory=dict)
     plots: Callable[[Calibration], Sequence[Plot | Table]] | None = None
     beside: Callable[[], Estimate | None] | None = None
+    stability: Stability | None = None
     findings: Findings = field(default_factory=dict)
 
     @property
@@ -331,6 +334,15 @@ class LearningResult(_Record):
     share: float
 
 
+class StabilityResult(_Record):
+    """The largest difference between an estimate on the way and the final one, and how often chance makes it."""
+
+    statistic: float
+    level: float
+    time_s: float
+    change: dict[str, float]
+
+
 class SessionResult(_Record):
     """What went in."""
 
@@ -367,6 +379,7 @@ class Result(_Record):
     causes: list[CauseResult]
     innovations: dict[str, InnovationsResult]
     learning: dict[str, LearningResult]
+    stability: StabilityResult | None
     findings: dict[str, list[dict[str, object]]]
     truth: dict[str, TruthResult] | None = None
 
@@ -392,6 +405,7 @@ def result(calibration: Calibration) -> Result:
         causes=[CauseResult(**asdict(cause)) for cause in a.causes],
         innovations={family: InnovationsResult(**asdict(found)) for family, found in c.innovations.items()},
         learning={name: LearningResult(**asdict(found)) for name, found in c.learning.items()},
+        stability=_stability(c.stability),
         findings={name: [dict(row) for row in rows] for name, rows in c.findings.items()},
         truth=truth_errors(c) if c.truth is not None else None,
     )
@@ -432,6 +446,13 @@ def software_versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             versions[package] = "not installed"
     return versions
+
+
+def _stability(found: Stability | None) -> StabilityResult | None:
+    if found is None:
+        return None
+    change = found.departures if found.changed else {}
+    return StabilityResult(statistic=found.statistic, level=found.level, time_s=found.time_s, change=change)
 
 
 def _chi_square(assessment: Assessment) -> ChiSquareResult:

@@ -43,11 +43,15 @@ def sequential_history(
     last = {key: i for i, own in enumerate(keys) for key in own}
     carried, begin = gtsam.GaussianFactorGraph(), 0
     rows: list[tuple[float, Array, Array]] = []
+    held_at_first: list[int] | None = None
+    steady = np.ones(len(problem.quantities), dtype=bool)
     moments = _moments(boundaries)
     if len(moments) < 2:
         return None
     for boundary in moments:
         held = [boundary.current_keys.get(p.key, p.key) for p in problem.parameters]
+        held_at_first = held_at_first or held
+        steady &= np.repeat(np.equal(held, held_at_first), [len(p.quantities) for p in problem.parameters])
         for i in range(begin, boundary.factors):
             carried.push_back(linear.at(i))
         begin = boundary.factors
@@ -58,9 +62,10 @@ def sequential_history(
         except RuntimeError:
             return None
         numbers, covariance = _solved(problem, now, values, boundary.current_keys, held)
-        rows.append((boundary.time, numbers, np.sqrt(np.diag(covariance))))
-    history = History(*(np.array(column) for column in zip(*rows, strict=True)))
-    return history, covariance
+        rows.append((boundary.time, numbers, covariance))
+    time, numbers, covariances = (np.array(column) for column in zip(*rows, strict=True))
+    sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    return History(time, numbers, sigmas, covariances, steady), covariance
 
 
 def _moments(boundaries: Sequence[StepBoundary]) -> list[StepBoundary]:

@@ -1,0 +1,126 @@
+"""Whether what was calibrated stayed as it was over the recording.
+
+If nothing changed, the estimate from what was recorded until t differs from the final one by a normal number with the
+covariance P(t) - P(T): the later estimate uses all that the earlier one does, and more (Hausman 1978, for an estimator
+that is efficient). The largest such difference over the recording is held against what chance does: paths drawn with
+the same covariances, whose steps from moment to moment are independent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.graph.problem import Array, Estimate, Quantity
+
+# A recording in which nothing changed is taken for one in which something did so often.
+LEVEL = 1e-3
+# Paths drawn, a batch at a time.
+_PATHS, _BATCH = 4000, 500
+# Directions in which the rest of the recording added less than this share of the variance say nothing of a change.
+_LEAST = 1e-3
+# Two moments make no path.
+_FEWEST_MOMENTS = 5
+
+
+@dataclass(frozen=True)
+class Stability:
+    """The largest difference between an estimate on the way and the final one.
+
+    Attributes:
+        statistic: its size as a standard normal number, by the cube root of chi-square over its degrees of freedom.
+        level: how often chance alone makes it as large or larger, anywhere in the recording.
+        time_s: when, s.
+        departures: parameter -> estimate until then less the final one, in the sigmas of that difference; largest
+            first.
+    """
+
+    statistic: float
+    level: float
+    time_s: float
+    departures: dict[str, float]
+
+    @property
+    def changed(self) -> bool:
+        """Whether it is more than chance."""
+        return self.level < LEVEL
+
+    @property
+    def sentence(self) -> str:
+        """What changed and when."""
+        name, size = next(iter(self.departures.items()))
+        return (
+            f"Something changed at about {self.time_s:.0f} s: {name} from before then is {abs(size):.1f} sigmas from that "
+            "of the whole recording."
+        )
+
+
+def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability | None:
+    """Of a batch estimate; None without a history of joint covariances, or with nothing in it that could change.
+
+    Quantities that walk are left out: they may change.
+
+    Args:
+        estimate: with its history.
+        quantities: of the estimate, in its order.
+    """
+    history = estimate.history
+    if history is None or history.covariance is None or history.steady is None:
+        return None
+    kept = np.flatnonzero(history.steady & np.array([q.prior_sigma != 0.0 for q in quantities], dtype=bool))
+    if len(history.time) < _FEWEST_MOMENTS or not len(kept):
+        return None
+    P = history.covariance[:, kept[:, None], kept]
+    difference = history.values[:-1, kept] - history.values[-1, kept]
+    whitening = [_whitening(P[i], P[-1]) for i in range(len(P) - 1)]
+    ranks = np.array([len(rows) for rows in whitening])
+    sizes = _as_normal(np.array([((W @ d) ** 2).sum() for W, d in zip(whitening, difference, strict=True)]), ranks)
+    worst = int(np.argmax(sizes))
+    beyond = _exceeded(P, whitening, ranks, float(sizes[worst]))
+    sigmas = np.sqrt(np.maximum(np.diag(P[worst] - P[-1]), 1e-12 * np.diag(P[worst])))
+    by_size = np.argsort(-np.abs(difference[worst] / sigmas))
+    departures = {quantities[kept[j]].name: float(difference[worst, j] / sigmas[j]) for j in by_size}
+    return Stability(float(sizes[worst]), beyond, float(history.time[worst]), departures)
+
+
+def _whitening(P: Array, last: Array) -> Array:
+    """(r, n): differences between the estimate with covariance P and the last one as r unit normal numbers."""
+    root = np.linalg.cholesky(P + 1e-12 * np.diag(np.diag(P)))
+    scaled = np.linalg.solve(root, np.linalg.solve(root, P - last).T)
+    eigenvalues, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
+    told = eigenvalues > _LEAST
+    return np.asarray((vectors[:, told] / np.sqrt(eigenvalues[told])).T @ np.linalg.inv(root))
+
+
+def _as_normal(square: Array, dof: Array) -> Array:
+    """Chi-square as a standard normal number (Wilson, Hilferty 1931); minus infinity without degrees of freedom."""
+    dof = np.broadcast_to(dof, square.shape)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = (np.cbrt(square / dof) - (1.0 - 2.0 / (9.0 * dof))) / np.sqrt(2.0 / (9.0 * dof))
+    return np.where(dof > 0, size, -np.inf)
+
+
+def _exceeded(P: Array, whitening: Sequence[Array], ranks: Array, size: float) -> float:
+    """Share of drawn paths whose largest difference is as large or larger."""
+    rng = np.random.default_rng(0)
+    n = P.shape[1]
+    roots = [_root(P[i] - P[i + 1]) for i in range(len(P) - 1)]
+    count = 0
+    for _ in range(_PATHS // _BATCH):
+        difference = np.zeros((_BATCH, n))
+        largest = np.full(_BATCH, -np.inf)
+        for i in reversed(range(len(roots))):
+            difference += rng.standard_normal((_BATCH, n)) @ roots[i].T
+            square = ((difference @ whitening[i].T) ** 2).sum(axis=1)
+            largest = np.maximum(largest, _as_normal(square, ranks[i]))
+        count += int((largest >= size).sum())
+    return count / _PATHS
+
+
+def _root(covariance: Array) -> Array:
+    """R with R R' the covariance, what rounding made negative left out."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(eigenvalues, 0.0)))

@@ -1,0 +1,101 @@
+"""A calibration that changes while it is recorded is found, with the time; one that does not raises no alarm."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import alidade
+from factors import so3
+from pipelines.graph.problem import Estimate, History, Quantity
+from pipelines.judgement.stability import stability
+from pipelines.solvers.batch import solve_batch
+
+HEAD = {"duration_s": 60.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 20.0}
+
+
+def session(seed: int, slip_deg: float) -> alidade.Session:
+    """A minute of head motion; half way the markers slip on the helmet."""
+    simulated = alidade.simulate("head", HEAD, seed)
+    wxyz = simulated.data.vision_wxyz.copy()
+    late = simulated.data.vision_t > 30.0
+    wxyz[late] = so3.multiply(wxyz[late], so3.exp(np.deg2rad([slip_deg, 0.0, 0.0])))
+    return alidade.open(replace(simulated, data=replace(simulated.data, vision_wxyz=wxyz)))
+
+
+def walk(rng: np.random.Generator, change: float = 0.0, n: int = 40) -> tuple[Estimate, tuple[Quantity, ...]]:
+    """Means of the first k of n unit normal vectors, shifted by `change` in the second half."""
+    z = rng.standard_normal((n, 2))
+    z[n // 2 :, 0] += change
+    k = np.arange(1, n + 1)
+    values = np.cumsum(z, axis=0) / k[:, None]
+    P = np.eye(2) / k[:, None, None]
+    history = History(k.astype(float), values, np.sqrt(np.diagonal(P, axis1=1, axis2=2)), P, np.array([True, True]))
+    quantities = tuple(Quantity(name, "rad", 10.0, 10.0, 1.0) for name in "ab")
+    return Estimate("batch", ("a", "b"), values[-1], P[-1], True, "", history=history), quantities
+
+
+def test_the_level_is_what_it_says() -> None:
+    """Levels of recordings in which nothing changes are spread evenly between 0 and 1."""
+    rng = np.random.default_rng(0)
+    levels = np.sort([found.level for _ in range(60) if (found := stability(*walk(rng)))])
+    assert len(levels) == 60
+    # Kolmogorov and Smirnov's bound, 99.9 %.
+    assert np.abs(levels - (np.arange(60) + 0.5) / 60).max() < 1.95 / np.sqrt(60)
+
+
+def test_a_change_is_found_where_it_is() -> None:
+    found = stability(*walk(np.random.default_rng(1), change=3.0))
+    assert found is not None
+    assert found.changed
+    assert found.time_s == pytest.approx(20.0, abs=2.0)
+    assert next(iter(found.departures)) == "a"
+
+
+def test_what_walks_or_is_fixed_may_change() -> None:
+    estimate, quantities = walk(np.random.default_rng(1), change=3.0)
+    history = estimate.history
+    assert history is not None
+    walking = replace(estimate, history=replace(history, steady=np.array([False, True])))
+    found = stability(walking, quantities)
+    assert found is not None
+    assert not found.changed
+    assert stability(estimate, [replace(q, prior_sigma=0.0) for q in quantities]) is None
+    assert stability(replace(estimate, history=None), quantities) is None
+
+
+def test_a_mount_that_slips_is_inconsistent_with_the_time_and_the_step() -> None:
+    """A slip of 0.5 deg once went through as calibrated, 14 sigmas off."""
+    calibration = session(0, 0.5).calibrate()
+    assert calibration.status == "inconsistent"
+    assert calibration.stability is not None
+    assert calibration.stability.time_s == pytest.approx(30.0, abs=5.0)
+    assert "Something changed at about 3" in calibration.headline
+    step = calibration.headline.split("From before to after: helmet_mount_x by ")[1]
+    assert float(step.split(" ")[0]) == pytest.approx(0.5, abs=0.2)
+
+
+def test_a_mount_that_stays_is_calibrated() -> None:
+    calibration = session(0, 0.0).calibrate()
+    assert calibration.status == "calibrated"
+    assert calibration.stability is not None
+    assert not calibration.stability.changed
+
+
+@pytest.mark.slow
+def test_slips_are_found_at_all_seeds_and_false_alarms_are_rare() -> None:
+    for seed in range(12):
+        slipped = session(seed, 0.5)
+        found = stability(solve_batch(slipped.problem()), slipped.problem().quantities)
+        assert found is not None
+        assert found.changed
+        assert found.time_s == pytest.approx(30.0, abs=5.0)
+    alarms = 0
+    for seed in range(40):
+        clean = session(seed, 0.0)
+        found = stability(solve_batch(clean.problem()), clean.problem().quantities)
+        assert found is not None
+        alarms += found.changed
+    assert alarms <= 1
