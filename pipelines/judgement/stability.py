@@ -52,8 +52,8 @@ class Stability:
         """What changed and when."""
         name, size = next(iter(self.departures.items()))
         return (
-            f"Something changed at about {self.time_s:.0f} s: {name} from before then is {abs(size):.1f} sigmas from that "
-            "of the whole recording."
+            f"Something changed at about {self.time_s:.0f} s: {name} from before then is {abs(size):.1f} sigmas from what "
+            "the whole recording gives."
         )
 
 
