@@ -26,7 +26,7 @@ from pipelines.judgement.causes import find_causes
 from pipelines.judgement.halves import Halves, held_out, split_at, split_halves
 from pipelines.judgement.observability import Cause, assess
 from pipelines.judgement.rejection import rejection_sentence, too_many_rejected
-from pipelines.judgement.stability import Stability, stability
+from pipelines.judgement.stability import Moved, Stability, stability
 from pipelines.methods import Method
 from pipelines.recording.info import SessionFacts, facts_of, lacking
 from pipelines.recording.message_reader import ENCODING
@@ -38,8 +38,8 @@ from pipelines.simulation.simulated import Simulated
 
 SOLVERS = ("batch", "incremental", "published")
 
-# Steps between the two sides of a change that are told: so many, of so many sigmas.
-_MOST_NAMED, _TOLD = 3, 3.0
+# Steps between the two sides of a change that are told.
+_MOST_NAMED = 3
 
 
 class Origin(Protocol):
@@ -211,9 +211,16 @@ class Session:
         causes: tuple[Cause, ...] | None = None
         for estimate, problem in solved:
             quantities = tuple(q for q in problem.quantities if q.name in estimate.names)
-            assessment = assess(quantities, estimate.covariance, estimate.chi_square, problem.advice)
             # The published solvers stand beside as they are.
             ours = estimate.solver != "published"
+            change = stability(estimate, quantities) if ours and estimate.converged else None
+            moved = self._moved(change) if change is not None and change.changed else None
+            assessment = assess(
+                quantities,
+                estimate.covariance if moved is None else moved.widened(estimate, quantities),
+                estimate.chi_square,
+                problem.advice,
+            )
             if ours and not estimate.converged:
                 assessment = assessment.unsolved(estimate.message)
             elif ours and (assessment.status == "inconsistent" or too_many_rejected(estimate.residuals)):
@@ -224,10 +231,10 @@ class Session:
                 assessment = assessment.explained(causes)
             elif ours:
                 assessment = assessment.remarked(rejection_sentence(estimate.residuals))
-            change = stability(estimate, quantities) if ours and estimate.converged else None
-            if change is not None and change.changed:
-                with progress.doing("looking at both sides of a change"):
-                    assessment = assessment.misfit(f"{change.sentence}{self._step(change, quantities)}")
+            if moved is not None and change is not None:
+                sentence = f"{change.sentence}{_told(moved, quantities)}"
+                small = moved.small(quantities)
+                assessment = assessment.remarked(sentence) if small else assessment.misfit(sentence)
             if ours:
                 assessment = assessment.remarked(*problem.premises)
             found.append(
@@ -250,20 +257,12 @@ class Session:
             )
         return found
 
-    def _step(self, change: Stability, quantities: Sequence[Quantity]) -> str:
-        """From before a change to after it, of the parameters that both parts determine; empty where none can be."""
+    def _moved(self, change: Stability) -> Moved:
+        """What the two sides of a change say."""
         if not self.method.hypotheses().cut:
-            return ""
-        parts = split_at(self.method, self.data, self.config, change.time_s)
-        moved = sorted(parts.items(), key=lambda each: -abs(each[1].difference_sigmas))[:_MOST_NAMED]
-        known = {q.name: human_unit(q) for q in quantities}
-        told = [
-            f"{name} by {known[name][1] * (p.second - p.first):.2g} ± "
-            f"{known[name][1] * float(np.hypot(p.first_sigma, p.second_sigma)):.1g} {known[name][0]}"
-            for name, p in moved
-            if abs(p.difference_sigmas) > _TOLD
-        ]
-        return f" From before to after: {', '.join(told)}." if told else ""
+            return Moved({})
+        with progress.doing("looking at both sides of a change"):
+            return Moved(split_at(self.method, self.data, self.config, change.time_s))
 
     def _solve(self, solver: str, window: float | None) -> tuple[Estimate, Problem]:
         problem = self.problem()
@@ -355,6 +354,19 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
         f"({ENCODING}): `alidade info` tells which for each method, `topics:` in the config can rename"
         + (f"; nearest is {nearest}" if nearest else "")
     )
+
+
+def _told(moved: Moved, quantities: Sequence[Quantity]) -> str:
+    """The largest steps in the units people read, and what a small one does; empty where the sides say nothing."""
+    if not moved.steps:
+        return ""
+    units = {q.name: human_unit(q) for q in quantities}
+    steps = [
+        f"{name} by {units[name][1] * step:.2g} ± {units[name][1] * sigma:.1g} {units[name][0]}"
+        for name, (step, sigma) in list(moved.steps.items())[:_MOST_NAMED]
+    ]
+    small = " That is little beside what is required, and in the sigmas." if moved.small(quantities) else ""
+    return f" From before to after: {', '.join(steps)}.{small}"
 
 
 def _shown(problem: Problem, duration: float, chunk: int) -> Iterator[Step]:

@@ -10,7 +10,8 @@ import pytest
 import alidade
 from factors import so3
 from pipelines.graph.problem import Estimate, History, Quantity
-from pipelines.judgement.stability import stability
+from pipelines.judgement.halves import Halves
+from pipelines.judgement.stability import Moved, stability
 from pipelines.solvers.batch import solve_batch
 
 HEAD = {"duration_s": 60.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 20.0}
@@ -75,6 +76,20 @@ def test_a_mount_that_slips_is_inconsistent_with_the_time_and_the_step() -> None
     assert "Something changed at about 3" in calibration.headline
     step = calibration.headline.split("From before to after: helmet_mount_x by ")[1]
     assert float(step.split(" ")[0]) == pytest.approx(0.5, abs=0.2)
+
+
+def test_a_small_step_is_told_and_widens_the_sigmas() -> None:
+    """Less than half of what is required does no harm, if it is not forgotten."""
+    quantities = (Quantity("a", "rad", 1.0, 1.0, 1.0), Quantity("b", "rad", 1.0, 1.0, 1.0))
+    moved = Moved({"a": Halves(0.0, 0.05, 0.4, 0.05), "b": Halves(0.0, 0.05, 0.1, 0.05)})
+    assert list(moved.steps) == ["a"]
+    assert moved.small(quantities)
+    estimate = Estimate("batch", ("a", "b"), np.zeros(2), 0.01 * np.eye(2), True, "")
+    np.testing.assert_allclose(moved.widened(estimate, quantities), np.diag([0.17, 0.01]))
+    large = Moved({"a": Halves(0.0, 0.05, 0.6, 0.05)})
+    assert not large.small(quantities)
+    np.testing.assert_allclose(large.widened(estimate, quantities), 0.01 * np.eye(2))
+    assert not Moved({}).small(quantities)
 
 
 def test_a_mount_that_stays_is_calibrated() -> None:

@@ -8,12 +8,13 @@ the same covariances, whose steps from moment to moment are independent.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pipelines.graph.problem import Array, Estimate, Quantity
+from pipelines.judgement.halves import Halves
 
 # A recording in which nothing changed is taken for one in which something did so often.
 LEVEL = 1e-3
@@ -21,6 +22,8 @@ LEVEL = 1e-3
 _PATHS, _BATCH = 4000, 500
 # Directions in which the rest of the recording added less than this share of the variance say nothing of a change.
 _LEAST = 1e-3
+# A step between the sides of a change is more than chance beyond so many sigmas.
+_STEP = 3.0
 # Two moments make no path.
 _FEWEST_MOMENTS = 5
 
@@ -51,10 +54,38 @@ class Stability:
     def sentence(self) -> str:
         """What changed and when."""
         name, size = next(iter(self.departures.items()))
-        return (
-            f"Something changed at about {self.time_s:.0f} s: {name} from before then is {abs(size):.1f} sigmas from what "
-            "the whole recording gives."
-        )
+        when, far = f"{self.time_s:.0f} s", f"{abs(size):.1f} sigmas"
+        return f"Something changed at about {when}: {name} from before is {far} from that of the whole recording."
+
+
+@dataclass(frozen=True)
+class Moved:
+    """What the two sides of a change say of the parameters that both determine.
+
+    Attributes:
+        parts: parameter -> value and sigma before and after; none where the sides cannot be solved.
+    """
+
+    parts: Mapping[str, Halves]
+
+    @property
+    def steps(self) -> dict[str, tuple[float, float]]:
+        """Parameter -> step and its sigma, of those that are more than chance, the surest first."""
+        sure = {name: p for name, p in self.parts.items() if abs(p.difference_sigmas) > _STEP}
+        order = sorted(sure.items(), key=lambda each: -abs(each[1].difference_sigmas))
+        return {name: (p.second - p.first, float(np.hypot(p.first_sigma, p.second_sigma))) for name, p in order}
+
+    def small(self, quantities: Sequence[Quantity]) -> bool:
+        """Whether every step is known, and less than half of what is required."""
+        required = {q.name: q.require for q in quantities}
+        return bool(self.steps) and all(abs(step) < 0.5 * required[name] for name, (step, _) in self.steps.items())
+
+    def widened(self, estimate: Estimate, quantities: Sequence[Quantity]) -> Array:
+        """The estimate's covariance with small steps added in square."""
+        if not self.small(quantities):
+            return estimate.covariance
+        step = np.array([self.steps.get(name, (0.0, 0.0))[0] for name in estimate.names])
+        return estimate.covariance + np.diag(step**2)
 
 
 def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability | None:
