@@ -16,7 +16,7 @@ from factors.vectorized import Ensemble
 from pipelines.solvers.batch import CHUNK
 
 SAMPLES, WINDOWS = 300_000, 36_000
-BIAS, SCALE, G = (int(gtsam.symbol(c, 0)) for c in "bsg")
+BIAS, ERRORS = (int(gtsam.symbol(c, 0)) for c in "be")
 
 
 def run() -> Iterator[Ratio]:
@@ -40,10 +40,10 @@ def run() -> Iterator[Ratio]:
     values = gtsam.Values()
     for k, attitude in enumerate(path.attitude(edges)):
         values.insert(k, so3.to_gtsam(attitude))
-    for key, size in [(BIAS, 3), (SCALE, 6), (G, 9)]:
+    for key, size in [(BIAS, 3), (ERRORS, 15)]:
         values.insert(key, np.zeros(size))
     factors = [
-        GyroIncrementFactor(edges[k + 1], turns[k], path, np.full(len(k), 1e-5)).on(k, k + 1, BIAS, SCALE, G)
+        GyroIncrementFactor(edges[k + 1], turns[k], path, np.full(len(k), 1e-5)).on(k, k + 1, BIAS, ERRORS)
         for k in np.array_split(np.arange(WINDOWS), WINDOWS // CHUNK)
     ]
     ours, native = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()

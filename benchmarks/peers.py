@@ -19,7 +19,7 @@ from benchmarks import static
 from benchmarks.batch import build, solve
 from benchmarks.measure import Ratio, costs
 from factors import so3
-from factors.attitude import RelativeAttitudeFactor
+from factors.gyro import GyroIncrementFactor
 from factors.model import Model
 from factors.preintegration import GyroPath
 from pipelines.config import load_config
@@ -50,9 +50,10 @@ class LosRows:
         self.start = so3.from_gtsam([step.initial.atRot3(int(gtsam.symbol("x", k))) for k in range(K)])
         angles = np.asarray(step.initial.atVector(problem.parameters[0].key))
         self.x0 = np.concatenate([np.zeros(3 * K), self.bias_hat, angles])
-        turns = GyroPath(data.gyro_t, data.gyro, self.bias_hat).increments(self.model.time[:-1], self.model.time[1:])
+        path = GyroPath(data.gyro_t, data.gyro, self.bias_hat)
+        turns = path.increments(self.model.time[:-1], self.model.time[1:])
         sigma = _SCENARIO.noise.gyro_density * np.sqrt(turns.duration)
-        self.gyro = RelativeAttitudeFactor(self.model.time[1:], so3.identity(K - 1), turns, self.bias_hat, sigma)
+        self.gyro = GyroIncrementFactor(self.model.time[1:], turns, path, sigma)
         self.prior = np.array([q.prior_sigma or np.inf for p in problem.parameters for q in p.quantities])
         self.prior = np.concatenate([self.prior[-3:], self.prior[:-3]])
         # The first attitude's prior, as in the graph: wide where pictures tell, held about the line of sight.

@@ -28,26 +28,16 @@ EPOCH_NS = 1_600_000_000_000_000_000  # the trials carry no date
 VISION_RATE_HZ = 25.0
 VISION_SIGMA = float(np.deg2rad(0.5))  # noise added to the motion capture, rad per axis
 
-# Scale and alignment errors of the trials' gyros as a fraction of the angle turned, such that chi-square fits. Trial 01
-# shows up to 0.5 % on one axis, the others 0.1 to 0.2 %.
-GYRO_SCALE = {"01": 0.01}
-OTHER_GYRO_SCALE = 0.005
-
-# White noise at rest is 1.1e-4 rad/s/sqrt(Hz); the rest up to this density is what motion adds beside the scale errors.
-CONFIG = """\
+# White noise at rest is 1.1e-4 rad/s/sqrt(Hz); the rest up to this density is what motion adds beside constant scale
+# and skew, which are estimated. Motion capture makes its angles by no focal length and keeps the IMU's time.
+CONFIG = f"""\
 method: head
 noise:
-  gyro_density: 2.0e-4
+  gyro_density: 1.5e-3
   gyro_bias_walk: 1.0e-5
-  gyro_scale: {gyro_scale}
-  vision_attitude: {vision_attitude:.4e}
+  vision_attitude: {VISION_SIGMA:.4e}
+sensors: {{camera: {{scale: 0}}, clock: {{skew: 0}}}}
 """
-
-
-def config_yaml(trial_path: Path) -> str:
-    """The config of a trial's session."""
-    gyro_scale = GYRO_SCALE.get(trial_path.name[:2], OTHER_GYRO_SCALE)
-    return CONFIG.format(gyro_scale=gyro_scale, vision_attitude=VISION_SIGMA)
 
 
 @dataclass(frozen=True)
@@ -182,9 +172,7 @@ def main() -> None:
             print(f"gyro bias less mean rate at rest: {np.rad2deg(found.bias_error).round(3).tolist()} deg/s")
             print(f"time offset: {1e3 * found.time_offset:.2f} ms")
             return
-        write_head(
-            options.out, to_session(read_trial(options.trial), options.seed), config_yaml=config_yaml(options.trial)
-        )
+        write_head(options.out, to_session(read_trial(options.trial), options.seed), config_yaml=CONFIG)
     except InputError as error:
         parser.error(str(error))
 

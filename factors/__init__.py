@@ -9,7 +9,7 @@ from importlib import import_module
 from typing import Any
 
 _HOMES = {
-    "attitude": ("RelativeAttitudeFactor", "VisionAttitudeFactor", "ahrs_factors"),
+    "attitude": ("VisionAttitudeFactor", "ahrs_factors"),
     "gyro": ("GyroIncrementFactor",),
     "indexer": ("AxisPath", "IndexerAverageFactor"),
     "los": ("GimbalPath", "LocalMotion", "LosDirectionFactor", "LosRateFactor"),

@@ -7,6 +7,7 @@ frame at the session's start, held fixed ("inertial"). Source: methods page, sec
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -14,7 +15,8 @@ import gtsam
 import numpy as np
 
 from factors import so3
-from factors.model import ROT3, Array, Model, Residuals
+from factors.gyro import PLATFORM, Derivatives, by_platform_errors, carried, needed, parted, platform_errors
+from factors.model import ROT3, Array, Block, Model, Residuals
 from factors.preintegration import GyroPath, Increments
 
 
@@ -52,52 +54,15 @@ def ahrs_factors(
 
 
 @dataclass(frozen=True)
-class RelativeAttitudeFactor(Model):
-    """Relative attitude over n windows when the attitude itself is wanted as the variable: bRv_j = dB^T bRv_i dV(bias).
-
-    Blocks: bRv_i, bRv_j (rotations), gyro bias (3). The head method uses `ahrs_factors` on iRv instead, which is the
-    same constraint as a native factor; this form serves graphs that hold bRv.
-
-    Attributes:
-        time: (n,) ends of the windows, s.
-        platform: (n, 4) dB, the platform's rotation over each window.
-        helmet: dV over the windows.
-        bias_hat: (3,), taken off when `helmet` was integrated.
-        sigma: (n,) rad per axis, helmet and platform together.
-    """
-
-    time: Array
-    platform: Array
-    helmet: Increments
-    bias_hat: Array
-    sigma: Array
-    rows: int = 3
-    blocks = (ROT3, ROT3, 3)
-
-    def __call__(self, bRv_i: Array, bRv_j: Array, bias: Array) -> Residuals:
-        """Residual Log((dB^T bRv_i dV)^T bRv_j) / sigma, (n, 3)."""
-        correction = np.einsum("nij,nj->ni", self.helmet.bias_jacobian, bias - self.bias_hat)
-        dV = so3.multiply(self.helmet.wxyz, so3.exp(correction))
-        predicted = so3.compose(so3.inverse(self.platform), bRv_i, dV)
-        error = so3.log(so3.multiply(so3.inverse(predicted), bRv_j))
-        weight = 1.0 / self.sigma
-
-        def jacobians() -> tuple[Array, ...]:
-            left = -so3.right_jacobian_inverse(-error) * weight[:, None, None]
-            right = so3.right_jacobian_inverse(error) * weight[:, None, None]
-            by_bias = so3.right_jacobian(correction) @ self.helmet.bias_jacobian
-            return left @ so3.matrix(so3.inverse(dV)), right, left @ by_bias
-
-        return error * weight[:, None], jacobians
-
-
-@dataclass(frozen=True)
 class VisionAttitudeFactor(Model):
-    """Attitudes of the helmet's marker frame seen by the platform's camera, at an unknown time offset.
+    """Attitudes of the helmet's marker frame seen by the platform's camera, at an unknown time.
 
-    Predicted: cRh = cRb bRv(t + dt) vRh with bRv(t + dt) = iRb(t + dt)^T iRv(t) dV(t, t + dt; bias), the gyros' own
-    samples carrying the attitude from the stamp to the true time. Blocks: iRv at the stamps (rotations), gyro bias (3),
-    cRb, vRh (rotations), dt (1, s; positive when the picture was taken later than its stamp says).
+    Predicted: cRh = cRb bRv(at) vRh with bRv(at) = dB(anchor, at)^T bRv(anchor) dV(anchor, at), the gyros' own samples
+    carrying the attitude from the time of the variable to that of the picture. Blocks: bRv at the anchors (rotations),
+    gyro bias (3), cRb, vRh (rotations), the pictures' errors (1 or 3) and, unless the gyros are perfect, the helmet
+    gyro's errors (6 or 15) and those of the platform's gyro (9), see factors.gyro. The pictures' errors are
+    time offset, s, positive when a picture was taken later than its stamp says; clock skew, at = stamp + time offset -
+    skew * elapsed; angle scale, Log(first^T cRh) is measured 1 + scale times as large.
 
     Attributes:
         time: (n,) stamps, s.
@@ -105,6 +70,11 @@ class VisionAttitudeFactor(Model):
         sqrt_information: (n, 3, 3); the error is cRh * Exp(delta), delta in frame h.
         helmet: the helmet's gyro.
         platform: the platform's gyro, None for a platform at rest.
+        errors: numbers of the helmet gyro's errors: 6, 15, or 0 for a perfect gyro.
+        platform_errors: whether the platform's gyro has errors too.
+        anchor: (n,) times of the variables, s; None: the stamps.
+        elapsed, first: (n,) s since the recording's first stamp, (n, 4) cRh of its first picture; with both, skew and
+            angle scale are variables.
     """
 
     time: Array
@@ -112,39 +82,78 @@ class VisionAttitudeFactor(Model):
     sqrt_information: Array
     helmet: GyroPath
     platform: GyroPath | None
+    errors: int = 0
+    platform_errors: bool = False
+    anchor: Array | None = None
+    elapsed: Array | None = None
+    first: Array | None = None
     rows: int = 3
-    blocks = (ROT3, 3, ROT3, ROT3, 1)
-    stacked: ClassVar = ("time", "measured", "sqrt_information")
+    stacked: ClassVar = ("time", "measured", "sqrt_information", "anchor", "elapsed", "first")
 
-    def __call__(self, iRv: Array, bias: Array, cRb: Array, vRh: Array, dt: Array) -> Residuals:
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """Attitudes, bias, mounts, the pictures' errors and those of the gyros."""
+        return ROT3, 3, ROT3, ROT3, 1 if self.elapsed is None else 3, *self._error_blocks
+
+    @property
+    def _error_blocks(self) -> tuple[int, ...]:
+        return (*([self.errors] if self.errors else []), *([PLATFORM] if self.platform_errors else []))
+
+    def __call__(self, bRv: Array, bias: Array, cRb: Array, vRh: Array, picture: Array, *of_gyros: Array) -> Residuals:
         """Residual sqrt_information * Log(predicted^T measured), (n, 3)."""
-        at = self.time + dt[:, 0]
-        step = self.helmet.increments(self.time, at)
-        bias_error = bias - self.helmet.bias_hat
-        correction = np.einsum("nij,nj->ni", step.bias_jacobian, bias_error)
-        dV = so3.multiply(step.wxyz, so3.exp(correction))
-        bRi = so3.identity(len(at)) if self.platform is None else so3.inverse(self.platform.attitude(at))
-        bRv = so3.compose(bRi, iRv, dV)
-        predicted = so3.compose(cRb, bRv, vRh)
-        error = so3.log(so3.multiply(so3.inverse(predicted), self.measured))
+        errors, platform = parted(of_gyros, self._error_blocks)
+        at, by_at = self._times(picture)
+        anchor = self.time if self.anchor is None else self.anchor
+        middle = 0.5 * (anchor + self.time)
+        dV, rate, by_gyro = carried(self.helmet, anchor, middle, at, bias, errors)
+        bRv = so3.multiply(bRv, dV)
+        by_dB: Derivatives = tuple
+        if self.platform is not None:
+            base_bias, base_errors = platform_errors(self.platform, platform, len(at))
+            dB, platform_rate, by_dB = carried(self.platform, anchor, middle, at, base_bias, base_errors)
+            bRv = so3.multiply(so3.inverse(dB), bRv)
+            rate = rate - so3.rotate(so3.inverse(bRv), platform_rate)
+        seen, by_cRh, by_scale = self._seen(so3.compose(cRb, bRv, vRh), picture)
+        error = so3.log(so3.multiply(so3.inverse(seen), self.measured))
 
         def jacobians() -> tuple[Array, ...]:
-            # A right perturbation eta of the prediction changes the error by -Jr^-1(-error) eta.
+            # A right perturbation eta of what is seen changes the error by -Jr^-1(-error) eta.
             weight = -self.sqrt_information @ so3.right_jacobian_inverse(-error)
-            hRv = so3.matrix(so3.inverse(vRh))
-            vRb = so3.matrix(so3.inverse(bRv))
-            by_correction = so3.right_jacobian(correction)
-            # Rate of dV: the gyro's rate seen through the bias correction, and the correction's own growth.
-            growth = np.einsum("nij,nj->ni", so3.hat(step.rate) @ step.bias_jacobian + np.eye(3), -bias_error)
-            rate = so3.rotate(so3.exp(-correction), step.rate) + np.einsum("nij,nj->ni", by_correction, growth)
-            if self.platform is not None:
-                rate = rate - np.einsum("nij,nj->ni", vRb, self.platform.rate(at))
+            by_picture = weight @ by_scale
+            weight = weight @ by_cRh()
+            by_bRv = weight @ so3.matrix(so3.inverse(vRh))
+            by_cRb = by_bRv @ so3.matrix(so3.inverse(bRv))
+            by_times = (by_bRv @ rate[..., None]) * by_at[:, None]
+            by_bias, *by_errors = (by_bRv @ each for each in by_gyro())
             return (
-                weight @ hRv @ so3.matrix(so3.inverse(dV)),
-                weight @ hRv @ by_correction @ step.bias_jacobian,
-                weight @ hRv @ vRb,
+                by_bRv @ so3.matrix(so3.inverse(dV)),
+                by_bias,
+                by_cRb,
                 weight,
-                weight @ hRv @ rate[..., None],
+                np.concatenate([by_times, by_picture], axis=2),
+                *by_errors,
+                *(-by_cRb @ each for each in by_platform_errors(by_dB, platform)),
             )
 
         return np.einsum("nij,nj->ni", self.sqrt_information, error), jacobians
+
+    def _times(self, picture: Array) -> tuple[Array, Array]:
+        """When the pictures were taken (n,), and its derivatives by time offset and skew (n, 1 or 2)."""
+        if picture.shape[1] == 1:
+            return self.time + picture[:, 0], np.ones((len(picture), 1))
+        elapsed = needed(self.elapsed)
+        at = self.time + picture[:, 0] - picture[:, 1] * elapsed
+        return at, np.stack([np.ones_like(elapsed), -elapsed], axis=1)
+
+    def _seen(self, cRh: Array, picture: Array) -> tuple[Array, Callable[[], Array], Array]:
+        """The attitudes with the scale of angles, and how cRh and that scale, if it is a variable, turn them."""
+        n = len(cRh)
+        if picture.shape[1] == 1:
+            return cRh, lambda: np.eye(3), np.empty((n, 3, 0))
+        first = needed(self.first)
+        turned, scale = so3.log(so3.multiply(so3.inverse(first), cRh)), 1.0 + picture[:, 2:]
+
+        def by_cRh() -> Array:
+            return scale[..., None] * so3.right_jacobian(scale * turned) @ so3.right_jacobian_inverse(turned)
+
+        return so3.multiply(first, so3.exp(scale * turned)), by_cRh, turned[..., None]

@@ -11,7 +11,7 @@ import datetime
 from collections.abc import Collection, Iterable
 from typing import Annotated, ClassVar, TypeVar
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_serializer
 
 from pipelines.errors import InputError, nearest
 from pipelines.recording.sources import TopicSource
@@ -84,6 +84,67 @@ DEFAULT_NOISE = Noise(
 )
 
 
+class Sheet(Section):
+    """A data sheet, one sigma each; a figure not given is that of the usual grade, one that is null ten times that."""
+
+    @model_serializer
+    def _given(self) -> dict[str, float | None]:
+        return {name: getattr(self, name) for name in type(self).model_fields if name in self.model_fields_set}
+
+
+class GyroSheet(Sheet):
+    """Of a gyro.
+
+    scale, no unit; skew, rad: half the angle error between two axes; g_sensitivity, rad/s per m/s^2.
+    """
+
+    scale: SigmaOrZero | None = None
+    skew: SigmaOrZero | None = None
+    g_sensitivity: SigmaOrZero | None = None
+
+
+class PlatformGyroSheet(Sheet):
+    """The same of a platform's gyro, with its bias, rad/s."""
+
+    bias: SigmaOrZero | None = None
+    scale: SigmaOrZero | None = None
+    skew: SigmaOrZero | None = None
+
+
+class CameraSheet(Sheet):
+    """Of a camera, or of what makes angles of its pictures: scale of the angles, no unit."""
+
+    scale: SigmaOrZero | None = None
+
+
+class ClockSheet(Sheet):
+    """Of the pictures' clock against the gyro's: skew, s/s."""
+
+    skew: SigmaOrZero | None = None
+
+
+class Sensors(Section):
+    """Data sheets of the sensors; what they do not say is as in sensors of the usual grade."""
+
+    gyro: GyroSheet = GyroSheet()
+    platform_gyro: PlatformGyroSheet = PlatformGyroSheet()
+    camera: CameraSheet = CameraSheet()
+    clock: ClockSheet = ClockSheet()
+
+
+def _ideal(value: object) -> object:
+    """`ideal` written out: all figures 0."""
+    if value == "ideal":
+        sheets = {name: type(sheet).model_fields for name, sheet in Sensors()}
+        return {name: dict.fromkeys(figures, 0.0) for name, figures in sheets.items()}
+    if isinstance(value, str):
+        raise ValueError(f"must be data sheets by sensor, or ideal, not {value!r}")
+    return value
+
+
+SensorSheets = Annotated[Sensors, BeforeValidator(_ideal)]
+
+
 class Tag(Section):
     """A tag: edge of the black square m, rotation bodyRtag (w, x, y, z), position in the body m."""
 
@@ -117,6 +178,7 @@ class Config(Section):
     noise: Noise = Noise()
     priors: dict[str, SigmaOrZero | None] = {}
     require: dict[str, Sigma] = {}
+    sensors: SensorSheets = Sensors()
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None
     date: Date | None = None
 

@@ -58,7 +58,7 @@ def show(calibrations: Sequence[Calibration]) -> None:
         table.add_column("value ± sigma" if alone else c.estimate.solver, justify="right")
     if alone:
         table.add_column("verdict", no_wrap=True)
-    for q in calibrations[0].problem.quantities:
+    for q in filter(lambda q: q.judged, calibrations[0].problem.quantities):
         unit, factor = human_unit(q)
         row = [q.name, unit]
         truth = next((e[q.name].value for e in errors if q.name in e), None)
@@ -69,7 +69,7 @@ def show(calibrations: Sequence[Calibration]) -> None:
             error = known[q.name].error_sigmas if q.name in known else None
             row.append(_cell(parameters[q.name], factor, error, alone) if q.name in parameters else "-")
         if alone and q.name in found[0]:
-            verdict = found[0][q.name].observability
+            verdict = calibrations[0].assessment.verdicts[q.name]
             row.append(f"[{COLOURS[verdict]}]{verdict}[/]")
         table.add_row(*row)
     console.print(table)
@@ -172,7 +172,7 @@ def show_plan(plan: Plan) -> None:
         table.add_column(column, justify="right", no_wrap=True)
     table.add_column("verdict", no_wrap=True)
     now, best = plan.now.sigmas, plan.best.sigmas
-    for q in plan.now.quantities:
+    for q in filter(lambda q: q.judged, plan.now.quantities):
         unit, factor = human_unit(q)
         cells = [f"{factor * sigma:.2g}" for sigma in (q.require, now[q.name], best[q.name])]
         verdict = plan.now.assessment.verdicts[q.name]

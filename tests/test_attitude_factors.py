@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from factors import so3
-from factors.attitude import RelativeAttitudeFactor, VisionAttitudeFactor, ahrs_factors
+from factors.attitude import VisionAttitudeFactor, ahrs_factors
+from factors.gyro import GyroIncrementFactor, symmetric
 from factors.model import Array
 from factors.preintegration import GyroPath
 from factors.testing import assert_jacobians
@@ -17,12 +18,16 @@ RNG = np.random.default_rng(1)
 N = 12
 
 
-def _path(seed: int, amplitude: float) -> GyroPath:
+T = np.arange(0.0, 6.0, 0.005)
+FORCE = np.stack([np.sin(T), np.cos(T), 9.8 + np.sin(2.0 * T)], axis=1)
+
+
+def _path(seed: int, amplitude: float, force: Array | None = None) -> GyroPath:
     rng = np.random.default_rng(seed)
-    t = np.arange(0.0, 6.0, 0.005)
+    t = T
     phase = rng.uniform(0, 6, size=3)
     rate = amplitude * np.sin(np.array([1.1, 0.7, 1.9]) * t[:, None] + phase)
-    return GyroPath(t, rate, rng.normal(scale=0.01, size=3))
+    return GyroPath(t, rate, rng.normal(scale=0.01, size=3), force)
 
 
 HELMET, PLATFORM = _path(1, 1.5), _path(2, 0.6)
@@ -73,6 +78,89 @@ def test_vision_jacobians_near_half_turn_errors() -> None:
     assert_jacobians(model, blocks, steps, rtol=2e-5)
 
 
+def _errors(size: float, g: bool) -> list[Array]:
+    """Blocks of the pictures' errors and of both gyros'."""
+    rng = np.random.default_rng(8)
+    picture = np.stack([np.full(N, 0.012), np.full(N, 3e-4), np.full(N, size)], axis=1)
+    gyro = size * rng.normal(size=(N, 15)) * ([1.0] * 6 + [0.03] * 9)
+    return [picture, gyro if g else gyro[:, :6], size * rng.normal(size=(N, 9))]
+
+
+def _vision_of_all(rows: np.ndarray, g: bool, moving: bool) -> tuple[VisionAttitudeFactor, list[Array]]:
+    """Some pictures of a factor with all variables, at random values."""
+    rng = np.random.default_rng(9)
+    picture, gyro, platform = _errors(0.05, g)
+    rotations = [so3.exp(rng.normal(size=(n, 3))) for n in (N, 1, 1)]
+    bias = HELMET.bias_hat + rng.normal(scale=0.02, size=(N, 3))
+    blocks = [rotations[0], bias, *(np.tile(q, (N, 1)) for q in rotations[1:]), picture, gyro]
+    measured = so3.exp(rng.normal(size=(N, 3)))
+    model = VisionAttitudeFactor(
+        TIMES[rows],
+        measured[rows],
+        (rng.normal(size=(N, 3, 3)) + 3 * np.eye(3))[rows],
+        _path(1, 1.5, FORCE if g else None),
+        PLATFORM if moving else None,
+        errors=15 if g else 6,
+        platform_errors=moving,
+        anchor=TIMES[rows] + np.linspace(-0.05, 0.05, N)[rows],
+        elapsed=TIMES[rows],
+        first=np.tile(so3.exp(np.array([0.1, 0.2, -0.3])), (N, 1))[rows],
+    )
+    return model, [*blocks, *([platform] if moving else [])]
+
+
+@pytest.mark.parametrize("moving", [True, False], ids=["moving platform", "platform at rest"])
+@pytest.mark.parametrize("g", [True, False], ids=["with g", "without g"])
+def test_vision_jacobians_with_all_variables(g: bool, moving: bool) -> None:
+    model, blocks = _vision_of_all(np.arange(N), g, moving)
+    steps = [1e-5, 1e-4, 1e-5, 1e-5, 1e-6, 1e-4, 1e-4]
+    assert_jacobians(model, blocks, steps[: len(blocks)])
+    everything = model(*blocks)
+    for i in range(N):
+        one = _vision_of_all(np.array([i]), g, moving)[0](*(b[i : i + 1] for b in blocks))
+        np.testing.assert_allclose(one[0][0], everything[0][i], rtol=1e-9, atol=1e-9)
+        for a, b in zip(one[1](), everything[1](), strict=True):
+            np.testing.assert_allclose(a[0], b[i], rtol=1e-9, atol=1e-7)
+
+
+def test_vision_of_known_errors_is_zero() -> None:
+    """Times, angles and rates off by what the variables say."""
+    scale, skew, offset = 0.01, 2e-4, 0.01
+    at = TIMES + offset - skew * (TIMES - TIMES[0])
+    S_numbers = np.array([0.01, -0.005, 0.008, 0.002, -0.003, 0.004])
+    S = symmetric(S_numbers)
+    base_bias = np.array([1e-3, -2e-3, 5e-4])
+    t = HELMET.t
+    w, base = (0.8 * np.sin(np.array(f) * t[:, None] + f[0]) for f in ([1.1, 0.7, 1.9], [0.3, 0.5, 0.4]))
+    bRv0, cRb, vRh = so3.exp(np.random.default_rng(3).normal(size=(3, 3)))
+    inertial, platform = (GyroPath(t, rate).attitude for rate in (w, base))
+
+    def bRv(times: Array) -> Array:
+        return so3.compose(so3.inverse(platform(times)), bRv0, inertial(times))
+
+    cRh = so3.compose(cRb, bRv(at), vRh)
+    turned = so3.log(so3.multiply(so3.inverse(cRh[:1]), cRh)) * (1.0 + scale)
+    measured = so3.multiply(cRh[:1], so3.exp(turned))
+    model = VisionAttitudeFactor(
+        TIMES,
+        measured,
+        np.tile(np.eye(3), (N, 1, 1)),
+        GyroPath(t, w + w @ S),
+        GyroPath(t, base - base @ S + base_bias),
+        errors=6,
+        platform_errors=True,
+        anchor=TIMES - 0.02,
+        elapsed=TIMES - TIMES[0],
+        first=np.tile(cRh[:1], (N, 1)),
+    )
+    errors = [np.array([offset, skew, scale]), S_numbers, np.concatenate([base_bias, -S_numbers])]
+    blocks = [bRv(TIMES - 0.02), np.zeros((N, 3)), *(np.tile(each, (N, 1)) for each in (cRb, vRh, *errors))]
+    np.testing.assert_allclose(model(*blocks)[0], 0.0, atol=3e-6)
+    for k in (4, 5, 6):
+        without = [0.0 * b if i == k else b for i, b in enumerate(blocks)]
+        assert np.abs(model(*without)[0]).max() > 1e-4
+
+
 def test_vision_rows_are_independent() -> None:
     blocks = _vision_blocks(1.0, 0.01)
     assert_rows_are_independent(lambda rows: _vision(rows, blocks, 0.3, PLATFORM), blocks)
@@ -86,23 +174,20 @@ def test_vision_is_zero_at_the_truth_and_follows_the_offset() -> None:
     assert np.abs(model(*late)[0]).max() > 1e-3
 
 
-def _relative(rows: np.ndarray, noise: float) -> tuple[RelativeAttitudeFactor, list[Array]]:
+def _relative(rows: np.ndarray, noise: float) -> tuple[GyroIncrementFactor, list[Array]]:
     start, stop = TIMES, TIMES + np.linspace(0.01, 0.9, N)
     rng = np.random.default_rng(7)
     helmet = HELMET.increments(start[rows], stop[rows])
-    platform = PLATFORM.increments(start, stop).wxyz
+    platform = PLATFORM.increments(start, stop)
     bRv_i = so3.exp(rng.normal(size=(N, 3)))
     bias = HELMET.bias_hat + rng.normal(scale=0.02, size=(N, 3))
     everything = HELMET.increments(start, stop)
     correction = np.einsum("nij,nj->ni", everything.bias_jacobian, bias - HELMET.bias_hat)
-    bRv_j = so3.compose(so3.inverse(platform), bRv_i, everything.wxyz, so3.exp(correction))
+    bRv_j = so3.compose(so3.inverse(platform.wxyz), bRv_i, everything.wxyz, so3.exp(correction))
     bRv_j = so3.multiply(bRv_j, so3.exp(rng.normal(scale=max(noise, 1e-15), size=(N, 3))))
     sigma = np.linspace(0.5, 2.0, N)
-    return RelativeAttitudeFactor(stop[rows], platform[rows], helmet, HELMET.bias_hat, sigma[rows]), [
-        bRv_i,
-        bRv_j,
-        bias,
-    ]
+    model = GyroIncrementFactor(stop[rows], helmet, HELMET, sigma[rows], platform[rows], PLATFORM)
+    return model, [bRv_i, bRv_j, bias]
 
 
 @pytest.mark.parametrize("noise", [0.5, 1e-7])
@@ -120,10 +205,11 @@ def test_relative_equals_native_path() -> None:
     """bRv variables with the vectorised factor and iRv variables with gtsam's AHRSFactor are the same constraint."""
     model, (bRv_i, bRv_j, bias) = _relative(np.arange(N), 0.3)
     iRb_i = PLATFORM.attitude(TIMES)
-    iRb_j = so3.multiply(iRb_i, model.platform)
+    assert model.platform_turns is not None
+    iRb_j = so3.multiply(iRb_i, model.platform_turns.wxyz)
     keys = list(range(N))
     native = ahrs_factors(
-        keys, [N + k for k in keys], [2 * N + k for k in keys], model.helmet, model.bias_hat, model.sigma**2
+        keys, [N + k for k in keys], [2 * N + k for k in keys], model.turns, HELMET.bias_hat, model.sigma**2
     )
     values = gtsam.Values()
     ours = gtsam.Values()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from datasets.broad import VISION_SIGMA, Trial, config_yaml, gyro_bias_at_rest, read_trial, to_session
+from datasets.broad import CONFIG, VISION_SIGMA, Trial, gyro_bias_at_rest, read_trial, to_session
 from factors import so3
 from pipelines.config import load_config
 from pipelines.errors import InputError
@@ -71,7 +71,7 @@ def test_bias_is_the_mean_at_rest(trial_file: Path) -> None:
 
 
 def test_config_is_valid() -> None:
-    config = load_config(config_yaml(Path("07.mat")).encode())
+    config = load_config(CONFIG.encode())
     assert config.method == "head"
     assert config.noise.vision_attitude == pytest.approx(VISION_SIGMA, rel=1e-4)
 

@@ -45,7 +45,8 @@ def test_calibrate_writes_everything(alidade: Command, session: Path, tmp_path: 
     names = [p["name"] for p in result["parameters"]]
     assert names[:4] == ["gyro_bias_x", "gyro_bias_y", "gyro_bias_z", "helmet_mount_x"]
     assert result["covariance"]["order"] == names
-    assert np.array(result["covariance"]["matrix"]).shape == (10, 10)
+    assert np.array(result["covariance"]["matrix"]).shape == (len(names), len(names))
+    assert [p.get("group") for p in result["parameters"]] == [None] * 10 + ["assumption"] * (len(names) - 10)
     for name in ("calibration.yaml", "report.html", "attitude.tum"):
         assert (tmp_path / "out" / name).stat().st_size > 100
     assert "helmet_mount_x" in run.out

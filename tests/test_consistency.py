@@ -34,9 +34,13 @@ Case = tuple[Method, Any, Config]
 @pytest.fixture(scope="module")
 def head() -> Case:
     """15 s, mounts known, no time offset."""
+    return head_of(15.0)
+
+
+def head_of(duration_s: float) -> Case:
     known = [f"{mount}_{axis}" for mount in ("helmet_mount", "camera_mount") for axis in "xyz"]
     scenario = HeadScenario(
-        duration_s=15,
+        duration_s=duration_s,
         vision_rate_hz=15,
         gyro_rate_hz=100,
         platform_gyro_rate_hz=100,
@@ -205,7 +209,8 @@ def test_a_tenth_rejected_is_told_and_a_quarter_is_too_much(head: Case) -> None:
 def test_halves_of_a_recording_agree_and_those_of_two_do_not(head: Case) -> None:
     find, data, config = head
     halves = split_halves(find, data, config)
-    assert set(halves) == {"gyro_bias_x", "gyro_bias_y", "gyro_bias_z"}
+    assumed = {q.name for q in find.problem(data, config).quantities if q.group}
+    assert set(halves) - assumed == {"gyro_bias_x", "gyro_bias_y", "gyro_bias_z"}
     assert max(abs(half.difference_sigmas) for half in halves.values()) < 4.0
     late = data.head_t > 0.5 * data.head_t[-1]
     jump = data.head_gyro + 0.02 * late[:, None] * np.array([1.0, 0.0, 0.0])
@@ -214,8 +219,9 @@ def test_halves_of_a_recording_agree_and_those_of_two_do_not(head: Case) -> None
     assert changed.second - changed.first == pytest.approx(0.02, rel=0.3)
 
 
-def test_measurements_held_out_are_predicted_as_well_as_the_noise_allows(head: Case) -> None:
-    find, data, config = head
+def test_measurements_held_out_are_predicted_as_well_as_the_noise_allows() -> None:
+    # A fifth of 900 pictures: the robust sigma of their 540 numbers is known to 5 %.
+    find, data, config = head_of(60.0)
     assert held_out(find.problem(data, config))["vision"] == pytest.approx(1.0, abs=0.15)
     wrong = with_noise(config, vision_attitude=0.2)
     assert held_out(find.problem(replace(data, vision_cov=data.vision_cov / 25.0), wrong))["vision"] > 3.0

@@ -22,6 +22,7 @@ gyro_rate_hz: 100
 vision_rate_hz: 20
 truth_rate_hz: 1
 priors: {helmet_mount_x: 0, helmet_mount_y: 0, helmet_mount_z: 0, time_offset: 0}
+sensors: ideal
 """
 
 

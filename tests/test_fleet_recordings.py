@@ -40,6 +40,7 @@ def scenario(mount_deg: tuple[float, float, float], one_axis: bool = False) -> H
             "vision_rate_hz": 20.0,
             "truth_rate_hz": 1.0,
             "priors": {"time_offset": 0},
+            "sensors": "ideal",
         }
     )
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import gtsam
 import numpy as np
 import pytest
@@ -11,9 +9,9 @@ from numpy.typing import NDArray
 
 from factors import so3
 from factors.attitude import ahrs_factors
-from factors.gyro import GyroIncrementFactor, correction, rate_error, symmetric
-from factors.model import Array, Block, Model, Residuals
-from factors.preintegration import GyroPath, Increments
+from factors.gyro import GyroIncrementFactor, carried, corrected, symmetric
+from factors.model import Array
+from factors.preintegration import GyroPath
 from factors.testing import assert_jacobians
 from factors.vectorized import Ensemble
 from tests.numerics import assert_rows_are_independent
@@ -37,9 +35,8 @@ def _error(path: GyroPath, windows: tuple[Array, Array], bias: Array, scale: Arr
     """Largest angle between increments corrected for known errors and the true samples integrated, rad."""
     turns = path.increments(*windows, scale=True)
     n = len(windows[0])
-    phi, _ = correction(turns, np.tile(bias - BIAS_HAT, (n, 1)), np.tile(scale, (n, 1)), np.tile(g, (n, 1)))
+    got, _ = corrected(turns, np.tile(bias - BIAS_HAT, (n, 1)), np.tile([*scale, *g], (n, 1)))
     true = GyroPath(T, RATE).increments(*windows).wxyz
-    got = so3.multiply(turns.wxyz, so3.exp(phi))
     return float(np.abs(so3.log(so3.multiply(so3.inverse(true), got))).max())
 
 
@@ -105,109 +102,138 @@ def test_specific_force_between_stamps() -> None:
     np.testing.assert_allclose(got, exact, atol=1e-5)
 
 
-def _blocks(angle: float, size: float, g: bool) -> list[Array]:
-    """Random values for the factor's blocks, scale and g-sensitivity of the given size."""
+def _blocks(angle: float, size: float, errors: int, platform: bool = False) -> list[Array]:
+    """Random values for the factor's blocks, with `errors` numbers of S and G, of the given size."""
     rng = np.random.default_rng(4)
     attitudes = [so3.exp(angle * rng.normal(size=(N, 3))) for _ in range(2)]
-    errors = [BIAS_HAT + 0.02 * rng.normal(size=(N, 3)), size * rng.normal(size=(N, 6))]
-    return [*attitudes, *errors, *([0.03 * size * rng.normal(size=(N, 9))] if g else [])]
+    gyro = [BIAS_HAT + 0.02 * rng.normal(size=(N, 3)), size * rng.normal(size=(N, 15)) * ([1.0] * 6 + [0.03] * 9)]
+    base = [size * rng.normal(size=(N, 9))] if platform else []
+    return [*attitudes, gyro[0], *([gyro[1][:, :errors]] if errors else []), *base]
 
 
-def _turns(g: bool) -> Increments:
-    path = GyroPath(T, RATE, BIAS_HAT, FORCE if g else None)
+def _factor(rows: NDArray[np.intp], errors: int, platform: bool = False) -> GyroIncrementFactor:
+    path = GyroPath(T, RATE, BIAS_HAT, FORCE if errors == 15 else None)
+    base = GyroPath(T, 0.3 * np.roll(RATE, 1, axis=1), 0.5 * BIAS_HAT)
     start = np.linspace(0.5, 15.0, N)
-    return path.increments(start, start + np.linspace(0.01, 0.9, N), scale=True)
+    stop = start + np.linspace(0.01, 0.9, N)
+    turns, base_turns = (p.increments(start, stop, scale=errors > 0)[rows] for p in (path, base))
+    sigma = np.linspace(0.5, 2.0, N)[rows]
+    if platform:
+        return GyroIncrementFactor(stop[rows], turns, path, sigma, base_turns, base)
+    return GyroIncrementFactor(stop[rows], turns, path, sigma)
 
 
-def _factor(rows: NDArray[np.intp], g: bool) -> GyroIncrementFactor:
-    return GyroIncrementFactor(T[rows], _turns(g)[rows], GyroPath(T, RATE, BIAS_HAT), np.linspace(0.5, 2.0, N)[rows])
+CASES = [(0, False), (6, False), (15, False), (6, True), (15, True)]
 
 
-@pytest.mark.parametrize("g", [True, False], ids=["with g", "without g"])
+@pytest.mark.parametrize(("errors", "platform"), CASES)
 @pytest.mark.parametrize(("angle", "size"), [(0.7, 0.1), (1e-6, 1e-9)], ids=["random", "near zero"])
-def test_increment_jacobians(g: bool, angle: float, size: float) -> None:
-    assert_jacobians(_factor(np.arange(N), g), _blocks(angle, size, g))
+def test_increment_jacobians(errors: int, platform: bool, angle: float, size: float) -> None:
+    assert_jacobians(_factor(np.arange(N), errors, platform), _blocks(angle, size, errors, platform))
 
 
-@pytest.mark.parametrize("g", [True, False], ids=["with g", "without g"])
-def test_increment_rows_are_independent(g: bool) -> None:
-    assert_rows_are_independent(lambda rows: _factor(rows, g), _blocks(0.7, 0.05, g))
+@pytest.mark.parametrize(("errors", "platform"), CASES)
+def test_increment_rows_are_independent(errors: int, platform: bool) -> None:
+    assert_rows_are_independent(lambda rows: _factor(rows, errors, platform), _blocks(0.7, 0.05, errors, platform))
 
 
-@dataclass(frozen=True)
-class _RateError(Model):
-    time: Array
-    read: Array
-    force: Array | None
-    rows: int = 3
+def test_a_platform_of_known_errors() -> None:
+    """The residual is zero where both gyros' errors are what they are."""
+    start = np.linspace(0.5, 15.0, N)
+    base_rate = 0.3 * np.roll(RATE, 1, axis=1)
+    scale, g = 1e-2 * SCALE, 1e-4 * G
+    gyro = _read(scale, g, BIAS)
+    base = GyroPath(T, base_rate @ (np.eye(3) + symmetric(-scale)).T - BIAS)
+    windows = start, start + 0.05
+    model = GyroIncrementFactor(
+        windows[1], gyro.increments(*windows, scale=True), gyro, np.ones(N), base.increments(*windows, scale=True), base
+    )
+    turned, carrying = (GyroPath(T, rate).increments(*windows).wxyz for rate in (RATE, base_rate))
+    i = so3.exp(np.random.default_rng(1).normal(size=(N, 3)))
+    j = so3.compose(so3.inverse(carrying), i, turned)
+    known = np.tile([*scale, *g], (N, 1)), np.tile([*-BIAS, *-scale], (N, 1))
+    np.testing.assert_allclose(model(i, j, np.tile(BIAS, (N, 1)), *known)[0], 0.0, atol=2e-7)
+    perfect = np.zeros((N, 9))
+    assert np.abs(model(i, j, np.tile(BIAS, (N, 1)), known[0], perfect)[0]).max() > 1e-4
 
-    @property
-    def blocks(self) -> tuple[Block, ...]:
-        return (3, 6) if self.force is None else (3, 6, 9)
 
-    def __call__(self, bias: Array, scale: Array, g: Array | None = None) -> Residuals:
-        return rate_error(bias, scale, g, self.read, self.force)
+def test_carried_over_short_windows() -> None:
+    """As corrected increments, and the rate at the end is the true one."""
+    scale, g = 1e-2 * SCALE, 1e-4 * G
+    gyro = _read(scale, g, BIAS)
+    start = np.linspace(0.5, 15.0, N)
+    stop = start + np.linspace(-0.02, 0.03, N)
+    got, rate, _ = carried(
+        gyro, start, 0.5 * (start + stop), stop, np.tile(BIAS, (N, 1)), np.tile([*scale, *g], (N, 1))
+    )
+    true = GyroPath(T, RATE).increments(start, stop)
+    # A scale of 1e-2 times the rate's second derivative, 50 rad/s^3, times the window's cube over 24.
+    np.testing.assert_allclose(so3.log(so3.multiply(so3.inverse(true.wxyz), got)), 0.0, atol=6e-7)
+    # The errors are those of the middle of the window: 1e-2 of what the rate changes in half of it.
+    np.testing.assert_allclose(rate, true.rate, atol=3e-3)
 
 
-@pytest.mark.parametrize("g", [True, False], ids=["with g", "without g"])
-def test_rate_error_and_its_jacobians(g: bool) -> None:
-    """The rate read by a gyro of known errors, less what it reads too much, is the rate."""
-    rng = np.random.default_rng(2)
-    w, f = rng.normal(size=(N, 3)), 9.8 * rng.normal(size=(N, 3))
-    _, _, bias, scale, *by_g = _blocks(0.0, 0.05, g)
-    read = w + np.einsum("nij,nj->ni", symmetric(scale), w) + bias
-    if g:
-        read += np.einsum("nij,nj->ni", by_g[0].reshape(N, 3, 3), f)
-    blocks = [bias, scale, *by_g]
-
-    model = _RateError(np.arange(float(N)), read, f if g else None)
-    np.testing.assert_allclose(read - model(*blocks)[0], w, atol=1e-12)
-    assert_jacobians(model, blocks)
+def test_errors_as_variables_need_derivatives_by_them() -> None:
+    path = GyroPath(T, RATE)
+    turns = path.increments([1.0], [2.0])
+    with pytest.raises(ValueError, match="scale=True"):
+        corrected(turns, np.zeros((1, 3)), np.zeros((1, 6)))
+    with pytest.raises(ValueError, match="specific force"):
+        corrected(path.increments([1.0], [2.0], scale=True), np.zeros((1, 3)), np.zeros((1, 15)))
 
 
 def test_equals_the_native_factor_where_the_gyro_is_perfect() -> None:
     start = np.linspace(0.5, 15.0, N)
     path = GyroPath(T, RATE, BIAS_HAT, FORCE)
     turns = path.increments(start, start + 0.1, scale=True)
-    i, j, bias, *_ = _blocks(0.4, 0.0, True)
+    i, j, bias, _ = _blocks(0.4, 0.0, 15)
     keys_i, keys_j, keys_bias = (list(range(k, k + N)) for k in (0, N, 2 * N))
     values = gtsam.Values()
     for k in range(N):
         values.insert(keys_i[k], so3.to_gtsam(i[k]))
         values.insert(keys_j[k], so3.to_gtsam(j[k]))
         values.insert(keys_bias[k], bias[k])
-    scale, g = 100, 101
-    values.insert(scale, np.zeros(6))
-    values.insert(g, np.zeros(9))
+    errors = 100
+    values.insert(errors, np.zeros(15))
     sigma = np.linspace(0.5, 2.0, N)
-    ours = GyroIncrementFactor(start + 0.1, turns, path, sigma).on(keys_i, keys_j, keys_bias, scale, g)
+    keys = keys_i, keys_j, keys_bias
+    ours = GyroIncrementFactor(start + 0.1, turns, path, sigma).on(*keys, errors)
+    perfect = GyroIncrementFactor(start + 0.1, path.increments(start, start + 0.1), path, sigma).on(*keys)
     graph = gtsam.NonlinearFactorGraph()
     for factor in ahrs_factors(keys_i, keys_j, keys_bias, turns, BIAS_HAT, sigma**2):
         graph.add(factor)
     assert ours.factor.error(values) == pytest.approx(graph.error(values), rel=1e-9)
+    assert perfect.factor.error(values) == pytest.approx(graph.error(values), rel=1e-9)
     ordering = gtsam.Ordering()
     for key in range(3 * N):
         ordering.push_back(key)
     expected = graph.linearize(values).hessian(ordering)[0]
-    _, A = ours.rows(values)
-    kept = np.concatenate([np.arange(3) + 3 * ours.keys.index(key) for key in range(3 * N)])
-    np.testing.assert_allclose((A.T @ A)[np.ix_(kept, kept)], expected, atol=1e-7 * np.abs(expected).max())
+    for each in (ours, perfect):
+        _, A = each.rows(values)
+        kept = np.concatenate([np.arange(3) + 3 * each.keys.index(key) for key in range(3 * N)])
+        np.testing.assert_allclose((A.T @ A)[np.ix_(kept, kept)], expected, atol=1e-7 * np.abs(expected).max())
 
 
 def test_several_factors_are_evaluated_as_one() -> None:
     """As the solvers do it; each then answers as it does alone."""
-    blocks = _blocks(0.5, 0.02, True)
+    blocks = _blocks(0.5, 0.02, 15, platform=True)
     values = gtsam.Values()
     for k in range(N):
         values.insert(k, so3.to_gtsam(blocks[0][k]))
         values.insert(N + k, so3.to_gtsam(blocks[1][k]))
-    for key, block in [(100, blocks[2]), (101, blocks[3]), (102, blocks[4])]:
+    for key, block in zip((100, 101, 102), blocks[2:], strict=True):
         values.insert(key, block[0])
-    whole = _factor(np.arange(N), True)
+    whole = _factor(np.arange(N), 15, platform=True)
+    assert whole.platform_turns is not None
     factors = [
-        GyroIncrementFactor(whole.time[part], whole.turns[part], whole.gyro, whole.sigma[part]).on(
-            part, [N + k for k in part], 100, 101, 102
-        )
+        GyroIncrementFactor(
+            whole.time[part],
+            whole.turns[part],
+            whole.gyro,
+            whole.sigma[part],
+            whole.platform_turns[part],
+            whole.platform,
+        ).on(part, [N + k for k in part], 100, 101, 102)
         for part in (range(4), range(4, 11), range(11, N))
     ]
     alone = [factor.rows(values) for factor in factors]

@@ -36,6 +36,8 @@ SHORT = {
     "duration_s": 20,
     "vision_rate_hz": 15,
     "gyro_rate_hz": 200,
+    # Errors of the sensors are drawn from what the solver assumes of them.
+    "sensors": {},
 }
 
 

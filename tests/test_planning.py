@@ -18,6 +18,7 @@ from pipelines.methods.cube.simulation import CubeScenario
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from pipelines.planning import Prediction, make_plan, predict, requirements, write_scenario
+from pipelines.settings import Sensors
 from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.simulation.scenario import load_scenario
 from pipelines.solvers.batch import solve_batch
@@ -29,7 +30,13 @@ SWAY = EulerMotion(
     roll=[Swing(amplitude_deg=10, frequency_hz=0.5)],
 )
 HEAD = HeadScenario(
-    duration_s=15, vision_rate_hz=10, gyro_rate_hz=100, platform_gyro_rate_hz=100, head=SWAY, platform=SWAY
+    duration_s=15,
+    vision_rate_hz=10,
+    gyro_rate_hz=100,
+    platform_gyro_rate_hz=100,
+    head=SWAY,
+    platform=SWAY,
+    sensors=Sensors(),
 )
 
 

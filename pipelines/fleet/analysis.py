@@ -50,7 +50,7 @@ class Population:
         method: of the recordings.
         name: the parameter's.
         unit: SI.
-        require: accuracy wanted.
+        require: accuracy wanted; None: none is.
         recordings: their names; `units` are what they show.
         dates: Unix s.
         values: SI; `sigmas` their own.
@@ -66,7 +66,7 @@ class Population:
     method: str
     name: str
     unit: str
-    require: float
+    require: float | None
     recordings: tuple[str, ...]
     units: tuple[str, ...]
     dates: Array

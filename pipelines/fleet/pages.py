@@ -103,7 +103,7 @@ def _render(template: str, plots: Sequence[Plot], **context: Any) -> str:
 
 
 def _readable(p: Population) -> tuple[str, float]:
-    return human_unit(Quantity(p.name, p.unit, None, 1.0, p.require))
+    return human_unit(Quantity(p.name, p.unit, None, 1.0, p.require or math.inf))
 
 
 def _outlying(p: Population, i: int) -> _Finding:
@@ -210,7 +210,7 @@ def _consistency_row(study: Study, solver: str) -> dict[str, Any]:
 
 def _accuracy_row(solver: str, name: str, row: tuple[statistics.Accuracy, Result]) -> dict[str, Any]:
     a, parameter = row
-    unit, factor = human_unit(Quantity(name, parameter["unit"], None, 1.0, parameter["require"]))
+    unit, factor = human_unit(Quantity(name, parameter["unit"], None, 1.0, parameter["require"] or math.inf))
     return {
         "solver": solver,
         "name": name,

@@ -82,16 +82,17 @@ def _parameters(view: View) -> Table:
         sigma, verdict = float(view.sigmas[i]), view.assessment.verdicts[q.name]
         value = to_digits_of(factor * float(view.values[i]), factor * sigma)
         table.add_row(q.name, unit, value, f"{factor * sigma:.2g}", required, f"[{COLOURS[verdict]}]{verdict}[/]")
-    if len(view.quantities) > _MOST_ROWS:
-        table.caption = f"the least accurate of {len(view.quantities)} parameters"
+    judged = sum(q.judged for q in view.quantities)
+    if judged > _MOST_ROWS:
+        table.caption = f"the least accurate of {judged} parameters"
     return table
 
 
 def _shown(view: View) -> list[int]:
     """The parameters shown: all, or those furthest from what is required, in their order."""
-    indexes = range(len(view.quantities))
+    indexes = [i for i, q in enumerate(view.quantities) if q.judged]
     if view.sigmas is None:
-        return list(indexes[:_MOST_ROWS])
+        return indexes[:_MOST_ROWS]
     ratio = [sigma / q.require for q, sigma in zip(view.quantities, view.sigmas.tolist(), strict=True)]
     return sorted(sorted(indexes, key=lambda i: -ratio[i])[:_MOST_ROWS])
 

@@ -86,9 +86,9 @@ class LiveServer:
                     "sigma": sigma,
                     "lower": value - sigma,
                     "upper": value + sigma,
-                    "require": q.require,
-                    "verdict": view.assessment.verdicts[q.name],
                 }
+                if q.judged:
+                    message |= {"require": q.require, "verdict": view.assessment.verdicts[q.name]}
                 self._log(f"/estimate/{q.name}", _ESTIMATE, {"unit": q.unit}, message, at)
         status = {
             "time_s": view.time,

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from factors import so3
 from factors.attitude import ahrs_factors
+from factors.gyro import GyroIncrementFactor, carried, corrected, platform_errors
 from factors.preintegration import GyroPath, Increments
-from pipelines.graph.problem import Array, Factor, Step
+from pipelines.graph.problem import Array, Factor, Parameter, Step
 from pipelines.graph.walking_bias import WalkingBias
 
 
@@ -25,6 +26,8 @@ def state(keyframe: int) -> int:
 class GyroChain:
     """Attitudes aRm at K keyframes: m the gyro, a a frame that a chain of increments holds on to.
 
+    That frame is inertial, or turns with a platform that has a gyro of its own.
+
     Attributes:
         time: (K,) of the keyframes, s.
         starts: (K,) whether a new chain begins at a keyframe: no increment leads to it.
@@ -34,6 +37,9 @@ class GyroChain:
         variance: (K - 1,) of each, rad^2 per axis.
         bias: its nodes over the keyframes.
         nodes: (K,) whole numbers: the node in force up to each keyframe.
+        errors: of the gyro, as factors.gyro has them; None: perfect.
+        platform, platform_turns: the platform's gyro and its increments; None in an inertial frame.
+        platform_errors: of that gyro, its bias first; None: perfect.
     """
 
     time: Array
@@ -44,6 +50,10 @@ class GyroChain:
     variance: Array
     bias: WalkingBias
     nodes: NDArray[np.intp]
+    errors: Parameter | None = None
+    platform: GyroPath | None = None
+    platform_turns: Increments | None = None
+    platform_errors: Parameter | None = None
 
     @classmethod
     def over(
@@ -56,7 +66,10 @@ class GyroChain:
         density: float,
         other_density: float = 0.0,
         walk: float,
-        scale_error: float,
+        scale_error: float = 0.0,
+        errors: Parameter | None = None,
+        platform: GyroPath | None = None,
+        platform_errors: Parameter | None = None,
     ) -> GyroChain:
         """A chain over keyframes.
 
@@ -66,8 +79,13 @@ class GyroChain:
             other_density: what else an increment is uncertain by, as of another gyro that it is made relative to.
             walk: of the bias, rad/s/sqrt(s).
             scale_error: sigma of an increment per angle turned.
+            errors, platform, platform_errors: as above.
         """
-        turns = gyro.increments(time[:-1], time[1:])
+        turns = gyro.increments(time[:-1], time[1:], scale=errors is not None)
+        unseen, platform_turns = turns.unseen, None
+        if platform is not None:
+            platform_turns = platform.increments(time[:-1], time[1:], scale=platform_errors is not None)
+            unseen = unseen + platform_turns.unseen
         by_scale = scale_error * np.linalg.norm(so3.log(turns.wxyz), axis=1)
         middles = np.where(starts, time, 0.5 * (time + np.roll(time, 1)))
         bias = WalkingBias.over(time[0], time[-1], middles, walk, density)
@@ -77,14 +95,23 @@ class GyroChain:
             initial=initial,
             gyro=gyro,
             turns=turns,
-            variance=(density**2 + other_density**2) * turns.duration + by_scale**2 + turns.unseen,
+            variance=(density**2 + other_density**2) * turns.duration + by_scale**2 + unseen,
             bias=bias,
             nodes=bias.node_at(middles),
+            errors=errors,
+            platform=platform,
+            platform_turns=platform_turns,
+            platform_errors=platform_errors,
         )
 
     def bias_keys(self, keyframes: Sequence[int] | NDArray[np.intp]) -> list[int]:
         """Variables of the bias in force up to keyframes."""
         return [self.bias.key(int(n)) for n in self.nodes[keyframes]]
+
+    @property
+    def error_keys(self) -> list[int]:
+        """Variables of the gyros' errors: the last blocks of factors that the gyros carry."""
+        return [p.key for p in (self.errors, self.platform_errors) if p is not None]
 
     def add(self, step: Step) -> None:
         """The attitudes at a step's keyframes, the increments that lead there, and the bias nodes that begin with them.
@@ -105,7 +132,9 @@ class GyroChain:
         for k in step.keyframes:
             step.initial.insert(state(k), so3.to_gtsam(self.initial[k]))
             step.timestamps[state(k)] = float(self.time[k])
-        step.factors.extend(self._increments([k for k in step.keyframes if not self.starts[k]]))
+        after = np.array([k for k in step.keyframes if not self.starts[k]], dtype=np.intp)
+        if len(after):
+            step.factors.extend(self._increments(after))
 
     def _new(self, keyframes: range) -> tuple[range, range]:
         """The bias nodes that begin with keyframes, and those that end, so that the mean up to there is defined."""
@@ -114,18 +143,16 @@ class GyroChain:
         last = keyframes.stop == len(self.time)
         return range(first, now + 1), range(max(first - 1, 1), now + 1 if last else now)
 
-    def _increments(self, after: list[int]) -> list[Factor]:
-        """Those that lead to keyframes, gtsam's native factors."""
-        ends = np.array(after, dtype=np.intp)
-        native = ahrs_factors(
-            [state(k - 1) for k in after],
-            [state(k) for k in after],
-            self.bias_keys(ends),
-            self.turns[ends - 1],
-            self.gyro.bias_hat,
-            self.variance[ends - 1],
-        )
-        return [Factor("gyro", f) for f in native]
+    def _increments(self, after: NDArray[np.intp]) -> list[Factor]:
+        """Those that lead to keyframes: gtsam's native factors where all that they depend on is the bias."""
+        states = [state(k - 1) for k in after], [state(k) for k in after]
+        bias, turns, variance = self.bias_keys(after), self.turns[after - 1], self.variance[after - 1]
+        if self.errors is None and self.platform is None:
+            native = ahrs_factors(*states, bias, turns, self.gyro.bias_hat, variance)
+            return [Factor("gyro", f) for f in native]
+        carrying = None if self.platform_turns is None else self.platform_turns[after - 1]
+        model = GyroIncrementFactor(self.time[after], turns, self.gyro, np.sqrt(variance), carrying, self.platform)
+        return [Factor.process_of("gyro", model.on(*states, bias, *self.error_keys))]
 
     def predict(
         self, keyframes: range, seen: Callable[[int, gtsam.Values], Array], current: gtsam.Values
@@ -142,13 +169,50 @@ class GyroChain:
         bias = current.atVector(self.bias.key(nodes.start - 1))
         for key in [*map(self.bias.key, nodes), *map(self.bias.mean_key, means)]:
             out.insert(key, bias)
-        for k in keyframes:
+        carried_by, turned = self._turned(keyframes, bias, current)
+        for k, carrier, turn in zip(keyframes, carried_by, turned, strict=True):
             if self.starts[k]:
                 attitude = seen(k, current)
             else:
                 before = (out if out.exists(state(k - 1)) else current).atRot3(state(k - 1))
-                turn = self.turns[k - 1]
-                correction = so3.exp(turn.bias_jacobian @ (bias - self.gyro.bias_hat))
-                attitude = so3.compose(so3.from_gtsam([before])[0], turn.wxyz, correction)
+                attitude = so3.compose(so3.inverse(carrier), so3.from_gtsam([before])[0], turn)
             out.insert(state(k), so3.to_gtsam(attitude))
         return out
+
+    def _turned(self, keyframes: range, bias: Array, values: gtsam.Values) -> tuple[Array, Array]:
+        """Increments (n, 4) of the platform and of the gyro that lead to keyframes, at the values."""
+        n, rows = len(keyframes), slice(keyframes.start - 1, keyframes.stop - 1)
+        errors, platform = self._errors(values, n)
+        turned, _ = corrected(self.turns[rows], np.tile(bias - self.gyro.bias_hat, (n, 1)), errors)
+        if self.platform is None or self.platform_turns is None:
+            return so3.identity(n), turned
+        platform_bias, scale = platform_errors(self.platform, platform, n)
+        return corrected(self.platform_turns[rows], platform_bias - self.platform.bias_hat, scale)[0], turned
+
+    def _errors(self, values: gtsam.Values, n: int) -> tuple[Array | None, Array | None]:
+        """Of the gyro and of the platform's, n equal rows; None for perfect ones."""
+        own, platform = (
+            None if p is None else np.broadcast_to(values.atVector(p.key), (n, len(p.quantities)))
+            for p in (self.errors, self.platform_errors)
+        )
+        return own, platform
+
+    def attitudes(self, keyframes: NDArray[np.intp], stamps: Array, at: Array, values: gtsam.Values) -> Array:
+        """Attitudes (n, 4) at times near keyframes, where the values hold those of the keyframes.
+
+        Args:
+            keyframes: (n,) whose attitude is carried to each time.
+            stamps: (n,) s, the times as first thought, between which and the keyframes the errors are evaluated.
+            at: (n,) s, the times.
+            values: an estimate.
+        """
+        n, start = len(at), self.time[keyframes]
+        middle = 0.5 * (start + stamps)
+        errors, platform = self._errors(values, n)
+        bias = np.array([values.atVector(key) for key in self.bias_keys(keyframes)]).reshape(n, 3)
+        attitude = so3.from_gtsam([values.atRot3(state(k)) for k in keyframes])
+        attitude = so3.multiply(attitude, carried(self.gyro, start, middle, at, bias, errors)[0])
+        if self.platform is None:
+            return attitude
+        carrier, *_ = carried(self.platform, start, middle, at, *platform_errors(self.platform, platform, n))
+        return so3.multiply(so3.inverse(carrier), attitude)

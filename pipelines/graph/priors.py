@@ -19,7 +19,7 @@ def prior_sigmas(parameter: Parameter) -> Array:
     """(n,) sigmas of the prior factor."""
     return np.array(
         [
-            _FREE * q.prior_scale if q.prior_sigma is None else q.prior_sigma or _PINNED * q.require
+            _FREE * q.prior_scale if q.prior_sigma is None else q.prior_sigma or _PINNED * min(q.require, q.prior_scale)
             for q in parameter.quantities
         ]
     )

@@ -7,9 +7,10 @@ method, return an `Estimate`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,9 +52,11 @@ class Quantity:
         unit: SI.
         prior_sigma: sigma of its prior; 0 fixes it, None leaves it free.
         prior_scale: the contract's default prior sigma, the yardstick for a free one.
-        require: the accuracy wanted, sigma.
+        require: the accuracy wanted, sigma; infinite: none is.
         extra_sigma: known error that the graph does not model, added in square to the reported sigma.
         prior_mean: of its prior.
+        group: "assumption" for a systematic effect that is a parameter only lest it spoil the others; None for what
+            is calibrated.
     """
 
     name: str
@@ -63,6 +66,12 @@ class Quantity:
     require: float
     extra_sigma: float = 0.0
     prior_mean: float = 0.0
+    group: Literal["assumption"] | None = None
+
+    @property
+    def judged(self) -> bool:
+        """Whether an accuracy is wanted of it, so that there is a verdict."""
+        return math.isfinite(self.require)
 
     @property
     def scale(self) -> float:
@@ -93,11 +102,22 @@ class Factor:
     family: str
     factor: gtsam.NonlinearFactor
     measurement: VectorizedFactor | None = None
+    process: VectorizedFactor | None = None
 
     @classmethod
     def of(cls, family: str, measurement: VectorizedFactor) -> Factor:
         """A measurement that may be an outlier."""
         return cls(family, measurement.factor, measurement)
+
+    @classmethod
+    def process_of(cls, family: str, process: VectorizedFactor) -> Factor:
+        """What joins variables and is no outlier."""
+        return cls(family, process.factor, process=process)
+
+    @property
+    def vectorized(self) -> VectorizedFactor | None:
+        """The vectorised factor behind it, whichever it is."""
+        return self.measurement or self.process
 
 
 def _no_values() -> gtsam.Values:

@@ -202,7 +202,7 @@ def learning(history: History, names: Sequence[str], quantities: Sequence[Quanti
         names: of the history's columns.
         quantities: those to tell about.
     """
-    required = {q.name: q.require for q in quantities if q.prior_sigma != 0.0}
+    required = {q.name: q.require for q in quantities if q.prior_sigma != 0.0 and q.judged}
     found = {}
     for i, name in enumerate(names):
         sigma = history.sigmas[:, i]
@@ -241,7 +241,7 @@ class Assessment:
 
     Attributes:
         status: the first that applies of unobservable, inconsistent, weak, calibrated.
-        verdicts: parameter -> verdict, in the order of the quantities.
+        verdicts: parameter -> verdict, in the order of the quantities; of those only that an accuracy is wanted of.
         directions: weak and unobservable ones, worst first.
         covariance: (n, n), the one judged: symmetric and finite whatever was given.
         consistency: None when the solver has no chi-square.
@@ -308,14 +308,15 @@ def assess(
     sigma is 0.9 of its prior's or more, else weak.
 
     Args:
-        quantities: what is reported; those with prior 0 are fixed and take no part.
+        quantities: what is reported; those with prior 0 are fixed and take no part, those of which no accuracy is
+            wanted have no verdict.
         covariance: of the reported numbers, rows and columns as the quantities.
         chi_square: of the residuals, if the solver has one.
         advice: the method's sentence for a direction, given its weights by parameter name.
     """
     covariance = _finite(quantities, covariance)
     sigmas = np.sqrt(np.diag(covariance))
-    verdicts = {q.name: _verdict(q, float(s)) for q, s in zip(quantities, sigmas, strict=True)}
+    verdicts = {q.name: _verdict(q, float(s)) for q, s in zip(quantities, sigmas, strict=True) if q.judged}
     directions = _directions(quantities, covariance, advice)
     consistency = _consistency(chi_square)
     status = _status([*verdicts.values(), *(d.verdict for d in directions)], consistency)
@@ -347,7 +348,7 @@ def _verdict(quantity: Quantity, sigma: float) -> Verdict:
 
 def _directions(quantities: Sequence[Quantity], covariance: Array, advice: Advice | None) -> tuple[Direction, ...]:
     """Weak and unobservable eigen-directions of the prior-scaled covariance, worst first."""
-    estimated = [i for i, q in enumerate(quantities) if q.prior_sigma != 0.0]
+    estimated = [i for i, q in enumerate(quantities) if q.prior_sigma != 0.0 and q.judged]
     if not estimated:
         return ()
     names = [quantities[i].name for i in estimated]

@@ -32,6 +32,20 @@ def read_gyro(
     return t, imu.gyro[keep], density
 
 
+def read_imu(
+    recording: Recording, topic: str, epoch_ns: int, dropped: dict[str, int]
+) -> tuple[Array, Array, float | None, Array | None]:
+    """As `read_gyro`, and the specific force (N, 3), m/s^2, of the same samples, None where the Imu has none.
+
+    It has none when its messages say so (covariance[0] = -1), when all is zero, or when a number is missing.
+    """
+    imu = recording.imu(topic)
+    t, keep = usable(topic, imu, epoch_ns, dropped)
+    force = imu.accel[keep]
+    told = np.isfinite(force).all() and force.any() and not (imu.accel_cov[keep, 0, 0] == -1.0).any()
+    return t, imu.gyro[keep], gyro_density(t, imu.gyro_cov[keep]), force if told else None
+
+
 def usable(
     topic: str, imu: ImuSeries, epoch_ns: int, dropped: dict[str, int], least: int = 2
 ) -> tuple[Array, NDArray[np.intp]]:

@@ -41,7 +41,7 @@ class SavedParameter(_Record):
     value: float
     sigma: float
     unit: str
-    verdict: Verdict
+    verdict: Verdict | None
 
 
 class SavedRotation(_Record):

@@ -30,6 +30,8 @@ class _Row:
     prior: str
     require: str
     verdict: str
+    assumed: bool
+    pull: str
     error: str
 
 
@@ -39,7 +41,7 @@ def report_html(calibration: Calibration) -> str:
 
     own = list(calibration.plots(calibration)) if calibration.plots else []
     plots = [*(each for each in own if isinstance(each, Plot)), *common_plots(calibration)]
-    facts = calibration.facts
+    facts, rows = calibration.facts, _rows(calibration)
     return (
         environment("pipelines.reports")
         .get_template("report.html")
@@ -48,7 +50,8 @@ def report_html(calibration: Calibration) -> str:
             by_advice=by_advice,
             method=calibration.method.title,
             start=datetime.datetime.fromtimestamp(facts.epoch_ns // 1_000_000_000, datetime.UTC),
-            rows=_rows(calibration),
+            rows=[row for row in rows if not row.assumed],
+            assumptions=[row for row in rows if row.assumed],
             formulas=[formula.text for formula in calibration.formulas],
             tables=[each for each in own if isinstance(each, Table)],
             plots=[(plot.title, plot.caption, _div(plot, i)) for i, plot in enumerate(plots)],
@@ -79,8 +82,10 @@ def _rows(calibration: Calibration) -> list[_Row]:
                 sigma=to_digits_of(factor * p.sigma, factor * p.sigma) if known else "unknown",
                 unit=unit,
                 prior="free" if p.prior_sigma is None else f"{factor * p.prior_sigma:.3g}",
-                require=f"{factor * p.require:.3g}",
-                verdict=p.observability,
+                require="" if p.require is None else f"{factor * p.require:.3g}",
+                verdict=p.observability or "",
+                assumed=p.group is not None,
+                pull="" if p.pull is None else f"{p.pull:+.1f}",
                 error=to_digits_of(factor * error.error, factor * p.sigma) + in_sigmas if error and known else "",
             )
         )

@@ -14,8 +14,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
+from pipelines.graph.assumptions import pull
 from pipelines.graph.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
 from pipelines.judgement.observability import Assessment, Fit, Innovations, Learning, Status, Verdict, learning
 from pipelines.judgement.rejection import rejection_sentence
@@ -111,8 +112,10 @@ class Calibration:
                 sigma=float(sigma),
                 unit=q.unit,
                 prior_sigma=q.prior_sigma,
-                require=q.require,
-                observability=self.assessment.verdicts[q.name],
+                require=q.require if q.judged else None,
+                observability=self.assessment.verdicts.get(q.name),
+                group=q.group,
+                pull=None if q.group is None else pull(q, float(value), float(sigma)),
             )
             for q, value, sigma in rows
         }
@@ -250,7 +253,7 @@ def _beyond_priors(calibration: Calibration) -> tuple[str, ...]:
     away = {
         q.name: abs(float(value) - q.prior_mean) / q.prior_sigma
         for q, value in zip(quantities, calibration.estimate.values, strict=True)
-        if q.prior_sigma
+        if q.prior_sigma and q.group is None
     }
     far = {name: sigmas for name, sigmas in away.items() if sigmas > _FAR_FROM_PRIOR}
     if not far:
@@ -274,8 +277,16 @@ class ParameterResult(_Record):
     sigma: float
     unit: str
     prior_sigma: float | None
-    require: float
-    observability: Verdict
+    require: float | None
+    observability: Verdict | None
+    group: Literal["assumption"] | None = None
+    pull: float | None = None
+
+    @model_serializer(mode="wrap")
+    def _without_group(self, handler: SerializerFunctionWrapHandler) -> dict[str, object]:
+        """What is calibrated belongs to no group and has no pull."""
+        content: dict[str, object] = handler(self)
+        return content if self.group else {k: v for k, v in content.items() if k not in ("group", "pull")}
 
 
 class CovarianceResult(_Record):

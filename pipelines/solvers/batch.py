@@ -42,27 +42,27 @@ _FEWEST_USED = 0.5
 
 @dataclass(frozen=True)
 class System:
-    """A graph, the order in which its variables are eliminated, and its measurements evaluated all at once.
+    """A graph, the order in which its variables are eliminated, and its vectorised factors evaluated all at once.
 
     Attributes:
         factors: of the graph.
         graph: the same for gtsam.
         ordering: of the elimination.
-        measurements: those among the factors.
+        ensemble: the vectorised ones among the factors.
         loss: how those that may be outliers are weighed; None counts all in full.
     """
 
     factors: Sequence[Factor]
     graph: gtsam.NonlinearFactorGraph
     ordering: gtsam.Ordering
-    measurements: Ensemble
+    ensemble: Ensemble
     loss: TruncatedLoss | None
 
     @classmethod
     def of(cls, factors: Sequence[Factor], shared: Sequence[int], loss: TruncatedLoss | None) -> System:
         """The system of some factors; the shared variables are eliminated last."""
         graph = graph_of(factors)
-        ensemble = Ensemble([f.measurement for f in factors if f.measurement is not None])
+        ensemble = Ensemble([v for f in factors if (v := f.vectorized) is not None])
         return cls(factors, graph, elimination_ordering(graph, shared), ensemble, loss)
 
     def under(self, loss: TruncatedLoss | None) -> System:
@@ -71,7 +71,7 @@ class System:
 
     def at(self, values: gtsam.Values) -> AbstractContextManager[None]:
         """Within the block the factors answer for these values, under the system's loss."""
-        return self.measurements.at(values, self.loss)
+        return self.ensemble.at(values, self.loss)
 
     def error(self, values: gtsam.Values) -> float:
         """Half the sum of squares."""

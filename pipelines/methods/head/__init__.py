@@ -10,7 +10,7 @@ from pipelines.methods import Method, Scenario
 from pipelines.methods.head.topics import NEEDS, TOPICS, HeadConfig
 
 if TYPE_CHECKING:
-    from pipelines.graph.problem import Estimate, Problem
+    from pipelines.graph.problem import Estimate, Findings, Problem
     from pipelines.judgement.checklist import ChecklistItem
     from pipelines.judgement.hypotheses import Hypotheses
     from pipelines.judgement.validation import Validation
@@ -97,6 +97,11 @@ class Head(Method):
         from pipelines.methods.head.formulas import formulas
 
         return formulas(parameters)
+
+    def findings(self, data: HeadData, config: Config, estimate: Estimate) -> Findings:
+        from pipelines.methods.head.findings import findings
+
+        return findings(data, config, estimate)
 
     def figures(self, data: HeadData, calibration: Calibration) -> Sequence[Plot]:
         from pipelines.methods.head.figures import head_plots

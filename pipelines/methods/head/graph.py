@@ -1,7 +1,7 @@
 """The head method: helmet attitude, gyro bias, mounts and time offset from a helmet MIMU, platform IMU and vision.
 
-The graph's states are iRv = iRb bRv at the vision frames, i the platform's frame at the start: with the platform's
-rotation iRb integrated from its own gyro, gtsam's native AHRSFactor joins them. Methods page, section 3.
+The graph's states are bRv at keyframes, joined by what the helmet's and the platform's gyro measured between them. A
+keyframe serves all pictures around it: the gyros carry its attitude to their times. Methods page, section 3.
 """
 
 from __future__ import annotations
@@ -18,29 +18,22 @@ from numpy.typing import NDArray
 from factors import so3
 from factors.attitude import VisionAttitudeFactor
 from factors.chi_square import gate
-from factors.earth import EARTH_RATE
+from factors.gyro import SCALE
 from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
 from pipelines.errors import InputError
 from pipelines.graph.gyro_chain import GyroChain, state
 from pipelines.graph.priors import rotation_prior, vector_prior
-from pipelines.graph.problem import (
-    Array,
-    Attitudes,
-    Factor,
-    Parameter,
-    Problem,
-    Quantity,
-    Step,
-    rotation_vector_coordinates,
-)
-from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
+from pipelines.graph.problem import Array, Attitudes, Factor, Problem, Step
+from pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, HeadParameters
 from pipelines.methods.head.recording import HeadData
-from pipelines.settings import DEFAULT_NOISE, Config, check_names, first_given
+from pipelines.settings import DEFAULT_NOISE, Config, first_given
 
-# Without vision for longer than this, s, a keyframe is set in between: gtsam corrects an increment for the bias to
-# first order only.
-_LONGEST_INCREMENT = 1.0
+# Pictures share a keyframe within this time, s, and keyframes are never farther apart than this, s: increments are
+# corrected for the gyro's errors to first order only, see factors.gyro.
+_SHARED, _LONGEST_INCREMENT = 0.1, 0.25
+# Pictures share a keyframe as far as what gyro noise adds on the way is at most this part of vision's.
+_NEGLIGIBLE = 0.1
 # Rates for the first guess are taken over this time, s: long against vision noise, short against turns.
 _GUESS_SPAN = 0.3
 _FEWEST_FRAMES = 10
@@ -48,21 +41,20 @@ _FEWEST_FRAMES = 10
 # Said where it is taken for granted.
 _AT_REST = "No platform IMU: the platform counts as at rest."
 
-_BIAS, _HELMET, _CAMERA, _OFFSET = "gyro_bias", "helmet_mount", "camera_mount", "time_offset"
-_HELMET_KEY, _CAMERA_KEY, _OFFSET_KEY = (int(gtsam.symbol(c, 0)) for c in "HCT")
-
 
 @dataclass(frozen=True)
 class _Model:
     """The recording prepared for the graph: what every step needs."""
 
-    chain: GyroChain  # iRv at the keyframes
-    vision: NDArray[np.intp]  # (K,) index into the vision frames, -1 where a keyframe only bridges a gap
+    chain: GyroChain  # bRv at the keyframes
+    pictures: NDArray[np.intp]  # (K + 1,) those of keyframe k are from pictures[k] to pictures[k + 1]
+    stamps: Array  # (frames,)
+    elapsed: Array  # (frames,) since the recording's first stamp
     measured: Array  # (frames, 4) cRh
+    first: Array  # (4,) cRh of the recording's first picture
     sqrt_information: Array  # (frames, 3, 3)
-    platform: GyroPath | None
     loss: TruncatedLoss
-    parameters: tuple[Parameter, ...]
+    parameters: HeadParameters
     helmet_guess: Array  # vRh
 
 
@@ -75,7 +67,7 @@ def problem(data: HeadData, config: Config) -> Problem:
     model = _prepare(data, config)
     return Problem(
         method="head",
-        parameters=model.parameters,
+        parameters=model.parameters.all,
         steps=partial(_steps, model),
         steps_after=partial(_steps, model, 1),
         loss=model.loss,
@@ -105,31 +97,37 @@ def _prepare(data: HeadData, config: Config) -> _Model:
         platform_density = first_given(
             config.noise.platform_gyro_density, data.platform_gyro_density, DEFAULT_NOISE.platform_gyro_density
         )
+    parameters = HeadParameters.of(config, platform is not None, data.head_force is not None)
     sqrt_information = _sqrt_information(data.vision_cov, inside, config)
 
-    bRi = so3.identity(len(vision_t)) if platform is None else so3.inverse(platform.attitude(vision_t))
-    iRh = so3.multiply(so3.inverse(bRi), measured)
+    iRb = so3.identity(len(vision_t)) if platform is None else platform.attitude(vision_t)
     sigma = float(1.0 / np.median(np.linalg.norm(sqrt_information, axis=(1, 2)) / np.sqrt(3.0)))
-    bias_hat, vRh = _guess(data, vision_t, iRh, sigma)
-    time, vision = _keyframes(vision_t)
+    bias_hat, vRh = _guess(data, vision_t, so3.multiply(iRb, measured), sigma)
+    negligible = (_NEGLIGIBLE * sigma) ** 2 / max(density**2 + platform_density**2, 1e-300)
+    time, pictures = _keyframes(vision_t, min(_SHARED, negligible))
+    sensitive = parameters.gyro is not None and len(parameters.gyro.quantities) > SCALE
     chain = GyroChain.over(
         time,
         np.arange(len(time)) == 0,
-        so3.interpolate(vision_t, so3.multiply(iRh, so3.inverse(vRh)), time),
-        GyroPath(data.head_t, data.head_gyro, bias_hat),
+        so3.interpolate(vision_t, so3.multiply(measured, so3.inverse(vRh)), time),
+        GyroPath(data.head_t, data.head_gyro, bias_hat, data.head_force if sensitive else None),
         density=density,
         other_density=platform_density,
         walk=first_given(config.noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk),
-        scale_error=first_given(config.noise.gyro_scale, DEFAULT_NOISE.gyro_scale),
+        errors=parameters.gyro,
+        platform=platform,
+        platform_errors=parameters.platform,
     )
     return _Model(
         chain=chain,
-        vision=vision,
+        pictures=pictures,
+        stamps=vision_t,
+        elapsed=vision_t - data.vision_t[0],
         measured=measured,
+        first=data.vision_wxyz[0],
         sqrt_information=sqrt_information,
-        platform=platform,
         loss=TruncatedLoss(gate(3)),
-        parameters=_parameters(config, platform is not None),
+        parameters=parameters,
         helmet_guess=vRh,
     )
 
@@ -143,18 +141,24 @@ def _sqrt_information(covariance: Array | None, inside: NDArray[np.bool_], confi
     return np.swapaxes(root, 1, 2)
 
 
-def _keyframes(vision_t: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Vision frames and, in gaps, keyframes that bridge them."""
+def _keyframes(stamps: Array, shared: float) -> tuple[Array, NDArray[np.intp]]:
+    """Times (K,) of the keyframes and, (K + 1,), where the pictures of each begin; some, in gaps, have none.
+
+    Pictures share one as long as they are within `shared` s; it is the one in their middle.
+    """
+    group = np.floor((stamps - stamps[0]) / shared) if shared > 0.0 else np.arange(len(stamps))
+    begins = np.flatnonzero(np.diff(group, prepend=-1.0))
+    middles = stamps[(begins + np.append(begins[1:], len(stamps)) - 1) // 2]
     bridges = [
         np.linspace(a, b, int(np.ceil((b - a) / _LONGEST_INCREMENT)) + 1)[1:-1]
-        for a, b in pairwise(vision_t)
+        for a, b in pairwise(middles)
         if b - a > _LONGEST_INCREMENT
     ]
-    time = np.concatenate([vision_t, *bridges])
-    vision = np.full(len(time), -1)
-    vision[: len(vision_t)] = np.arange(len(vision_t))
+    time = np.concatenate([middles, *bridges])
+    count = np.zeros(len(time), dtype=int)
+    count[: len(middles)] = np.diff(begins, append=len(stamps))
     order = np.argsort(time, kind="stable")
-    return time[order], vision[order]
+    return time[order], np.append(0, np.cumsum(count[order]))
 
 
 def _guess(data: HeadData, vision_t: Array, iRh: Array, sigma: float) -> tuple[Array, Array]:
@@ -183,38 +187,14 @@ def _guess(data: HeadData, vision_t: Array, iRh: Array, sigma: float) -> tuple[A
     return np.median(gyro - so3.rotate(vRh, seen), axis=0), vRh
 
 
-def _parameters(config: Config, platform: bool) -> tuple[Parameter, ...]:
-    """The method's parameters with their priors; without a platform topic the camera mount is fixed by default."""
-
-    def quantity(
-        name: str, unit: str, scale: float, require: float, fixed: bool = False, extra: float = 0.0
-    ) -> Quantity:
-        prior = config.priors.get(name, 0.0 if fixed else scale)
-        return Quantity(name, unit, prior, scale, config.require.get(name, require), extra)
-
-    def triple(
-        name: str, unit: str, scale: float, require: float, fixed: bool = False, extra: float = 0.0
-    ) -> tuple[Quantity, ...]:
-        return tuple(quantity(f"{name}_{axis}", unit, scale, require, fixed, extra) for axis in "xyz")
-
-    parameters = (
-        Parameter(FIRST_BIAS, triple(_BIAS, "rad/s", 0.05, 2e-3, extra=0.0 if platform else EARTH_RATE)),
-        Parameter(_HELMET_KEY, triple(_HELMET, "rad", 0.35, 1e-2), rotation_vector_coordinates),
-        Parameter(_CAMERA_KEY, triple(_CAMERA, "rad", 0.35, 1e-2, fixed=not platform), rotation_vector_coordinates),
-        Parameter(_OFFSET_KEY, (quantity(_OFFSET, "s", 0.05, 5e-3),)),
-    )
-    names = [q.name for p in parameters for q in p.quantities]
-    check_names(config.priors, names, "priors")
-    check_names(config.require, names, "require")
-    return parameters
-
-
 def _steps(model: _Model, chunk: int, after: float = -np.inf) -> Iterator[Step]:
     """The first keyframe with the calibration variables and their priors, then `chunk` keyframes at a time."""
     time = model.chain.time
     taken = int(np.searchsorted(time, after, side="right"))
     if taken == 0:
         yield _step(model, range(1))
+    # Pictures that share keyframes make longer factors: fewer keyframes in each.
+    chunk = max(1, chunk // 2) if len(model.stamps) > 1.5 * len(time) else chunk
     for begin in range(max(taken, 1), len(time), chunk):
         yield _step(model, range(begin, min(begin + chunk, len(time))))
 
@@ -235,66 +215,64 @@ def _step(model: _Model, keyframes: range) -> Step:
 
 def _begin(model: _Model, step: Step) -> None:
     """The calibration variables and their priors."""
-    step.initial.insert(_HELMET_KEY, so3.to_gtsam(model.helmet_guess))
-    step.initial.insert(_CAMERA_KEY, so3.to_gtsam(so3.identity()))
-    step.initial.insert(_OFFSET_KEY, np.zeros(1))
-    bias, helmet, camera, offset = model.parameters
-    step.factors.extend(
-        [
-            vector_prior(bias, np.zeros(3)),
-            rotation_prior(helmet),
-            rotation_prior(camera),
-            vector_prior(offset, np.zeros(1)),
-        ]
-    )
+    p = model.parameters
+    step.initial.insert(p.helmet.key, so3.to_gtsam(model.helmet_guess))
+    step.initial.insert(p.camera.key, so3.to_gtsam(so3.identity()))
+    step.factors.extend([vector_prior(p.bias, np.zeros(3)), rotation_prior(p.helmet), rotation_prior(p.camera)])
+    for vector in (p.picture, p.gyro, p.platform):
+        if vector is not None:
+            zeros = np.zeros(len(vector.quantities))
+            step.initial.insert(vector.key, zeros)
+            step.factors.append(vector_prior(vector, zeros))
+
+
+def _pictures(model: _Model, keyframes: Sequence[int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The pictures of some keyframes, and the keyframe of each."""
+    rows = [np.arange(*model.pictures[k : k + 2]) for k in keyframes]
+    return np.concatenate(rows), np.repeat(np.array(keyframes, dtype=np.intp), [len(r) for r in rows])
 
 
 def _vision_factor(model: _Model, keyframes: range) -> list[Factor]:
-    seen = [k for k in keyframes if model.vision[k] >= 0]
-    if not seen:
+    rows, of = _pictures(model, keyframes)
+    if len(rows) == 0:
         return []
-    chain, rows = model.chain, model.vision[seen]
-    rows_model = VisionAttitudeFactor(
-        chain.time[seen], model.measured[rows], model.sqrt_information[rows], chain.gyro, model.platform
+    chain, p = model.chain, model.parameters
+    seen = VisionAttitudeFactor(
+        model.stamps[rows],
+        model.measured[rows],
+        model.sqrt_information[rows],
+        chain.gyro,
+        chain.platform,
+        errors=0 if p.gyro is None else len(p.gyro.quantities),
+        platform_errors=p.platform is not None,
+        anchor=chain.time[of],
+        elapsed=model.elapsed[rows] if p.clock else None,
+        first=np.broadcast_to(model.first, (len(rows), 4)) if p.clock else None,
     )
-    measurement = rows_model.on(
-        [state(k) for k in seen],
-        chain.bias_keys(seen),
-        _CAMERA_KEY,
-        _HELMET_KEY,
-        _OFFSET_KEY,
-        loss=model.loss,
-    )
-    return [Factor.of("vision", measurement)]
+    states = [state(k) for k in of]
+    keys = p.camera.key, p.helmet.key, p.picture.key, *chain.error_keys
+    return [Factor.of("vision", seen.on(states, chain.bias_keys(of), *keys, loss=model.loss))]
 
 
 def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) -> Attitudes:
-    """bRv at the vision frames' true times, stamp + time offset, on the gyro's clock."""
-    seen = [k for k in keyframes if model.vision[k] >= 0]
-    if not seen:
+    """bRv at the pictures' true times on the gyro's clock."""
+    rows, of = _pictures(model, keyframes)
+    if len(rows) == 0:
         return Attitudes(np.empty(0), np.empty((0, 4)))
-    chain = model.chain
-    stamps = chain.time[seen]
-    at = stamps + float(values.atVector(_OFFSET_KEY)[0])
-    iRv = so3.from_gtsam([values.atRot3(state(k)) for k in seen])
-    bias = np.array([values.atVector(key) for key in chain.bias_keys(seen)])
-    step = chain.gyro.increments(stamps, at)
-    correction = np.einsum("nij,nj->ni", step.bias_jacobian, bias - chain.gyro.bias_hat)
-    iRv_at = so3.compose(iRv, step.wxyz, so3.exp(correction))
-    if model.platform is None:
-        return Attitudes(at, iRv_at)
-    return Attitudes(at, so3.multiply(so3.inverse(model.platform.attitude(at)), iRv_at))
+    offset, *skew = values.atVector(model.parameters.picture.key)[:2]
+    at = model.stamps[rows] + offset - (skew[0] * model.elapsed[rows] if skew else 0.0)
+    return Attitudes(at, model.chain.attitudes(of, model.stamps[rows], at, values))
 
 
 def _advice(weights: Mapping[str, float]) -> str:
     """The motion that would make a weak direction observable."""
-    strongest = {name.rsplit("_", 1)[0] if name != _OFFSET else name for name, w in weights.items() if abs(w) > 0.3}
-    if {_CAMERA, _HELMET} <= strongest:
+    strongest = {name.rsplit("_", 1)[0] if name != OFFSET else name for name, w in weights.items() if abs(w) > 0.3}
+    if {CAMERA, HELMET} <= strongest:
         return "camera and helmet mounts trade against each other: turn the platform about two axes while recording"
-    if _CAMERA in strongest:
+    if CAMERA in strongest:
         return "the camera mount needs platform motion: turn the platform about two axes while recording"
-    if _HELMET in strongest:
+    if HELMET in strongest:
         return "the helmet mount needs head motion about two axes: nod and shake the head"
-    if _OFFSET in strongest:
+    if OFFSET in strongest:
         return "the time offset needs faster head motion: turn the head back and forth within a second"
     return "the gyro bias needs a longer recording with vision"

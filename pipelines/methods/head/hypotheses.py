@@ -6,7 +6,7 @@ from pipelines.judgement.hypotheses import AXES, Hypotheses
 
 HYPOTHESES = Hypotheses(
     streams={
-        "head_t": ("head_gyro",),
+        "head_t": ("head_gyro", "head_force"),
         "platform_t": ("platform_gyro",),
         "vision_t": ("vision_wxyz", "vision_cov"),
         "truth_t": ("truth_wxyz",),

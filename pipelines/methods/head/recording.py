@@ -19,7 +19,7 @@ from pipelines.recording.checks import (
     nanoseconds,
     unit_quaternions,
 )
-from pipelines.recording.gyro import read_gyro
+from pipelines.recording.gyro import read_gyro, read_imu
 from pipelines.recording.reading import Recording
 from pipelines.recording.topics import CAMERA_INFO, IMAGE, wanted
 from pipelines.recording.writing import attached, write_session
@@ -40,7 +40,8 @@ class HeadData:
     gyro w_ib in b; both None when there is no platform topic. vision_t (K,), vision_wxyz (K, 4): measured cRh, unit.
     vision_cov (K, 3, 3) rad^2: covariance of delta in R*Exp(delta), delta in h; None if unknown. truth_t (T,),
     truth_wxyz (T, 4): bRv, for scoring only, or None. gyro_density, platform_gyro_density, rad/s/sqrt(Hz): from the
-    covariances of the messages, None if they say nothing. dropped: reason -> messages.
+    covariances of the messages, None if they say nothing. head_force (N, 3) m/s^2: specific force by the helmet's
+    accelerometer in v, at head_t; None if it has none. dropped: reason -> messages.
     """
 
     epoch_ns: int
@@ -55,6 +56,7 @@ class HeadData:
     truth_wxyz: Array | None = None
     gyro_density: float | None = None
     platform_gyro_density: float | None = None
+    head_force: Array | None = None
     dropped: dict[str, int] = field(default_factory=dict)
 
 
@@ -68,7 +70,7 @@ def read_head(recording: Recording, config: Config) -> HeadData:
     epoch = recording.epoch_ns
     recording.read_together(dict.fromkeys(map(config.topic, _NUMBERS), ()))
     name = config.topic(HEAD_IMU)
-    head_t, head_gyro, density = read_gyro(recording, name, epoch, dropped)
+    head_t, head_gyro, density, head_force = read_imu(recording, name, epoch, dropped)
     spans = {name: head_t}
 
     platform_t = platform_gyro = platform_density = None
@@ -102,6 +104,7 @@ def read_head(recording: Recording, config: Config) -> HeadData:
         truth_wxyz,
         density,
         platform_density,
+        head_force,
         dropped,
     )
 
@@ -119,13 +122,14 @@ def write_head(
     back if the first sample is the one at t = 0.
     """
 
-    def imu(t: Array, gyro: Array, density: float | None) -> series.ImuSeries:
+    def imu(t: Array, gyro: Array, density: float | None, force: Array | None = None) -> series.ImuSeries:
         variance = 0.0 if density is None else density**2 / np.median(np.diff(t))
         t_ns = nanoseconds(t, data.epoch_ns)
-        return series.ImuSeries(t_ns, gyro, gyro_cov=variance * np.eye(3), frame_id="imu")
+        accel = np.zeros(3) if force is None else force
+        return series.ImuSeries(t_ns, gyro, accel, gyro_cov=variance * np.eye(3), frame_id="imu")
 
     topics: dict[str, series.Topic] = {
-        HEAD_IMU.name: imu(data.head_t, data.head_gyro, data.gyro_density),
+        HEAD_IMU.name: imu(data.head_t, data.head_gyro, data.gyro_density, data.head_force),
     }
     if data.platform_t is not None and data.platform_gyro is not None:
         topics[PLATFORM_IMU.name] = imu(data.platform_t, data.platform_gyro, data.platform_gyro_density)

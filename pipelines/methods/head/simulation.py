@@ -8,6 +8,7 @@ true attitude at the end of every interval, with no integration error.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from io import StringIO
 from typing import Annotated, Self
 
@@ -16,13 +17,16 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from factors import so3
-from factors.earth import earth_rate
+from factors.earth import earth_rate, gravity
 from pipelines.errors import InputError
+from pipelines.methods.head.parameters import ASSUMPTIONS
 from pipelines.methods.head.pictures import HeadPictures, draw
 from pipelines.methods.head.recording import HeadData
 from pipelines.recording import series
 from pipelines.recording.checks import nanoseconds
+from pipelines.settings import SensorSheets
 from pipelines.simulation.motion import EulerMotion, Swing, sample_times
+from pipelines.simulation.sensors import read_by, true_values
 from pipelines.simulation.simulated import Simulated
 
 Array = NDArray[np.float64]
@@ -43,6 +47,7 @@ class HeadNoise(BaseModel):
     gyro_density: NotNegative = 1e-4  # rad/s/sqrt(Hz)
     gyro_bias_walk: NotNegative = 1e-6  # rad/s/sqrt(s)
     platform_gyro_density: NotNegative = 1e-5  # rad/s/sqrt(Hz)
+    accel_density: NotNegative = 2e-3  # m/s^2/sqrt(Hz), of the helmet
     vision_attitude: NotNegative = 8.7e-3  # rad per axis of frame h
 
 
@@ -75,6 +80,10 @@ class HeadScenario(BaseModel):
     outlier_fraction: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     outlier_deg: NotNegative = 20.0  # an outlier is turned this far about a random axis
     pictures: HeadPictures = HeadPictures()  # when pictures are asked for: they take the place of vision's attitudes
+    # Data sheets that errors of the sensors are drawn from, passed on to the config; ideal: there are none; null: none
+    # either, but the config does not know.
+    sensors: SensorSheets | None = None
+    effects: dict[str, float] = {}  # assumptions by name and their true values, whatever the data sheets
     priors: dict[str, float | None] = {}  # passed on to the recording's config
 
     @model_validator(mode="after")
@@ -86,17 +95,23 @@ class HeadScenario(BaseModel):
 
 def simulate_head(scenario: HeadScenario, seed: int) -> tuple[HeadData, dict[str, float]]:
     """A session and the true values of its parameters (rad/s, rad, s; the bias is its mean over the session)."""
-    rng = np.random.default_rng(seed)
+    # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
+    rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     noise = scenario.noise
+    effects = true_values(ASSUMPTIONS, scenario.sensors, scenario.effects, rng_of_sensors)
     head_t, head_rate = _gyro(scenario, scenario.gyro_rate_hz, scenario.gyro_phase, helmet=True)
+    force = _specific_force(scenario, head_t)
     bias = _walking_bias(scenario, len(head_t), rng)
-    head_gyro = head_rate + bias + _white(noise.gyro_density, scenario.gyro_rate_hz, len(head_t), rng)
+    head_gyro = read_by(head_rate, "gyro", effects, force) + bias
+    head_gyro = head_gyro + _white(noise.gyro_density, scenario.gyro_rate_hz, len(head_t), rng)
     platform_t = platform_gyro = None
     if scenario.platform is not None:
         rate_hz = scenario.platform_gyro_rate_hz
         platform_t, platform_gyro = _gyro(scenario, rate_hz, scenario.platform_gyro_phase, helmet=False)
+        platform_gyro = read_by(platform_gyro, "platform", effects)
+        platform_gyro += [effects[f"platform_bias_{axis}"] for axis in "xyz"]
         platform_gyro = platform_gyro + _white(noise.platform_gyro_density, rate_hz, len(platform_t), rng)
-    vision_t, vision_wxyz = _vision(scenario, rng)
+    vision_t, vision_wxyz = _vision(scenario, effects, rng)
     truth_t = sample_times(scenario.duration_s, scenario.truth_rate_hz)
     variance = noise.vision_attitude**2
     data = HeadData(
@@ -113,8 +128,9 @@ def simulate_head(scenario: HeadScenario, seed: int) -> tuple[HeadData, dict[str
         dropped={},
         gyro_density=noise.gyro_density or None,
         platform_gyro_density=(noise.platform_gyro_density or None) if scenario.platform else None,
+        head_force=force + _white(noise.accel_density, scenario.gyro_rate_hz, len(head_t), rng_of_sensors),
     )
-    return data, _truth(scenario, bias)
+    return data, {**_truth(scenario, bias), **effects}
 
 
 def simulate_pictures(scenario: HeadScenario, seed: int) -> tuple[series.CameraInfo, series.ImageSeries]:
@@ -125,9 +141,10 @@ def simulate_pictures(scenario: HeadScenario, seed: int) -> tuple[series.CameraI
     """
     if scenario.outlier_fraction > 0.0:
         raise InputError("outlier_fraction: pictures are simulated without outliers; leave out --images")
-    t, cRh = _sights(scenario)
+    effects = true_values(ASSUMPTIONS, scenario.sensors, scenario.effects, np.random.default_rng([seed, 1]))
+    t, at, cRh = _sights(scenario, effects)
     rng = np.random.default_rng(seed)
-    return draw(scenario.pictures, t + scenario.time_offset_s, nanoseconds(t, EPOCH_NS), cRh, rng)
+    return draw(scenario.pictures, at, nanoseconds(t, EPOCH_NS), cRh, rng)
 
 
 def head_config(scenario: HeadScenario, images: bool = False) -> str:
@@ -140,7 +157,9 @@ def head_config(scenario: HeadScenario, images: bool = False) -> str:
     noise = scenario.noise.model_dump()
     if scenario.platform is None:
         del noise["platform_gyro_density"]
-    config = {"method": "head", "noise": noise, "priors": scenario.priors}
+    config: dict[str, object] = {"method": "head", "noise": noise, "priors": scenario.priors}
+    if scenario.sensors is not None:
+        config["sensors"] = scenario.model_dump()["sensors"]
     if images:
         del noise["vision_attitude"]
         config["head"] = {"board": scenario.pictures.board.model_dump()}
@@ -170,6 +189,15 @@ def _gyro(scenario: HeadScenario, rate_hz: float, phase: float, helmet: bool) ->
     return t, so3.log(so3.multiply(so3.inverse(attitude[:-1]), attitude[1:])) * rate_hz
 
 
+def _specific_force(scenario: HeadScenario, t: Array) -> Array:
+    """What the helmet's accelerometer would read without noise, (N, 3) m/s^2 in v: it turns about a point at rest."""
+    nRv = scenario.head.attitude(t)
+    if scenario.platform is not None:
+        nRv = so3.multiply(scenario.platform.attitude(t), nRv)
+    latitude = np.deg2rad(scenario.latitude_deg or 0.0)
+    return so3.rotate(so3.inverse(nRv), np.array([0.0, 0.0, float(gravity(latitude))]))
+
+
 def _white(density: float, rate_hz: float, n: int, rng: np.random.Generator) -> Array:
     return density * np.sqrt(rate_hz) * rng.standard_normal((n, 3))
 
@@ -180,20 +208,23 @@ def _walking_bias(scenario: HeadScenario, n: int, rng: np.random.Generator) -> A
     return np.asarray(start + np.cumsum(steps, axis=0))
 
 
-def _sights(scenario: HeadScenario) -> tuple[Array, Array]:
-    """Stamps of what vision sees and exact cRh, shape (K, 4)."""
+def _sights(scenario: HeadScenario, effects: Mapping[str, float]) -> tuple[Array, Array, Array]:
+    """Stamps of what vision sees, true times, and cRh without noise, shape (K, 4)."""
     t = sample_times(scenario.duration_s, scenario.vision_rate_hz, scenario.vision_phase)
     seen = np.ones(len(t), dtype=bool)
     for start, end in scenario.vision_outages_s:
         seen &= (t < start) | (t >= end)
     t = t[seen]
     cRb, vRh = _mount(scenario.camera_mount_deg), _mount(scenario.helmet_mount_deg)
-    return t, so3.compose(cRb, scenario.head.attitude(t + scenario.time_offset_s), vRh)
+    at = t + scenario.time_offset_s - effects["clock_skew"] * (t - t[0])
+    cRh = so3.compose(cRb, scenario.head.attitude(at), vRh)
+    turned = so3.log(so3.multiply(so3.inverse(cRh[0]), cRh))
+    return t, at, so3.multiply(cRh[0], so3.exp((1.0 + effects["vision_scale"]) * turned))
 
 
-def _vision(scenario: HeadScenario, rng: np.random.Generator) -> tuple[Array, Array]:
+def _vision(scenario: HeadScenario, effects: Mapping[str, float], rng: np.random.Generator) -> tuple[Array, Array]:
     """Stamps and measured cRh, shape (K, 4)."""
-    t, cRh = _sights(scenario)
+    t, _, cRh = _sights(scenario, effects)
     n = len(t)
     error = so3.exp(scenario.noise.vision_attitude * rng.standard_normal((n, 3)))
     axis = rng.standard_normal((n, 3))

@@ -1,0 +1,92 @@
+"""Assumptions: systematic effects of real sensors as parameters of the graph, with priors as data sheets state them.
+
+What a recording determines of such an effect is estimated; what it does not determine enlarges the sigmas of what it
+trades with. A method lists its `Assumption`s and makes variables of them with `parameter`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pipelines.graph.problem import Parameter, Quantity
+from pipelines.settings import Config
+
+# What is left free has a prior so many times the one in force.
+_FREE = 10.0
+# A sigma of more than this part of its prior's says nothing.
+_UNTOLD = 0.98
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """Numbers that one figure of a data sheet is about.
+
+    Attributes:
+        names: of the parameters, which are 0 for a perfect sensor.
+        unit: SI.
+        sheet: the sensor, as under `sensors` in the config.
+        figure: of that sensor, likewise.
+        sigma: the figure of a sensor of the usual grade, one sigma.
+    """
+
+    names: tuple[str, ...]
+    unit: str
+    sheet: str
+    figure: str
+    sigma: float
+
+
+def scale_assumptions(sensor: str, sheet: str, sigma: float) -> tuple[Assumption, Assumption]:
+    """The six numbers of a gyro's S, in the order of factors.gyro: measured = (I + S) w."""
+    return (
+        Assumption(tuple(f"{sensor}_scale_{axis}" for axis in "xyz"), "", sheet, "scale", sigma),
+        Assumption(tuple(f"{sensor}_skew_{axes}" for axes in ("xy", "xz", "yz")), "", sheet, "skew", sigma),
+    )
+
+
+def sensitivity_assumption(sensor: str, sheet: str, sigma: float) -> Assumption:
+    """The nine numbers of a gyro's G, by rows: measured = w + G f."""
+    names = tuple(f"{sensor}_g_{row}{column}" for row in "xyz" for column in "xyz")
+    return Assumption(names, "rad/s/(m/s^2)", sheet, "g_sensitivity", sigma)
+
+
+def quantities(assumption: Assumption, config: Config) -> tuple[Quantity, ...]:
+    """With the priors in force: the config's `priors`, else its `sensors`, else the usual grade's."""
+    sheet = _stated(config, assumption)
+    usual = sheet or assumption.sigma
+
+    def quantity(name: str) -> Quantity:
+        prior = config.priors.get(name, sheet)
+        if prior is None:
+            prior = _FREE * usual
+        return Quantity(name, assumption.unit, prior, usual, config.require.get(name, math.inf), group="assumption")
+
+    return tuple(map(quantity, assumption.names))
+
+
+def parameter(key: int, assumptions: Sequence[Assumption], config: Config) -> Parameter | None:
+    """One variable of several assumptions; None if all are fixed, so that the graph can do without."""
+    all_of_them = tuple(q for assumption in assumptions for q in quantities(assumption, config))
+    return Parameter(key, all_of_them) if any(q.prior_sigma for q in all_of_them) else None
+
+
+def pull(quantity: Quantity, value: float, sigma: float) -> float | None:
+    """How far the recording takes an assumption from its prior, in sigmas of what it could; None if it says nothing.
+
+    The estimate's change from the prior has the variance prior_sigma^2 - sigma^2.
+    """
+    prior = quantity.prior_sigma or 0.0
+    if sigma > _UNTOLD * prior or prior == 0.0:
+        return None
+    return (value - quantity.prior_mean) / math.sqrt(prior**2 - sigma**2)
+
+
+def _stated(config: Config, assumption: Assumption) -> float:
+    """The figure in force, one sigma."""
+    sheet = getattr(config.sensors, assumption.sheet)
+    if assumption.figure not in sheet.model_fields_set:
+        return assumption.sigma
+    figure: float | None = getattr(sheet, assumption.figure)
+    return _FREE * assumption.sigma if figure is None else figure

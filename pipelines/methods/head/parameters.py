@@ -1,0 +1,111 @@
+"""What the head method calibrates and what it assumes: names, priors and accuracies of the contract."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import chain
+
+import gtsam
+
+from factors.earth import EARTH_RATE
+from pipelines.errors import InputError
+from pipelines.graph.assumptions import (
+    Assumption,
+    parameter,
+    quantities,
+    scale_assumptions,
+    sensitivity_assumption,
+)
+from pipelines.graph.problem import Parameter, Quantity, rotation_vector_coordinates
+from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
+from pipelines.settings import Config, check_names
+
+BIAS, HELMET, CAMERA, OFFSET = "gyro_bias", "helmet_mount", "camera_mount", "time_offset"
+
+# The grades of real-sensor data sheets, one sigma: MEMS gyros, uncalibrated, and a platform's of 10 deg/h.
+SCALE = scale_assumptions("gyro", "gyro", 1e-2)
+SENSITIVITY = sensitivity_assumption("gyro", "gyro", 1e-4)
+PLATFORM_BIAS = Assumption(tuple(f"platform_bias_{axis}" for axis in "xyz"), "rad/s", "platform_gyro", "bias", 5e-5)
+PLATFORM_SCALE = scale_assumptions("platform", "platform_gyro", 1e-2)
+CLOCK_SKEW = Assumption(("clock_skew",), "", "clock", "skew", 1e-4)
+VISION_SCALE = Assumption(("vision_scale",), "", "camera", "scale", 3e-3)
+ASSUMPTIONS = (*SCALE, SENSITIVITY, PLATFORM_BIAS, *PLATFORM_SCALE, CLOCK_SKEW, VISION_SCALE)
+
+
+@dataclass(frozen=True)
+class HeadParameters:
+    """The variables that all measurements share.
+
+    Attributes:
+        bias: the helmet gyro's (3), rad/s, its first node.
+        helmet, camera: vRh, cRb.
+        picture: time offset alone, or with clock skew and vision scale.
+        gyro: S of the helmet's gyro (6), or S and G (15); None for a perfect one.
+        platform: bias and S of the platform's gyro (9); None for a perfect one, or none.
+    """
+
+    bias: Parameter
+    helmet: Parameter
+    camera: Parameter
+    picture: Parameter
+    gyro: Parameter | None
+    platform: Parameter | None
+
+    @classmethod
+    def of(cls, config: Config, platform: bool, accelerometer: bool) -> HeadParameters:
+        """With the priors in force; a camera without a moving platform is fixed by default.
+
+        Args:
+            config: priors, data sheets, accuracies wanted.
+            platform: whether there is a platform gyro.
+            accelerometer: whether the helmet's IMU measures specific force.
+        """
+        if config.noise.gyro_scale:
+            figure = config.noise.gyro_scale
+            raise InputError(
+                f"noise.gyro_scale: head estimates the gyro's scale; write sensors: {{gyro: {{scale: {figure:g}, "
+                f"skew: {figure:g}}}}} instead"
+            )
+
+        def quantity(name: str, unit: str, scale: float, require: float, fixed: bool, extra: float) -> Quantity:
+            prior = config.priors.get(name, 0.0 if fixed else scale)
+            return Quantity(name, unit, prior, scale, config.require.get(name, require), extra)
+
+        def triple(
+            name: str, unit: str, scale: float, require: float, fixed: bool = False, extra: float = 0.0
+        ) -> tuple[Quantity, ...]:
+            return tuple(quantity(f"{name}_{axis}", unit, scale, require, fixed, extra) for axis in "xyz")
+
+        bias = triple(BIAS, "rad/s", 0.05, 2e-3, extra=0.0 if platform else EARTH_RATE)
+        mounts = triple(HELMET, "rad", 0.35, 1e-2), triple(CAMERA, "rad", 0.35, 1e-2, fixed=not platform)
+        offset = quantity(OFFSET, "s", 0.05, 5e-3, False, 0.0)
+        assumed = chain.from_iterable(quantities(each, config) for each in ASSUMPTIONS)
+        known = [q.name for q in (*bias, *mounts[0], *mounts[1], offset, *assumed)]
+        check_names(config.priors, known, "priors")
+        check_names(config.require, known, "require")
+
+        clock = parameter(_key("T"), (CLOCK_SKEW, VISION_SCALE), config)
+        sensitive = accelerometer and parameter(_key("G"), (SENSITIVITY,), config) is not None
+        return cls(
+            bias=Parameter(FIRST_BIAS, bias),
+            helmet=Parameter(_key("H"), mounts[0], rotation_vector_coordinates),
+            camera=Parameter(_key("C"), mounts[1], rotation_vector_coordinates),
+            picture=Parameter(_key("T"), (offset, *(clock.quantities if clock else ()))),
+            gyro=parameter(_key("G"), (*SCALE, SENSITIVITY) if sensitive else SCALE, config),
+            platform=parameter(_key("P"), (PLATFORM_BIAS, *PLATFORM_SCALE), config) if platform else None,
+        )
+
+    @property
+    def clock(self) -> bool:
+        """Whether clock skew and vision scale are variables."""
+        return len(self.picture.quantities) > 1
+
+    @property
+    def all(self) -> tuple[Parameter, ...]:
+        """In reporting order."""
+        found = (self.bias, self.helmet, self.camera, self.picture, self.gyro, self.platform)
+        return tuple(each for each in found if each is not None)
+
+
+def _key(letter: str) -> int:
+    return int(gtsam.symbol(letter, 0))
