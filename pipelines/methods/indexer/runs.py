@@ -21,8 +21,8 @@ _SPEED_SPAN = 0.2
 _SHORTEST = 0.4
 # Less turning than this in all, rad, calibrates nothing.
 _LEAST_TURNED = 0.5
-# How far a motion reaches into the rest about it, in samples.
-_REST_SAMPLES = 2
+# How far a motion reaches into the rest about it, in samples: to third order, the angle at its edge is made of the next two.
+_REST_SAMPLES = 3
 # A pause between samples is a gap when longer than both of these: s, sample intervals.
 _GAP = 0.1
 _GAP_SAMPLES = 2.5
