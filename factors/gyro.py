@@ -66,10 +66,10 @@ def corrected(turns: Increments, bias_error: Array, errors: Array | None) -> tup
         by_scale = N[:, None] @ (to_end @ needed(turns.scale_jacobian)).reshape(-1, 3, 3, 3) @ N[:, None]
         by_scale -= by_bias[..., None] * bias_off[:, None, None]
         if g_off is None:
-            return by_bias, _folded(by_scale)
+            return by_bias, by_symmetric(by_scale)
         by_g = N[:, None] @ (to_end @ needed(turns.g_jacobian)).reshape(-1, 3, 3, 3)
         by_scale -= by_g @ np.swapaxes(g_off, 1, 2)[:, None]
-        return by_bias, np.concatenate([_folded(by_scale), by_g.reshape(-1, 3, 9)], axis=2)
+        return by_bias, np.concatenate([by_symmetric(by_scale), by_g.reshape(-1, 3, 9)], axis=2)
 
     return so3.multiply(turns.wxyz, so3.exp(phi)), derivatives
 
@@ -208,7 +208,7 @@ def _rate_error(bias_error: Array, errors: Array | None, rate: Array, force: Arr
     excess = _apply(N, excess)
 
     def derivatives() -> tuple[Array, ...]:
-        by_errors = _folded(N[..., None] * (rate - excess)[:, None, None])
+        by_errors = by_symmetric(N[..., None] * (rate - excess)[:, None, None])
         if G is None:
             return N, by_errors
         return N, np.concatenate([by_errors, (N[..., None] * needed(force)[:, None, None]).reshape(-1, 3, 9)], axis=2)
@@ -247,8 +247,8 @@ def _apply(matrices: Array, vectors: Array) -> Array:
     return np.einsum("...ij,...j->...i", matrices, vectors)
 
 
-def _folded(by_entry: Array) -> Array:
-    """By the entries of a matrix, (n, 3, 3, 3), to by the six numbers of a symmetric one, (n, 3, 6)."""
+def by_symmetric(by_entry: Array) -> Array:
+    """Derivatives by the entries of a matrix, (n, 3, 3, 3), to those by the numbers of a symmetric one, (n, 3, 6)."""
     out = by_entry[..., _ROW, _COLUMN]
     out[..., 3:] += by_entry[..., _COLUMN[3:], _ROW[3:]]
     return out

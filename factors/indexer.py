@@ -8,10 +8,13 @@ alpha turns about the outer axis x, beta about the inner axis z; epsilon, the ax
 tilt of the inner axis about +y, zero when they are perpendicular. The mounting is told by the angles theta of
 C_t^m = Rx(theta_x) Ry(theta_y) Rz(theta_z) with the passive matrices Rx(a) = Exp(a ex).T and so on, that is
 tRm = Exp(theta_z ez) Exp(theta_y ey) Exp(theta_x ex). Source: CN115265591B; methods page, section 2.
+
+An encoder reads angle + s sin(angle) + c cos(angle), at a time `delay` later than its stamp says.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,11 +22,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factors import so3
+from factors.gyro import by_symmetric, symmetric
 from factors.model import Array, Block, Model, Residuals
 
-Option = Literal["scale", "epsilon", "tilt"]
+Option = Literal["errors", "encoder", "epsilon", "tilt"]
+# What the encoders' errors are, in the order of their block.
+ENCODER_ERRORS = ("outer sin", "outer cos", "inner sin", "inner cos", "delay")
 
 _EX, _EY, _EZ = np.eye(3)
+_SIZES: dict[Option, int] = {"errors": 6, "encoder": len(ENCODER_ERRORS), "epsilon": 1, "tilt": 3}
 # Nodes of two-point Gauss quadrature on [0, 1], weights 1/2.
 _GAUSS = 0.5 + np.array([-1.0, 1.0]) / np.sqrt(12.0)
 
@@ -56,6 +63,7 @@ class PlatformRates:
     Attributes:
         edges: (n + 1,) s, where the windows begin and end.
         fixed, cosine, sine: (n, 3) rad/s.
+        by_encoder: (n, 3, 3, 5), how those three change with the encoders' errors, ENCODER_ERRORS.
         noise: (3 n, 2 (n + 1) + n) 1/s, change of the means with encoder noise of 1 rad a sample. Columns: the outer
             and the inner encoder at each edge, one after the other, then the inner one's mean over each window.
     """
@@ -64,7 +72,13 @@ class PlatformRates:
     fixed: Array
     cosine: Array
     sine: Array
+    by_encoder: Array
     noise: Array
+
+    def parts(self, encoder: Array) -> Array:
+        """The three parts (n, part, 3) with the encoders' errors, (5,) or (n, 5)."""
+        parts = np.stack([self.fixed, self.cosine, self.sine], axis=1)
+        return parts + np.einsum("npie,ne->npi", self.by_encoder, np.broadcast_to(encoder, (len(parts), 5)))
 
 
 class AxisPath:
@@ -84,6 +98,7 @@ class AxisPath:
         self._angles = np.stack([np.asarray(outer, dtype=float), np.asarray(inner, dtype=float)], axis=1)
         if len(self.t) < 2 or len(self._angles) != len(self.t):
             raise ValueError(f"needs at least two stamps with their angles; got {self.t.shape}, {self._angles.shape}")
+        self._speed = np.gradient(self._angles, self.t, axis=0)
         self._base_rate = np.asarray(base_rate, dtype=float)
         pieces = self._arc(np.diff(self.t), self._angles[:-1], self._angles[1:])
         self._integral = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(pieces, axis=0)])
@@ -99,7 +114,7 @@ class AxisPath:
             raise ValueError(f"windows must lie within [{self.t[0]}, {self.t[-1]}] s and not be empty")
         i = np.clip(np.searchsorted(self.t, edges, side="right") - 1, 0, len(self.t) - 2)
         weights, samples = self._interpolation(edges, i)
-        angles = np.einsum("nk,nkd->nd", weights, self._angles[samples])
+        angles, speed = (np.einsum("nk,nkd->nd", weights, each[samples]) for each in (self._angles, self._speed))
         integral = self._integral[i] + self._arc(edges - self.t[i], self._angles[i], angles)
         duration = np.diff(edges)[:, None, None]
         mean = np.diff(integral, axis=0) / duration
@@ -117,7 +132,50 @@ class AxisPath:
         turned = np.zeros((n, 3, n))
         turned[np.arange(n), :, np.arange(n)] = so3.cross(mean[:, 0] + mean[:, 1], _EZ) / np.sqrt(samples)[:, None]
         columns = [noise.reshape(3 * n, 2 * (n + 1)), turned.reshape(3 * n, n)]
-        return PlatformRates(edges, mean[:, 0], mean[:, 1], mean[:, 2], np.hstack(columns))
+        by_encoder = self._by_encoder(edges, angles, speed)
+        return PlatformRates(edges, mean[:, 0], mean[:, 1], mean[:, 2], by_encoder, np.hstack(columns))
+
+    def _by_encoder(self, edges: Array, angles: Array, speed: Array) -> Array:
+        """Derivatives of the mean rates' parts by the encoders' errors, (n, part, 3, 5), from what holds at the edges.
+
+        Errors of the axes' angles turn the platform by phi, and a turned body's rate w grows by phi' + w x phi: the
+        first integrates to the edges, the second is summed over the samples between them.
+        """
+        inside = slice(np.searchsorted(self.t, edges[0], side="right"), np.searchsorted(self.t, edges[-1]))
+        order = np.argsort(np.concatenate([self.t[inside], edges]), kind="stable")
+        t, angles, speed = (
+            np.concatenate([each[inside], at])[order]
+            for each, at in ((self.t, edges), (self._angles, angles), (self._speed, speed))
+        )
+        at_edge = np.flatnonzero(order >= len(order) - len(edges))
+        # By how much each axis is elsewhere than read, (k, axis, 5).
+        change = np.zeros((len(t), 2, len(ENCODER_ERRORS)))
+        for axis in range(2):
+            change[:, axis, 2 * axis], change[:, axis, 2 * axis + 1] = (
+                -np.sin(angles[:, axis]),
+                -np.cos(angles[:, axis]),
+            )
+        change[:, :, 4] = -speed
+        begin, end = angles[:-1], angles[1:]
+        middle, duration = 0.5 * (begin + end), np.diff(t)
+        outer_axis = _in_platform(np.broadcast_to(_EX, (len(t), 3)), angles[:, 1])
+        axes = np.stack([outer_axis, np.zeros_like(outer_axis)], axis=3)
+        axes[:, 0, 2, 1] = 1.0
+        # w x phi of 1 rad about each axis; the outer axis carries what it turns through the base's rate.
+        crossing = np.stack(
+            [
+                so3.cross(_EZ, _in_platform(np.broadcast_to(_EX, (len(duration), 3)), middle[:, 1]))
+                * (end - begin)[:, 1, None, None]
+                + duration[:, None, None]
+                * _in_platform(so3.cross(self._base_rate_turned(middle[:, 0]), _EX), middle[:, 1]),
+                so3.cross(self._arc(duration, begin, end), _EZ),
+            ],
+            axis=3,
+        )
+        swept = np.einsum("kpia,kae->kpie", crossing, 0.5 * (change[:-1] + change[1:]))
+        turned = np.einsum("kpia,kae->kpie", axes[at_edge], change[at_edge])
+        total = np.diff(turned, axis=0) + np.add.reduceat(swept, at_edge[:-1], axis=0)
+        return np.asarray(total / np.diff(edges)[:, None, None, None])
 
     def _interpolation(self, at: Array, i: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
         """Weights and indexes (n, 4) of the samples that make the angles at the times, in the intervals i.
@@ -148,12 +206,20 @@ class AxisPath:
 
     def _base_rate_in_platform(self, angles: Array) -> Array:
         """The base's rate in t, as its three parts, (n, part, 3)."""
-        v = so3.rotate(so3.exp(-angles[:, :1] * _EX), self._base_rate)
-        vx, vy, vz = v.T
-        c, s = np.cos(angles[:, 1]), np.sin(angles[:, 1])
-        zero = np.zeros_like(vx)
-        parts = [[s * vy, c * vy, zero], [c * vx, -s * vx, vz], [-c * vz, s * vz, vx]]
-        return np.moveaxis(np.array(parts), 2, 0)
+        return _in_platform(self._base_rate_turned(angles[:, 0]), angles[:, 1])
+
+    def _base_rate_turned(self, outer: Array) -> Array:
+        """The base's rate behind the outer axis, (n, 3)."""
+        return so3.rotate(so3.exp(-outer[:, None] * _EX), self._base_rate)
+
+
+def _in_platform(vectors: Array, inner: Array) -> Array:
+    """Vectors (n, 3) behind the outer axis seen in t, as their parts, (n, part, 3)."""
+    vx, vy, vz = vectors.T
+    c, s = np.cos(inner), np.sin(inner)
+    zero = np.zeros_like(vx)
+    parts = [[s * vy, c * vy, zero], [c * vx, -s * vx, vz], [-c * vz, s * vz, vx]]
+    return np.moveaxis(np.array(parts), 2, 0)
 
 
 def gyro_edges(t: Array) -> Array:
@@ -174,11 +240,12 @@ def gyro_means(edges: Array, rate: Array, cuts: NDArray[np.intp]) -> Array:
 class IndexerAverageFactor(Model):
     """Mean gyro rate over n adjoining windows against the mean that the encoders and the earth's rate say.
 
-        gyro = (1 + scale) * mRt w + bias,    w = fixed + cos(epsilon) cosine + sin(epsilon) sine
+        gyro = (I + S) mRt w + bias,    w = fixed + cos(epsilon) cosine + sin(epsilon) sine
 
     compared in frame t, where encoder noise has fixed directions. Blocks: theta (3), gyro bias (3, rad/s), then
-    the options: "scale" (3), the gyro's scale error; "epsilon" (1, rad); "tilt" (3, rad), a small rotation of the true
-    platform rate against the encoders' account of it, w -> Exp(tilt) w, for errors that come again with every turn.
+    the options: "errors" (6), the numbers of S as factors.gyro has them; "encoder" (5), the encoders' errors, on which
+    w depends linearly; "epsilon" (1, rad); "tilt" (3, rad), a small rotation of the true platform rate against the
+    encoders' account of it, w -> Exp(tilt) w, for errors that come again with every turn.
 
     Attributes:
         gyro: (n, 3) mean rates, rad/s.
@@ -234,30 +301,38 @@ class IndexerAverageFactor(Model):
     @property
     def blocks(self) -> tuple[Block, ...]:
         """theta, bias and the options."""
-        return (3, 3, *(1 if option == "epsilon" else 3 for option in self.options))
+        return (3, 3, *(_SIZES[option] for option in self.options))
 
     def __call__(self, theta: Array, bias: Array, *more: Array) -> Residuals:
-        """Residual sqrt_information * (tRm (gyro - bias) / (1 + scale) - Exp(tilt) w), (n, 3)."""
+        """Residual sqrt_information * (tRm (I + S)^-1 (gyro - bias) - Exp(tilt) w), (n, 3)."""
         given = dict(zip(self.options, more, strict=True))
-        gain = 1.0 + given.get("scale", np.zeros(3))
         epsilon, tilt = given.get("epsilon", np.zeros(1)), given.get("tilt", np.zeros(3))
         theta = self.theta_unit * theta
         tRm = mounting(theta)
-        corrected = (self.gyro - bias) / gain
-        encoders = self.rates.fixed + np.cos(epsilon) * self.rates.cosine + np.sin(epsilon) * self.rates.sine
+        corrected, N = self.gyro - bias, np.asarray(np.eye(3))
+        if "errors" in given:
+            N = np.asarray(np.linalg.inv(np.eye(3) + symmetric(given["errors"])))
+            corrected = np.einsum("nij,nj->ni", N, corrected)
+        parts = self.rates.parts(given.get("encoder", np.zeros(len(ENCODER_ERRORS))))
+        encoders = parts[:, 0] + np.cos(epsilon) * parts[:, 1] + np.sin(epsilon) * parts[:, 2]
         turn = so3.exp(tilt)
         error = so3.rotate(tRm, corrected) - so3.rotate(turn, encoders)
 
         def jacobians() -> tuple[Array, ...]:
-            by_gyro = so3.matrix(tRm) / np.broadcast_to(gain, theta.shape)[:, None, :]
-            by_epsilon = -np.sin(epsilon) * self.rates.cosine + np.cos(epsilon) * self.rates.sine
-            blocks: dict[Option, Array] = {
-                "scale": -by_gyro * corrected[:, None, :],
-                "epsilon": -so3.rotate(turn, by_epsilon)[..., None],
-                "tilt": so3.matrix(turn) @ so3.hat(encoders) @ so3.right_jacobian(tilt),
+            by_gyro = so3.matrix(tRm) @ N
+            cosine, sine = np.cos(epsilon)[..., None], np.sin(epsilon)[..., None]
+            by_encoder = self.rates.by_encoder
+            by_epsilon = -np.sin(epsilon) * parts[:, 1] + np.cos(epsilon) * parts[:, 2]
+            blocks: dict[Option, Callable[[], Array]] = {
+                "errors": lambda: -by_symmetric(by_gyro[..., None] * corrected[:, None, None]),
+                "encoder": lambda: (
+                    -so3.matrix(turn) @ (by_encoder[:, 0] + cosine * by_encoder[:, 1] + sine * by_encoder[:, 2])
+                ),
+                "epsilon": lambda: -so3.rotate(turn, by_epsilon)[..., None],
+                "tilt": lambda: so3.matrix(turn) @ so3.hat(encoders) @ so3.right_jacobian(tilt),
             }
             by_theta = -so3.matrix(tRm) @ so3.hat(corrected) @ _angle_axes(theta) * self.theta_unit
-            return tuple(self._whiten(block) for block in (by_theta, -by_gyro, *(blocks[o] for o in self.options)))
+            return tuple(self._whiten(block) for block in (by_theta, -by_gyro, *(blocks[o]() for o in self.options)))
 
         return self._whiten(error[..., None])[..., 0], jacobians
 

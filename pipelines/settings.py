@@ -117,6 +117,13 @@ class CameraSheet(Sheet):
     scale: SigmaOrZero | None = None
 
 
+class EncoderSheet(Sheet):
+    """Of encoders: amplitude of the error that comes once a turn, sine and cosine each, rad; delay of a reading, s."""
+
+    once_per_turn: SigmaOrZero | None = None
+    delay: SigmaOrZero | None = None
+
+
 class ClockSheet(Sheet):
     """Of the pictures' clock against the gyro's: skew, s/s."""
 
@@ -130,6 +137,7 @@ class Sensors(Section):
     platform_gyro: PlatformGyroSheet = PlatformGyroSheet()
     camera: CameraSheet = CameraSheet()
     clock: ClockSheet = ClockSheet()
+    encoder: EncoderSheet = EncoderSheet()
 
 
 def _ideal(value: object) -> object:

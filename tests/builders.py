@@ -26,6 +26,8 @@ from pipelines.recording.info import SessionFacts, TopicFacts
 from pipelines.reports.result import Calibration, quantities_of
 from pipelines.settings import Config
 
+# Data sheets of sensors without errors.
+IDEAL = Config.model_validate({"sensors": "ideal"}).sensors
 EPOCH_NS = 1_795_176_000_123_456_789
 MOUNT = np.array([0.03, -0.02, 0.5])
 NAMES = ("helmet_mount_x", "helmet_mount_y", "helmet_mount_z", "time_offset", "free", "pinned")

@@ -49,7 +49,7 @@ def passive(axis: int) -> Any:
 def read(expression: str, known: Mapping[str, Any]) -> Any:
     """The value of a formula's text, read as the text says, not by the code beside it."""
     expression = re.sub(r"\bExp\((\w+) (e[xyz])\)", r"Exp(\1 * \2)", expression)
-    expression = re.sub(r"^\[\[.*?\]\]", lambda rows: f"Matrix({rows[0]})", expression)
+    expression = re.sub(r"\[\[.*?\]\]", lambda rows: f"Matrix({rows[0]})", expression)
     axes = dict(zip(("ex", "ey", "ez"), np.eye(3), strict=True))
     words = {
         **axes,
@@ -58,7 +58,9 @@ def read(expression: str, known: Mapping[str, Any]) -> Any:
         "Ry": passive(1),
         "Rz": passive(2),
         "Matrix": Matrix,
-        "inverse": lambda rotation: Rotation(rotation.matrix.T),
+        "sin": np.sin,
+        "cos": np.cos,
+        "inverse": lambda m: Matrix(np.linalg.inv(m)) if isinstance(m, Matrix) else Rotation(m.matrix.T),
     }
     return eval(expression, {"__builtins__": {}}, {**words, **known})
 
@@ -82,6 +84,15 @@ CASES: dict[str, tuple[str, Collection[str]]] = {
         (
             *(f"{name}_{axis}" for name in ("theta", "gyro_bias", "gyro_scale") for axis in "xyz"),
             "axis_nonperpendicularity",
+        ),
+    ),
+    "indexer of real sensors": (
+        "indexer",
+        (
+            *(f"{name}_{axis}" for name in ("theta", "gyro_bias", "gyro_scale") for axis in "xyz"),
+            *(f"gyro_skew_{axes}" for axes in ("xy", "xz", "yz")),
+            *(f"encoder_{joint}_{part}" for joint in ("outer_x", "inner_z") for part in ("sin", "cos")),
+            "encoder_delay",
         ),
     ),
     "head": (

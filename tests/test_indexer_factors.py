@@ -28,7 +28,7 @@ from tests.numerics import assert_rows_are_independent
 RNG = np.random.default_rng(3)
 N = 9
 BASE_RATE = so3.rotate(so3.exp([0.3, -0.2, 0.9]), earth_rate(0.7))
-OPTIONS: tuple[Option, ...] = ("scale", "epsilon", "tilt")
+OPTIONS: tuple[Option, ...] = ("errors", "encoder", "epsilon", "tilt")
 
 
 def _angles(t: Array) -> tuple[Array, Array]:
@@ -47,7 +47,8 @@ def _brute_force(start: float, stop: float, epsilon: float) -> Array:
 def _rates(n: int = N, spread: float = 0.3) -> PlatformRates:
     edges = np.linspace(1.0, 20.0, n + 1)
     parts = RNG.normal(scale=spread, size=(3, n, 3))
-    return PlatformRates(edges, parts[0], parts[1], parts[2], np.zeros((3 * n, 3 * n + 2)))
+    by_encoder = RNG.normal(size=(n, 3, 3, 5))
+    return PlatformRates(edges, parts[0], parts[1], parts[2], by_encoder, np.zeros((3 * n, 3 * n + 2)))
 
 
 def _model(gyro: Array, rates: PlatformRates) -> IndexerAverageFactor:
@@ -117,7 +118,7 @@ def test_gyro_mean_is_the_integral_between_sample_edges() -> None:
 
 
 def _blocks(size: float) -> list[Array]:
-    shapes = [(3, 1.0), (3, 0.05), (3, 0.1), (1, 0.3), (3, 0.5)]
+    shapes = [(3, 1.0), (3, 0.05), (6, 0.05), (5, 0.1), (1, 0.3), (3, 0.5)]
     return [np.tile(RNG.normal(scale=size * spread, size=width), (N, 1)) for width, spread in shapes]
 
 
@@ -126,7 +127,7 @@ def test_jacobians(size: float) -> None:
     assert_jacobians(_model(RNG.normal(size=(N, 3)), _rates()), _blocks(size))
 
 
-@pytest.mark.parametrize("options", [(), ("scale",), ("tilt", "epsilon")])
+@pytest.mark.parametrize("options", [(), ("errors",), ("tilt", "encoder", "epsilon")])
 def test_jacobians_with_some_options(options: tuple[Option, ...]) -> None:
     model = replace(_model(RNG.normal(size=(N, 3)), _rates()), options=options)
     blocks = dict(zip(("theta", "bias", *OPTIONS), _blocks(0.3), strict=True))
@@ -138,7 +139,7 @@ def test_theta_may_count_another_unit() -> None:
     blocks = _blocks(0.3)
     in_units = [blocks[0] / 1e-3, *blocks[1:]]
     np.testing.assert_allclose(model(*in_units)[0], replace(model, theta_unit=1.0)(*blocks)[0], atol=1e-12)
-    assert_jacobians(model, in_units, [1e-2, 1e-5, 1e-5, 1e-5, 1e-5])
+    assert_jacobians(model, in_units, [1e-2, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5])
 
 
 def test_jacobians_near_the_singular_angle() -> None:
@@ -154,7 +155,12 @@ def test_windows_without_encoder_noise_are_independent() -> None:
     def model(rows: np.ndarray) -> IndexerAverageFactor:
         edges = np.append(rates.edges[rows], rates.edges[rows[-1] + 1])
         some = PlatformRates(
-            edges, rates.fixed[rows], rates.cosine[rows], rates.sine[rows], np.zeros((3 * len(rows), 3 * len(rows) + 2))
+            edges,
+            rates.fixed[rows],
+            rates.cosine[rows],
+            rates.sine[rows],
+            rates.by_encoder[rows],
+            np.zeros((3 * len(rows), 3 * len(rows) + 2)),
         )
         return IndexerAverageFactor.of(gyro[rows], some, 1e-3, 0.0, OPTIONS)
 
@@ -176,10 +182,32 @@ def test_encoder_noise_at_a_common_edge_cancels_in_the_sum() -> None:
 
 
 def test_residual_vanishes_at_the_truth() -> None:
-    theta, bias, scale, epsilon, tilt = _blocks(0.3)
+    theta, bias, errors, encoder, epsilon, tilt = _blocks(0.3)
     rates = _rates()
-    w = so3.rotate(so3.exp(tilt), rates.fixed + np.cos(epsilon) * rates.cosine + np.sin(epsilon) * rates.sine)
-    gyro = (1.0 + scale) * so3.rotate(so3.inverse(mounting(theta)), w) + bias
+    fixed, cosine, sine = np.moveaxis(rates.parts(encoder), 1, 0)
+    w = so3.rotate(so3.exp(tilt), fixed + np.cos(epsilon) * cosine + np.sin(epsilon) * sine)
+    xx, yy, zz, xy, xz, yz = errors[0]
+    gain = np.eye(3) + np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    gyro = so3.rotate(so3.inverse(mounting(theta)), w) @ gain + bias
     model = IndexerAverageFactor.of(gyro, rates, 1.0, 0.0, OPTIONS)
-    np.testing.assert_allclose(model(theta, bias, scale, epsilon, tilt)[0], 0.0, atol=1e-13)
-    assert np.abs(model(theta + 1e-3, bias, scale, epsilon, tilt)[0]).max() > 1e-5
+    np.testing.assert_allclose(model(theta, bias, errors, encoder, epsilon, tilt)[0], 0.0, atol=1e-13)
+    assert np.abs(model(theta + 1e-3, bias, errors, encoder, epsilon, tilt)[0]).max() > 1e-5
+
+
+@pytest.mark.parametrize("size", [1e-6, 1e-3])
+def test_mean_rates_with_encoder_errors_are_those_of_the_true_angles(size: float) -> None:
+    """To first order in the errors, for any motion."""
+    t = np.linspace(0.0, 30.0, 3001)
+    edges = np.array([0.503, 3.21, 11.7704, 29.0])
+    errors = size * np.array([1.0, -0.7, 0.8, 0.5, 1.3])
+
+    def read(at: Array) -> list[Array]:
+        true = _angles(at + errors[4])
+        sines = zip(true, errors[:4].reshape(2, 2), strict=True)
+        return [angle + s * np.sin(angle) + c * np.cos(angle) for angle, (s, c) in sines]
+
+    (outer, inner), (outer_read, inner_read) = _angles(t), read(t)
+    expected = AxisPath(t, outer, inner, BASE_RATE).rates(edges).parts(np.zeros(5))
+    found = AxisPath(t, outer_read, inner_read, BASE_RATE).rates(edges)
+    assert np.abs(found.parts(np.zeros(5)) - expected).max() > 0.05 * size
+    np.testing.assert_allclose(found.parts(errors), expected, atol=2.0 * size**2 + 1e-4 * size)

@@ -15,9 +15,11 @@ from pipelines.methods.indexer.graph import problem
 from pipelines.methods.indexer.recording import read_indexer
 from pipelines.methods.indexer.simulation import ARCSEC, IndexerScenario, indexer_config, simulate_indexer
 from pipelines.recording.reading import open_recording
+from pipelines.settings import Sensors
 from pipelines.simulation.scenario import load_scenario
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.incremental import solve_incremental
+from tests.builders import IDEAL
 
 
 def _problem(scenario: IndexerScenario, seed: int) -> tuple[Problem, dict[str, float]]:
@@ -39,7 +41,8 @@ def _assert_same(estimate: Estimate, batch: Estimate) -> None:
 @pytest.mark.parametrize("window", [1.0, None], ids=["window", "all"])
 @pytest.mark.parametrize("name", ["ideal", "rough", "large_angles", "two_positions"])
 def test_ends_where_batch_does(name: str, window: float | None) -> None:
-    graph, truth = _problem(load_scenario(IndexerScenario, f"indexer_{name}"), 1)
+    ideal = load_scenario(IndexerScenario, f"indexer_{name}").model_copy(update={"sensors": IDEAL})
+    graph, truth = _problem(ideal, 1)
     batch, incremental = solve_batch(graph), solve_incremental(graph, window)
     _assert_same(incremental, batch)
     error = incremental.values - np.array([truth[n] for n in incremental.names])
@@ -50,11 +53,20 @@ def test_ends_where_batch_does(name: str, window: float | None) -> None:
 
 def test_independent_simulator_within_three_sigma(shared_data: Path) -> None:
     recording = open_recording(shared_data / "contract" / "indexer_nominal.mcap")
-    config = load_config(recording.attachment("alidade.yaml"))
+    config = load_config(recording.attachment("alidade.yaml")).model_copy(update={"sensors": IDEAL})
     truth = json.loads((shared_data / "contract" / "indexer_nominal.truth.json").read_text())
     estimate = solve_incremental(problem(read_indexer(recording, config), config))
     expected = np.array([truth[name] for name in estimate.names])
     assert np.abs((estimate.values - expected) / estimate.sigmas).max() < 3.0
+
+
+def test_ends_where_batch_does_with_real_sensors() -> None:
+    scenario = load_scenario(IndexerScenario, "indexer_nominal").model_copy(update={"sensors": Sensors()})
+    graph, truth = _problem(scenario, 1)
+    batch, incremental = solve_batch(graph), solve_incremental(graph)
+    _assert_same(incremental, batch)
+    error = incremental.values - np.array([truth[n] for n in incremental.names])
+    assert np.abs(error / incremental.sigmas).max() < 3.0
 
 
 @pytest.mark.slow

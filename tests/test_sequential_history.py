@@ -14,6 +14,7 @@ from pipelines.methods.indexer import graph as indexer
 from pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
 from pipelines.simulation.scenario import load_scenario
 from pipelines.solvers.batch import solve_batch
+from tests.builders import IDEAL
 from tests.short_problems import head_problem, los_problem
 
 
@@ -46,7 +47,7 @@ def test_history_where_sigmas_are_below_what_gtsam_takes_for_a_constraint() -> N
     """A quiet gyro, or hours of one, ties the session's mean bias to less than 1e-8 rad/s: no constraint for that."""
     ideal = load_scenario(IndexerScenario, "indexer_rough")
     noise = ideal.noise.model_copy(update={"gyro_density": 1e-8, "gyro_bias_walk": 1e-12})
-    scenario = ideal.model_copy(update={"noise": noise})
+    scenario = ideal.model_copy(update={"noise": noise, "sensors": IDEAL})
     data, _ = simulate_indexer(scenario, 1)
     whole = solve_batch(indexer.problem(data, load_config(indexer_config(scenario).encode())))
     assert whole.history is not None

@@ -76,7 +76,14 @@ def test_runs_are_found_wrapped_or_not_and_drives_turn_what_they_are_told() -> N
 def test_gyro_scale_bias_and_noise_are_as_stated() -> None:
     noise = IndexerNoise(gyro_density=1e-5)
     exact, _ = simulate_indexer(_scenario(), 3)
-    data, truth = simulate_indexer(_scenario(noise=noise, gyro_bias_deg_h=100, gyro_scale=(1e-3, -2e-3, 3e-3)), 3)
+    data, truth = simulate_indexer(
+        _scenario(
+            noise=noise,
+            gyro_bias_deg_h=100,
+            effects={"gyro_scale_x": 1e-3, "gyro_scale_y": -2e-3, "gyro_scale_z": 3e-3},
+        ),
+        3,
+    )
     scale, bias = ([truth[f"{name}_{a}"] for a in "xyz"] for name in ("gyro_scale", "gyro_bias"))
     white = data.gyro - (1.0 + np.array(scale)) * exact.gyro - bias
     assert white.std() == pytest.approx(1e-5 * np.sqrt(200.0), rel=0.02)

@@ -38,11 +38,14 @@ class Assumption:
     sigma: float
 
 
-def scale_assumptions(sensor: str, sheet: str, sigma: float) -> tuple[Assumption, Assumption]:
-    """The six numbers of a gyro's S, in the order of factors.gyro: measured = (I + S) w."""
+def scale_assumptions(
+    sensor: str, sheet: str, sigma: float, skew_sigma: float | None = None
+) -> tuple[Assumption, Assumption]:
+    """The six numbers of a gyro's S, in the order of factors.gyro: measured = (I + S) w; skew as scale if not given."""
+    skew_sigma = sigma if skew_sigma is None else skew_sigma
     return (
         Assumption(tuple(f"{sensor}_scale_{axis}" for axis in "xyz"), "", sheet, "scale", sigma),
-        Assumption(tuple(f"{sensor}_skew_{axes}" for axes in ("xy", "xz", "yz")), "", sheet, "skew", sigma),
+        Assumption(tuple(f"{sensor}_skew_{axes}" for axes in ("xy", "xz", "yz")), "", sheet, "skew", skew_sigma),
     )
 
 

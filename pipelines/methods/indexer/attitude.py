@@ -23,9 +23,17 @@ def frames(data: IndexerData, motion: AxisMotion) -> NDArray[np.intp]:
     return np.flatnonzero((data.gyro_t >= motion.t[0]) & (data.gyro_t <= motion.t[-1]))[::stride]
 
 
-def carrier(data: IndexerData, motion: AxisMotion, rows: NDArray[np.intp], theta: Array, epsilon: float) -> Array:
-    """nRb = nRm mRt tRb at gyro samples."""
+def carrier(
+    data: IndexerData, motion: AxisMotion, rows: NDArray[np.intp], theta: Array, epsilon: float, encoder: Array
+) -> Array:
+    """nRb = nRm mRt tRb at gyro samples; the encoders' errors (5,) as factors.indexer has them."""
     assert data.attitude is not None
-    outer, inner = (np.interp(data.gyro_t[rows], motion.t, angle) for angle in motion.angles.T)
+    at = data.gyro_t[rows] - encoder[4]
+    outer, inner = (
+        angle - sine * np.sin(angle) - cosine * np.cos(angle)
+        for angle, (sine, cosine) in zip(
+            (np.interp(at, motion.t, read) for read in motion.angles.T), encoder[:4].reshape(2, 2), strict=True
+        )
+    )
     mRb = so3.multiply(so3.inverse(mounting(theta)), so3.inverse(base_from_platform(outer, inner, epsilon)))
     return so3.multiply(data.attitude[rows], mRb)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.earth import EARTH_RATE
-from factors.indexer import IndexerAverageFactor, Option
+from factors.indexer import ENCODER_ERRORS, IndexerAverageFactor, Option
 from pipelines.errors import InputError
 from pipelines.graph.priors import prior_sigmas, vector_prior
 from pipelines.graph.problem import Array, Attitudes, Factor, Parameter, Problem, Step
@@ -29,7 +29,15 @@ from pipelines.graph.walking_bias import WalkingBias
 from pipelines.methods.indexer.attitude import carrier, frames
 from pipelines.methods.indexer.groups import Group, groups_of
 from pipelines.methods.indexer.guess import agreeing, guess
-from pipelines.methods.indexer.parameters import EPSILON, KEYS, SCALE, THETA_UNIT, indexer_parameters, theta_coordinates
+from pipelines.methods.indexer.parameters import (
+    EPSILON,
+    KEYS,
+    SCALE,
+    SKEW,
+    THETA_UNIT,
+    indexer_parameters,
+    theta_coordinates,
+)
 from pipelines.methods.indexer.recording import IndexerData
 from pipelines.methods.indexer.runs import AxisMotion, axis_motion, cut_turns, encoder_scatter
 from pipelines.methods.indexer.topics import FIX
@@ -65,7 +73,7 @@ class _Model:
     def options(self) -> tuple[Option, ...]:
         """The factor's options that are parameters."""
         given = {p.key for p in self.parameters}
-        names: tuple[Option, ...] = ("scale", "epsilon")
+        names: tuple[Option, ...] = ("errors", "encoder", "epsilon")
         return tuple(name for name in names if KEYS[name] in given)
 
 
@@ -105,7 +113,7 @@ def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]
                 f"indexer: the earth's rate shows in windows of {shortest:.3g} s and the latitude is not known; "
                 f"record {config.topic(FIX)} or give latitude_deg in the config"
             )
-    groups, disagreeing = agreeing(groups, config, density, encoder)
+    groups, disagreeing = agreeing(groups, parameters, density, encoder)
     theta_guess, bias_guess = guess(groups)
     starts = np.array([g.rates.edges[0] for g in groups])
     walk = first_given(config.noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk)
@@ -198,8 +206,9 @@ def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) ->
     """The carrier's attitude nRb."""
     rows = model.frames[list(keyframes)]
     epsilon = float(values.atVector(KEYS["epsilon"])[0]) if "epsilon" in model.options else 0.0
+    encoder = values.atVector(KEYS["encoder"]) if "encoder" in model.options else np.zeros(len(ENCODER_ERRORS))
     theta = theta_coordinates(values, KEYS["theta"])[0]
-    return Attitudes(model.data.gyro_t[rows], carrier(model.data, model.motion, rows, theta, epsilon))
+    return Attitudes(model.data.gyro_t[rows], carrier(model.data, model.motion, rows, theta, epsilon, encoder))
 
 
 def _advice(weights: Mapping[str, float]) -> str:
@@ -207,7 +216,9 @@ def _advice(weights: Mapping[str, float]) -> str:
     strongest = {name for name, w in weights.items() if abs(w) > 0.3}
     if strongest & set(EPSILON):
         return "the axes' right angle needs turns about both axes, the outer one with the inner at 0 and at 180 degrees"
-    if strongest & set(SCALE):
+    if strongest & set(SKEW.names):
+        return "the gyro's skew needs turns about the outer axis with the inner at 90 and at -90 degrees"
+    if strongest & set(SCALE.names):
         return (
             "the gyro's scale needs turns about each of its axes: the outer axis with the inner at 0 and at 90 degrees"
         )

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from factors import so3
 from factors.indexer import mounting_angles
 from pipelines.errors import InputError
-from pipelines.graph.problem import Array
+from pipelines.graph.problem import Array, Parameter
 from pipelines.methods.indexer.groups import Group
 from pipelines.methods.indexer.parameters import SCALE
-from pipelines.settings import Config
 
 # A gyro that departs from the encoders by more than this share of the rate is not the gyro of this axis.
 _DISAGREEMENT = 0.01
 
 
 def agreeing(
-    groups: tuple[Group, ...], config: Config, density: float, encoder: float
+    groups: tuple[Group, ...], parameters: Sequence[Parameter], density: float, encoder: float
 ) -> tuple[tuple[Group, ...], int]:
     """The groups whose gyro follows the encoders, and how many do not.
 
@@ -37,9 +38,8 @@ def agreeing(
         misfit = np.linalg.norm(gyro - w @ A.T - b, axis=1)
         # Least absolute misfit: one damaged turn does not bend the fit.
         weight = np.array([g.duration for g in groups]) / np.maximum(misfit, 1e-4 * speed.max())
-    allowed = _DISAGREEMENT + 3.0 * max(
-        [np.inf if config.priors.get(name, 0.0) is None else config.priors.get(name, 0.0) or 0.0 for name in SCALE]
-    )
+    scales = [q.prior_sigma or 0.0 for p in parameters for q in p.quantities if q.name in SCALE.names]
+    allowed = _DISAGREEMENT + 3.0 * max(scales, default=0.0)
     for axis, name in (("outer", "outer_x"), ("inner", "inner_z")):
         mine = [i for i, g in enumerate(groups) if g.run.axis == axis]
         if not mine:
@@ -54,7 +54,7 @@ def agreeing(
         if abs(gain - 1.0) > allowed:
             raise InputError(
                 f"indexer: about the axis {name} the gyro turns at {100.0 * gain:.4g} % of the encoder's rate, more "
-                "than 1 % off; check units and gear, or free the gyro's scale (priors: gyro_scale_x ...)"
+                "than 1 % off; check units and gear, or say so of the gyro (sensors: {gyro: {scale: 0.05}})"
             )
     duration = np.array([g.duration for g in groups])
     noise = np.sqrt(density**2 / duration + 2.0 * (encoder / duration) ** 2)

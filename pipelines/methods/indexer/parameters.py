@@ -1,24 +1,40 @@
-"""The parameters of the indexer method: their names, variables and priors."""
+"""What the indexer method calibrates and what it assumes: names, variables, priors and accuracies of the contract."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from itertools import chain
 
 import gtsam
 import numpy as np
 
+from pipelines.graph.assumptions import Assumption, parameter, quantities, scale_assumptions
 from pipelines.graph.problem import Array, Parameter, Quantity
 from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
+from pipelines.methods.indexer.recording import JOINTS
 from pipelines.settings import Config, check_names
 
 THETA = ("theta_x", "theta_y", "theta_z")
 BIAS = ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")
-SCALE = ("gyro_scale_x", "gyro_scale_y", "gyro_scale_z")
 EPSILON = ("axis_nonperpendicularity",)
-NAMES = (*THETA, *BIAS, *SCALE, *EPSILON)
+
+# What data sheets of navigation-grade sensors state, one sigma: fibre-optic or laser gyros after factory calibration,
+# axes that turn with encoders of some arc seconds.
+SCALE, SKEW = scale_assumptions("gyro", "gyro", 1e-4, 2e-5)
+ONCE_PER_TURN = Assumption(
+    tuple(f"encoder_{joint}_{part}" for joint in JOINTS for part in ("sin", "cos")),
+    "rad",
+    "encoder",
+    "once_per_turn",
+    5e-6,
+)
+DELAY = Assumption(("encoder_delay",), "s", "encoder", "delay", 1e-3)
+ASSUMPTIONS = (SCALE, SKEW, ONCE_PER_TURN, DELAY)
+ERRORS, ENCODER = (*SCALE.names, *SKEW.names), (*ONCE_PER_TURN.names, *DELAY.names)
 
 KEYS: dict[str, int] = {
-    name: int(gtsam.symbol(c, 0)) for name, c in zip(("theta", "scale", "epsilon"), "TSE", strict=True)
+    name: int(gtsam.symbol(c, 0)) for name, c in zip(("theta", "errors", "encoder", "epsilon"), "TSNE", strict=True)
 }
 
 # The variable theta counts these, rad: a smoother linearises anew when a variable has moved by some hundredth, and
@@ -27,25 +43,35 @@ THETA_UNIT = 1e-3
 
 
 def indexer_parameters(config: Config) -> tuple[Parameter, ...]:
-    """The method's parameters with their priors; options only where the config gives them a prior other than 0."""
-    check_names(config.priors, NAMES, "priors")
-    check_names(config.require, NAMES, "require")
+    """The method's parameters with their priors in force; of the assumptions those that are not all fixed.
 
-    def several(names: Sequence[str], unit: str, scale: float, require: float, default: float) -> tuple[Quantity, ...]:
+    That the axes are not perpendicular is assumed only where the config gives it a prior.
+    """
+    assumed = chain.from_iterable(quantities(each, config) for each in ASSUMPTIONS)
+    known = [*THETA, *BIAS, *(q.name for q in assumed), *EPSILON]
+    check_names(config.priors, known, "priors")
+    check_names(config.require, known, "require")
+
+    def calibrated(names: Sequence[str], unit: str, scale: float, require: float) -> tuple[Quantity, ...]:
         return tuple(
-            Quantity(name, unit, config.priors.get(name, default), scale, config.require.get(name, require))
+            Quantity(name, unit, config.priors.get(name, scale), scale, config.require.get(name, require))
             for name in names
         )
 
-    parameters = [
-        Parameter(KEYS["theta"], several(THETA, "rad", 0.1, 5e-5, 0.1), theta_coordinates),
-        Parameter(FIRST_BIAS, several(BIAS, "rad/s", 1e-3, 1e-5, 1e-3)),
-    ]
-    if any(config.priors.get(name, 0.0) != 0.0 for name in SCALE):
-        parameters.append(Parameter(KEYS["scale"], several(SCALE, "1", 0.01, 1e-3, 0.0)))
-    if config.priors.get(EPSILON[0], 0.0) != 0.0:
-        parameters.append(Parameter(KEYS["epsilon"], several(EPSILON, "rad", 1e-2, 5e-5, 0.0)))
-    return tuple(parameters)
+    axes = tuple(
+        Quantity(
+            name, "rad", config.priors.get(name, 0.0), 1e-2, config.require.get(name, math.inf), group="assumption"
+        )
+        for name in EPSILON
+    )
+    found = (
+        Parameter(KEYS["theta"], calibrated(THETA, "rad", 0.1, 5e-5), theta_coordinates),
+        Parameter(FIRST_BIAS, calibrated(BIAS, "rad/s", 1e-3, 1e-5)),
+        parameter(KEYS["errors"], (SCALE, SKEW), config),
+        parameter(KEYS["encoder"], (ONCE_PER_TURN, DELAY), config),
+        Parameter(KEYS["epsilon"], axes) if any(q.prior_sigma != 0.0 for q in axes) else None,
+    )
+    return tuple(each for each in found if each is not None)
 
 
 def theta_coordinates(values: gtsam.Values, key: int) -> tuple[Array, Array]:

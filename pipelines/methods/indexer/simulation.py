@@ -7,6 +7,7 @@ interval, centred on its stamp, divided by the interval.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from io import StringIO
 from typing import Annotated, Literal
@@ -18,8 +19,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from factors import so3
 from factors.earth import earth_rate
 from pipelines.errors import InputError
-from pipelines.methods.indexer.recording import IndexerData
+from pipelines.methods.indexer.parameters import ASSUMPTIONS
+from pipelines.methods.indexer.recording import JOINTS, IndexerData
+from pipelines.settings import SensorSheets
 from pipelines.simulation.motion import sample_times
+from pipelines.simulation.sensors import read_by, true_values
 from pipelines.simulation.simulated import Simulated
 
 Array = NDArray[np.float64]
@@ -77,7 +81,6 @@ class IndexerScenario(BaseModel):
     noise: IndexerNoise = IndexerNoise()
     mounting_deg: Vector = (0.5, -0.3, 0.4)  # theta_x, theta_y, theta_z
     gyro_bias_deg_h: NotNegative = 5.0  # sigma per axis
-    gyro_scale: Vector = (0.0, 0.0, 0.0)
     axis_nonperpendicularity_arcsec: float = 0.0
     ripple: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0  # of the rate while turning, relative
     ripple_per_turn: Annotated[int, Field(ge=1)] = 24
@@ -90,6 +93,10 @@ class IndexerScenario(BaseModel):
     encoder_rate_hz: Positive = 100.0
     encoder_phase: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0  # of the first stamp, in sample intervals
     attitude_noise_arcsec: NotNegative | None = None  # of the attitude the INS puts out; null: it puts out none
+    # Data sheets that errors of the sensors are drawn from, passed on to the config; ideal: there are none; null: none
+    # either, but the config does not know.
+    sensors: SensorSheets | None = None
+    effects: dict[str, float] = {}  # assumptions by name and their true values, whatever the data sheets
     priors: dict[str, float | None] = {}  # passed on to the recording's config
 
 
@@ -118,7 +125,9 @@ class _Drive:
 
 def simulate_indexer(scenario: IndexerScenario, seed: int) -> tuple[IndexerData, dict[str, float]]:
     """A session and the true values of its parameters (rad, rad/s; the bias is its mean over the session)."""
+    # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
     rng = np.random.default_rng(seed)
+    effects = true_values(ASSUMPTIONS, scenario.sensors, scenario.effects, np.random.default_rng([seed, 1]))
     drives, duration = _program(scenario)
     phases = rng.uniform(0.0, 2.0 * np.pi, size=(2, 1 + len(scenario.encoder_harmonics_arcsec)))
     gyro_t = _recorded(sample_times(duration, scenario.gyro_rate_hz), drives, scenario)
@@ -132,7 +141,9 @@ def simulate_indexer(scenario: IndexerScenario, seed: int) -> tuple[IndexerData,
     )
     white = noise.gyro_density * np.sqrt(scenario.gyro_rate_hz) * rng.standard_normal((len(gyro_t), 3))
     encoder_t = _recorded(sample_times(duration, scenario.encoder_rate_hz, scenario.encoder_phase), drives, scenario)
-    outer, inner = _encoders(scenario, _commanded(scenario, drives, encoder_t), rng)
+    at = encoder_t + effects["encoder_delay"]
+    truly = _angles(scenario, drives, phases, at)
+    outer, inner = _encoders(scenario, _commanded(scenario, drives, at) + _once_per_turn(truly, effects), rng)
     attitude = None
     if scenario.attitude_noise_arcsec is not None:
         error = scenario.attitude_noise_arcsec * ARCSEC * rng.standard_normal((len(gyro_t), 3))
@@ -140,7 +151,7 @@ def simulate_indexer(scenario: IndexerScenario, seed: int) -> tuple[IndexerData,
     data = IndexerData(
         EPOCH_NS,
         gyro_t,
-        (1.0 + np.array(scenario.gyro_scale)) * rate + bias + white,
+        read_by(rate, "gyro", effects) + bias + white,
         encoder_t,
         outer,
         inner,
@@ -148,7 +159,7 @@ def simulate_indexer(scenario: IndexerScenario, seed: int) -> tuple[IndexerData,
         attitude,
         noise.gyro_density or None,
     )
-    return data, _truth(scenario, bias)
+    return data, {**_truth(scenario, bias), **effects}
 
 
 def simulated(scenario: IndexerScenario, seed: int, images: bool = False) -> Simulated:
@@ -175,12 +186,14 @@ def indexer_config(scenario: IndexerScenario) -> str:
     noise = scenario.noise.model_dump() | {"encoder": float(np.sqrt(variance))}
     if not noise["gyro_density"]:
         del noise["gyro_density"]
-    config = {
+    config: dict[str, object] = {
         "method": "indexer",
         "noise": noise,
         "priors": scenario.priors,
         "indexer": {"base_attitude": list(scenario.base_attitude)},
     }
+    if scenario.sensors is not None:
+        config["sensors"] = scenario.model_dump()["sensors"]
     text = StringIO()
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style = False
@@ -257,6 +270,12 @@ def _attitude(scenario: IndexerScenario, drives: list[_Drive], phases: Array, t:
     return so3.compose(np.array(scenario.base_attitude), baseRt, tRm)
 
 
+def _once_per_turn(angles: Array, effects: Mapping[str, float]) -> Array:
+    """What the encoders read too much at the axes' angles (2, N), rad."""
+    sine, cosine = ([[effects[f"encoder_{joint}_{part}"]] for joint in JOINTS] for part in ("sin", "cos"))
+    return np.asarray(sine * np.sin(angles) + cosine * np.cos(angles))
+
+
 def _encoders(scenario: IndexerScenario, commanded: Array, rng: np.random.Generator) -> Array:
     """Encoder readings (2, M), rad."""
     read = commanded + scenario.noise.encoder * rng.standard_normal(commanded.shape)
@@ -269,7 +288,6 @@ def _truth(scenario: IndexerScenario, bias: Array) -> dict[str, float]:
     vectors = {
         "theta": np.deg2rad(scenario.mounting_deg),
         "gyro_bias": bias.mean(axis=0),
-        "gyro_scale": np.array(scenario.gyro_scale),
     }
     truth = {
         f"{name}_{axis}": float(value)

@@ -5,16 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factors import so3
+from factors.gyro import symmetric
 from factors.indexer import mounting
 from pipelines.graph.problem import Array
 from pipelines.judgement.validation import Validation
 from pipelines.methods.indexer.attitude import carrier
 from pipelines.methods.indexer.groups import Group, groups_of
-from pipelines.methods.indexer.parameters import BIAS, EPSILON, SCALE, THETA, several
+from pipelines.methods.indexer.parameters import BIAS, ENCODER, EPSILON, ERRORS, THETA, several
 from pipelines.methods.indexer.recording import IndexerData
-from pipelines.methods.indexer.runs import axis_motion
+from pipelines.methods.indexer.runs import AxisMotion, axis_motion
 from pipelines.methods.indexer.topics import IndexerConfig
 from pipelines.settings import Config
 
@@ -41,13 +43,16 @@ def validate(data: IndexerData, config: Config, values: Mapping[str, float]) -> 
     if data.attitude is not None:
         rows = np.flatnonzero((data.gyro_t >= motion.t[0]) & (data.gyro_t <= motion.t[-1]))
         bRn = so3.inverse(np.array(config.section(IndexerConfig).base_attitude))
-        errors = [
-            so3.log(so3.multiply(bRn, carrier(data, motion, rows, several(some, THETA), *several(some, EPSILON))))
-            for some in ({}, values)
-        ]
+        errors = [so3.log(so3.multiply(bRn, _carrier(data, motion, rows, some))) for some in ({}, values)]
         claim = "the publication claims 0.005 deg over an hour"
         found.insert(0, Validation("attitude put out", "rad", data.gyro_t[rows], errors[0], errors[1], claim))
     return found
+
+
+def _carrier(data: IndexerData, motion: AxisMotion, rows: NDArray[np.intp], values: Mapping[str, float]) -> Array:
+    """The carrier's attitude at gyro samples, by calibrated parameters."""
+    epsilon = float(several(values, EPSILON)[0])
+    return carrier(data, motion, rows, several(values, THETA), epsilon, several(values, ENCODER))
 
 
 def misfit(groups: Sequence[Group], values: Mapping[str, float]) -> tuple[Array, Array]:
@@ -57,13 +62,17 @@ def misfit(groups: Sequence[Group], values: Mapping[str, float]) -> tuple[Array,
         groups: in which an axis turns.
         values: parameters by name; those not named are zero.
     """
-    tRm, bias, gain = mounting(several(values, THETA)), several(values, BIAS), 1.0 + several(values, SCALE)
-    epsilon = several(values, EPSILON)
+    tRm, bias, gain = (
+        mounting(several(values, THETA)),
+        several(values, BIAS),
+        np.eye(3) + symmetric(several(values, ERRORS)),
+    )
+    epsilon, encoder = several(values, EPSILON), several(values, ENCODER)
     errors = []
     for group in groups:
         share = np.diff(group.rates.edges) / group.duration
-        rates = group.rates.fixed + np.cos(epsilon) * group.rates.cosine + np.sin(epsilon) * group.rates.sine
-        expected = share @ rates
-        found = so3.rotate(tRm, (group.mean_gyro - bias) / gain)
+        fixed, cosine, sine = np.moveaxis(group.rates.parts(encoder), 1, 0)
+        expected = share @ (fixed + np.cos(epsilon) * cosine + np.sin(epsilon) * sine)
+        found = so3.rotate(tRm, np.linalg.solve(gain, group.mean_gyro - bias))
         errors.append((found - expected) / np.linalg.norm(expected))
     return np.array([float(g.rates.edges[-1]) for g in groups]), np.array(errors).reshape(-1, 3)
