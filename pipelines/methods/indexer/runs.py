@@ -21,7 +21,7 @@ _SPEED_SPAN = 0.2
 _SHORTEST = 0.4
 # Less turning than this in all, rad, calibrates nothing.
 _LEAST_TURNED = 0.5
-# How far a motion reaches into the rest about it, in samples: to third order, the angle at its edge is made of the next two.
+# How far a motion reaches into the rest about it, in samples: the angle at its edge is made of two on either side.
 _REST_SAMPLES = 3
 # A pause between samples is a gap when longer than both of these: s, sample intervals.
 _GAP = 0.1
