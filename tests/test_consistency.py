@@ -83,13 +83,13 @@ def test_what_fits_has_no_cause(head: Case) -> None:
 
 
 @pytest.mark.slow
-def test_noise_stated_five_times_too_small_is_named_with_its_factor(head: Case) -> None:
+def test_noise_stated_three_times_too_small_is_named_with_its_factor(head: Case) -> None:
     find, data, config = head
-    wrong = replace(data, vision_cov=data.vision_cov / 25.0)
-    label = first_cause((find, wrong, with_noise(config, vision_attitude=0.2)))
+    wrong = replace(data, vision_cov=data.vision_cov / 9.0)
+    label = first_cause((find, wrong, with_noise(config, vision_attitude=1.0 / 3.0)))
     name, said = label.split(" is stated ")
     assert name == "the noise vision_attitude"
-    assert float(said.split()[0]) == pytest.approx(5.0, rel=0.1)
+    assert float(said.split()[0]) == pytest.approx(3.0, rel=0.1)
 
 
 @pytest.mark.slow
