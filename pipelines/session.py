@@ -22,6 +22,7 @@ from pipelines.config import load_config, recorded_config
 from pipelines.discovery import nearest_suggestion, suggestions, with_suggested
 from pipelines.errors import InputError
 from pipelines.graph.problem import Estimate, Problem, Quantity, Step
+from pipelines.judgement.assumptions import Strained, strained
 from pipelines.judgement.causes import find_causes
 from pipelines.judgement.halves import Halves, held_out, split_at, split_halves
 from pipelines.judgement.observability import Cause, assess
@@ -223,6 +224,8 @@ class Session:
             )
             if ours and not estimate.converged:
                 assessment = assessment.unsolved(estimate.message)
+            elif ours and (far := strained(estimate, quantities)):
+                assessment = assessment.remarked(rejection_sentence(estimate.residuals)).explained(_not_as_assumed(far))
             elif ours and (assessment.status == "inconsistent" or too_many_rejected(estimate.residuals)):
                 assessment = assessment.misfit(rejection_sentence(estimate.residuals))
                 with progress.doing("looking for causes"):
@@ -354,6 +357,19 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
         f"({ENCODING}): `alidade info` tells which for each method, `topics:` in the config can rename"
         + (f"; nearest is {nearest}" if nearest else "")
     )
+
+
+def _not_as_assumed(found: Sequence[Strained]) -> list[Cause]:
+    """Assumptions that do not hold, as causes, in the units people read."""
+    causes = []
+    for each in found[:_MOST_NAMED]:
+        unit, factor = human_unit(each.quantity)
+        like = f" (or {', '.join(each.others)}, which it cannot be told from)" if each.others else ""
+        found_ = f"{factor * each.value:.3g} ± {factor * each.sigma:.1g} {unit}".strip()
+        prior = f"{factor * (each.quantity.prior_sigma or 0.0):.2g} {unit}".strip()
+        evidence = f"estimated as {found_} where its data sheet says 0 ± {prior}, a pull of {abs(each.pull):.1f}"
+        causes.append(Cause(f"{each.quantity.name} is not what was assumed{like}", evidence))
+    return causes
 
 
 def _told(moved: Moved, quantities: Sequence[Quantity]) -> str:
