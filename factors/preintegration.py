@@ -106,10 +106,9 @@ class GyroPath:
         return so3.multiply(self._attitude[i], so3.exp(_arc(self._rate[i], self._slope[i], s)))
 
     def rate(self, at: ArrayLike) -> Array:
-        """Rate (n, 3) at the times, bias_hat taken off, rad/s."""
+        """Rate (n, 3) at the times, linear between samples, bias_hat taken off, rad/s."""
         i, s = self._place(np.asarray(at, dtype=float))
-        w0, a = self._rate[i], self._slope[i]
-        return _rate(w0, a, s, _arc(w0, a, s))
+        return self._rate[i] + self._slope[i] * s
 
     def specific_force(self, at: ArrayLike) -> Array | None:
         """Specific force (n, 3) at the times, m/s^2; None where it is not known."""
@@ -131,41 +130,38 @@ class GyroPath:
         start, stop = np.asarray(start, dtype=float), np.asarray(stop, dtype=float)
         # Both ends in one call: what a few windows cost is calls.
         ends = np.concatenate([start, stop])
-        (q0, q1), (p0, p1), (_, rate) = (np.split(each, 2) for each in self._at(ends))
-        i0, i1 = np.split(self._place(ends)[0], 2)
-        to_end = -so3.matrix(so3.inverse(q1))
-        jacobian = to_end @ ((self._integral[i1] - self._integral[i0]) + (p1 - p0))
-        unseen = np.abs(np.interp(stop, self.t, self._unseen) - np.interp(start, self.t, self._unseen))
-        turned = Increments(stop - start, so3.multiply(so3.inverse(q0), q1), jacobian, rate, unseen)
-        if not scale:
-            return turned
-        by = [
-            to_end @ self._moments(ends, np.concatenate([p0, p1]), v)
-            for v in (self._rate, self._force)
-            if v is not None
-        ]
-        return replace(turned, scale_jacobian=by[0], g_jacobian=by[1] if len(by) == 2 else None)
-
-    def _at(self, at: Array) -> tuple[Array, Array, Array]:
-        """Attitude, integral of its matrix since the sample interval's start, and rate at the times."""
-        i, s = self._place(at)
+        i, s = self._place(ends)
         w0, a = self._rate[i], self._slope[i]
         arc = _arc(w0, a, s)
+        attitude = so3.multiply(self._attitude[i], so3.exp(arc))
+        # The attitude matrix's integral since the samples before the ends.
         begun = so3.matrix(self._attitude[i]) @ (s[..., None] * so3.right_jacobian(-arc))
-        return so3.multiply(self._attitude[i], so3.exp(arc)), begun, _rate(w0, a, s, arc)
+        (q0, q1), (c0, c1), (p0, p1) = (np.split(each, 2) for each in (attitude, self._integral[i], begun))
+        to_end = -so3.matrix(so3.inverse(q1))
+        n = len(start)
+        turned = Increments(
+            duration=stop - start,
+            wxyz=so3.multiply(so3.inverse(q0), q1),
+            bias_jacobian=to_end @ ((c1 - c0) + (p1 - p0)),
+            rate=_rate(w0[n:], a[n:], s[n:], arc[n:]),
+            unseen=np.abs(np.interp(stop, self.t, self._unseen) - np.interp(start, self.t, self._unseen)),
+        )
+        if not scale:
+            return turned
+        by = [to_end @ self._moments(i, s, begun, v) for v in (self._rate, self._force) if v is not None]
+        return replace(turned, scale_jacobian=by[0], g_jacobian=by[1] if len(by) == 2 else None)
 
-    def _moments(self, ends: Array, begun: Array, vector: Array) -> Array:
+    def _moments(self, i: NDArray[np.intp], s: Array, begun: Array, vector: Array) -> Array:
         """Integral over windows of the attitude matrix times each component of a vector, (n, 3, 9): [i, 3 a + b].
 
         Within a sample interval the attitude's integral is taken with the vector's mean, which leaves out a twelfth of
         how both change in it. Column by column: all at once would take 27 times the stream's memory.
 
         Args:
-            ends: (2 n,) the windows' starts, then their ends.
+            i, s: (2 n,), (2 n, 1) the samples before the windows' starts, then before their ends, and the times since.
             begun: (2 n, 3, 3) integral of the attitude matrix from the sample before each end.
             vector: (N, 3) at the stamps, linear in between.
         """
-        i, s = self._place(ends)
         slope = (vector[i + 1] - vector[i]) / (self.t[i + 1] - self.t[i])[:, None]
         at_ends = np.einsum("nia,nb->niab", begun, vector[i] + 0.5 * s * slope).reshape(-1, 3, 9)
         start, stop = np.split(i, 2)
