@@ -161,7 +161,7 @@ def test_an_effect_of_the_data_sheets_size_is_within_three_sigma(effects: dict[s
 
 
 def test_encoder_errors_are_told_by_the_recording() -> None:
-    """Ten times the data sheet's, with the mounting right all the same; left out they cost hundreds of sigmas."""
+    """Ten times the data sheet's, with the mounting right all the same; left out they cost eight sigmas."""
     effects = {"encoder_inner_z_cos": 5e-5, "encoder_delay": 1e-2}
     estimate, error = _effect(1, **effects)
     assert np.abs(error / estimate.sigmas).max() < 3.5
@@ -181,7 +181,7 @@ def _reported(estimate: Estimate) -> list[tuple[Quantity, float, float]]:
     ]
 
 
-@pytest.mark.parametrize(("runs", "name"), [(10, "nominal"), pytest.param(50, "rough", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("runs", "name"), [(10, "nominal"), pytest.param(50, "nominal", marks=pytest.mark.slow)])
 def test_errors_of_real_sensors_agree_with_the_covariance(runs: int, name: str) -> None:
     """Mean NEES over the runs inside its 99 % interval, with effects drawn from what is assumed of them."""
     scenario = load_scenario(IndexerScenario, f"indexer_{name}").model_copy(update={"sensors": Sensors()})
