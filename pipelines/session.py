@@ -176,7 +176,8 @@ class Session:
         return cls(method, simulated.data, config, Arrays(method, simulated.data, simulated.truth))
 
     def problem(self) -> Problem:
-        """The graph."""
+        """The graph. Raises InputError when the data are too few, or the config says what the method has no use for."""
+        _check_sheets(self.method, self.config)
         return self.method.problem(self.data, self.config)
 
     @cached_property
@@ -357,6 +358,15 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
         f"({ENCODING}): `alidade info` tells which for each method, `topics:` in the config can rename"
         + (f"; nearest is {nearest}" if nearest else "")
     )
+
+
+def _check_sheets(method: Method, config: Config) -> None:
+    """Raise InputError when a data sheet is stated that the method has no use for: it would be ignored in silence."""
+    for name in config.sensors.model_fields_set - set(method.sheets):
+        sheet = getattr(config.sensors, name)
+        if any(getattr(sheet, figure) != 0.0 for figure in sheet.model_fields_set):
+            used = ", ".join(f"sensors.{each}" for each in method.sheets) or "no data sheet"
+            raise InputError(f"sensors.{name}: method {method.name} has no use for it; it uses {used}")
 
 
 def _not_as_assumed(found: Sequence[Strained]) -> list[Cause]:

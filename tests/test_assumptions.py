@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import alidade
 from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.graph.assumptions import Assumption, pull, quantities
@@ -164,3 +165,13 @@ def test_result_and_report_tell_assumptions_apart(alidade: Command, tmp_path: Pa
     calibrated, assumed = tables
     assert "gyro_scale_x" not in calibrated
     assert "gyro_scale_x" in assumed
+
+
+def test_a_data_sheet_that_a_method_has_no_use_for_is_refused() -> None:
+    """It would be ignored in silence; `ideal` and figures of 0 say nothing and are taken everywhere."""
+    simulated = alidade.simulate("cube", {"poses": 6}, seed=1)
+    stated = alidade.Config.model_validate({"sensors": {"clock": {"skew": 1e-4}}})
+    with pytest.raises(alidade.InputError, match="sensors.clock: method cube has no use for it; it uses no"):
+        alidade.open(simulated, config=stated).problem()
+    for nothing in ("ideal", {"clock": {"skew": 0.0}}):
+        alidade.open(simulated, config=alidade.Config.model_validate({"sensors": nothing})).problem()

@@ -52,6 +52,7 @@ class Method(ABC):
         topics: what it reads, the optional ones included.
         needs: what it cannot do without.
         section: the model of its own section of the config, if it has one.
+        sheets: the data sheets it uses, as under `sensors` in the config.
         rotations: parameters that are rotation vectors, without their _x, _y, _z -> the rotation each is.
         scenarios: folder with scenarios that come with the method, if it brings its own.
     """
@@ -61,6 +62,7 @@ class Method(ABC):
     topics: ClassVar[tuple[Topic, ...]]
     needs: ClassVar[tuple[Need, ...]]
     section: ClassVar[type[MethodSection] | None] = None
+    sheets: ClassVar[tuple[str, ...]] = ()
     rotations: ClassVar[Mapping[str, str]] = {}
     scenarios: ClassVar[Path | None] = None
 

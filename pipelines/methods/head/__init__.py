@@ -31,6 +31,7 @@ class Head(Method):
     topics = TOPICS
     needs = NEEDS
     section = HeadConfig
+    sheets = ("gyro", "platform_gyro", "camera", "clock")
     rotations: ClassVar[Mapping[str, str]] = {"helmet_mount": "vRh", "camera_mount": "cRb"}
 
     @property

@@ -31,6 +31,7 @@ class Indexer(Method):
     topics = TOPICS
     needs = NEEDS
     section = IndexerConfig
+    sheets = ("gyro", "encoder")
 
     @property
     def data(self) -> type[IndexerData]:
