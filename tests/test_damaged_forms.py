@@ -25,7 +25,7 @@ from pipelines.recording.ros1_bag import MAGIC
 from pipelines.recording.writing import write_session
 from tests import forms
 from tests.damage import CONFIG, Whole, flips, read, spoilt, topics
-from tests.test_recording_forms import turning, write_csv
+from tests.turning import turning, write_csv
 
 MIB = 1 << 20
 CSV = b"columns: {/imu: {time: t, unit: ns, gyro: [x, y, z], accel: [x, y, z]}}"

@@ -110,7 +110,9 @@ def test_what_it_cannot_do_is_one_line(command: Command, folder: Path) -> None:
     assert done.stderr == "alidade: gyro_pair has no camera: leave out --images\n"
     assert (
         "gyro_pair_one_axis"
-        in command(folder, "simulate", "gyro_pair", "--scenario", "none", "--out", "x.mcap", "--quiet", code=2).stderr
+        in command(
+            folder, "simulate", "gyro_pair", "--scenario", "one_axis", "--out", "x.mcap", "--quiet", code=2
+        ).stderr
     )
 
 

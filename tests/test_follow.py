@@ -218,7 +218,7 @@ def test_no_file(tmp_path: Path) -> None:
 
 
 def test_no_mcap(tmp_path: Path) -> None:
-    (tmp_path / "s.mcap").write_bytes(b"SQLite format 3\0" + bytes(100))
+    (tmp_path / "s.mcap").write_bytes(b"%PDF-1.7" + bytes(100))
     with pytest.raises(InputError, match="not an MCAP file"):
         _follow(Settings(tmp_path / "s.mcap", patience=60.0))
 

@@ -28,6 +28,7 @@ from pipelines.session import calibrate
 from tests import forms
 from tests.command import Command
 from tests.recorded import T0, assert_same, session
+from tests.turning import turning, write_csv
 
 MCAP, SQLITE = StoragePlugin.MCAP, StoragePlugin.SQLITE3
 
@@ -268,14 +269,6 @@ def _channels(module: Any, context: Any) -> dict[str, Any]:
 # -- logs and tables
 
 
-def turning(n: int = 500) -> tuple[Any, Any, Any]:
-    """Stamps at 100 Hz, rates and unit quaternions of a body that turns."""
-    rng = np.random.default_rng(5)
-    t_ns = T0 + 10_000_000 * np.arange(n)
-    wxyz = rng.normal(size=(n, 4))
-    return t_ns, rng.normal(size=(n, 3)), wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)
-
-
 def test_euroc_folders(tmp_path: Path) -> None:
     t_ns, gyro, wxyz = turning()
     accel, position = gyro[::-1], gyro * 3.0
@@ -312,12 +305,6 @@ def test_euroc_folders(tmp_path: Path) -> None:
     assert list(recording.images("/cam0/image")) == list(zip(t_ns[:3].tolist(), pictures, strict=True))
     camera = recording.camera_info("/cam0/camera_info")
     assert (camera.width, camera.distortion_model, len(camera.d)) == (752, "plumb_bob", 5)
-
-
-def write_csv(path: Path, names: list[str], t_ns: Any, rows: Any) -> Path:
-    lines = [",".join([str(t), *map(repr, row)]) for t, row in zip(t_ns.tolist(), rows.tolist(), strict=True)]
-    path.write_text("\r\n".join([",".join(names), *lines, ""]))
-    return path
 
 
 def test_tum_trajectories_keep_their_stamps_to_the_nanosecond(tmp_path: Path) -> None:

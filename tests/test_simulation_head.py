@@ -210,6 +210,6 @@ def test_bad_scenario_is_one_clear_line(text: str, complaint: str, tmp_path: Pat
     assert "\n" not in str(caught.value)
 
 
-def test_unknown_scenario_names_the_shipped_ones() -> None:
-    with pytest.raises(InputError, match="head_turntable"):
+def test_unknown_scenario_names_the_nearest_shipped_ones() -> None:
+    with pytest.raises(InputError, match="the nearest are head_nominal, "):
         load_scenario(HeadScenario, "head_nominl")
