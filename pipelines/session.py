@@ -225,16 +225,15 @@ class Session:
             )
             if ours and not estimate.converged:
                 assessment = assessment.unsolved(estimate.message)
-            elif ours and (far := strained(estimate, quantities)):
-                assessment = assessment.remarked(rejection_sentence(estimate.residuals)).explained(_not_as_assumed(far))
             elif ours and (assessment.status == "inconsistent" or too_many_rejected(estimate.residuals)):
                 assessment = assessment.misfit(rejection_sentence(estimate.residuals))
                 with progress.doing("looking for causes"):
                     if causes is None:
                         causes = find_causes(self.method, self.data, self.config, estimate)
-                assessment = assessment.explained(causes)
+                assessment = assessment.explained(_first(causes, _not_as_assumed(strained(estimate, quantities))))
             elif ours:
                 assessment = assessment.remarked(rejection_sentence(estimate.residuals))
+                assessment = assessment.explained(_not_as_assumed(strained(estimate, quantities)))
             if moved is not None and change is not None:
                 sentence = f"{change.sentence}{_told(moved, quantities)}"
                 small = moved.small(quantities)
@@ -367,6 +366,12 @@ def _check_sheets(method: Method, config: Config) -> None:
         if any(getattr(sheet, figure) != 0.0 for figure in sheet.model_fields_set):
             used = ", ".join(f"sensors.{each}" for each in method.sheets) or "no data sheet"
             raise InputError(f"sensors.{name}: method {method.name} has no use for it; it uses {used}")
+
+
+def _first(tried: Sequence[Cause], assumed: Sequence[Cause]) -> list[Cause]:
+    """A fault that explains everything goes before an assumption that it strains, noise that does so after it."""
+    faults = [cause for cause in tried if not cause.label.startswith("the noise ")]
+    return [*faults, *assumed, *(cause for cause in tried if cause not in faults)]
 
 
 def _not_as_assumed(found: Sequence[Strained]) -> list[Cause]:

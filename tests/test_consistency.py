@@ -259,6 +259,7 @@ def test_a_trial_that_raises_ends_alone(head: Case, monkeypatch: pytest.MonkeyPa
     assert causes[0].label == "the sign of the helmet gyro's y is wrong"
 
 
+@pytest.mark.slow
 def test_a_noise_many_times_larger_is_never_an_explanation(head: Case) -> None:
     """Following such advice once ended in `calibrated` with an error of 157 sigmas."""
     method_, data, config = head
