@@ -24,7 +24,7 @@ from pipelines.errors import InputError
 from pipelines.graph.problem import Estimate, Problem, Quantity, Step
 from pipelines.judgement.assumptions import Strained, strained
 from pipelines.judgement.causes import find_causes
-from pipelines.judgement.halves import Halves, held_out, split_at, split_halves
+from pipelines.judgement.halves import Halves, held_out, span, split_at, split_halves
 from pipelines.judgement.observability import Cause, assess
 from pipelines.judgement.rejection import rejection_sentence, too_many_rejected
 from pipelines.judgement.stability import Moved, Stability, stability
@@ -128,10 +128,8 @@ class Arrays:
 
     def facts(self, _: Config) -> SessionFacts:
         """Length of the data; there are no topics."""
-        times = [t for name in self.method.hypotheses().streams if (t := getattr(self.data, name)) is not None]
-        spans = [(float(t[0]), float(t[-1])) for t in times if len(t)]
-        duration = max(stop for _, stop in spans) - min(start for start, _ in spans) if spans else 0.0
-        return SessionFacts(self.epoch_ns, duration, (), (), {self.method.name: ()})
+        start, stop = span(self.method, self.data)
+        return SessionFacts(self.epoch_ns, stop - start, (), (), {self.method.name: ()})
 
     def truth(self) -> dict[str, object] | None:
         """As given."""

@@ -52,7 +52,7 @@ class Halves:
 
 def split_halves(method: Method, data: Any, config: Config) -> dict[str, Halves]:
     """What either half of a recording determines by itself, see `split_at`."""
-    start, stop = _span(method, data)
+    start, stop = span(method, data)
     return split_at(method, data, config, 0.5 * (start + stop))
 
 
@@ -63,10 +63,9 @@ def split_at(method: Method, data: Any, config: Config, middle: float) -> dict[s
     differs between the parts by its walk too.
     """
     hypotheses = method.hypotheses()
-    start, stop = _span(method, data)
-    first, second = (
-        outcome(method, cut(hypotheses, data, *span), config) for span in ((start, middle), (middle, stop + 1.0))
-    )
+    start, stop = span(method, data)
+    parts = (start, middle), (middle, stop + 1.0)
+    first, second = (outcome(method, cut(hypotheses, data, *part), config) for part in parts)
     if first is None or second is None:
         return {}
     a, b = first.estimate, second.estimate
@@ -78,10 +77,11 @@ def split_at(method: Method, data: Any, config: Config, middle: float) -> dict[s
     return found
 
 
-def _span(method: Method, data: Any) -> tuple[float, float]:
-    """First and last stamp, s."""
-    times = [time for stamps in method.hypotheses().streams if (time := getattr(data, stamps)) is not None]
-    return float(min(t[0] for t in times)), float(max(t[-1] for t in times))
+def span(method: Method, data: Any) -> tuple[float, float]:
+    """First and last stamp of a method's data, s; zeros where there is none."""
+    streams = [time for stamps in method.hypotheses().streams if (time := getattr(data, stamps)) is not None]
+    times = [time for time in streams if len(time)]
+    return float(min((t[0] for t in times), default=0.0)), float(max((t[-1] for t in times), default=0.0))
 
 
 def held_out(problem: Problem) -> dict[str, float]:
