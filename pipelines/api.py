@@ -135,9 +135,10 @@ def follow(
     window: float | None = 1.0,
     patience: float = 30.0,
 ) -> Calibration:
-    """Calibrate a recording while it is being written; returns when it is finished, or nothing is new for `patience` s.
+    """Calibrate a recording while it is being made; returns when it is finished, or nothing is new for `patience` s.
 
-    `show` is given what is known whenever that changes.
+    `path` is a file or a folder that is being written, `ws://host:port` of a Foxglove bridge, or `-` for standard
+    input; `show` is given what is known whenever that changes.
 
     Raises:
         InputError: the file does not appear, is no recording, or cannot be used in the end.
@@ -145,9 +146,11 @@ def follow(
     """
     from pipelines.follow.follower import Follower
     from pipelines.follow.follower import Settings as Following
+    from pipelines.follow.sources import source_of
 
-    settings = Following(Path(path), method, None if config is None else Path(config), window, patience)
-    return Follower(settings, show or (lambda _: None), lambda _: None, lambda: False).follow()
+    settings = Following(method, None if config is None else Path(config), window, patience)
+    with source_of(str(path), say=lambda _: None) as source:
+        return Follower(source, settings, show or (lambda _: None), lambda _: None, lambda: False).follow()
 
 
 def _scenario(method: Method, given: str | Path | Mapping[str, Any] | BaseModel | None, images: bool) -> BaseModel:

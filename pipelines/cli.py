@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Sequence
 from enum import StrEnum
@@ -126,7 +127,10 @@ def compare(
 
 @app.command()
 def follow(
-    session: _Session,
+    source: Annotated[
+        str,
+        typer.Argument(metavar="SOURCE", help="A file or folder being written, ws://host:port, - for standard input."),
+    ],
     method: _MethodName = None,
     config: _ConfigFile = None,
     window: _Window = "1",
@@ -134,16 +138,19 @@ def follow(
     checkpoint: Annotated[Path | None, typer.Option(help="File to save the run in, and to go on from.")] = None,
     serve: Annotated[bool, typer.Option("--serve", help="Estimates live over Foxglove's WebSocket.")] = False,
     port: Annotated[int, typer.Option(help="Of --serve, on this machine alone.")] = 8765,
-    out: Annotated[Path | None, typer.Option(help="Folder for the results; default: SESSION-incremental.")] = None,
+    record: Annotated[
+        Path | None, typer.Option(help="Folder to keep what comes by ws:// or -; a later run goes on in it.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; default: SOURCE-incremental.")] = None,
 ) -> None:
     """Calibrate a recording while it is being written, and say what is still missing. Ctrl-C ends it."""
     from pipelines.follow.follow import follow as run
     from pipelines.follow.follower import Settings
     from pipelines.reports.write import write_results
 
-    settings = Settings(session, method, config, _seconds(window), patience, checkpoint)
-    calibration = run(settings, port if serve else None)
-    folder = out or _beside(session, "incremental")
+    settings = Settings(method, config, _seconds(window), patience, checkpoint)
+    calibration = run(source, settings, port if serve else None, record)
+    folder = out or _beside(Path(_file_name(source)), "incremental")
     written = write_results(folder, calibration)
     _tell(calibration, folder, written)
 
@@ -409,6 +416,13 @@ def _beside(session: Path, what: str) -> Path:
     session = session if session.name else session.resolve()
     name = "".join(letter for letter in session.stem if letter not in "*?[]").rstrip("_-.") or "recording"
     return session.with_name(f"{name}-{what}")
+
+
+def _file_name(source: str) -> str:
+    """A source by a name that a file may have: a stream by letters and digits alone."""
+    if source == "-":
+        return "stdin"
+    return re.sub(r"\W+", "-", source.partition("://")[2]).strip("-") if "://" in source else source
 
 
 def _tell(calibration: Calibration, folder: Path, written: Sequence[Path], as_json: bool = False) -> NoReturn:

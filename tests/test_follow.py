@@ -22,6 +22,7 @@ from pipelines.errors import InputError
 from pipelines.follow.follower import Follower, Settings
 from pipelines.follow.guidance import View
 from pipelines.follow.serve import LiveServer
+from pipelines.follow.sources import Source
 from pipelines.methods.los.recording import write_los
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from pipelines.reports.result import Calibration
@@ -167,7 +168,7 @@ def test_live_killed_and_resumed_it_ends_as_batch_on_the_finished_file(whole: Pa
     assert {p.name for p in (out).iterdir()} >= {"result.json", "report.html", "calibration.yaml", "estimates.mcap"}
 
 
-def _follow(settings: Settings, go: Path | None = None) -> tuple[Calibration, list[View], list[str]]:
+def _follow(path: Path, settings: Settings, go: Path | None = None) -> tuple[Calibration, list[View], list[str]]:
     """Followed to the end; whoever waits for `go` may go on when there is an estimate."""
     views: list[View] = []
     said: list[str] = []
@@ -177,7 +178,7 @@ def _follow(settings: Settings, go: Path | None = None) -> tuple[Calibration, li
         if go is not None and view.values is not None:
             go.touch()
 
-    return Follower(settings, show, said.append, lambda: False).follow(), views, said
+    return Follower(Source(path), settings, show, said.append, lambda: False).follow(), views, said
 
 
 def _unfinished(whole: Path, target: Path, share: float) -> Path:
@@ -190,7 +191,7 @@ def test_a_recording_that_stops_growing_unfinished_gives_what_is_there(whole: Pa
     raw = tmp_path / "raw.mcap"
     assert _recorder(whole, raw, chunks=False).wait() == 0
     session = _unfinished(raw, tmp_path / "s.mcap", 0.4)
-    calibration, views, said = _follow(Settings(session, patience=1.5))
+    calibration, views, said = _follow(session, Settings(patience=1.5))
     assert said[-1] == "nothing new for 1.5 s: the recording is not finished, the result is that of what is there"
     assert 16.0 < calibration.facts.duration_s < 24.0
     assert views[-1].values is not None
@@ -200,7 +201,7 @@ def test_a_recording_that_stops_growing_unfinished_gives_what_is_there(whole: Pa
 def test_what_is_missing_is_said_until_the_accuracy_is_reached(whole: Path, tmp_path: Path) -> None:
     session = tmp_path / "s.mcap"
     recorder = _recorder(whole, session, 8.0, tmp_path / "go")
-    calibration, views, _ = _follow(Settings(session, patience=30.0), tmp_path / "go")
+    calibration, views, _ = _follow(session, Settings(patience=30.0), tmp_path / "go")
     assert recorder.wait() == 0
     assert calibration.assessment.status == "calibrated"
     last = views[-1]
@@ -213,36 +214,36 @@ def test_what_is_missing_is_said_until_the_accuracy_is_reached(whole: Path, tmp_
 
 
 def test_no_file(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"s\.mcap: no such file, or nothing in it, after 0\.3 s of waiting"):
-        _follow(Settings(tmp_path / "s.mcap", patience=0.3))
+    with pytest.raises(InputError, match=r"s\.mcap: nothing there, or nothing in it, after 0\.3 s of waiting"):
+        _follow(tmp_path / "s.mcap", Settings(patience=0.3))
 
 
 def test_no_mcap(tmp_path: Path) -> None:
     (tmp_path / "s.mcap").write_bytes(b"%PDF-1.7" + bytes(100))
     with pytest.raises(InputError, match="not an MCAP file"):
-        _follow(Settings(tmp_path / "s.mcap", patience=60.0))
+        _follow(tmp_path / "s.mcap", Settings(patience=60.0))
 
 
 def test_too_little_to_calibrate_is_the_readers_own_line(whole: Path, tmp_path: Path) -> None:
     session = _unfinished(whole, tmp_path / "s.mcap", 0.002)
     with pytest.raises(InputError, match=re.escape(str(session))):
-        _follow(Settings(session, patience=1.0))
+        _follow(session, Settings(patience=1.0))
 
 
 def test_a_checkpoint_of_another_config_is_refused(whole: Path, tmp_path: Path) -> None:
     checkpoint, config = tmp_path / "c", tmp_path / "c.yaml"
-    _follow(Settings(whole, checkpoint=checkpoint))
+    _follow(whole, Settings(checkpoint=checkpoint))
     assert checkpoint.exists()
     config.write_text("require: {delta_px: 0.5}\n")
     with pytest.raises(InputError, match=r"checkpoint is of another config, \{.*\}, not \{.*delta_px"):
-        _follow(Settings(whole, config=config, checkpoint=checkpoint))
-    _, _, said = _follow(Settings(whole, checkpoint=checkpoint))
+        _follow(whole, Settings(config=config, checkpoint=checkpoint))
+    _, _, said = _follow(whole, Settings(checkpoint=checkpoint))
     assert said[0].startswith("resumed at 4")
 
 
-def test_without_foxglove_sdk_serving_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "foxglove", None)
-    with pytest.raises(InputError, match=r"--serve needs foxglove-sdk.*alidade\[serve\]"):
+def test_without_websockets_serving_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "websockets.sync.client", None)
+    with pytest.raises(InputError, match=r"--serve need websockets.*alidade\[live\]"):
         LiveServer()
 
 

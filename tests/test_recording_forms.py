@@ -26,7 +26,6 @@ from pipelines.recording.topics import IMU
 from pipelines.recording.writing import write_session
 from pipelines.session import calibrate
 from tests import forms
-from tests.command import Command
 from tests.recorded import T0, assert_same, session
 from tests.turning import turning, write_csv
 
@@ -701,9 +700,3 @@ def test_the_same_calibration_out_of_another_form(tmp_path: Path) -> None:
     assert ours.assessment.status == theirs.assessment.status == "calibrated"
     np.testing.assert_equal(ours.estimate.values, theirs.estimate.values)
     np.testing.assert_array_equal(ours.estimate.covariance, theirs.estimate.covariance)
-
-
-def test_following_a_folder_is_one_line(tmp_path: Path, alidade: Command) -> None:
-    refused = alidade("follow", tmp_path)
-    assert refused.code == 2
-    assert "a folder; follow the file that is being written in it" in refused.err

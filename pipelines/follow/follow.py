@@ -6,20 +6,28 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from types import FrameType
 
 from pipelines.follow.follower import Follower, Settings
 from pipelines.follow.guidance import View
 from pipelines.follow.screen import Screen
 from pipelines.follow.serve import LiveServer
+from pipelines.follow.sources import source_of
 from pipelines.reports.result import Calibration
 from pipelines.terminal import console
 
 
-def follow(settings: Settings, port: int | None) -> Calibration:
+def follow(what: str, settings: Settings, port: int | None, record: Path | None = None) -> Calibration:
     """Follow a recording until it ends, shown in the terminal and, with a port, served on it.
 
-    The first Ctrl-C ends it with what is there, the second at once. Raises as `Follower.follow` does.
+    The first Ctrl-C ends it with what is there, the second at once. Raises as `source_of` and `Follower.follow` do.
+
+    Args:
+        what: a path, ws://host:port, or - for standard input.
+        settings: how.
+        port: of the server.
+        record: folder where streams are kept.
     """
     with ExitStack() as stack:
         server = None if port is None else stack.enter_context(LiveServer(port))
@@ -33,7 +41,8 @@ def follow(settings: Settings, port: int | None) -> Calibration:
             if server is not None:
                 server.show(view)
 
-        return Follower(settings, show, screen.say, stopped.is_set).follow()
+        source = stack.enter_context(source_of(what, record, screen.say))
+        return Follower(source, settings, show, screen.say, stopped.is_set).follow()
 
 
 @contextmanager

@@ -17,8 +17,8 @@ from importlib import metadata
 from pathlib import Path
 
 from pipelines.errors import InputError
-from pipelines.follow.growing import is_finished, size_of
 from pipelines.follow.guidance import View, view_of
+from pipelines.follow.sources import Source
 from pipelines.graph.problem import Problem, Step
 from pipelines.judgement.checklist import ChecklistItem
 from pipelines.recording.reading import open_recording
@@ -40,17 +40,15 @@ _FINGERPRINT = 4096
 
 @dataclass(frozen=True)
 class Settings:
-    """What to follow, and how.
+    """How to follow.
 
     Attributes:
-        path: of the recording.
         method, config: override the recording's own.
         window: s, of the incremental solver; None keeps the whole history.
         patience: s, without anything new, after which what is there is taken as all there will be.
         checkpoint: file the run is saved in from time to time, and resumed from.
     """
 
-    path: Path
     method: str | None = None
     config: Path | None = None
     window: float | None = 1.0
@@ -62,15 +60,22 @@ class Follower:
     """A recording being followed.
 
     Args:
-        settings: what and how.
+        source: of the recording.
+        settings: how.
         show: is given the view of what is known whenever it changes.
         say: is given sentences for the person recording.
         stopped: whether to go on no longer; asked often.
     """
 
     def __init__(
-        self, settings: Settings, show: Callable[[View], None], say: Callable[[str], None], stopped: Callable[[], bool]
+        self,
+        source: Source,
+        settings: Settings,
+        show: Callable[[View], None],
+        say: Callable[[str], None],
+        stopped: Callable[[], bool],
     ) -> None:
+        self.source = source
         self.settings, self._show, self._say, self._stopped = settings, show, say, stopped
         self._run: Run | None = None
         self._epoch_ns = 0
@@ -90,15 +95,13 @@ class Follower:
                 another recording, config or version.
             IndeterminateError: states other than the parameters are not determined.
         """
-        path, patience = self.settings.path, self.settings.patience
-        if path.is_dir():
-            raise InputError(f"{path}: a folder; follow the file that is being written in it")
+        source, patience = self.source, self.settings.patience
         size, grown, due = -1, time.monotonic(), 0.0
         while True:
             now = time.monotonic()
-            if size_of(path) != size:
-                size, grown, new = size_of(path), now, True
-            finished = size > 0 and is_finished(path)
+            if source.size != size:
+                size, grown, new = source.size, now, True
+            finished = source.is_finished
             over = finished or self._stopped() or now - grown > patience
             if over:
                 return self._end(finished, size)
@@ -126,13 +129,13 @@ class Follower:
         """The recording cannot be read yet, or holds too little; raises InputError when it never will."""
         if "not an MCAP file" in reason:
             raise InputError(reason)
-        reason = reason.removeprefix(f"{self.settings.path}: ")
+        reason = reason.removeprefix(f"{self.source.path}: ")
         if reason != self._waiting:
             self._waiting = reason
             self._say(f"not enough yet: {reason}")
 
     def _read(self) -> Session:
-        return Session.read(open_recording(self.settings.path), self.settings.method, self.settings.config)
+        return Session.read(open_recording(self.source.where), self.settings.method, self.settings.config)
 
     def _new_steps(self, session: Session, problem: Problem) -> Iterator[Step]:
         """The steps not taken yet, for a run that is the one to take them: a new one if the past has changed."""
@@ -194,7 +197,7 @@ class Follower:
 
     def _identify(self, session: Session) -> dict[str, str]:
         """What a checkpoint belongs to, in words."""
-        with self.settings.path.open("rb") as stream:
+        with self.source.parts[0].open("rb") as stream:
             head = hashlib.sha256(stream.read(_FINGERPRINT)).hexdigest()[:12]
         return {
             "recording": f"one that starts at {session.origin.epoch_ns} ns ({head})",
@@ -208,9 +211,9 @@ class Follower:
 
     def _end(self, finished: bool, size: int) -> Calibration:
         """Everything there is."""
-        path = self.settings.path
         if size <= 0:
-            raise InputError(f"{path}: no such file, or nothing in it, after {self.settings.patience:g} s of waiting")
+            wait = "" if finished else f", after {self.settings.patience:g} s of waiting"
+            raise InputError(f"{self.source.name}: nothing there, or nothing in it{wait}")
         if not finished:
             why = "stopped" if self._stopped() else f"nothing new for {self.settings.patience:g} s"
             self._say(f"{why}: the recording is not finished, the result is that of what is there")

@@ -47,6 +47,12 @@ RATES = (IMU, VECTOR, TWIST)
 # Pictures, as files and raw.
 PICTURES = (COMPRESSED_IMAGE, IMAGE)
 
+# All types that anything is taken from.
+SENSORS = (
+    *(IMU, MAGNETIC_FIELD, JOINT_STATE, NAV_SAT_FIX, CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, VECTOR, QUATERNION, POSE),
+    *(PLAIN_POSE, TRANSFORM, ODOMETRY, TWIST, ACCEL, TF, TAG_DETECTIONS),
+)
+
 # Not among the types rosbags brings along.
 _APRILTAG_MSGS = {
     "apriltag_msgs/msg/Point": "float64 x\nfloat64 y\n",

@@ -18,7 +18,8 @@ from pipelines.recording.parts import Parts
 
 _ZSTD, _SQLITE, _ULOG, _ARDUPILOT = b"\x28\xb5\x2f\xfd", b"SQLite format 3\0", b"ULog\x01\x12\x35", b"\xa3\x95"
 _TABLES = {".csv", ".tum", ".txt"}
-_PARTS = (".mcap", ".db3", ".bag", ".zstd", ".zst")
+# How the parts of a recording may be called.
+PARTS = (".mcap", ".db3", ".bag", ".zstd", ".zst")
 # A compressed file may unpack to so many times its size, beyond so many bytes.
 _LARGEST_RATIO, _SMALL = 100, 1 << 28
 _METADATA, _LONGEST_METADATA = "metadata.yaml", 1 << 24
@@ -140,7 +141,7 @@ def _folder(path: Path, strict: bool) -> Container:
     root = find_euroc(path)
     if root is not None:
         return read_euroc(path, root)
-    there = sorted(file for file in path.iterdir() if file.suffix in _PARTS and file.is_file())
+    there = sorted(file for file in path.iterdir() if file.suffix in PARTS and file.is_file())
     if len({_PART_NAME.sub("", file.name) for file in there}) > 1:
         names = ", ".join(file.name for file in there)
         raise InputError(f"{path}: a folder of several recordings ({names}); name one, or the parts by a pattern")

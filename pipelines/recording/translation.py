@@ -20,14 +20,8 @@ from pipelines.recording.container import Schema
 from pipelines.recording.messages import Definition, MessageError
 
 _HEADER, _TIME = "std_msgs/msg/Header", "builtin_interfaces/msg/Time"
-_SAME_NAME = (
-    *(messages.IMU, messages.MAGNETIC_FIELD, messages.JOINT_STATE, messages.NAV_SAT_FIX, messages.CAMERA_INFO),
-    *(messages.COMPRESSED_IMAGE, messages.IMAGE, messages.VECTOR, messages.QUATERNION, messages.POSE),
-    *(messages.PLAIN_POSE, messages.TRANSFORM, messages.ODOMETRY, messages.TWIST, messages.ACCEL, messages.TF),
-    messages.TAG_DETECTIONS,
-)
 # Last part of a type's name -> ROS 2 type.
-_ROS = {name.rpartition("/")[2]: name for name in _SAME_NAME}
+_ROS = {name.rpartition("/")[2]: name for name in messages.SENSORS}
 _FOXGLOVE = {
     "CompressedImage": messages.COMPRESSED_IMAGE,
     "PoseInFrame": messages.PLAIN_POSE,
