@@ -16,15 +16,15 @@ _HOMES = {
     "loss": ("TruncatedLoss",),
     "model": ("POSE3", "ROT3", "Model"),
     "preintegration": ("GyroPath", "Increments"),
+    "tags": ("TagAttitudeFactor",),
     "triad": (
         "AccelFactor",
-        "GyroRotationFactor",
         "GyroStaticFactor",
         "MagFactor",
-        "TagAttitudeFactor",
         "TriadPriorFactor",
         "WeightedSumFactor",
     ),
+    "turns": ("GyroRotationFactor",),
     "vectorized": ("Ensemble", "VectorizedFactor"),
 }
 _MODULE_OF = {name: module for module, names in _HOMES.items() for name in names}

@@ -1,7 +1,6 @@
-"""Factors of the cube method: an accelerometer, a gyro and a magnetometer in a body seen by a camera.
+"""Triads of the cube method, and what an accelerometer, a gyro and a magnetometer at rest say.
 
-Frames: b body (the cube), n level East-North-Up, B reference, C its camera (optical: x right, y down, z forward), T a
-tag on the body (x right, y up, z out of the face).
+Frames: b body (the cube), n level East-North-Up.
 
 Each sensor is a *triad*, one vector of 12 numbers: the rows of A (3 x 3), then c (3), with raw = A nominal + c + noise,
 `nominal` being what an ideal sensor along the axes of b would say. Calibrations are told the other way round, nominal =
@@ -12,14 +11,12 @@ sensor with an AprilTag hexahedron.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from factors import so3
 from factors.model import ROT3, Array, Block, Model, Residuals
-from factors.preintegration import GyroPath
 
 _UP = np.array([0.0, 0.0, 1.0])
 
@@ -75,52 +72,91 @@ class TriadPriorFactor(Model):
 
 @dataclass(frozen=True)
 class AccelFactor(Model):
-    """Mean of an accelerometer at rest: raw = A bRn (0, 0, g) + c. Blocks: nRb (rotations), triad (12).
+    """Mean of an accelerometer at rest: u = A bRn (0, 0, g) + c, raw = u + square u^2 + cube u^3, axis by axis.
+
+    Blocks: nRb (rotations), triad (12) and, of one that is curved, its terms (3 square, s^2/m, and 3 cube, (s^2/m)^2).
 
     Attributes:
         time: (n,) s.
         raw: (n, 3).
         sigma: (n,) per axis, in the unit of raw.
         gravity: g, m/s^2.
+        curved: whether it has square and cube terms.
     """
 
     time: Array
     raw: Array
     sigma: Array
     gravity: float
+    curved: bool = False
     rows: int = 3
-    blocks = (ROT3, 12)
 
-    def __call__(self, nRb: Array, triads: Array) -> Residuals:
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """Attitude, triad and, of a curved one, its terms."""
+        return (ROT3, 12, 6) if self.curved else (ROT3, 12)
+
+    def __call__(self, nRb: Array, triads: Array, *curvature: Array) -> Residuals:
         """Residual (predicted - raw) / sigma, (n, 3)."""
         error, jacobians = _at_rest(self.raw, self.sigma, nRb, triads, self.gravity * _UP)
-        return error, lambda: jacobians()[:2]
+        if not curvature:
+            return error, lambda: jacobians()[:2]
+        square, cube = curvature[0][:, :3], curvature[0][:, 3:]
+        weight = 1.0 / self.sigma[:, None]
+        u = error / weight + self.raw
+        bent = (square * u**2 + cube * u**3) * weight
+
+        def with_terms() -> tuple[Array, ...]:
+            slope = (1.0 + 2.0 * square * u + 3.0 * cube * u**2)[..., None]
+            powers = np.concatenate([(u**2 * weight)[..., None] * np.eye(3), (u**3 * weight)[..., None] * np.eye(3)], 2)
+            by_attitude, by_triad, _ = jacobians()
+            return slope * by_attitude, slope * by_triad, powers
+
+        return error + bent, with_terms
 
 
 @dataclass(frozen=True)
 class GyroStaticFactor(Model):
-    """Mean of a gyro at rest on the turning earth: raw = A bRn w_ie + c + d.
+    """Mean of a gyro at rest on the turning earth: raw = A bRn w_ie + c + d + G bRn (0, 0, g).
 
-    Blocks: nRb (rotations), triad (12), d (3; how far the gyro's offset has wandered, in the unit of raw).
+    Blocks: nRb (rotations), triad (12), d (3; how far the gyro's offset has wandered, in the unit of raw) and, of one
+    that feels gravity, G by rows (9, rad/s per m/s^2).
 
     Attributes:
         time: (n,) s.
         raw: (n, 3).
         sigma: (n,) per axis, in the unit of raw.
         earth_rate: (3,) w_ie in n, rad/s.
+        gravity: g, m/s^2, of a gyro that feels it; None: it does not.
     """
 
     time: Array
     raw: Array
     sigma: Array
     earth_rate: Array
+    gravity: float | None = None
     rows: int = 3
-    blocks = (ROT3, 12, 3)
 
-    def __call__(self, nRb: Array, triads: Array, wandered: Array) -> Residuals:
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """Attitude, triad, wandered offset and, of one that feels gravity, G."""
+        return (ROT3, 12, 3) if self.gravity is None else (ROT3, 12, 3, 9)
+
+    def __call__(self, nRb: Array, triads: Array, wandered: Array, *sensitivity: Array) -> Residuals:
         """Residual (predicted - raw) / sigma, (n, 3)."""
         error, jacobians = _at_rest(self.raw - wandered, self.sigma, nRb, triads, self.earth_rate)
-        return error, lambda: (*jacobians()[:2], np.eye(3) / self.sigma[:, None, None])
+        weight = 1.0 / self.sigma
+        by_wandered = np.eye(3) * weight[:, None, None]
+        if self.gravity is None:
+            return error, lambda: (*jacobians()[:2], by_wandered)
+        force = so3.rotate(so3.inverse(nRb), self.gravity * _UP)
+        G = sensitivity[0].reshape(-1, 3, 3) * weight[:, None, None]
+
+        def with_force() -> tuple[Array, ...]:
+            by_attitude, by_triad, _ = jacobians()
+            return by_attitude + G @ so3.hat(force), by_triad, by_wandered, _by_triad(force, weight)[..., :9]
+
+        return error + np.einsum("nij,nj->ni", G, force), with_force
 
 
 @dataclass(frozen=True)
@@ -168,53 +204,6 @@ def _by_triad(nominal: Array, weight: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class GyroRotationFactor(Model):
-    """A gyro's rotation between two attitudes, integrated with its whole triad: nRb_j = Exp(w_ie T)^T nRb_i dR(A, c).
-
-    Blocks: nRb_i, nRb_j (rotations), triad (12), d_i, d_j (3 each; how far the gyro's offset has wandered at both ends,
-    in the unit of raw: their mean adds to c). Samples are mean rates centred on their stamps, integrated as
-    factors.preintegration does: the arc between point rates w0 and w1 is T (w0 + w1) / 2 + T^2 (w0 x w1) / 12.
-
-    Attributes:
-        time: (n,) ends of the turns, s.
-        stamps: n times (N,), s; a turn goes from its first stamp to its last.
-        raw: n times (N, 3), at the stamps.
-        earth_rate: (3,) w_ie in n, rad/s.
-        sigma: (n,) rad per axis.
-    """
-
-    time: Array
-    stamps: Sequence[Array]
-    raw: Sequence[Array]
-    earth_rate: Array
-    sigma: Array
-    rows: int = 3
-    blocks = (ROT3, ROT3, 12, 3, 3)
-
-    def __call__(self, nRb_i: Array, nRb_j: Array, triads: Array, wandered_i: Array, wandered_j: Array) -> Residuals:
-        """Residual Log(predicted^T nRb_j) / sigma, (n, 3)."""
-        A, c = parts(triads)
-        offsets = c + 0.5 * (wandered_i + wandered_j)
-        K = np.linalg.inv(A)
-        rates = [(raw - offset) @ k.T for raw, offset, k in zip(self.raw, offsets, K, strict=True)]
-        paths = [GyroPath(t, w) for t, w in zip(self.stamps, rates, strict=True)]
-        dR = np.array([path.attitude(path.t[-1:])[0] for path in paths])
-        turned = np.array([t[-1] - t[0] for t in self.stamps])[:, None] * self.earth_rate
-        predicted = so3.compose(so3.exp(-turned), nRb_i, dR)
-        error = so3.log(so3.multiply(so3.inverse(predicted), nRb_j))
-        weight = 1.0 / self.sigma
-
-        def jacobians() -> tuple[Array, ...]:
-            left = -so3.right_jacobian_inverse(-error) * weight[:, None, None]
-            right = so3.right_jacobian_inverse(error) * weight[:, None, None]
-            by_triad = left @ np.array([_turn_by_triad(p, w, k) for p, w, k in zip(paths, rates, K, strict=True)])
-            by_wandered = 0.5 * by_triad[..., 9:]
-            return left @ so3.matrix(so3.inverse(dR)), right, by_triad, by_wandered, by_wandered
-
-        return error * weight[:, None], jacobians
-
-
-@dataclass(frozen=True)
 class WeightedSumFactor(Model):
     """The weighted sum of several vectors is zero. Blocks: as many vectors (3) as weights.
 
@@ -239,86 +228,3 @@ class WeightedSumFactor(Model):
         scaled = self.weights / self.sigma
         total = sum((w * v for w, v in zip(scaled, vectors, strict=True)), start=np.zeros((1, 3)))
         return total, lambda: tuple(w * np.eye(3)[None] for w in scaled)
-
-
-def _turn_by_triad(path: GyroPath, rate: Array, K: Array) -> Array:
-    """Jacobian (3, 12) of a turn's rotation, perturbed on the right, by the triad; dw = -K (dA w + dc)."""
-    # The rates that the path takes as linear in between; at its last stamp that is the sample itself.
-    points = path.rate(path.t)
-    points[-1] = rate[-1]
-    dt = np.diff(path.t)[:, None, None]
-    w0, w1 = points[:-1], points[1:]
-    arcs = 0.5 * dt[..., 0] * (w0 + w1) + dt[..., 0] ** 2 / 12.0 * so3.cross(w0, w1)
-    attitude = so3.matrix(path.attitude(path.t))
-    # What a change of each arc does to the end.
-    carried = attitude[-1].T @ attitude[1:] @ so3.right_jacobian(arcs)
-    by_rate = np.zeros((len(points), 3, 3))
-    by_rate[:-1] += carried @ (0.5 * dt * np.eye(3) - dt**2 / 12.0 * so3.hat(w1))
-    by_rate[1:] += carried @ (0.5 * dt * np.eye(3) + dt**2 / 12.0 * so3.hat(w0))
-    by_c = -by_rate @ K
-    by_A = np.einsum("kia,kb->iab", by_c, points).reshape(3, 9)
-    return np.concatenate([by_A, by_c.sum(axis=0)], axis=1)
-
-
-@dataclass(frozen=True)
-class TagAttitudeFactor(Model):
-    """Attitude of the body by the corners of its tags: nRb = Exp(heading Up) nRB BRC cRb, cRb seen through the corners.
-
-    A corner at q in the tag's frame stands at P = cRb (position of the tag + bRt D q) + p in the camera's frame and is
-    seen at (Px, Py) / Pz. All tags seen in one pose share nRb and p, so they settle the attitude together. Blocks: nRb
-    (rotations), p (3; origin of b in C, m), nRB (rotations), heading (1, rad; correction of nRB about Up), correction
-    of BRC (rotations, on the right), correction D of bRt (rotations, on the right).
-
-    Attributes:
-        time: (n,) s; a measurement is one tag seen in one pose.
-        measured: (n, 4, 2) z = 1 coordinates of the corners, free of lens distortion.
-        sqrt_information: (n, 4, 2, 2) of each corner.
-        corners: (n, 4, 3) q, m.
-        bRt: (n, 4) attitude of the tag in b as the layout has it.
-        position: (n, 3) of the tag in b, m.
-        BRC: (4,) camera mount as given.
-    """
-
-    time: Array
-    measured: Array
-    sqrt_information: Array
-    corners: Array
-    bRt: Array
-    position: Array
-    BRC: Array
-    rows: int = 8
-    blocks = (ROT3, 3, ROT3, 1, ROT3, ROT3)
-
-    def __call__(self, nRb: Array, p: Array, nRB: Array, heading: Array, mount: Array, tag: Array) -> Residuals:
-        """Residual sqrt_information (predicted - measured), (n, 8)."""
-        n = len(self.time)
-        BRC = so3.multiply(self.BRC, mount)
-        nRC = so3.compose(so3.exp(heading * _UP), nRB, BRC)
-        cRb = so3.multiply(so3.inverse(nRC), nRb)
-        bRt = so3.multiply(self.bRt, tag)
-        in_body = self.position[:, None] + so3.rotate(bRt[:, None], self.corners)
-        turned = so3.rotate(cRb[:, None], in_body)
-        P = turned + p[:, None]
-        # A corner behind the camera cannot be seen: a residual that no step may leave there.
-        depth = np.where(P[..., 2:] > 0.0, P[..., 2:], np.inf)
-        seen = np.where(P[..., 2:] > 0.0, P[..., :2] / depth, 1e3)
-        error = np.einsum("nkij,nkj->nki", self.sqrt_information, seen - self.measured)
-
-        def jacobians() -> tuple[Array, ...]:
-            by_point = np.zeros((n, 4, 2, 3))
-            by_point[..., 0, 0] = by_point[..., 1, 1] = 1.0 / depth[..., 0]
-            by_point[..., 2] = -seen / depth
-            by_point = self.sqrt_information @ by_point
-            body = by_point @ so3.matrix(cRb)[:, None]
-            camera = by_point @ so3.hat(turned)
-            blocks = (
-                -body @ so3.hat(in_body),
-                by_point,
-                camera @ so3.matrix(so3.inverse(BRC))[:, None],
-                camera @ so3.rotate(so3.inverse(nRC), _UP)[:, None, :, None],
-                camera,
-                -body @ so3.matrix(bRt)[:, None] @ so3.hat(self.corners),
-            )
-            return tuple(block.reshape(n, 8, -1) for block in blocks)
-
-        return error.reshape(n, 8), jacobians

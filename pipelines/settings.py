@@ -130,20 +130,42 @@ class ClockSheet(Sheet):
     skew: SigmaOrZero | None = None
 
 
+class AccelSheet(Sheet):
+    """Of an accelerometer that reads u + square u^2 + cube u^3: square, s^2/m, and cube, (s^2/m)^2."""
+
+    square: SigmaOrZero | None = None
+    cube: SigmaOrZero | None = None
+
+
+class ReferenceSheet(Sheet):
+    """Of an attitude reference: tilt of its level, rad."""
+
+    tilt: SigmaOrZero | None = None
+
+
+class FieldSheet(Sheet):
+    """Of the earth's magnetic field where the recording is made: model_error, T, of its model there."""
+
+    model_error: Sigma | None = None
+
+
 class Sensors(Section):
     """Data sheets of the sensors; what they do not say is as in sensors of the usual grade."""
 
     gyro: GyroSheet = GyroSheet()
+    accel: AccelSheet = AccelSheet()
     platform_gyro: PlatformGyroSheet = PlatformGyroSheet()
     camera: CameraSheet = CameraSheet()
     clock: ClockSheet = ClockSheet()
     encoder: EncoderSheet = EncoderSheet()
+    reference: ReferenceSheet = ReferenceSheet()
+    field: FieldSheet = FieldSheet()
 
 
 def _ideal(value: object) -> object:
-    """`ideal` written out: all figures 0."""
+    """`ideal` written out: all figures 0, but for the field, which is no sensor."""
     if value == "ideal":
-        sheets = {name: type(sheet).model_fields for name, sheet in Sensors()}
+        sheets = {name: type(sheet).model_fields for name, sheet in Sensors() if name != "field"}
         return {name: dict.fromkeys(figures, 0.0) for name, figures in sheets.items()}
     if isinstance(value, str):
         raise ValueError(f"must be data sheets by sensor, or ideal, not {value!r}")

@@ -19,7 +19,8 @@ from pipelines.judgement.causes import find_causes
 from pipelines.judgement.halves import cut, held_out, split_halves
 from pipelines.judgement.rejection import rejection_sentence, too_many_rejected
 from pipelines.methods import Method, method
-from pipelines.methods.cube.simulation import CubeCamera, CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
+from pipelines.methods.cube.simulation import simulate_cube
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.methods.head.recording import write_head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head

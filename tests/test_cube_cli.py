@@ -18,7 +18,8 @@ from factors import so3
 from pipelines import cli
 from pipelines.methods import simulate
 from pipelines.methods.cube.data import CubeData, Sightings
-from pipelines.methods.cube.simulation import CubeCamera, CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
+from pipelines.methods.cube.simulation import simulate_cube
 from pipelines.methods.cube.writing import write_cube
 from pipelines.vision.camera import Camera
 

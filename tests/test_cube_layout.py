@@ -13,7 +13,8 @@ from factors import so3
 from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.methods.cube.layout import cube_layout, layout_yaml
-from pipelines.methods.cube.simulation import CubeCamera, CubeScenario, Errors, TagCube, cube_config, simulate_cube
+from pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Errors, TagCube, cube_config
+from pipelines.methods.cube.simulation import simulate_cube
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.methods.cube.writing import write_cube
 from pipelines.recording.reading import open_recording

@@ -24,7 +24,7 @@ from pipelines.methods.cube.findings import findings
 from pipelines.methods.cube.graph import problem
 from pipelines.methods.cube.published import published_estimate
 from pipelines.methods.cube.recording import read_cube
-from pipelines.methods.cube.simulation import (
+from pipelines.methods.cube.scenario import (
     CubeCamera,
     CubeScenario,
     Errors,
@@ -33,8 +33,8 @@ from pipelines.methods.cube.simulation import (
     ReferenceAttitude,
     TagCube,
     cube_config,
-    simulate_cube,
 )
+from pipelines.methods.cube.simulation import simulate_cube
 from pipelines.methods.cube.static_intervals import static_intervals
 from pipelines.methods.cube.topics import CubeConfig, Raw, RawConversion
 from pipelines.methods.cube.validation import validate

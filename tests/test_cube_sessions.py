@@ -15,7 +15,8 @@ from pipelines.errors import InputError
 from pipelines.methods.cube.data import CubeData, Sightings, local_field
 from pipelines.methods.cube.poses import static_poses
 from pipelines.methods.cube.recording import read_cube
-from pipelines.methods.cube.simulation import CubeCamera, CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
+from pipelines.methods.cube.simulation import simulate_cube
 from pipelines.methods.cube.static_intervals import static_intervals
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.methods.cube.writing import write_cube

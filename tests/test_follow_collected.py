@@ -16,7 +16,8 @@ from pipelines.judgement.checklist import ChecklistItem
 from pipelines.judgement.observability import assess
 from pipelines.methods import method
 from pipelines.methods.cube.guidance import next_pose
-from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.scenario import CubeScenario, cube_config
+from pipelines.methods.cube.simulation import simulate_cube
 from pipelines.methods.head.simulation import HeadScenario, simulate_head
 from pipelines.methods.indexer.simulation import IndexerScenario, simulate_indexer
 from pipelines.methods.los.simulation import LosScenario, simulate_los

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from pipelines.methods.cube.simulation import CubeScenario
+from pipelines.methods.cube.scenario import CubeScenario
 from pipelines.methods.head.simulation import HeadScenario
 from pipelines.methods.indexer.simulation import IndexerScenario, Position
 from pipelines.methods.los.simulation import LosScenario

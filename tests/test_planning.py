@@ -14,7 +14,7 @@ from pipelines.errors import InputError
 from pipelines.methods import method
 from pipelines.methods.cube.faces import Resting, Side
 from pipelines.methods.cube.next_poses import next_poses
-from pipelines.methods.cube.simulation import CubeScenario
+from pipelines.methods.cube.scenario import CubeScenario
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from pipelines.planning import Prediction, make_plan, predict, requirements, write_scenario

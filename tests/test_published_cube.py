@@ -14,7 +14,8 @@ from pipelines.errors import InputError
 from pipelines.methods.cube.data import CubeData, local_field
 from pipelines.methods.cube.graph import problem
 from pipelines.methods.cube.published import nominal_vectors, published_estimate, regression
-from pipelines.methods.cube.simulation import CubeCamera, CubeScenario, Errors, cube_config, simulate_cube
+from pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Errors, cube_config
+from pipelines.methods.cube.simulation import simulate_cube
 
 RNG = np.random.default_rng(1)
 K = np.eye(3) + 0.05 * RNG.normal(size=(3, 3))

@@ -15,7 +15,8 @@ from pipelines.methods.cube.data import CubeData
 from pipelines.methods.cube.figures import cube_plots
 from pipelines.methods.cube.findings import findings, parts_of, white_noise
 from pipelines.methods.cube.graph import problem
-from pipelines.methods.cube.simulation import CubeCamera, CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
+from pipelines.methods.cube.simulation import simulate_cube
 from pipelines.methods.cube.tables import described
 from pipelines.reports.result import Calibration, Plot, Table
 from pipelines.settings import Config

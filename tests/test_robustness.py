@@ -16,7 +16,8 @@ from pipelines.graph.problem import Estimate, Problem
 from pipelines.judgement.observability import assess
 from pipelines.methods.cube import graph as cube
 from pipelines.methods.cube.parameters import triad_names
-from pipelines.methods.cube.simulation import CubeScenario, cube_config, simulate_cube
+from pipelines.methods.cube.scenario import CubeScenario, cube_config
+from pipelines.methods.cube.simulation import simulate_cube
 from pipelines.methods.indexer import graph as indexer
 from pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
 from pipelines.methods.los import graph as los

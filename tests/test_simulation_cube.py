@@ -15,7 +15,7 @@ from pipelines.methods import simulate
 from pipelines.methods.cube.faces import Resting
 from pipelines.methods.cube.poses import static_poses
 from pipelines.methods.cube.recording import read_cube
-from pipelines.methods.cube.simulation import (
+from pipelines.methods.cube.scenario import (
     YEAR,
     CubeCamera,
     CubeNoise,
@@ -24,8 +24,8 @@ from pipelines.methods.cube.simulation import (
     FieldErrors,
     ReferenceAttitude,
     cube_config,
-    simulate_cube,
 )
+from pipelines.methods.cube.simulation import simulate_cube
 from pipelines.methods.cube.static_intervals import static_intervals
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.recording.reading import open_recording

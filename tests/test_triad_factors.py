@@ -8,19 +8,19 @@ import pytest
 from factors import so3
 from factors.earth import earth_rate
 from factors.model import Array, Block, Model, dimension, retract
+from factors.tags import TagAttitudeFactor
 from factors.testing import assert_jacobians
 from factors.triad import (
     AccelFactor,
-    GyroRotationFactor,
     GyroStaticFactor,
     MagFactor,
-    TagAttitudeFactor,
     TriadPriorFactor,
     WeightedSumFactor,
     calibration,
     parts,
     triad,
 )
+from factors.turns import GyroRotationFactor
 from tests.numerics import assert_rows_are_independent
 
 N = 7
@@ -49,8 +49,11 @@ def _static(kind: str, rows: np.ndarray) -> Model:
     raw = _rng(5).normal(size=(N, 3))[rows]
     if kind == "accel":
         return AccelFactor(TIMES[rows], raw, _sigma(rows), 9.8)
-    if kind == "gyro":
-        return GyroStaticFactor(TIMES[rows], raw, _sigma(rows), EARTH * 1e4)
+    if kind == "curved accel":
+        return AccelFactor(TIMES[rows], raw, _sigma(rows), 9.8, curved=True)
+    if kind.startswith("gyro"):
+        gravity = 9.8 if kind == "gyro that feels gravity" else None
+        return GyroStaticFactor(TIMES[rows], raw, _sigma(rows), EARTH * 1e4, gravity)
     return MagFactor(TIMES[rows], raw, _sigma(rows))
 
 
@@ -59,45 +62,70 @@ def _static_blocks(kind: str) -> list[Array]:
     blocks: list[Array] = [_rotations(rng), _triads(rng)]
     if kind == "mag":
         return [*blocks, rng.normal(size=(N, 3))]
-    if kind == "gyro":
-        return [*blocks, 0.1 * rng.normal(size=(N, 3))]
+    if kind.startswith("gyro"):
+        blocks.append(0.1 * rng.normal(size=(N, 3)))
+    if kind == "gyro that feels gravity":
+        blocks.append(0.1 * rng.normal(size=(N, 9)))
+    if kind == "curved accel":
+        blocks.append(np.repeat([1e-2, 1e-3], 3) * rng.normal(size=(N, 6)))
     return blocks
 
 
-@pytest.mark.parametrize("kind", ["accel", "gyro", "mag"])
+@pytest.mark.parametrize("kind", ["accel", "curved accel", "gyro", "gyro that feels gravity", "mag"])
 def test_static_jacobians(kind: str) -> None:
     blocks = _static_blocks(kind)
     assert_jacobians(_static(kind, np.arange(N)), blocks)
     assert_rows_are_independent(lambda rows: _static(kind, rows), blocks)
 
 
-def _turns(rows: np.ndarray, angle: float) -> GyroRotationFactor:
-    """Turns of different length and number of samples, at rates that change direction."""
-    stamps, raw = [], []
+def test_static_models_are_what_they_say() -> None:
+    """Axis by axis, from the attitude's matrix."""
+    rng = _rng(13)
+    (nRb, triads, wandered, G), terms = _static_blocks("gyro that feels gravity"), 1e-3 * rng.normal(size=(N, 6))
+    A, c = parts(triads)
+    up = so3.matrix(nRb)[:, 2]
+    sigma = np.ones(N)
+    raw = np.einsum("nij,nkj,k->ni", A, so3.matrix(nRb), EARTH) + c + wandered
+    raw += 9.8 * np.einsum("nij,nj->ni", G.reshape(N, 3, 3), up)
+    np.testing.assert_allclose(
+        GyroStaticFactor(TIMES, raw, sigma, EARTH, 9.8)(nRb, triads, wandered, G)[0], 0, atol=1e-13
+    )
+    u = 9.8 * np.einsum("nij,nj->ni", A, up) + c
+    raw = u + terms[:, :3] * u**2 + terms[:, 3:] * u**3
+    np.testing.assert_allclose(AccelFactor(TIMES, raw, sigma, 9.8, curved=True)(nRb, triads, terms)[0], 0, atol=1e-12)
+
+
+def _turns(rows: np.ndarray, angle: float, feels: bool = False) -> GyroRotationFactor:
+    """Turns of different length and number of samples, at rates and forces that change direction."""
+    stamps, raw, accel = [], [], []
     for i in rows:
         rng = _rng(100 + i)
         t = np.arange(0.0, 0.8 + 0.1 * i, 0.01)
         stamps.append(t)
         raw.append(angle * np.sin(rng.uniform(0.5, 3, size=3) * t[:, None] + rng.uniform(0, 6, size=3)))
-    return GyroRotationFactor(TIMES[rows], stamps, raw, EARTH * 1e3, _sigma(rows))
+        accel.append(9.8 * np.sin(rng.uniform(0.5, 3, size=3) * t[:, None] + rng.uniform(0, 6, size=3)))
+    return GyroRotationFactor(TIMES[rows], stamps, raw, EARTH * 1e3, _sigma(rows), accel if feels else None)
 
 
+@pytest.mark.parametrize("feels", [False, True], ids=["plain", "feels force"])
 @pytest.mark.parametrize("angle", [2.0, 1e-6], ids=["turning", "at rest"])
 @pytest.mark.parametrize("miss", [1.0, 1e-7, 3.0], ids=["far off", "agreeing", "near half a turn"])
-def test_turn_jacobians(angle: float, miss: float) -> None:
+def test_turn_jacobians(angle: float, miss: float, feels: bool) -> None:
     rng = _rng(2)
-    model = _turns(np.arange(N), angle)
+    model = _turns(np.arange(N), angle, feels)
     start, triads = _rotations(rng), _triads(rng, 0.05)
-    wandered = list(0.01 * rng.normal(size=(2, N, 3)))
+    others = list(0.01 * rng.normal(size=(2, N, 3)))
+    if feels:
+        others += [1e-2 * rng.normal(size=(N, 9)), _triads(rng, 0.05)]
     # Attitudes at the end that miss the prediction by `miss` rad.
-    error = model(start, so3.identity(N), triads, *wandered)[0] * _sigma(np.arange(N))[:, None]
+    error = model(start, so3.identity(N), triads, *others)[0] * _sigma(np.arange(N))[:, None]
     predicted = so3.inverse(so3.exp(error))
     direction = rng.normal(size=(N, 3))
     delta = miss * direction / np.linalg.norm(direction, axis=1)[:, None]
-    blocks = [start, so3.multiply(predicted, so3.exp(delta)), triads, *wandered]
+    blocks = [start, so3.multiply(predicted, so3.exp(delta)), triads, *others]
     tolerance = 2e-5 if miss > 2.0 else 2e-6
     assert_jacobians(model, blocks, rtol=tolerance)
-    assert_rows_are_independent(lambda rows: _turns(rows, angle), blocks)
+    assert_rows_are_independent(lambda rows: _turns(rows, angle, feels), blocks)
 
 
 def test_turn_of_a_miscalibrated_gyro_on_the_turning_earth() -> None:
@@ -108,10 +136,16 @@ def test_turn_of_a_miscalibrated_gyro_on_the_turning_earth() -> None:
     w_ib = np.array([0.9, -0.4, 0.6])
     wandered = 0.01 * rng.normal(size=(2, 1, 3))
     raw = np.tile(np.linalg.solve(K, w_ib - b) + wandered.mean(axis=0), (len(t), 1))
+    accel_K, accel_b, G = np.eye(3) + 0.05 * rng.normal(size=(3, 3)), rng.normal(size=3), 1e-2 * rng.normal(size=(3, 3))
+    force = 9.8 * np.sin(rng.uniform(0.5, 3, size=3) * t[:, None])
+    accel = (force - accel_b) @ np.linalg.inv(accel_K).T
     iRb0 = so3.exp(np.array([[0.3, 1.0, -0.7]]))
     nRb1 = so3.compose(so3.exp(-EARTH * t[-1]), iRb0, so3.exp(w_ib * t[-1]))
     model = GyroRotationFactor(t[-1:], [t], [raw], EARTH, np.ones(1))
     np.testing.assert_allclose(model(iRb0, nRb1, triad(K, b)[None], *wandered)[0], 0.0, atol=1e-12)
+    feels = GyroRotationFactor(t[-1:], [t], [raw + force @ G.T], EARTH, np.ones(1), [accel])
+    of_force = G.reshape(1, 9), triad(accel_K, accel_b)[None]
+    np.testing.assert_allclose(feels(iRb0, nRb1, triad(K, b)[None], *wandered, *of_force)[0], 0.0, atol=1e-12)
 
 
 def _tags(rows: np.ndarray, blocks: list[Array] | None) -> TagAttitudeFactor:
@@ -136,7 +170,7 @@ def _tag_blocks(angle: float) -> list[Array]:
         _rotations(rng),
         np.array([0.1, -0.05, 0.7]) + 0.05 * rng.normal(size=(N, 3)),
         _rotations(rng),
-        angle * rng.normal(size=(N, 1)),
+        angle * rng.normal(size=(N, 3)),
         _rotations(rng, angle),
         _rotations(rng, angle),
     ]

@@ -57,7 +57,7 @@ def sensitivity_assumption(sensor: str, sheet: str, sigma: float) -> Assumption:
 
 def quantities(assumption: Assumption, config: Config) -> tuple[Quantity, ...]:
     """With the priors in force: the config's `priors`, else its `sensors`, else the usual grade's."""
-    sheet = _stated(config, assumption)
+    sheet = stated(config, assumption)
     usual = sheet or assumption.sigma
 
     def quantity(name: str) -> Quantity:
@@ -86,8 +86,8 @@ def pull(quantity: Quantity, value: float, sigma: float) -> float | None:
     return (value - quantity.prior_mean) / math.sqrt(prior**2 - sigma**2)
 
 
-def _stated(config: Config, assumption: Assumption) -> float:
-    """The figure in force, one sigma."""
+def stated(config: Config, assumption: Assumption) -> float:
+    """The figure in force, one sigma: the config's `sensors`, else the usual grade's."""
     sheet = getattr(config.sensors, assumption.sheet)
     if assumption.figure not in sheet.model_fields_set:
         return assumption.sigma

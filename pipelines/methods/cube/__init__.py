@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pipelines.judgement.hypotheses import Hypotheses
     from pipelines.judgement.validation import Validation
     from pipelines.methods.cube.data import CubeData
-    from pipelines.methods.cube.simulation import CubeScenario
+    from pipelines.methods.cube.scenario import CubeScenario
     from pipelines.methods.formula import Formula
     from pipelines.recording.reading import Recording
     from pipelines.reports.calibration import SavedCalibration
@@ -32,6 +32,7 @@ class Cube(Method):
     topics = TOPICS
     needs = NEEDS
     section = CubeConfig
+    sheets = ("gyro", "accel", "reference", "field")
     rotations: ClassVar[Mapping[str, str]] = {"camera_mount": "correction of BRC"}
 
     @property
@@ -57,7 +58,7 @@ class Cube(Method):
 
     @property
     def scenario(self) -> type[CubeScenario]:
-        from pipelines.methods.cube.simulation import CubeScenario
+        from pipelines.methods.cube.scenario import CubeScenario
 
         return CubeScenario
 

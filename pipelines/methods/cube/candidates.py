@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from pipelines.methods import Scenario
 from pipelines.methods.cube.next_poses import next_poses
-from pipelines.methods.cube.simulation import CubeScenario
+from pipelines.methods.cube.scenario import CubeScenario
 
 # Poses that are proposed together, and the seed of their simulation.
 _SERIES, _SEED = 6, 0

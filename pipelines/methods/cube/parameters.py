@@ -1,4 +1,4 @@
-"""The cube's calibration variables: their priors, first values and the numbers they are reported as."""
+"""What the cube method calibrates and what it assumes: priors, first values and the numbers they are reported as."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ import numpy as np
 
 from factors import so3
 from factors.triad import TriadPriorFactor, calibration, triad
+from pipelines.errors import InputError
+from pipelines.graph import assumptions
+from pipelines.graph.assumptions import Assumption, quantities, sensitivity_assumption, stated
 from pipelines.graph.linear import linear_factor
 from pipelines.graph.priors import prior_sigmas, rotation_prior, vector_prior
 from pipelines.graph.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
@@ -19,7 +22,16 @@ from pipelines.settings import Config, check_names
 
 TRIADS = ("accel", "gyro", "mag")
 TRIAD_KEYS: dict[str, int] = {name: int(gtsam.symbol(c, 0)) for name, c in zip(TRIADS, "AGM", strict=True)}
-MOUNT_KEY, HEADING_KEY, FIELD_KEY = (int(gtsam.symbol(c, 0)) for c in "CHF")
+MOUNT_KEY, SAID_KEY, FIELD_KEY, SENSITIVITY_KEY, CURVATURE_KEY = (int(gtsam.symbol(c, 0)) for c in "CHFSQ")
+
+# The grades of consumer MEMS sensors and of a dual-antenna reference, one sigma.
+SENSITIVITY = sensitivity_assumption("gyro", "gyro", 2e-4)
+SQUARE = Assumption(tuple(f"accel_square_{i}" for i in "123"), "s^2/m", "accel", "square", 1e-5)
+CUBE = Assumption(tuple(f"accel_cube_{i}" for i in "123"), "s^4/m^2", "accel", "cube", 1e-6)
+TILT = Assumption(("reference_tilt_e", "reference_tilt_n"), "rad", "reference", "tilt", 1e-3)
+ASSUMPTIONS = (SENSITIVITY, SQUARE, CUBE, TILT)
+# The earth's field, each component about its model: outdoors; a building may add ten times that.
+FIELD = Assumption(("field_e", "field_n", "field_u"), "T", "field", "model_error", 5e-7)
 
 # Of the total intensity by WMM 2025, T: global error model of its technical report (NOAA/NCEI and BGS, 2024).
 _STRENGTH_SIGMA = 1.38e-7
@@ -53,23 +65,32 @@ class Parameters:
         triads: name -> parameter, reported for the raw numbers as recorded.
         priors: name -> (12,) sigmas of rows of K and of b in nominal units; 0 fixed, inf free.
         rotations: mount and tags, corrections about the identity; none without a camera.
-        heading: correction of the reference's heading, None without a camera.
+        said: correction of what the reference says, tilt about East and North and heading; None without a camera.
         field: the earth's field in n about the model, None without a magnetometer.
         field_model: (3,) T.
+        sensitivity: G of the gyro, None where it does not feel force.
+        curvature: square and cube terms of the accelerometer, None where it has none.
     """
 
     triads: Mapping[str, Parameter]
     priors: Mapping[str, Array]
     rotations: tuple[Parameter, ...]
-    heading: Parameter | None
+    said: Parameter | None
     field: Parameter | None
     field_model: Array | None
+    sensitivity: Parameter | None
+    curvature: Parameter | None
 
     @property
     def all(self) -> tuple[Parameter, ...]:
         """In reporting order."""
-        rest = [*self.rotations[:1], self.heading, *self.rotations[1:], self.field]
+        rest = [*self.rotations[:1], self.said, *self.rotations[1:], self.field, self.sensitivity, self.curvature]
         return (*self.triads.values(), *(p for p in rest if p is not None))
+
+    @property
+    def zeros(self) -> tuple[Parameter, ...]:
+        """Vectors with priors about zero."""
+        return tuple(p for p in (self.said, self.sensitivity, self.curvature) if p is not None)
 
     def initial(self, gyro_bias: Array) -> gtsam.Values:
         """First values: nominal sensors but for the gyro's offset (3,), mounts as given, the model's field."""
@@ -79,8 +100,8 @@ class Parameters:
             values.insert(parameter.key, triad(np.eye(3), b))
         for parameter in self.rotations:
             values.insert(parameter.key, so3.to_gtsam(so3.identity()))
-        if self.heading is not None:
-            values.insert(self.heading.key, np.zeros(1))
+        for vector in self.zeros:
+            values.insert(vector.key, np.zeros(len(vector.quantities)))
         if self.field is not None and self.field_model is not None:
             values.insert(self.field.key, self.field_model)
         return values
@@ -94,19 +115,19 @@ def first_priors(parameters: Parameters) -> list[Factor]:
         prior = TriadPriorFactor(np.zeros(1), mean[None], parameters.priors[name][None])
         factors.append(Factor("prior", prior.on(parameter.key).factor))
     factors += [rotation_prior(p) for p in parameters.rotations]
-    if parameters.heading is not None:
-        factors.append(vector_prior(parameters.heading, np.zeros(1)))
+    factors += [vector_prior(p, np.zeros(len(p.quantities))) for p in parameters.zeros]
     if parameters.field is not None and parameters.field_model is not None:
         factors.append(vector_prior(parameters.field, parameters.field_model))
-        factors.append(_strength(parameters.field.key, parameters.field_model))
+        if prior_sigmas(parameters.field).max() <= FIELD.sigma:
+            factors.append(_strength(parameters.field.key, parameters.field_model))
     return factors
 
 
 def _strength(key: int, model: Array) -> Factor:
     """The field's strength is as the model says, to the model's own error.
 
-    No motion tells it from the magnetometer's scale, and the priors on the components are made for its direction, which
-    iron nearby turns.
+    No motion tells it from the magnetometer's scale, and the usual prior on the components is made for its direction.
+    Not for a field that is farther off: what a building does to it, it does to its strength too.
     """
     along = (model / np.linalg.norm(model))[None]
     return Factor("prior", linear_factor({key: along}, {key: model}, _STRENGTH_SIGMA))
@@ -122,8 +143,13 @@ def cube_parameters(config: Config, camera: bool, reference: bool, field: Array 
         field: (3,) T, the field model in n; None without a magnetometer.
 
     Raises:
-        InputError: the config names a parameter that the method does not know.
+        InputError: the config names a parameter that the method does not know, or states noise.gyro_scale.
     """
+    if config.noise.gyro_scale:
+        raise InputError(
+            "noise.gyro_scale: cube estimates the gyro's scale and skew, gyro_k11 to gyro_k33, and its g-sensitivity; "
+            "leave it out, or write priors: {gyro_k11: ...} and sensors: {gyro: {g_sensitivity: ...}} instead"
+        )
     tags = sorted(config.section(CubeConfig).tags)
     _check_names(config, tags)
 
@@ -145,27 +171,37 @@ def cube_parameters(config: Config, camera: bool, reference: bool, field: Array 
         triads[name] = _triad_parameter(TRIAD_KEYS[name], plain, getattr(config.section(CubeConfig).raw, name))
         priors[name] = prior_sigmas(Parameter(0, tuple(plain)))
     rotations: list[Parameter] = []
-    heading = None
+    said = None
     if camera:
         rotations.append(rotation(MOUNT_KEY, "camera_mount", 5e-3, not reference))
         rotations += [rotation(tag_key(tag), f"tag_{tag}", 3e-3, tag == tags[0]) for tag in tags]
-        heading = Parameter(HEADING_KEY, (quantity("reference_heading", "rad", 1e-2, 1e-2, not reference),))
+        tilt = [q if reference else replace(q, prior_sigma=0.0) for q in quantities(TILT, config)]
+        heading = quantity("reference_heading", "rad", 1e-2, 1e-2, not reference)
+        said = Parameter(SAID_KEY, (*tilt, heading))
     field_parameter = None
     if field is not None:
-        names = ("field_e", "field_n", "field_u")
         modelled = [
-            replace(quantity(name, "T", 5e-7, 1e-6), prior_mean=float(mean))
-            for name, mean in zip(names, field, strict=True)
+            replace(quantity(name, "T", stated(config, FIELD), 1e-6), prior_mean=float(mean))
+            for name, mean in zip(FIELD.names, field, strict=True)
         ]
         field_parameter = Parameter(FIELD_KEY, tuple(modelled))
-    return Parameters(triads, priors, tuple(rotations), heading, field_parameter, field)
+    return Parameters(
+        triads=triads,
+        priors=priors,
+        rotations=tuple(rotations),
+        said=said,
+        field=field_parameter,
+        field_model=field,
+        sensitivity=assumptions.parameter(SENSITIVITY_KEY, (SENSITIVITY,), config),
+        curvature=assumptions.parameter(CURVATURE_KEY, (SQUARE, CUBE), config),
+    )
 
 
 def _check_names(config: Config, tags: Sequence[int]) -> None:
     """Raise InputError for priors or requirements of unknown parameters, whatever the recording holds."""
     known = [entry for name in TRIADS for entry in triad_names(name)]
     known += [f"{name}_{axis}" for name in ("camera_mount", *(f"tag_{tag}" for tag in tags)) for axis in "xyz"]
-    known += ["reference_heading", "field_e", "field_n", "field_u"]
+    known += ["reference_heading", *(name for each in (*ASSUMPTIONS, FIELD) for name in each.names)]
     check_names(config.priors, known, "priors")
     check_names(config.require, known, "require")
 

@@ -9,192 +9,42 @@ of the interval, of force and field the mean over their middles.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from io import StringIO
-from typing import Annotated, Any, Self
+from dataclasses import replace
 
 import numpy as np
-from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from factors import so3
 from factors.earth import earth_rate, gravity, magnetic_field
 from pipelines.errors import InputError
+from pipelines.graph.assumptions import stated
 from pipelines.methods.cube.data import CubeData, Sightings
-from pipelines.methods.cube.faces import FACES, Resting
+from pipelines.methods.cube.faces import FACES
+from pipelines.methods.cube.motion import drawn_motion
+from pipelines.methods.cube.parameters import ASSUMPTIONS, CUBE, FIELD, SENSITIVITY, SQUARE, TILT
+from pipelines.methods.cube.scenario import (
+    EPOCH_NS,
+    FORWARD,
+    YEAR,
+    CubeCamera,
+    CubeScenario,
+    Magnetometer,
+    Pictures,
+    ReferenceAttitude,
+    cube_config,
+)
+from pipelines.settings import Config
 from pipelines.simulation.motion import sample_times
 from pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
+from pipelines.simulation.sensors import true_values
 from pipelines.simulation.simulated import Simulated
 from pipelines.vision.camera import Camera
 
 Array = NDArray[np.float64]
-
-# 2026-11-20 12:00 UTC, and the year of that day for the field model.
-EPOCH_NS, YEAR = 1_795_176_000_000_000_000, 2026.8849315068493
-Positive = Annotated[float, Field(gt=0.0)]
-NotNegative = Annotated[float, Field(ge=0.0)]
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
-
 _PARTS = 8
-# From 0 to 1, and from 0 to 1 and back, over [0, 1], at rest with two derivatives at both ends.
-_STEP = Polynomial([0, 0, 0, 10, -15, 6])
-_BUMP = 64.0 * Polynomial([0, 0, 0, 1]) * Polynomial([1, -1]) ** 3
 _SQUARE = 0.5 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 # A tag is read when the cosine between its normal and the way to the camera is more than this.
 _LEAST_COSINE = 0.3
-_FORWARD = (-0.5, 0.5, -0.5, 0.5)  # BRC of a camera that looks along x of the reference, z up
-
-
-class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class CubeNoise(_Part):
-    """Noise of the sensors, under the names the recording's config gives them."""
-
-    gyro_density: Positive = 1.2e-4  # rad/s/sqrt(Hz)
-    gyro_bias_walk: NotNegative = 2e-6  # rad/s/sqrt(s)
-    accel_density: Positive = 1.5e-3  # m/s^2/sqrt(Hz)
-    mag_density: Positive = 5e-8  # T/sqrt(Hz)
-    corner_px: Positive = 0.2  # of the detections; pictures have their own
-
-
-class Errors(_Part):
-    """Sigmas of what is to be found."""
-
-    gain: NotNegative = 0.02  # of each entry of K - 1
-    accel_bias: NotNegative = 0.3  # m/s^2
-    gyro_bias: NotNegative = 0.01  # rad/s
-    mag_bias: NotNegative = 1e-5  # T
-    camera_mount: NotNegative = 5e-3  # rad
-    tag_mount: NotNegative = 3e-3  # rad
-
-
-class FieldErrors(_Part):
-    """Sigmas of the earth's field against its model, T."""
-
-    direction: NotNegative = 5e-7  # each way across the model's field
-    strength: NotNegative = 1.33e-7  # along it
-
-
-class Place(_Part):
-    """Where on the earth."""
-
-    latitude_deg: float = 40.0
-    longitude_deg: float = 116.3
-    height: float = 50.0
-
-
-class TagCube(_Part):
-    """The cube that the device is in, m."""
-
-    edge: Positive = 0.16
-    tag_size: Positive = 0.12
-    hidden: tuple[int, ...] = ()  # ids of tags that are never seen
-
-
-class Pictures(_Part):
-    """Of the camera, where they are drawn in place of detections."""
-
-    rate_hz: Positive = 5.0
-    blur_px: NotNegative = 0.7
-    grey_noise: NotNegative = 2.0
-    exposure_s: Positive = 4e-3
-
-
-class CubeCamera(_Part):
-    """The camera that looks at the cube."""
-
-    rate_hz: Positive = 20.0
-    distortion: tuple[float, ...] = (-0.12, 0.05, 4e-4, -3e-4, 0.0)
-    occluded: Share = 0.05  # of the tags in a picture, by a finger
-    pictures: Pictures = Pictures()
-
-
-class Magnetometer(_Part):
-    """The device's magnetometer, and iron about it."""
-
-    rate_hz: Positive = 50.0
-    disturbed: Share = 0.0  # of the poses stand near iron
-    disturbance: NotNegative = 2e-6  # T, sigma per axis
-
-
-class ReferenceAttitude(_Part):
-    """The attitude reference that carries the camera."""
-
-    rate_hz: Positive = 10.0
-    heading_deg: float = 0.0  # correction that its heading needs, and the sigma about it
-    heading_error_deg: NotNegative = 0.573
-    level_noise_deg: Positive = 0.02  # of roll and pitch, of a message
-    heading_noise_deg: Positive = 0.05
-
-
-class CubeScenario(_Part):
-    """What the `cube` simulator is asked for; every key has a default, `null` leaves a sensor out."""
-
-    poses: Annotated[int, Field(ge=0)] = 24  # in random attitudes
-    attitudes: list[Resting] = []  # of more poses, after those
-    static_s: Positive = 4.0
-    turn_rad_s: Positive = 0.8  # mean rate of the turns between poses
-    turn_axes: list[tuple[float, float, float]] = []  # in b; turns about these only, in turn; none: any attitude
-    distance: Positive = 0.7  # m, of the cube from the camera
-    imu_rate_hz: Positive = 100.0
-    noise: CubeNoise = CubeNoise()
-    errors: Errors = Errors()
-    field: FieldErrors = FieldErrors()
-    place: Place = Place()
-    cube: TagCube = TagCube()
-    camera: CubeCamera | None = CubeCamera()
-    magnetometer: Magnetometer | None = Magnetometer()
-    reference: ReferenceAttitude | None = ReferenceAttitude()
-    priors: dict[str, float | None] = {}  # passed on to the recording's config
-
-    @model_validator(mode="after")
-    def _some(self) -> Self:
-        if not self.poses + len(self.attitudes):
-            raise ValueError("poses or attitudes are needed")
-        return self
-
-
-@dataclass(frozen=True, eq=False)
-class Motion:
-    """The cube's way: attitudes nRb (P, 4) and places (P, 3), m in C, of the poses, and the hand's detours between.
-
-    start (P,), stop (P,): of the static poses, s. wobble (P - 1, 3) rad in b, detour (P - 1, 3) m.
-    """
-
-    start: Array
-    stop: Array
-    nRb: Array
-    place: Array
-    wobble: Array
-    detour: Array
-
-    def _phase(self, t: Array) -> tuple[NDArray[np.intp], Array, Array]:
-        """The pose that a moment comes after, how far the turn from it has gone (0 to 1), and the turn's duration."""
-        k = np.clip(np.searchsorted(self.start, t, side="right") - 1, 0, len(self.start) - 1)
-        following = np.minimum(k + 1, len(self.start) - 1)
-        duration = np.where(following > k, self.start[following] - self.stop[k], 1.0)
-        return k, np.where(following > k, np.clip((t - self.stop[k]) / duration, 0.0, 1.0), 0.0), duration
-
-    def attitude(self, t: Array) -> Array:
-        """nRb (N, 4) at the times."""
-        k, u, _ = self._phase(t)
-        if len(self.start) == 1:
-            return np.broadcast_to(self.nRb[0], (len(t), 4))
-        turn = np.append(so3.log(so3.multiply(so3.inverse(self.nRb[:-1]), self.nRb[1:])), np.zeros((1, 3)), axis=0)
-        wobble = np.append(self.wobble, np.zeros((1, 3)), axis=0)
-        return so3.compose(self.nRb[k], so3.exp(turn[k] * _STEP(u)[:, None]), so3.exp(wobble[k] * _BUMP(u)[:, None]))
-
-    def position(self, t: Array, derivative: int = 0) -> Array:
-        """Place (N, 3) of the cube in C, m, or a derivative of it by time."""
-        k, u, duration = self._phase(t)
-        step, bump = (f.deriv(derivative) if derivative else f for f in (_STEP, _BUMP))
-        after = np.append(self.place[1:], self.place[-1:], axis=0)
-        detour = np.append(self.detour, np.zeros((1, 3)), axis=0)
-        moved = (after[k] - self.place[k]) * step(u)[:, None] + detour[k] * bump(u)[:, None]
-        return moved / duration[:, None] ** derivative + (0.0 if derivative else self.place[k])
 
 
 def simulate_cube(scenario: CubeScenario, seed: int) -> tuple[CubeData, dict[str, float]]:
@@ -216,48 +66,9 @@ def simulated(scenario: CubeScenario, seed: int, images: bool = False) -> Simula
     return Simulated(data, world.truth, cube_config(scenario, images=True), world.pictures(t, scenario.camera.pictures))
 
 
-def cube_config(scenario: CubeScenario, images: bool = False) -> str:
-    """The recording's config (YAML): the cube as built to the drawing, the noise simulated, the scenario's priors."""
-    from ruamel.yaml import YAML
-
-    noise = scenario.noise.model_dump()
-    if images:
-        del noise["corner_px"]  # the tracker's own
-    config: dict[str, Any] = {"method": "cube", "noise": noise, "priors": scenario.priors, "date": "2026-11-20"}
-    if scenario.camera:
-        tags = {
-            i: {
-                "size": scenario.cube.tag_size,
-                "rotation": list(wxyz),
-                "position": [0.5 * scenario.cube.edge * x for x in normal],
-            }
-            for i, (wxyz, normal) in FACES.items()
-        }
-        config["cube"] = {"tag_family": "36h11", "tags": tags, "camera_rotation": list(_FORWARD)}
-    text = StringIO()
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = None
-    yaml.dump(config, text)
-    return text.getvalue()
-
-
 def attitudes(scenario: CubeScenario, seed: int) -> Array:
     """nRb (P, 4) of the poses of a scenario's session."""
     return _World(scenario, seed).motion.nRb
-
-
-def _attitudes(scenario: CubeScenario, rng: np.random.Generator) -> Array:
-    """nRb (P, 4): the random ones, then those given."""
-    n = scenario.poses
-    given = np.array([each.nRb for each in scenario.attitudes]).reshape(-1, 4)
-    if not (n and scenario.turn_axes):
-        return np.vstack([so3.normalize(rng.standard_normal((n, 4))), given])
-    axes = np.array([scenario.turn_axes[k % len(scenario.turn_axes)] for k in range(n - 1)]).reshape(-1, 3)
-    angle = rng.uniform(0.8, 2.4, n - 1) * rng.choice([-1.0, 1.0], n - 1)
-    found = [so3.normalize(rng.standard_normal(4))]
-    for axis, a in zip(axes, angle, strict=True):
-        found.append(so3.multiply(found[-1], so3.exp(a * axis / np.linalg.norm(axis))))
-    return np.vstack([np.array(found), given])
 
 
 class _World:
@@ -265,7 +76,9 @@ class _World:
 
     def __init__(self, scenario: CubeScenario, seed: int) -> None:
         self.scenario = scenario
-        self.rng = np.random.default_rng(seed)
+        # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
+        self.rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
+        self.effects = true_values(ASSUMPTIONS, scenario.sensors, scenario.effects, rng_of_sensors)
         self.place_rad = np.deg2rad([scenario.place.latitude_deg, scenario.place.longitude_deg])
         latitude, longitude = self.place_rad
         self.field, self.heading = self._surroundings(magnetic_field(latitude, longitude, scenario.place.height, YEAR))
@@ -280,7 +93,7 @@ class _World:
             so3.exp([0.0, 0.0, self.rng.uniform(-np.pi, np.pi)]), so3.exp(0.02 * self.rng.standard_normal(3))
         )
         self.mount = scenario.errors.camera_mount * self.rng.standard_normal(3)
-        self.nRC = so3.compose(self.nRB, _FORWARD, so3.exp(self.mount))
+        self.nRC = so3.compose(self.nRB, FORWARD, so3.exp(self.mount))
         # The lowest id defines the body frame.
         self.tags = {i: scenario.errors.tag_mount * self.rng.standard_normal(3) * (i != min(FACES)) for i in FACES}
         self.K = {
@@ -294,7 +107,7 @@ class _World:
         errors = scenario.errors
         sigmas = {"accel": errors.accel_bias, "gyro": errors.gyro_bias, "mag": errors.mag_bias}
         self.b = {name: sigma * self.rng.standard_normal(3) for name, sigma in sigmas.items()}
-        self.motion = self._motion()
+        self.motion = drawn_motion(scenario, self.rng)
         self.duration = float(self.motion.stop[-1])
         self.truth: dict[str, float] = {}
 
@@ -308,21 +121,12 @@ class _World:
         along = model / np.linalg.norm(model)
         error = s.field.direction * rng.standard_normal(3)
         error += along * (s.field.strength * rng.standard_normal() - along @ error)
+        if s.sensors is not None and "model_error" in s.sensors.field.model_fields_set:
+            error = stated(Config(sensors=s.sensors), FIELD) * rng.standard_normal(3)
         if s.reference is None:
             return model + error, 0.0
         heading_deg = s.reference.heading_deg + s.reference.heading_error_deg * rng.standard_normal()
         return model + error, float(np.deg2rad(heading_deg))
-
-    def _motion(self) -> Motion:
-        s, rng = self.scenario, self.rng
-        nRb = _attitudes(s, rng)
-        n = len(nRb)
-        place = np.array([0.0, 0.0, s.distance]) + [0.04, 0.03, 0.05] * rng.uniform(-1, 1, (n, 3))
-        angles = np.linalg.norm(so3.log(so3.multiply(so3.inverse(nRb[:-1]), nRb[1:])), axis=1)
-        turning = np.maximum(angles, 0.5) / s.turn_rad_s
-        start = np.concatenate([[0.0], np.cumsum(s.static_s + turning)])
-        wobble = (0.0 if s.turn_axes else 0.15) * rng.standard_normal((n - 1, 3))
-        return Motion(start, start + s.static_s, nRb, place, wobble, 0.05 * rng.standard_normal((n - 1, 3)))
 
     def data(self) -> CubeData:
         """Everything recorded; sets the truth."""
@@ -357,7 +161,11 @@ class _World:
 
     def _raw(self, name: str, nominal: Array, density: float, rate_hz: float, walk: Array | float = 0.0) -> Array:
         noise = density * np.sqrt(rate_hz) * self.rng.standard_normal(nominal.shape)
-        return (nominal - self.b[name]) @ np.linalg.inv(self.K[name]).T + walk + noise
+        said = (nominal - self.b[name]) @ np.linalg.inv(self.K[name]).T
+        if name == "accel":
+            square, cube = ([self.effects[f"accel_{term}_{i}"] for i in "123"] for term in ("square", "cube"))
+            said = said + square * said**2 + cube * said**3
+        return np.asarray(said + walk + noise)
 
     def _imu(self) -> tuple[Array, Array, Array]:
         s, rate = self.scenario, self.scenario.imu_rate_hz
@@ -372,7 +180,8 @@ class _World:
         force = force + [0.0, 0.0, float(gravity(self.place_rad[0], s.place.height))]
         accel = so3.rotate(so3.inverse(self.motion.attitude(moments)), force).reshape(-1, _PARTS, 3).mean(axis=1)
         walk = np.cumsum(s.noise.gyro_bias_walk / np.sqrt(rate) * self.rng.standard_normal(rates.shape), axis=0)
-        gyro = self._raw("gyro", rates, s.noise.gyro_density, rate, walk)
+        felt = accel @ np.array([[self.effects[f"gyro_g_{i}{j}"] for i in "xyz"] for j in "xyz"])
+        gyro = self._raw("gyro", rates, s.noise.gyro_density, rate, walk + felt)
         self.b["gyro"] = self.b["gyro"] - self.K["gyro"] @ walk.mean(axis=0)
         return t, gyro, self._raw("accel", accel, s.noise.accel_density, rate)
 
@@ -389,8 +198,8 @@ class _World:
     def _reference(self, sensor: ReferenceAttitude) -> tuple[Array, Array, Array]:
         t = sample_times(self.duration, sensor.rate_hz, 0.4)
         sigma = np.deg2rad([sensor.level_noise_deg, sensor.level_noise_deg, sensor.heading_noise_deg])
-        heading = so3.exp([0.0, 0.0, -self.heading])
-        wxyz = so3.compose(so3.exp(sigma * self.rng.standard_normal((len(t), 3))), heading, self.nRB)
+        off = so3.exp([-self.effects["reference_tilt_e"], -self.effects["reference_tilt_n"], -self.heading])
+        wxyz = so3.compose(so3.exp(sigma * self.rng.standard_normal((len(t), 3))), off, self.nRB)
         return t, wxyz, np.tile(np.diag(sigma**2), (len(t), 1, 1))
 
     def _tag(self, tag: int, t: Array) -> tuple[Array, Array, Array]:
@@ -450,7 +259,7 @@ class _World:
         return [Quad(np.full((1, 1), 120.0), (0.05, 0.018), cRt, (centre + on_edge) * 0.99)]
 
     def _truth(self) -> dict[str, float]:
-        truth: dict[str, float] = {}
+        truth = {name: self.effects[name] for each in (SENSITIVITY, SQUARE, CUBE) for name in each.names}
         for name in ("accel", "gyro", *(("mag",) if self.scenario.magnetometer else ())):
             truth |= {f"{name}_k{i + 1}{j + 1}": float(self.K[name][i, j]) for i in range(3) for j in range(3)}
             truth |= {f"{name}_b{i + 1}": float(self.b[name][i]) for i in range(3)}
@@ -461,6 +270,7 @@ class _World:
             if self.scenario.reference:
                 vectors["camera_mount"] = self.mount
                 truth["reference_heading"] = self.heading
+                truth |= {name: self.effects[name] for name in TILT.names}
             truth |= {
                 f"{name}_{axis}": float(x)
                 for name, vector in vectors.items()

@@ -1,0 +1,112 @@
+"""What a pose of the cube says as factors: its sensors at rest, its tags, and the turn that led to it."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from factors import so3
+from factors.tags import TagAttitudeFactor
+from factors.triad import AccelFactor, GyroStaticFactor, MagFactor
+from factors.turns import GyroRotationFactor
+from pipelines.graph.problem import Factor
+from pipelines.methods.cube.model import Model
+from pipelines.methods.cube.parameters import (
+    CURVATURE_KEY,
+    FIELD_KEY,
+    MOUNT_KEY,
+    SAID_KEY,
+    SENSITIVITY_KEY,
+    TRIAD_KEYS,
+    tag_key,
+)
+from pipelines.methods.cube.poses import SeenTags
+from pipelines.methods.cube.topics import CubeConfig
+from pipelines.methods.cube.wandering import deviation_key
+
+
+def pose_key(k: int) -> int:
+    """Variable of nRb in pose k, a Rot3."""
+    return int(gtsam.symbol("x", k))
+
+
+def place_key(k: int) -> int:
+    """Variable of the cube's place in the camera in pose k, (3,) m."""
+    return int(gtsam.symbol("p", k))
+
+
+def reference_key(k: int) -> int:
+    """Variable of what the reference says in pose k, nRB, a Rot3; of pose 0 where it stands still."""
+    return int(gtsam.symbol("R", k))
+
+
+def sensor_factors(model: Model, k: int) -> list[Factor]:
+    """Accelerometer, gyro and magnetometer at rest in pose k."""
+    poses, row = model.poses, slice(k, k + 1)
+    time = 0.5 * poses.span[row].sum(axis=1)
+    gyro_density, accel_density, mag_density = model.density
+    duration = poses.duration[row]
+    curved, feels = model.parameters.curvature is not None, model.parameters.sensitivity is not None
+    accel = AccelFactor(time, poses.accel[row], accel_density / np.sqrt(duration), model.gravity, curved)
+    gyro_sigma = np.sqrt(gyro_density**2 / duration + model.unknown_rate**2)
+    gyro = GyroStaticFactor(time, poses.gyro[row], gyro_sigma, model.earth_rate, model.gravity if feels else None)
+    terms, G = [CURVATURE_KEY] if curved else [], [SENSITIVITY_KEY] if feels else []
+    factors = [
+        Factor.of("accelerometer", accel.on(pose_key(k), TRIAD_KEYS["accel"], *terms)),
+        Factor.of("gyro at rest", gyro.on(pose_key(k), TRIAD_KEYS["gyro"], deviation_key(k), *G)),
+    ]
+    if model.field is not None and poses.mag is not None and poses.mag_duration[k] > 0.0:
+        mag = MagFactor(time, poses.mag[row], mag_density / np.sqrt(poses.mag_duration[row]))
+        seen = mag.on(pose_key(k), TRIAD_KEYS["mag"], FIELD_KEY, loss=model.loss)
+        factors.append(Factor.of("magnetometer", seen))
+    return factors
+
+
+def tag_factor(model: Model, k: int, seen: SeenTags) -> Factor:
+    """All tags seen in pose k."""
+    from pipelines.vision.pose import TagBody
+
+    body = TagBody.from_board(model.config.section(CubeConfig))
+    camera = model.data.camera
+    assert camera is not None
+    rows = np.searchsorted(body.ids, seen.ids)
+    rays = camera.rays(seen.corners)
+    # How z = 1 coordinates follow pixels, by central differences over a pixel.
+    ahead, behind = (camera.rays(seen.corners[..., None, :] + s * 0.5 * np.eye(2)) for s in (1.0, -1.0))
+    slope = np.swapaxes(ahead[..., :2] / ahead[..., 2:] - behind[..., :2] / behind[..., 2:], -1, -2)
+    covariance = slope @ seen.covariance @ np.swapaxes(slope, -1, -2)
+    n = len(seen.ids)
+    tags = TagAttitudeFactor(
+        time=np.full(n, 0.5 * model.poses.span[k].sum()),
+        measured=rays[..., :2] / rays[..., 2:],
+        sqrt_information=np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2),
+        corners=so3.rotate(so3.inverse(body.bRt[rows])[:, None], body.corners[rows] - body.position[rows, None]),
+        bRt=body.bRt[rows],
+        position=body.position[rows],
+        BRC=model.reference.BRC,
+    )
+    reference = reference_key(k if model.reference.moves else 0)
+    measurement = tags.on(
+        [pose_key(k)] * n,
+        [place_key(k)] * n,
+        [reference] * n,
+        SAID_KEY,
+        MOUNT_KEY,
+        [tag_key(int(i)) for i in seen.ids],
+        loss=model.loss,
+    )
+    return Factor.of("tags", measurement)
+
+
+def turn_factor(model: Model, k: int) -> Factor:
+    """What the gyro turned from pose k - 1 to pose k."""
+    samples, feels = model.samples(k), model.parameters.sensitivity is not None
+    t = samples.t
+    duration = float(t[-1] - t[0])
+    sigma = np.sqrt([model.density[0] ** 2 * duration + (model.unknown_rate * duration) ** 2])
+    accel = [samples.accel] if feels else None
+    rotation = GyroRotationFactor(t[-1:], [t], [samples.gyro], model.earth_rate, sigma, accel)
+    of_force = [SENSITIVITY_KEY, TRIAD_KEYS["accel"]] if feels else []
+    gyro = TRIAD_KEYS["gyro"]
+    measured = rotation.on(pose_key(k - 1), pose_key(k), gyro, deviation_key(k - 1), deviation_key(k), *of_force)
+    return Factor("gyro turns", measured.factor)

@@ -1,0 +1,162 @@
+"""What the cube's simulator is asked for, and the config that its recordings carry."""
+
+from __future__ import annotations
+
+from io import StringIO
+from typing import Annotated, Any, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from pipelines.methods.cube.faces import FACES, Resting
+from pipelines.settings import SensorSheets
+
+# 2026-11-20 12:00 UTC, and the year of that day for the field model.
+EPOCH_NS, YEAR = 1_795_176_000_000_000_000, 2026.8849315068493
+# BRC of a camera that looks along x of the reference, z up.
+FORWARD = (-0.5, 0.5, -0.5, 0.5)
+
+Positive = Annotated[float, Field(gt=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class CubeNoise(_Part):
+    """Noise of the sensors, under the names the recording's config gives them."""
+
+    gyro_density: Positive = 1.2e-4  # rad/s/sqrt(Hz)
+    gyro_bias_walk: NotNegative = 2e-6  # rad/s/sqrt(s)
+    accel_density: Positive = 1.5e-3  # m/s^2/sqrt(Hz)
+    mag_density: Positive = 5e-8  # T/sqrt(Hz)
+    corner_px: Positive = 0.2  # of the detections; pictures have their own
+
+
+class Errors(_Part):
+    """Sigmas of what is to be found."""
+
+    gain: NotNegative = 0.02  # of each entry of K - 1
+    accel_bias: NotNegative = 0.3  # m/s^2
+    gyro_bias: NotNegative = 0.01  # rad/s
+    mag_bias: NotNegative = 1e-5  # T
+    camera_mount: NotNegative = 5e-3  # rad
+    tag_mount: NotNegative = 3e-3  # rad
+
+
+class FieldErrors(_Part):
+    """Sigmas of the earth's field against its model, T; a data sheet of the field goes before them."""
+
+    direction: NotNegative = 5e-7  # each way across the model's field
+    strength: NotNegative = 1.33e-7  # along it
+
+
+class Place(_Part):
+    """Where on the earth."""
+
+    latitude_deg: float = 40.0
+    longitude_deg: float = 116.3
+    height: float = 50.0
+
+
+class TagCube(_Part):
+    """The cube that the device is in, m."""
+
+    edge: Positive = 0.16
+    tag_size: Positive = 0.12
+    hidden: tuple[int, ...] = ()  # ids of tags that are never seen
+
+
+class Pictures(_Part):
+    """Of the camera, where they are drawn in place of detections."""
+
+    rate_hz: Positive = 5.0
+    blur_px: NotNegative = 0.7
+    grey_noise: NotNegative = 2.0
+    exposure_s: Positive = 4e-3
+
+
+class CubeCamera(_Part):
+    """The camera that looks at the cube."""
+
+    rate_hz: Positive = 20.0
+    distortion: tuple[float, ...] = (-0.12, 0.05, 4e-4, -3e-4, 0.0)
+    occluded: Share = 0.05  # of the tags in a picture, by a finger
+    pictures: Pictures = Pictures()
+
+
+class Magnetometer(_Part):
+    """The device's magnetometer, and iron about it."""
+
+    rate_hz: Positive = 50.0
+    disturbed: Share = 0.0  # of the poses stand near iron
+    disturbance: NotNegative = 2e-6  # T, sigma per axis
+
+
+class ReferenceAttitude(_Part):
+    """The attitude reference that carries the camera."""
+
+    rate_hz: Positive = 10.0
+    heading_deg: float = 0.0  # correction that its heading needs, and the sigma about it
+    heading_error_deg: NotNegative = 0.573
+    level_noise_deg: Positive = 0.02  # of roll and pitch, of a message
+    heading_noise_deg: Positive = 0.05
+
+
+class CubeScenario(_Part):
+    """What the `cube` simulator is asked for; every key has a default, `null` leaves a sensor out."""
+
+    poses: Annotated[int, Field(ge=0)] = 24  # in random attitudes
+    attitudes: list[Resting] = []  # of more poses, after those
+    static_s: Positive = 4.0
+    turn_rad_s: Positive = 0.8  # mean rate of the turns between poses
+    turn_axes: list[tuple[float, float, float]] = []  # in b; turns about these only, in turn; none: any attitude
+    distance: Positive = 0.7  # m, of the cube from the camera
+    imu_rate_hz: Positive = 100.0
+    noise: CubeNoise = CubeNoise()
+    errors: Errors = Errors()
+    field: FieldErrors = FieldErrors()
+    place: Place = Place()
+    cube: TagCube = TagCube()
+    camera: CubeCamera | None = CubeCamera()
+    magnetometer: Magnetometer | None = Magnetometer()
+    reference: ReferenceAttitude | None = ReferenceAttitude()
+    # Data sheets that errors of sensors and field are drawn from, passed on to the config; ideal: there are none but
+    # those of the field; null: none either, but the config does not know.
+    sensors: SensorSheets | None = None
+    effects: dict[str, float] = {}  # assumptions by name and their true values, whatever the data sheets
+    priors: dict[str, float | None] = {}  # passed on to the recording's config
+
+    @model_validator(mode="after")
+    def _some(self) -> Self:
+        if not self.poses + len(self.attitudes):
+            raise ValueError("poses or attitudes are needed")
+        return self
+
+
+def cube_config(scenario: CubeScenario, images: bool = False) -> str:
+    """The recording's config (YAML): the cube as built to the drawing, the noise simulated, the scenario's priors."""
+    from ruamel.yaml import YAML
+
+    noise = scenario.noise.model_dump()
+    if images:
+        del noise["corner_px"]  # the tracker's own
+    config: dict[str, Any] = {"method": "cube", "noise": noise, "priors": scenario.priors, "date": "2026-11-20"}
+    if scenario.sensors is not None:
+        config["sensors"] = scenario.model_dump()["sensors"]
+    if scenario.camera:
+        tags = {
+            i: {
+                "size": scenario.cube.tag_size,
+                "rotation": list(wxyz),
+                "position": [0.5 * scenario.cube.edge * x for x in normal],
+            }
+            for i, (wxyz, normal) in FACES.items()
+        }
+        config["cube"] = {"tag_family": "36h11", "tags": tags, "camera_rotation": list(FORWARD)}
+    text = StringIO()
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = None
+    yaml.dump(config, text)
+    return text.getvalue()

@@ -1,0 +1,65 @@
+"""How the offset of a cube's gyro wanders about its mean over the session."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factors.triad import WeightedSumFactor
+from pipelines.graph.linear import linear_factor
+from pipelines.graph.problem import Array, Factor
+from pipelines.methods.cube.poses import StaticPoses
+
+# A gyro bias that does not walk still does so by this much, rad/s, for the sake of the arithmetic.
+_STEADY = 1e-8
+
+
+def deviation_key(k: int) -> int:
+    """Variable of how far the offset is from its mean in pose k, (3,) in nominal units."""
+    return int(gtsam.symbol("d", k))
+
+
+@dataclass(frozen=True)
+class GaussMarkovDeviation:
+    """How the gyro's offset deviates from its mean over the session: a random walk that stays bounded.
+
+    A first-order Gauss-Markov process: over short times the walk, over the session the deviation that a walk has from
+    its own mean, whose variance is walk^2 times a sixth of the session.
+
+    Attributes:
+        sigma: (P,) of each pose's deviation, given the one before it; of the first alone.
+        correlation: (P,) with the one before it; 0 for the first.
+        weights: (P,) share of the session that a pose stands for.
+        end: of the last pose, s.
+    """
+
+    sigma: Array
+    correlation: Array
+    weights: Array
+    end: float
+
+    @classmethod
+    def over(cls, poses: StaticPoses, walk: float) -> GaussMarkovDeviation:
+        """For a walk in rad/s/sqrt(s)."""
+        start, stop = poses.span.T
+        middle = 0.5 * (start + stop)
+        length = float(stop[-1] - start[0])
+        stationary = max(walk * float(np.sqrt(length / 6.0)), _STEADY)
+        correlation = np.append(0.0, np.exp(-np.diff(middle) / (length / 3.0)))
+        edges = np.concatenate([start[:1], 0.5 * (middle[1:] + middle[:-1]), stop[-1:]])
+        return cls(stationary * np.sqrt(1.0 - correlation**2), correlation, np.diff(edges) / length, float(stop[-1]))
+
+    def factors(self, k: int) -> list[Factor]:
+        """How the offset came to where it is in pose k; after the last, that c is its mean over the session."""
+        key, sigma = deviation_key(k), float(self.sigma[k])
+        if k == 0:
+            noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
+            return [Factor("bias walk", gtsam.PriorFactorVector(key, np.zeros(3), noise))]
+        blocks = {key: np.eye(3), deviation_key(k - 1): -self.correlation[k] * np.eye(3)}
+        found = [Factor("bias walk", linear_factor(blocks, dict.fromkeys(blocks, np.zeros(3)), sigma))]
+        if k == len(self.weights) - 1:
+            mean = WeightedSumFactor(np.array([self.end]), self.weights, _STEADY)
+            found.append(Factor("definition", mean.on(*(deviation_key(i) for i in range(k + 1))).factor))
+        return found
