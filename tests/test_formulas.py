@@ -13,6 +13,7 @@ import alidade
 from factors import so3
 from factors.indexer import base_from_platform, mounting
 from factors.los import LosDirectionFactor
+from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.methods import method
 from pipelines.methods.formula import apply
@@ -69,6 +70,13 @@ def plain(value: Any) -> Array:
     return value.matrix if isinstance(value, Rotation) else np.asarray(value)
 
 
+CUBE = (
+    *(f"{s}_k{i}{j}" for s in ("accel", "gyro", "mag") for i in "123" for j in "123"),
+    *(f"{s}_b{i}" for s in ("accel", "gyro", "mag") for i in "123"),
+    *(f"{n}_{axis}" for n in ("camera_mount", "tag_17") for axis in "xyz"),
+    "reference_heading",
+)
+CUBE_ERRORS = ("gyro_g_xx", "gyro_g_zy", "accel_square_2", "accel_cube_1", "accel_cube_3", "reference_tilt_n")
 CASES: dict[str, tuple[str, Collection[str]]] = {
     "los": ("los", ("delta_px", "delta_gx", "delta_gy", "delta_z", "gyro_bias_x", "gyro_bias_y", "gyro_bias_z")),
     "los with options": (
@@ -99,25 +107,33 @@ CASES: dict[str, tuple[str, Collection[str]]] = {
         "head",
         (*(f"{n}_{axis}" for n in ("gyro_bias", "helmet_mount", "camera_mount") for axis in "xyz"), "time_offset"),
     ),
-    "cube": (
-        "cube",
+    "head of real sensors": (
+        "head",
         (
-            *(f"{s}_k{i}{j}" for s in ("accel", "gyro", "mag") for i in "123" for j in "123"),
-            *(f"{s}_b{i}" for s in ("accel", "gyro", "mag") for i in "123"),
-            *(f"{n}_{axis}" for n in ("camera_mount", "tag_17") for axis in "xyz"),
-            "reference_heading",
+            *(f"{n}_{axis}" for n in ("gyro_bias", "helmet_mount", "camera_mount", "gyro_scale") for axis in "xyz"),
+            *(f"platform_{n}_{axis}" for n in ("bias", "scale") for axis in "xyz"),
+            *("time_offset", "clock_skew", "gyro_skew_xz", "gyro_g_xy", "gyro_g_zz", "platform_skew_xy"),
         ),
     ),
+    "cube": ("cube", CUBE),
+    "cube of real sensors": ("cube", (*CUBE, *CUBE_ERRORS)),
+    "cube in counts": ("cube", (*CUBE, *CUBE_ERRORS)),
 }
 ROTATIONS = {"cRh", "nRm", "camera_rotation", "rotation_17", "nRB_said", "CRT", "bodyRtag"}
 NUMBERS = {"azimuth", "elevation", "outer", "inner", "stamp"}
+
+
+def _config(case: str) -> Config:
+    """Counts where the case says so."""
+    raw = "cube: {raw: {accel: {scale: 2.0e-3, offset: 3.0}, gyro: {scale: 1.0e-2, offset: -2.0}}}"
+    return load_config(raw.encode() if case.endswith("counts") else b"{}")
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_text_says_what_the_code_computes(case: str) -> None:
     name, parameters = CASES[case]
     rng = np.random.default_rng(0)
-    formulas = method(name).formulas(parameters)
+    formulas = method(name).formulas(parameters, _config(case))
     values = {parameter: float(x) for parameter, x in zip(parameters, rng.normal(size=len(parameters)), strict=True)}
     measured: dict[str, Any] = {}
     for quantity in dict.fromkeys(m for formula in formulas for m in formula.measured):
@@ -145,14 +161,14 @@ def test_los_formulas_are_those_of_the_graph_whatever_is_free() -> None:
     angles = 0.1 * rng.normal(size=len(names))
     gimbal = rng.normal(size=(1, 2))
     cRm = LosDirectionFactor(np.zeros(1), np.zeros((1, 2)), np.zeros((1, 2, 2)), gimbal, names).camera(angles[None])[0]
-    formulas = method("los").formulas(names)
+    formulas = method("los").formulas(names, Config())
     values = dict(zip(names, angles.tolist(), strict=True))
     found = apply(formulas, values, {"azimuth": gimbal[0, 0], "elevation": gimbal[0, 1]})
     np.testing.assert_allclose(so3.log(so3.compose(found["lRb"], found["M"], so3.inverse(cRm))), 0.0, atol=1e-12)
     text = " ".join(formula.text for formula in formulas)
     assert all(name in text for name in names)
     assert "time_offset" not in text
-    assert "time_offset" in method("los").formulas([*names, "time_offset"])[-1].text
+    assert "time_offset" in method("los").formulas([*names, "time_offset"], Config())[-1].text
 
 
 def test_indexer_formulas_scale_the_gyro_and_tilt_the_axes_where_these_are_free() -> None:
@@ -164,20 +180,27 @@ def test_indexer_formulas_scale_the_gyro_and_tilt_the_axes_where_these_are_free(
     theta, bias, scale = (np.array([values[f"{n}_{a}"] for a in "xyz"]) for n in ("theta", "gyro_bias", "gyro_scale"))
     rate = rng.normal(size=3)
     measured = (1.0 + scale) * so3.rotate(so3.inverse(mounting(theta)), rate) + bias
-    found = apply(method("indexer").formulas(free), values, {"gyro": measured, "outer": 0.3, "inner": 0.7})
+    found = apply(method("indexer").formulas(free, Config()), values, {"gyro": measured, "outer": 0.3, "inner": 0.7})
     np.testing.assert_allclose(found["w_it"], rate, atol=1e-12)
     tilt = values["axis_nonperpendicularity"]
     np.testing.assert_allclose(so3.matrix(found["bRt"]), so3.matrix(base_from_platform(0.3, 0.7, tilt)), atol=1e-12)
 
 
 def test_a_calibration_applies_itself() -> None:
-    data, truth = alidade.simulate("head", {"duration_s": 12.0, "time_offset_s": 0.02}, seed=1)
+    settings = {"duration_s": 12.0, "time_offset_s": 0.02}
+    data, truth = alidade.simulate("head", {**settings, "effects": {"gyro_scale_x": 0.03}}, seed=1)
     calibration = alidade.calibrate(data, method="head")
     assert calibration.parameters["time_offset"].value == pytest.approx(truth["time_offset"], abs=5e-3)
-    found = calibration.apply(gyro=data.head_gyro[:5], cRh=data.vision_wxyz[:3], stamp=data.vision_t[:3])
-    bias = np.array([calibration.parameters[f"gyro_bias_{axis}"].value for axis in "xyz"])
-    np.testing.assert_allclose(found["w_iv"], data.head_gyro[:5] - bias)
+    found = calibration.apply(gyro=data.head_gyro, cRh=data.vision_wxyz[:3], stamp=data.vision_t[:3])
+    # A scale that the recording determined is applied; what is left is what a gyro without it says.
+    bias = np.array([truth[f"gyro_bias_{axis}"] for axis in "xyz"])
+    plain, _ = alidade.simulate("head", settings, seed=1)
+    off, left = (np.abs(rate - plain.head_gyro + bias).max() for rate in (data.head_gyro - bias, found["w_iv"]))
+    assert left < 0.3 * off
     assert found["bRv"].shape == (3, 4)
+    feels = method("head").formulas(["gyro_g_xx"], Config())
+    with pytest.raises(InputError, match="apply: gyro serves only together with accel"):
+        apply(feels, {}, {"gyro": np.zeros(3)})
     with pytest.raises(InputError, match="nothing is computed from giro; measurements are gyro, cRh, stamp"):
         calibration.apply(giro=np.zeros(3))
 

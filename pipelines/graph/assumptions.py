@@ -15,8 +15,8 @@ from pipelines.settings import Config
 
 # What is left free has a prior so many times the one in force.
 _FREE = 10.0
-# A sigma of more than this part of its prior's says nothing.
-_UNTOLD = 0.98
+# A sigma of more than this part of its prior's says nothing, one of less than that determines it.
+_UNTOLD, _DETERMINED = 0.98, 0.5
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,11 @@ def pull(quantity: Quantity, value: float, sigma: float) -> float | None:
     if sigma > _UNTOLD * prior or prior == 0.0:
         return None
     return (value - quantity.prior_mean) / math.sqrt(prior**2 - sigma**2)
+
+
+def determined(quantity: Quantity, sigma: float) -> bool:
+    """Whether the recording, and not the prior, says what an assumption is: then it is worth applying."""
+    return sigma < _DETERMINED * (quantity.prior_sigma or 0.0)
 
 
 def stated(config: Config, assumption: Assumption) -> float:

@@ -137,8 +137,11 @@ class Method(ABC):
     # -- reports
 
     @abstractmethod
-    def formulas(self, parameters: Collection[str]) -> Sequence[Formula]:
-        """How a result with these parameters is applied, in the order of evaluation."""
+    def formulas(self, parameters: Collection[str], config: Config) -> Sequence[Formula]:
+        """How a result with these parameters is applied, in the order of evaluation.
+
+        Assumptions that the recording does not determine are not among them.
+        """
 
     def findings(self, data: Any, config: Config, estimate: Estimate) -> Findings:  # noqa: ARG002
         """What there is to tell beside the parameters."""

@@ -9,7 +9,7 @@ likewise.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -51,6 +51,27 @@ def passive(axis: int, angle: Any) -> Array:
     return so3.exp(-np.asarray(angle, dtype=float)[..., None] * np.eye(3)[axis])
 
 
+def matrix_text(rows: Sequence[Sequence[str]], known: Collection[str]) -> str:
+    """A matrix of parameters as formulas write it, those that are not among the known ones as 0."""
+    return f"[{', '.join(vector_text(row, known) for row in rows)}]"
+
+
+def vector_text(names: Sequence[str], known: Collection[str]) -> str:
+    """A vector of parameters, likewise."""
+    return f"[{', '.join(name if name in known else '0' for name in names)}]"
+
+
+def symmetric_text(names: Sequence[str], known: Collection[str]) -> str:
+    """I + S, S of the numbers xx yy zz xy xz yz."""
+    xx, yy, zz, xy, xz, yz = (name if name in known else "0" for name in names)
+    return f"[[1 + {xx}, {xy}, {xz}], [{xy}, 1 + {yy}, {yz}], [{xz}, {yz}, 1 + {zz}]]"
+
+
+def numbers_of(space: Any, names: Sequence[str]) -> Array:
+    """Values of parameters, 0 for those that are not there."""
+    return np.array([getattr(space, name, 0.0) for name in names])
+
+
 def apply(formulas: Sequence[Formula], values: Mapping[str, float], measured: Mapping[str, Any]) -> dict[str, Array]:
     """Everything that follows from a calibration's values and what is measured.
 
@@ -63,12 +84,17 @@ def apply(formulas: Sequence[Formula], values: Mapping[str, float], measured: Ma
         Name -> result, for each formula whose measurements are given.
 
     Raises:
-        InputError: something is given that no formula measures.
+        InputError: something is given that no formula measures, or that only serves with what is not given.
     """
     known = dict.fromkeys(name for formula in formulas for name in formula.measured)
     for name in measured:
         if name not in known:
             raise InputError(f"apply: nothing is computed from {name}; measurements are {', '.join(known)}")
+    for name in measured:
+        beside = [set(formula.measured) for formula in formulas if name in formula.measured]
+        if all(needed - measured.keys() for needed in beside):
+            fewest = min((needed - measured.keys() for needed in beside), key=len)
+            raise InputError(f"apply: {name} serves only together with {', '.join(sorted(fewest))}")
     space = SimpleNamespace(**values, **_vectors(values), **{k: np.asarray(v, float) for k, v in measured.items()})
     results: dict[str, Array] = {}
     for formula in formulas:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
-from pipelines.graph.assumptions import pull
+from pipelines.graph.assumptions import determined, pull
 from pipelines.graph.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
 from pipelines.judgement.observability import Assessment, Fit, Innovations, Learning, Status, Verdict, learning
 from pipelines.judgement.rejection import rejection_sentence
@@ -160,7 +160,7 @@ class Calibration:
 
             calibration.apply(gyro=w)["w_iv"]
 
-        What the solver does not know counts as zero.
+        What the solver does not know counts as zero, and so do assumptions that it does not determine.
 
         Args:
             measured: by the names in the formulas: numbers, vectors (..., 3), quaternions w, x, y, z (..., 4); SI.
@@ -170,8 +170,8 @@ class Calibration:
         """
         from pipelines.methods.formula import apply
 
+        values = {name: parameter.value for name, parameter in self.parameters.items() if name in self._applied}
         unknown = dict.fromkeys((q.name for q in self.problem.quantities), 0.0)
-        values = {name: parameter.value for name, parameter in self.parameters.items()}
         return apply(self.formulas, {**unknown, **values}, measured)
 
     def __repr__(self) -> str:
@@ -197,8 +197,18 @@ class Calibration:
 
     @property
     def formulas(self) -> Sequence[Formula]:
-        """How it is applied."""
-        return self.method.formulas([q.name for q in self.problem.quantities])
+        """How it is applied, assumptions that the recording does not determine left out."""
+        return self.method.formulas(self._applied, self.config)
+
+    @property
+    def _applied(self) -> list[str]:
+        """The parameters, of the assumptions those that the recording determines."""
+        sigmas = {name: parameter.sigma for name, parameter in self.parameters.items()}
+        return [
+            q.name
+            for q in self.problem.quantities
+            if q.group is None or (q.name in sigmas and determined(q, sigmas[q.name]))
+        ]
 
     @property
     def counts(self) -> dict[str, int]:

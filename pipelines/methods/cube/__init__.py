@@ -92,10 +92,10 @@ class Cube(Method):
 
         return checklist(data, config)
 
-    def formulas(self, parameters: Collection[str]) -> Sequence[Formula]:
+    def formulas(self, parameters: Collection[str], config: Config) -> Sequence[Formula]:
         from pipelines.methods.cube.formulas import formulas
 
-        return formulas(parameters)
+        return formulas(parameters, config)
 
     def figures(self, data: CubeData, calibration: Calibration) -> Sequence[Plot | Table]:
         from pipelines.methods.cube.figures import cube_plots

@@ -11,9 +11,9 @@ from factors import so3
 from factors.earth import earth_rate, gravity
 from factors.preintegration import GyroPath
 from pipelines.graph.problem import Array
+from pipelines.methods.cube.compensation import calibrated, calibrated_rates
 from pipelines.methods.cube.coverage import coverage
 from pipelines.methods.cube.data import CubeData, local_field, nominal
-from pipelines.methods.cube.findings import calibrated
 from pipelines.methods.cube.poses import StaticPoses, static_poses, turn
 from pipelines.methods.cube.tables import NAMES, cube_tables
 from pipelines.methods.cube.topics import CubeConfig
@@ -76,7 +76,7 @@ def _turns(
 ) -> tuple[Array, Array, Array]:
     """Ends of the turns, and errors (n, 3), rad, of the gyro's rotation over each, before and after calibration."""
     assert data.latitude is not None
-    rates = nominal(data.gyro, config.section(CubeConfig).raw.gyro)
+    rates = nominal(data.gyro, config.section(CubeConfig).raw.gyro), calibrated_rates(data, config, values)
     time: list[float] = []
     before: list[Array] = []
     after: list[Array] = []
@@ -85,8 +85,8 @@ def _turns(
         t = data.imu_t[samples]
         earth = so3.exp(earth_rate(data.latitude) * (t[-1] - t[0]))
         expected = so3.compose(so3.inverse(nRb[i - 1]), earth, nRb[i])
-        for errors, gyro in ((before, rates[samples]), (after, calibrated("gyro", rates[samples], config, values))):
-            turned = GyroPath(t, gyro).attitude(t[-1:])[0]
+        for errors, rate in zip((before, after), rates, strict=True):
+            turned = GyroPath(t, rate[samples]).attitude(t[-1:])[0]
             errors.append(so3.log(so3.multiply(so3.inverse(expected), turned)))
         time.append(span[i, 0])
     return np.array(time), np.array(before), np.array(after)

@@ -8,7 +8,8 @@ import numpy as np
 
 from factors import so3
 from pipelines.graph.problem import Array, Estimate, Findings
-from pipelines.methods.cube.data import CubeData, noise_densities, nominal, recorded
+from pipelines.methods.cube.compensation import calibrated
+from pipelines.methods.cube.data import CubeData, noise_densities, nominal
 from pipelines.methods.cube.parameters import TRIADS, triad_names
 from pipelines.methods.cube.poses import StaticPoses, static_poses
 from pipelines.methods.cube.topics import MAG, CubeConfig
@@ -40,13 +41,6 @@ def findings(data: CubeData, config: Config, estimate: Estimate) -> Findings:
         "noise": [_noise(name, data, config, poses, values) for name in known],
         "static_poses": _poses(poses, config, estimate, values),
     }
-
-
-def calibrated(name: str, vectors: Array, config: Config, values: Mapping[str, float]) -> Array:
-    """K raw + b of vectors (n, 3) given in nominal units."""
-    numbers = np.array([values[entry] for entry in triad_names(name)])
-    raw = recorded(vectors, getattr(config.section(CubeConfig).raw, name))
-    return np.asarray(raw @ numbers[:9].reshape(3, 3).T + numbers[9:])
 
 
 def parts_of(K: Array) -> Array:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
 
 from factors import so3
-from pipelines.methods.formula import Formula
+from pipelines.methods.cube.compensation import straightened
+from pipelines.methods.cube.data import nominal, recorded
+from pipelines.methods.cube.parameters import CUBE, SENSITIVITY, SQUARE, TILT
+from pipelines.methods.cube.topics import CubeConfig, RawConversion
+from pipelines.methods.formula import Formula, matrix_text, numbers_of, vector_text
+from pipelines.settings import Config
 
 _TRIADS = {
     "accel": ("specific force along the cube's axes, m/s^2", "f_b"),
@@ -17,9 +22,19 @@ _TRIADS = {
 }
 
 
-def formulas(parameters: Collection[str]) -> list[Formula]:
-    """Of the sensors, mounts and tags that are among the parameters; raw numbers are as recorded."""
-    found = [_triad(name) for name in _TRIADS if f"{name}_k11" in parameters]
+def formulas(parameters: Collection[str], config: Config) -> list[Formula]:
+    """Of the sensors, mounts and tags that are among the parameters; raw numbers are as recorded.
+
+    The accelerometer's curvature and the gyro's g-sensitivity, which are about nominal units, where they are known.
+    """
+    raw = config.section(CubeConfig).raw
+    found: list[Formula] = []
+    if "accel_k11" in parameters:
+        found += _accelerometer(parameters, raw.accel)
+    if "gyro_k11" in parameters:
+        found.append(_gyro(parameters, raw.gyro))
+    if "mag_k11" in parameters:
+        found.append(_triad("mag", "mag", ("mag",), lambda v: v.mag))
     if "camera_mount_x" in parameters:
         found.append(
             Formula(
@@ -33,13 +48,14 @@ def formulas(parameters: Collection[str]) -> list[Formula]:
     tags = sorted(int(name[4:-2]) for name in parameters if name.startswith("tag_") and name.endswith("_x"))
     found += [_tag(tag) for tag in tags]
     if "reference_heading" in parameters:
+        names = (*TILT.names, "reference_heading")
         found.append(
             Formula(
                 "reference to level, from its own attitude nRB_said in East-North-Up",
                 "nRB",
-                "Exp(reference_heading ez) * nRB_said",
+                f"Exp({vector_text(names, parameters)}) * nRB_said",
                 ("nRB_said",),
-                lambda v: so3.multiply(so3.exp(v.reference_heading * np.eye(3)[2]), v.nRB_said),
+                lambda v: so3.multiply(so3.exp(numbers_of(v, names)), v.nRB_said),
             )
         )
     if "camera_mount_x" in parameters and "reference_heading" in parameters:
@@ -55,17 +71,60 @@ def formulas(parameters: Collection[str]) -> list[Formula]:
     return found
 
 
-def _triad(name: str) -> Formula:
+def _accelerometer(parameters: Collection[str], conversion: RawConversion | None) -> list[Formula]:
+    """With its curvature taken off, in nominal units, if any of it is known."""
+    if not any(name in parameters for each in (SQUARE, CUBE) for name in each.names):
+        return [_triad("accel", "accel", ("accel",), lambda v: v.accel)]
+    square, cube = (vector_text(each.names, parameters) for each in (SQUARE, CUBE))
+    said = "accel" if conversion is None else f"(accel - {conversion.offset!r}) * {conversion.scale!r}"
+    back = "accel_u" if conversion is None else f"(accel_u / {conversion.scale!r} + {conversion.offset!r})"
+
+    def bent(by: str) -> str:
+        return f"{said} - {square} * {by}**2 - {cube} * {by}**3"
+
+    def once(v: Any) -> so3.Array:
+        read = nominal(v.accel, conversion)
+        return np.asarray(read - numbers_of(v, SQUARE.names) * read**2 - numbers_of(v, CUBE.names) * read**3)
+
+    def straight(v: Any) -> so3.Array:
+        return straightened(nominal(v.accel, conversion), numbers_of(v, SQUARE.names), numbers_of(v, CUBE.names))
+
+    meaning = "accelerometer without its curvature, m/s^2, axis by axis"
+    first = said if conversion is None else f"({said})"
+    return [
+        Formula(f"{meaning}, nearly", "accel_near", bent(first), ("accel",), once),
+        Formula(meaning, "accel_u", bent("accel_near"), ("accel",), straight),
+        _triad("accel", back, ("accel",), lambda v: recorded(v.accel_u, conversion)),
+    ]
+
+
+def _gyro(parameters: Collection[str], conversion: RawConversion | None) -> Formula:
+    """With what it says for the specific force taken off, if that is known."""
+    if not any(name in parameters for name in SENSITIVITY.names):
+        return _triad("gyro", "gyro", ("gyro",), lambda v: v.gyro)
+    felt = f"{matrix_text([SENSITIVITY.names[i : i + 3] for i in (0, 3, 6)], parameters)} * f_b"
+    text = f"(gyro - {felt})" if conversion is None else f"(gyro - {felt} / {conversion.scale!r})"
+    scale = 1.0 if conversion is None else conversion.scale
+    return _triad(
+        "gyro",
+        text,
+        ("gyro", "accel"),
+        lambda v: v.gyro - v.f_b @ numbers_of(v, SENSITIVITY.names).reshape(3, 3).T / scale,
+    )
+
+
+def _triad(name: str, said: str, measured: tuple[str, ...], read: Callable[[Any], so3.Array]) -> Formula:
+    """K and b applied to what a sensor said, as text and as code."""
     meaning, result = _TRIADS[name]
     rows = ", ".join(f"[{', '.join(f'{name}_k{i}{j}' for j in '123')}]" for i in "123")
 
     def compute(v: Any) -> so3.Array:
         K = np.array([[getattr(v, f"{name}_k{i}{j}") for j in "123"] for i in "123"])
         b = np.array([getattr(v, f"{name}_b{i}") for i in "123"])
-        return np.asarray(getattr(v, name) @ K.T + b)
+        return np.asarray(read(v) @ K.T + b)
 
     bias = f"[{', '.join(f'{name}_b{i}' for i in '123')}]"
-    return Formula(meaning, result, f"[{rows}] * {name} + {bias}", (name,), compute)
+    return Formula(meaning, result, f"[{rows}] * {said} + {bias}", measured, compute)
 
 
 def _tag(tag: int) -> Formula:

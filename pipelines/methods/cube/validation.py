@@ -11,8 +11,8 @@ from factors.earth import gravity
 from factors.preintegration import GyroPath
 from pipelines.errors import InputError
 from pipelines.judgement.validation import Validation
+from pipelines.methods.cube.compensation import calibrated, calibrated_rates
 from pipelines.methods.cube.data import CubeData, local_field, nominal
-from pipelines.methods.cube.findings import calibrated
 from pipelines.methods.cube.poses import StaticPoses, static_poses, turn
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.settings import Config
@@ -58,7 +58,7 @@ def _turns(data: CubeData, config: Config, poses: StaticPoses, values: Mapping[s
 
     The camera is taken to stand still; the earth's own turning, 0.1 mrad in two seconds, is not taken off.
     """
-    rates = nominal(data.gyro, config.section(CubeConfig).raw.gyro)
+    rates = nominal(data.gyro, config.section(CubeConfig).raw.gyro), calibrated_rates(data, config, values)
     time, errors = [], []
     for k in range(1, len(poses)):
         before, after = poses.tags[k - 1], poses.tags[k]
@@ -67,8 +67,8 @@ def _turns(data: CubeData, config: Config, poses: StaticPoses, values: Mapping[s
         samples = turn(data, poses.span[k - 1, 1], poses.span[k, 0])
         seen = so3.multiply(so3.inverse(before.pose.cRb), after.pose.cRb)
         pair = []
-        for gyro in (rates[samples], calibrated("gyro", rates[samples], config, values)):
-            path = GyroPath(data.imu_t[samples], gyro)
+        for rate in rates:
+            path = GyroPath(data.imu_t[samples], rate[samples])
             pair.append(so3.log(so3.multiply(so3.inverse(seen), path.attitude(path.t[-1:])[0])))
         time.append(poses.span[k, 0])
         errors.append(pair)

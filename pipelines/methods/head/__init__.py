@@ -94,7 +94,7 @@ class Head(Method):
 
         return checklist(data, config)
 
-    def formulas(self, parameters: Collection[str]) -> Sequence[Formula]:
+    def formulas(self, parameters: Collection[str], config: Config) -> Sequence[Formula]:  # noqa: ARG002
         from pipelines.methods.head.formulas import formulas
 
         return formulas(parameters)

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from typing import Any
+
+import numpy as np
 
 from factors import so3
-from pipelines.methods.formula import Formula
+from factors.gyro import symmetric
+from pipelines.methods.formula import Formula, matrix_text, numbers_of, symmetric_text, vector_text
+from pipelines.methods.head.parameters import CLOCK_SKEW, PLATFORM_BIAS, PLATFORM_SCALE, SCALE, SENSITIVITY
+
+_S, _PLATFORM_S = (tuple(name for each in scale for name in each.names) for scale in (SCALE, PLATFORM_SCALE))
+_G = [SENSITIVITY.names[i : i + 3] for i in (0, 3, 6)]
 
 
-def formulas(_: Collection[str]) -> list[Formula]:
-    """The same for all parameters: those that are fixed are reported too."""
+def formulas(parameters: Collection[str]) -> list[Formula]:
+    """With those errors of gyros and clock that are among the parameters."""
     return [
         Formula("markers to helmet IMU", "vRh", "Exp(helmet_mount)", (), lambda v: so3.exp(v.helmet_mount)),
         Formula("platform to camera", "cRb", "Exp(camera_mount)", (), lambda v: so3.exp(v.camera_mount)),
-        Formula(
-            "rate of the helmet, rad/s in v", "w_iv", "gyro - gyro_bias", ("gyro",), lambda v: v.gyro - v.gyro_bias
-        ),
+        _helmet_rate(parameters),
+        *_platform_rate(parameters),
         Formula(
             "attitude of the helmet on the platform from a camera measurement cRh",
             "bRv",
@@ -23,11 +30,51 @@ def formulas(_: Collection[str]) -> list[Formula]:
             ("cRh",),
             lambda v: so3.compose(so3.inverse(v.cRb), v.cRh, so3.inverse(v.vRh)),
         ),
-        Formula(
-            "time of that attitude on the gyro's clock, s",
-            "time",
-            "stamp + time_offset",
-            ("stamp",),
-            lambda v: v.stamp + v.time_offset,
-        ),
+        _time(parameters),
     ]
+
+
+def _helmet_rate(parameters: Collection[str]) -> Formula:
+    """With the specific force that the helmet's accelerometer measures, if the gyro feels it."""
+    feels = any(name in parameters for name in SENSITIVITY.names)
+
+    def compute(v: Any) -> so3.Array:
+        rate = v.gyro - v.gyro_bias
+        if feels:
+            rate = rate - v.accel @ numbers_of(v, SENSITIVITY.names).reshape(3, 3).T
+        return np.asarray(rate @ np.linalg.inv(np.eye(3) + symmetric(numbers_of(v, _S))))
+
+    felt = f"gyro - {matrix_text(_G, parameters)} * accel - gyro_bias" if feels else "gyro - gyro_bias"
+    text, measured = _scaled(felt, _S, parameters), ("gyro", "accel") if feels else ("gyro",)
+    return Formula("rate of the helmet, rad/s in v", "w_iv", text, measured, compute)
+
+
+def _platform_rate(parameters: Collection[str]) -> list[Formula]:
+    """Where the recording says what the platform's gyro is off."""
+    if not any(name in parameters for name in (*PLATFORM_BIAS.names, *_PLATFORM_S)):
+        return []
+
+    def compute(v: Any) -> so3.Array:
+        gain = np.eye(3) + symmetric(numbers_of(v, _PLATFORM_S))
+        return np.asarray((v.platform_gyro - numbers_of(v, PLATFORM_BIAS.names)) @ np.linalg.inv(gain))
+
+    text = _scaled(f"platform_gyro - {vector_text(PLATFORM_BIAS.names, parameters)}", _PLATFORM_S, parameters)
+    return [Formula("rate of the platform, rad/s in b", "w_ib", text, ("platform_gyro",), compute)]
+
+
+def _scaled(rate: str, names: tuple[str, ...], parameters: Collection[str]) -> str:
+    """A rate through the inverse of I + S, where S is known."""
+    known = any(name in parameters for name in names)
+    return f"inverse({symmetric_text(names, parameters)}) * ({rate})" if known else rate
+
+
+def _time(parameters: Collection[str]) -> Formula:
+    skew = CLOCK_SKEW.names[0]
+    less = f", and less by {skew} for each second since the first stamp" if skew in parameters else ""
+    return Formula(
+        f"time of that attitude on the gyro's clock, s{less}",
+        "time",
+        "stamp + time_offset",
+        ("stamp",),
+        lambda v: v.stamp + v.time_offset,
+    )

@@ -90,7 +90,7 @@ class Indexer(Method):
 
         return checklist(data, config)
 
-    def formulas(self, parameters: Collection[str]) -> Sequence[Formula]:
+    def formulas(self, parameters: Collection[str], config: Config) -> Sequence[Formula]:  # noqa: ARG002
         from pipelines.methods.indexer.formulas import formulas
 
         return formulas(parameters)

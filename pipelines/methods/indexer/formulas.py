@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
 
 from factors import so3
 from factors.gyro import symmetric
-from pipelines.methods.formula import Formula, passive
-from pipelines.methods.indexer.parameters import ENCODER, ERRORS, SCALE
+from pipelines.methods.formula import Formula, numbers_of, passive, symmetric_text
+from pipelines.methods.indexer.parameters import DELAY, ENCODER, ERRORS
 
 
 def formulas(parameters: Collection[str]) -> list[Formula]:
@@ -38,13 +38,11 @@ def formulas(parameters: Collection[str]) -> list[Formula]:
 
 def _rate(parameters: Collection[str]) -> Formula:
     true = "(gyro - gyro_bias)"
-    if SCALE.names[0] in parameters:
-        xx, yy, zz, xy, xz, yz = (name if name in parameters else "0" for name in ERRORS)
-        rows = f"[[1 + {xx}, {xy}, {xz}], [{xy}, 1 + {yy}, {yz}], [{xz}, {yz}, 1 + {zz}]]"
-        true = f"(inverse({rows}) * {true})"
+    if any(name in parameters for name in ERRORS):
+        true = f"(inverse({symmetric_text(ERRORS, parameters)}) * {true})"
 
     def compute(v: Any) -> so3.Array:
-        gain = np.eye(3) + symmetric(np.array([getattr(v, name, 0.0) for name in ERRORS]))
+        gain = np.eye(3) + symmetric(numbers_of(v, ERRORS))
         return so3.rotate(so3.inverse(v.mRt), (v.gyro - v.gyro_bias) @ np.linalg.inv(gain).T)
 
     return Formula("rate of the platform, rad/s", "w_it", f"inverse(mRt) * {true}", ("gyro",), compute)
@@ -52,23 +50,26 @@ def _rate(parameters: Collection[str]) -> Formula:
 
 def _angles(parameters: Collection[str]) -> list[Formula]:
     """The axes' angles from what the encoders read."""
-    if ENCODER[0] not in parameters:
-        return []
+    late = f", {DELAY.names[0]} s after the stamp of the reading" if DELAY.names[0] in parameters else ""
 
-    def angle(axis: str, sine: str, cosine: str) -> Formula:
+    def angle(axis: str, names: Sequence[str]) -> Formula:
         def compute(v: Any) -> so3.Array:
-            read = np.asarray(getattr(v, axis))
-            return np.asarray(read - getattr(v, sine) * np.sin(read) - getattr(v, cosine) * np.cos(read))
+            (sine, cosine), read = numbers_of(v, names), np.asarray(getattr(v, axis))
+            return np.asarray(read - sine * np.sin(read) - cosine * np.cos(read))
 
+        sine, cosine = (name if name in parameters else "0" for name in names)
         expression = f"{axis} - {sine} * sin({axis}) - {cosine} * cos({axis})"
-        meaning = f"angle of the {axis} axis, rad, encoder_delay s after the stamp of the reading"
-        return Formula(meaning, f"{axis}_angle", expression, (axis,), compute)
+        return Formula(f"angle of the {axis} axis, rad{late}", f"{axis}_angle", expression, (axis,), compute)
 
-    return [angle("outer", *ENCODER[:2]), angle("inner", *ENCODER[2:4])]
+    return [angle("outer", ENCODER[:2]), angle("inner", ENCODER[2:4])] if _corrected(parameters) else []
+
+
+def _corrected(parameters: Collection[str]) -> bool:
+    return any(name in parameters for name in ENCODER)
 
 
 def _base(parameters: Collection[str]) -> Formula:
-    outer, inner = ("outer_angle", "inner_angle") if ENCODER[0] in parameters else ("outer", "inner")
+    outer, inner = ("outer_angle", "inner_angle") if _corrected(parameters) else ("outer", "inner")
     tilt = "Exp(axis_nonperpendicularity ey) * " if "axis_nonperpendicularity" in parameters else ""
     return Formula(
         "platform to base, from the encoders' angles",

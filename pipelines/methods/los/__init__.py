@@ -91,7 +91,7 @@ class Los(Method):
 
         return checklist(data, config)
 
-    def formulas(self, parameters: Collection[str]) -> Sequence[Formula]:
+    def formulas(self, parameters: Collection[str], config: Config) -> Sequence[Formula]:  # noqa: ARG002
         from pipelines.methods.los.formulas import formulas
 
         return formulas(parameters)

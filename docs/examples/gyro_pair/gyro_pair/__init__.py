@@ -95,7 +95,7 @@ class GyroPair(Method):
 
         return checklist(data, config)
 
-    def formulas(self, parameters: Collection[str]) -> Sequence[Formula]:
+    def formulas(self, parameters: Collection[str], config: Config) -> Sequence[Formula]:  # noqa: ARG002
         from gyro_pair.formulas import formulas
 
         return formulas(parameters)

@@ -171,7 +171,7 @@ def test_formulas_undo_what_was_simulated() -> None:
     still = {"density": 1e-9, "bias_walk": 0.0, "turn_on_bias_deg_s": 0.5}
     session = simulated(gyro_a={"rate_hz": 100, **still}, gyro_b={"rate_hz": 100, **still}, time_offset_s=0.0)
     data = session.data
-    found = apply(METHOD.formulas(()), session.truth, {"gyro_b": data.b_gyro, "stamp": data.b_t})
+    found = apply(METHOD.formulas((), Config()), session.truth, {"gyro_b": data.b_gyro, "stamp": data.b_t})
     np.testing.assert_allclose(found["gyro_a"], data.a_gyro, atol=1e-6)
     np.testing.assert_allclose(found["time"], data.a_t)
 

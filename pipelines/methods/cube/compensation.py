@@ -1,0 +1,51 @@
+"""A calibration applied to what a cube's sensors said."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from pipelines.graph.problem import Array
+from pipelines.methods.cube.data import CubeData, nominal, recorded
+from pipelines.methods.cube.parameters import CUBE, SENSITIVITY, SQUARE, triad_names
+from pipelines.methods.cube.topics import CubeConfig
+from pipelines.settings import Config
+
+
+def calibrated(
+    name: str, vectors: Array, config: Config, values: Mapping[str, float], force: Array | None = None
+) -> Array:
+    """K raw + b of vectors (n, 3) given in nominal units, an accelerometer's curvature and a gyro's G f taken off.
+
+    Args:
+        name: of the sensor.
+        vectors: what it said.
+        config: of the recording.
+        values: parameters by name; assumptions that are not among them are 0.
+        force: (n, 3) specific force in b, m/s^2, that a gyro felt; None: none.
+    """
+    if name == "accel":
+        vectors = straightened(
+            vectors, *(np.array([values.get(n, 0.0) for n in each.names]) for each in (SQUARE, CUBE))
+        )
+    if name == "gyro" and force is not None:
+        vectors = vectors - force @ np.array([values.get(n, 0.0) for n in SENSITIVITY.names]).reshape(3, 3).T
+    numbers = np.array([values[entry] for entry in triad_names(name)])
+    raw = recorded(vectors, getattr(config.section(CubeConfig).raw, name))
+    return np.asarray(raw @ numbers[:9].reshape(3, 3).T + numbers[9:])
+
+
+def calibrated_rates(data: CubeData, config: Config, values: Mapping[str, float]) -> Array:
+    """All of the gyro's samples calibrated, (N, 3) rad/s in b."""
+    raw = config.section(CubeConfig).raw
+    force = None
+    if "accel_k11" in values:
+        force = calibrated("accel", nominal(data.accel, raw.accel), config, values)
+    return calibrated("gyro", nominal(data.gyro, raw.gyro), config, values, force)
+
+
+def straightened(read: Array, square: Array, cube: Array) -> Array:
+    """u (n, 3) from read = u + square u^2 + cube u^3, in two steps: to (3 cube u^2)^2 of what the terms add."""
+    once = read - square * read**2 - cube * read**3
+    return np.asarray(read - square * once**2 - cube * once**3)
