@@ -33,7 +33,7 @@ from pipelines.recording.info import SessionFacts, facts_of, lacking
 from pipelines.recording.message_reader import ENCODING
 from pipelines.recording.reading import Recording, open_recording
 from pipelines.reports.result import Calibration
-from pipelines.reports.units import human_unit
+from pipelines.reports.units import human_unit, to_digits_of
 from pipelines.settings import TRUTH, Config
 from pipelines.simulation.simulated import Simulated
 
@@ -376,11 +376,12 @@ def _not_as_assumed(found: Sequence[Strained]) -> list[Cause]:
     """Assumptions that do not hold, as causes, in the units people read."""
     causes = []
     for each in found[:_MOST_NAMED]:
-        unit, factor = human_unit(each.quantity)
+        q, (unit, factor) = each.quantity, human_unit(each.quantity)
         like = f" (or {', '.join(each.others)}, which it cannot be told from)" if each.others else ""
-        found_ = f"{factor * each.value:.3g} ± {factor * each.sigma:.1g} {unit}".strip()
-        prior = f"{factor * (each.quantity.prior_sigma or 0.0):.2g} {unit}".strip()
-        evidence = f"estimated as {found_} where its data sheet says 0 ± {prior}, a pull of {abs(each.pull):.1f}"
+        sigma, prior = factor * each.sigma, factor * (q.prior_sigma or 0.0)
+        found_ = f"{to_digits_of(factor * each.value, sigma)} ± {sigma:.1g} {unit}".strip()
+        assumed = f"{to_digits_of(factor * q.prior_mean, prior)} ± {prior:.2g} {unit}".strip()
+        evidence = f"estimated as {found_} where {assumed} was assumed, a pull of {abs(each.pull):.1f}"
         causes.append(Cause(f"{each.quantity.name} is not what was assumed{like}", evidence))
     return causes
 

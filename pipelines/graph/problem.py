@@ -57,6 +57,7 @@ class Quantity:
         prior_mean: of its prior.
         group: "assumption" for a systematic effect that is a parameter only lest it spoil the others; None for what
             is calibrated.
+        nuisance: calibrated, but beside the purpose: a value far beyond its prior is a fault, as of an assumption.
     """
 
     name: str
@@ -67,6 +68,12 @@ class Quantity:
     extra_sigma: float = 0.0
     prior_mean: float = 0.0
     group: Literal["assumption"] | None = None
+    nuisance: bool = False
+
+    @property
+    def assumed(self) -> bool:
+        """Whether its prior is what it is, not where it is to be looked for."""
+        return self.nuisance or self.group is not None
 
     @property
     def judged(self) -> bool:

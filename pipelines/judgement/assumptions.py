@@ -43,9 +43,9 @@ def strained(estimate: Estimate, quantities: Sequence[Quantity]) -> tuple[Strain
     pulls = {
         i: size
         for i, q in enumerate(quantities)
-        if q.group is not None and (size := pull(q, float(estimate.values[i]), float(sigmas[i]))) is not None
+        if q.assumed and (size := pull(q, float(estimate.values[i]), float(sigmas[i]))) is not None
     }
-    assumed = [i for i, q in enumerate(quantities) if q.group is not None and sigmas[i] > 0.0]
+    assumed = [i for i, q in enumerate(quantities) if q.assumed and sigmas[i] > 0.0]
     left = sorted((i for i, p in pulls.items() if abs(p) > _FAR), key=lambda i: -abs(pulls[i]))
     found = []
     while left:

@@ -263,7 +263,7 @@ def _beyond_priors(calibration: Calibration) -> tuple[str, ...]:
     away = {
         q.name: abs(float(value) - q.prior_mean) / q.prior_sigma
         for q, value in zip(quantities, calibration.estimate.values, strict=True)
-        if q.prior_sigma and q.group is None
+        if q.prior_sigma and not q.assumed
     }
     far = {name: sigmas for name, sigmas in away.items() if sigmas > _FAR_FROM_PRIOR}
     if not far:

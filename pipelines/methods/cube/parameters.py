@@ -157,8 +157,11 @@ def cube_parameters(config: Config, camera: bool, reference: bool, field: Array 
         sigma = config.priors.get(name, 0.0 if fixed else prior)
         return Quantity(name, unit, sigma, prior, config.require.get(name, require))
 
+    def nuisance(name: str, unit: str, prior: float, require: float, fixed: bool = False) -> Quantity:
+        return replace(quantity(name, unit, prior, require, fixed), nuisance=True)
+
     def rotation(key: int, name: str, prior: float, fixed: bool) -> Parameter:
-        triple = tuple(quantity(f"{name}_{axis}", "rad", prior, 1e-2, fixed) for axis in "xyz")
+        triple = tuple(nuisance(f"{name}_{axis}", "rad", prior, 1e-2, fixed) for axis in "xyz")
         return Parameter(key, triple, rotation_vector_coordinates)
 
     triads, priors = {}, {}
@@ -176,12 +179,12 @@ def cube_parameters(config: Config, camera: bool, reference: bool, field: Array 
         rotations.append(rotation(MOUNT_KEY, "camera_mount", 5e-3, not reference))
         rotations += [rotation(tag_key(tag), f"tag_{tag}", 3e-3, tag == tags[0]) for tag in tags]
         tilt = [q if reference else replace(q, prior_sigma=0.0) for q in quantities(TILT, config)]
-        heading = quantity("reference_heading", "rad", 1e-2, 1e-2, not reference)
+        heading = nuisance("reference_heading", "rad", 1e-2, 1e-2, not reference)
         said = Parameter(SAID_KEY, (*tilt, heading))
     field_parameter = None
     if field is not None:
         modelled = [
-            replace(quantity(name, "T", stated(config, FIELD), 1e-6), prior_mean=float(mean))
+            replace(nuisance(name, "T", stated(config, FIELD), 1e-6), prior_mean=float(mean))
             for name, mean in zip(FIELD.names, field, strict=True)
         ]
         field_parameter = Parameter(FIELD_KEY, tuple(modelled))
