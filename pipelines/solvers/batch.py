@@ -30,6 +30,13 @@ _MOST_DAMPING = 1e8
 # An error (unit: half a squared sigma) less than this above the minimum has nothing more than 0.005 sigma off. What a
 # linearisation foresaw wrongly of its step is about what is left for the next one.
 _ERROR_TOLERANCE = 1e-5
+# A step that was to lower the error by less than this, half a sigma, and does by less than a tenth of it has only
+# to do with what is of second order: noise, which is all that a sensor at rest tells of a mount or a delay.
+_LITTLE = 0.15
+# Parts of a step along it that are tried, and how many steps the states have to return to the floor.
+_SHARES, _MOST_RETURNS = (1.0, 0.3, 0.1, 0.03), 2
+# Shared variables are held by so many times their information.
+_HELD = 1e6
 # So much a measurement is near enough to tell which ones lie outside the gate: on average they move by 0.05 sigma yet.
 _ROUGH_TOLERANCE = 1e-3
 # Below this mean pull of outliers on plain least squares, in sigmas a measurement, good measurements stay inside the
@@ -48,6 +55,7 @@ class System:
         factors: of the graph.
         graph: the same for gtsam.
         ordering: of the elimination.
+        shared: the variables that all measurements share.
         ensemble: the vectorised ones among the factors.
         loss: how those that may be outliers are weighed; None counts all in full.
     """
@@ -55,6 +63,7 @@ class System:
     factors: Sequence[Factor]
     graph: gtsam.NonlinearFactorGraph
     ordering: gtsam.Ordering
+    shared: Sequence[int]
     ensemble: Ensemble
     loss: TruncatedLoss | None
 
@@ -63,7 +72,7 @@ class System:
         """The system of some factors; the shared variables are eliminated last."""
         graph = graph_of(factors)
         ensemble = Ensemble([v for f in factors if (v := f.vectorized) is not None])
-        return cls(factors, graph, elimination_ordering(graph, shared), ensemble, loss)
+        return cls(factors, graph, elimination_ordering(graph, shared), shared, ensemble, loss)
 
     def under(self, loss: TruncatedLoss | None) -> System:
         """The same system with another loss."""
@@ -82,6 +91,10 @@ class System:
         """The linear system about the values."""
         with self.at(values):
             return self.graph.linearize(values)
+
+    def holding_shared(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
+        """The linear system about the values in which the shared variables stay where they are."""
+        return _damped(self.linearize(values), _HELD, self.shared)
 
     def residuals(self, values: gtsam.Values) -> dict[str, Residuals]:
         """Residuals of all measurements, by family."""
@@ -208,7 +221,12 @@ def _minimize(
     most: int = _MOST_ITERATIONS,
     most_damping: float = _MOST_DAMPING,
 ) -> Solution:
-    """Gauss-Newton steps, damped (Levenberg-Marquardt) only when a full step fails."""
+    """Gauss-Newton steps, damped (Levenberg-Marquardt) only where full ones fail.
+
+    A full step along a curved valley, such as that of two mounts whose product alone is known, leaves the floor and
+    raises the error by what is of second order. Damping would only make it crawl; there the states are brought back to
+    the floor instead, see `_along_valley`.
+    """
     error = system.error(values)
     if not np.isfinite(error):
         return Solution(system, values, False, "the residuals at the start are not finite", 0)
@@ -216,37 +234,65 @@ def _minimize(
     for iteration in range(1, most + 1):
         linear = system.linearize(values)
         while True:
-            candidate, foreseen = _step(linear, values, system.ordering, damping)
-            new_error = system.error(candidate) if candidate is not None else np.inf
+            delta, foreseen = _step(linear, system.ordering, damping)
+            candidate = values if delta is None else values.retract(delta)
+            new_error = np.inf if delta is None else system.error(candidate)
+            if delta is not None and damping == 0.0 and error < new_error:
+                candidate, new_error = _along_valley(system, values, error, delta)
             if new_error <= error + _ERROR_TOLERANCE:
                 break
+            if damping == 0.0 and delta is not None and foreseen < _LITTLE:
+                return Solution(system, values, True, f"converged after {iteration} iterations", iteration)
             damping = max(10.0 * damping, 1e-6)
             if damping > most_damping:
                 return Solution(system, values, False, f"no step lowers the error of {error:.6g}", iteration)
-        assert candidate is not None
         fall, rounding = error - new_error, 1e-13 * error + 1e-10 * new_error
         values, error = candidate, new_error
-        if damping == 0.0 and min(fall, abs(fall - foreseen)) < tolerance + rounding:
+        small = foreseen < _LITTLE and fall < 0.1 * _LITTLE
+        if damping == 0.0 and (small or min(fall, abs(fall - foreseen)) < tolerance + rounding):
             return Solution(system, values, True, f"converged after {iteration} iterations", iteration)
         damping = damping / 10.0 if damping > 1e-6 else 0.0
     return Solution(system, values, False, f"not converged after {most} iterations", most)
 
 
+def _along_valley(
+    system: System, values: gtsam.Values, error: float, delta: gtsam.VectorValues
+) -> tuple[gtsam.Values, float]:
+    """Values on a step's way with a lower error, and that error; infinite if there is none.
+
+    The states are solved for anew with the shared variables held where the step takes them, and these go less far until
+    that lowers the error.
+    """
+    for share in _SHARES:
+        candidate = values.retract(delta.scale(share))
+        for _ in range(_MOST_RETURNS):
+            back, _ = _step(system.holding_shared(candidate), system.ordering, 0.0)
+            if back is None:
+                break
+            candidate = candidate.retract(back)
+            new_error = system.error(candidate)
+            if new_error < error:
+                return candidate, new_error
+    return values, np.inf
+
+
 def _step(
-    linear: gtsam.GaussianFactorGraph, values: gtsam.Values, ordering: gtsam.Ordering, damping: float
-) -> tuple[gtsam.Values | None, float]:
-    """Values after one (damped) step, None if the system is singular, and by how much it should lower the error."""
+    linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, damping: float
+) -> tuple[gtsam.VectorValues | None, float]:
+    """One (damped) step, None if the system is singular, and by how much it should lower the error."""
     try:
         if damping > 0.0:
             linear = _damped(linear, damping)
         delta = linear.optimize(ordering, gtsam.EliminateQR)
-        return values.retract(delta), -0.5 * linear.gradientAtZero().dot(delta)
+        return delta, -0.5 * linear.gradientAtZero().dot(delta)
     except RuntimeError:
         return None, 0.0
 
 
-def _damped(linear: gtsam.GaussianFactorGraph, damping: float) -> gtsam.GaussianFactorGraph:
-    """The system with each unknown held by `damping` times its own information."""
+def _damped(
+    linear: gtsam.GaussianFactorGraph, damping: float, keys: Sequence[int] | None = None
+) -> gtsam.GaussianFactorGraph:
+    """The system with unknowns (all, or those named) held by `damping` times their own information."""
     gradient = linear.gradientAtZero()
     diagonal = {key: np.zeros(len(gradient.at(key))) for key in linear.keyVector()}
     for i in range(linear.size()):
@@ -257,8 +303,8 @@ def _damped(linear: gtsam.GaussianFactorGraph, damping: float) -> gtsam.Gaussian
             diagonal[key] += squares[:size]
             squares = squares[size:]
     out = linear.clone()
-    for key, information in diagonal.items():
-        scale = np.sqrt(damping * np.maximum(information, 1e-6))
+    for key in diagonal if keys is None else keys:
+        scale = np.sqrt(damping * np.maximum(diagonal[key], 1e-6))
         noise = gtsam.noiseModel.Unit.Create(len(scale))
         out.add(gtsam.JacobianFactor(key, np.diag(scale), np.zeros(len(scale)), noise))
     return out
