@@ -102,9 +102,12 @@ def test_weak_motion_exits_with_3_and_names_the_direction(alidade: Command, tmp_
     assert any("camera_mount" in name for d in result["null_directions"] for name in d["weights"])
 
 
-def test_wrong_noise_exits_with_4(alidade: Command, session: Path, tmp_path: Path) -> None:
+def test_wrong_noise_exits_with_4(alidade: Command, scenario: HeadScenario, tmp_path: Path) -> None:
+    short = scenario.model_copy(update={"duration_s": 6.0, "sensors": "ideal"})
+    simulated, truth = simulate_head(short, 1)
+    write_head(tmp_path / "s.mcap", simulated, truth, head_config(short))
     (tmp_path / "noise.yaml").write_text("noise: {vision_attitude: 0.002}\n")
-    run = alidade("calibrate", session, "--config", tmp_path / "noise.yaml", "--out", tmp_path / "out")
+    run = alidade("calibrate", tmp_path / "s.mcap", "--config", tmp_path / "noise.yaml", "--out", tmp_path / "out")
     assert run.code == 4
     assert "noise" in run.out
 

@@ -43,7 +43,7 @@ def sigmas_off(path: Path) -> tuple[np.ndarray, str]:
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    settings = scenario(duration_s=12, vision_rate_hz=9)
+    settings = scenario(duration_s=9, vision_rate_hz=8)
     return written(tmp_path_factory.mktemp("pictures") / "s.mcap", settings, 1)
 
 
@@ -59,7 +59,7 @@ def test_every_parameter_from_pictures_alone(session: Path) -> None:
 
 def test_attitudes_seen_in_pictures_are_the_boards(session: Path) -> None:
     """Mounts and time offset included; their errors fit the covariance that came with them."""
-    settings = scenario(duration_s=12, vision_rate_hz=9)
+    settings = scenario(duration_s=9, vision_rate_hz=8)
     exact = settings.model_copy(update={"noise": settings.noise.model_copy(update={"vision_attitude": 0.0})})
     expected, _ = simulate_head(exact, 1)
     data = read(session)

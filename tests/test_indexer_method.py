@@ -126,7 +126,7 @@ def test_tilted_base() -> None:
     assert np.abs(error / estimate.sigmas).max() < 3.5
 
 
-@pytest.mark.parametrize(("runs", "name"), [(6, "ideal"), pytest.param(50, "ideal", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("runs", "name"), [(4, "ideal"), pytest.param(50, "ideal", marks=pytest.mark.slow)])
 def test_errors_agree_with_the_covariance(runs: int, name: str) -> None:
     """Mean NEES over the runs inside its 99 % interval."""
     nees = []
@@ -181,7 +181,7 @@ def _reported(estimate: Estimate) -> list[tuple[Quantity, float, float]]:
     ]
 
 
-@pytest.mark.parametrize(("runs", "name"), [(10, "nominal"), pytest.param(50, "nominal", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("runs", "name"), [(4, "nominal"), pytest.param(50, "nominal", marks=pytest.mark.slow)])
 def test_errors_of_real_sensors_agree_with_the_covariance(runs: int, name: str) -> None:
     """Mean NEES over the runs inside its 99 % interval, with effects drawn from what is assumed of them."""
     scenario = load_scenario(IndexerScenario, f"indexer_{name}").model_copy(update={"sensors": Sensors()})

@@ -40,6 +40,8 @@ _MOST_NOISE = 4.0
 _MOST_NAMED = 3
 # How far the typical residual has to fall for a change to be looked at closely.
 _PROMISING = 0.97
+# A change whose typical residual is so many times the least one's explains nothing that the other does not.
+_RIVAL = 3.0
 # Noise this far from the one stated is worth a word.
 _NOTABLE = 1.1
 
@@ -82,6 +84,7 @@ def _screened(method: Method, data: Any, config: Config, before: Outcome) -> lis
     found = list(trials(method, data, config))
     scores = [quick_score(method, cut(hypotheses, changed, *stretch), other) for _, changed, other in found]
     enough = _PROMISING * quick_score(method, cut(hypotheses, data, *stretch), config)
+    enough = min(enough, _RIVAL * min(scores, default=np.inf))
     return [found[i] for i in np.argsort(scores)[:_MOST_NAMED] if scores[i] < enough]
 
 

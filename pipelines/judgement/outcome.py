@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 # A recording with more than this share rejected does not fit.
 _OUTLIERS = 0.1
+# Iterations after which a model that is right has long converged; one that is wrong may wander for many times as long.
+_ENOUGH = 15
 # Iterations of a quick score.
 _FEW = 5
 # A model that is right needs no more damping than this; one that needs more is not looked at any longer.
@@ -91,7 +93,7 @@ def outcome(method: Method, data: Any, config: Config) -> Outcome | None:
 
     try:
         problem = method.problem(data, config)
-        return Outcome.of(problem, solve_batch(problem))
+        return Outcome.of(problem, solve_batch(problem, _ENOUGH))
     except Exception:
         return None
 

@@ -113,11 +113,15 @@ class Solution:
     iterations: int
 
 
-def solve_batch(problem: Problem) -> Estimate:
+def solve_batch(problem: Problem, most: int = _MOST_ITERATIONS) -> Estimate:
     """The maximum a-posteriori estimate with the joint marginal covariance of its parameters.
 
     Outliers are found by graduated non-convexity on the problem's truncated loss: the final solution is plain least
     squares on the measurements inside the gate, so its covariance and chi-square mean what they say.
+
+    Args:
+        problem: to be solved.
+        most: iterations of each minimisation, after which it counts as not converged.
 
     Raises:
         IndeterminateError: states other than the parameters are not determined; names the variable.
@@ -125,7 +129,7 @@ def solve_batch(problem: Problem) -> Estimate:
     start = time.perf_counter()
     whole = Assembly.of(problem.steps(CHUNK))
     built = time.perf_counter()
-    solution = optimize(whole.factors, whole.initial, whole.shared(problem), problem.loss)
+    solution = optimize(whole.factors, whole.initial, whole.shared(problem), problem.loss, most)
     solved = time.perf_counter()
     values, system, ordering = solution.values, solution.system, solution.system.ordering
     linear = system.linearize(values)
@@ -196,7 +200,7 @@ def optimize(
     if loss is None:
         return _minimize(unweighed, values, most=most, most_damping=most_damping)
     measurements = sum(len(f.measurement.model.time) for f in factors if f.measurement is not None)
-    plain = _minimize(unweighed, values, _ROUGH_TOLERANCE * measurements)
+    plain = _minimize(unweighed, values, _ROUGH_TOLERANCE * measurements, most)
     values, iterations = plain.values, plain.iterations
     norms = np.concatenate([np.linalg.norm(r.whitened, axis=1) for r in unweighed.residuals(values).values()])
     outlying = norms[norms > loss.gate]
@@ -207,10 +211,10 @@ def optimize(
             values, iterations = relaxed.values, iterations + relaxed.iterations
             mu *= 4.0
     truncated = unweighed.under(loss)
-    final = _minimize(truncated, values)
+    final = _minimize(truncated, values, most=most)
     used = np.concatenate([r.used for r in truncated.residuals(final.values).values()])
     if used.mean() < _FEWEST_USED:
-        final = _minimize(unweighed, plain.values)
+        final = _minimize(unweighed, plain.values, most=most)
     return replace(final, iterations=iterations + final.iterations)
 
 
