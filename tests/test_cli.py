@@ -15,6 +15,7 @@ import pytest
 
 from pipelines.methods.head.recording import HeadData, write_head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from pipelines.settings import IDEAL
 from pipelines.simulation.scenario import load_scenario
 from tests.command import Command, Run
 
@@ -103,7 +104,7 @@ def test_weak_motion_exits_with_3_and_names_the_direction(alidade: Command, tmp_
 
 
 def test_wrong_noise_exits_with_4(alidade: Command, scenario: HeadScenario, tmp_path: Path) -> None:
-    short = scenario.model_copy(update={"duration_s": 6.0, "sensors": "ideal"})
+    short = scenario.model_copy(update={"duration_s": 6.0, "sensors": IDEAL})
     simulated, truth = simulate_head(short, 1)
     write_head(tmp_path / "s.mcap", simulated, truth, head_config(short))
     (tmp_path / "noise.yaml").write_text("noise: {vision_attitude: 0.002}\n")

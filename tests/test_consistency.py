@@ -28,7 +28,7 @@ from pipelines.methods.head.recording import write_head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.settings import Config
+from pipelines.settings import IDEAL, Config, Sensors
 from pipelines.simulation.motion import EulerMotion, Swing
 
 Case = tuple[Method, Any, Config]
@@ -40,7 +40,7 @@ def head() -> Case:
     return head_of(15.0)
 
 
-def head_of(duration_s: float, sensors: str | None = "ideal") -> Case:
+def head_of(duration_s: float, sensors: Sensors | None = IDEAL) -> Case:
     known = [f"{mount}_{axis}" for mount in ("helmet_mount", "camera_mount") for axis in "xyz"]
     scenario = HeadScenario(
         duration_s=duration_s,

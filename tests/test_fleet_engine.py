@@ -23,6 +23,7 @@ from pipelines.fleet.fleet import Settings, calibrate_fleet
 from pipelines.fleet.recordings import find
 from pipelines.methods.head.recording import write_head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from pipelines.settings import IDEAL
 
 pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
 pytest.importorskip("arro3.io", reason="needs the extra alidade[fleet]")
@@ -36,7 +37,7 @@ Start = Callable[..., subprocess.Popen[str]]
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recordings")
-    scenario = HeadScenario(duration_s=4.0, gyro_rate_hz=100.0, vision_rate_hz=20.0, truth_rate_hz=1.0, sensors="ideal")
+    scenario = HeadScenario(duration_s=4.0, gyro_rate_hz=100.0, vision_rate_hz=20.0, truth_rate_hz=1.0, sensors=IDEAL)
     for seed in range(COUNT):
         data, truth = simulate_head(scenario, seed)
         write_head(folder / f"U{seed:02}.mcap", data, truth, head_config(scenario))
