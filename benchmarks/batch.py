@@ -87,7 +87,7 @@ def native_head(data: HeadData) -> Graph:
     starts = np.arange(len(time)) == 0
     chain = GyroChain.over(time, starts, gyro.attitude(time), gyro, density=1e-4, walk=1e-6)
     step = Step(float(time[-1]), keyframes=range(len(time)))
-    chain.add(step)
+    chain.add(step, step.keyframes)
     noise = gtsam.noiseModel.Isotropic.Sigma(3, 0.05)
     step.factors.append(Factor("prior", gtsam.PriorFactorVector(FIRST_BIAS, np.zeros(3), noise)))
     return with_mount(step.factors, step.initial, [state(k) for k in step.keyframes], "vision", 8.7e-3)

@@ -167,6 +167,11 @@ class Session:
             raise InputError(f"{error}{f'; nearest is {nearest}' if nearest else ''}") from error
         return cls(chosen, data, config, Recorded(recording))
 
+    def again(self, recording: Recording) -> Session:
+        """The same method and config with another recording, or another part of it. Raises InputError."""
+        recording.use(self.config.topics.values(), self.config.columns)
+        return replace(self, data=self.method.read(recording, self.config), origin=Recorded(recording))
+
     @classmethod
     def of(cls, method: Method, simulated: Simulated, config_file: Path | None = None) -> Session:
         """A simulated recording that was never written."""

@@ -1,9 +1,9 @@
 """Follows a growing recording: looks at it again and again, and hands what is new to the incremental solver.
 
-Every look reads the whole recording anew, which keeps one reader and its checks for both files that grow and files that
-are finished. The steps taken already are left out where they cannot change (Problem.steps_after); where they can, as
-with turns and poses still under way, the few steps there are are taken anew. A look is followed by a pause that grows
-with what the look cost, so that following never takes more than a third of a core for reading.
+A look costs what is new, not what was there: once the solver has marginalised the past out, data are read and the graph
+is built from there on alone (Problem.onward). Methods whose past may still change, as with turns and poses under way,
+and errors taken from pictures of a first target, are read whole; their looks are followed by longer pauses, so that
+following never takes more than a third of a core for reading.
 """
 
 from __future__ import annotations
@@ -16,23 +16,29 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
+import numpy as np
+
 from pipelines.errors import InputError
 from pipelines.follow.guidance import View, view_of
 from pipelines.follow.sources import Source
 from pipelines.graph.problem import Problem, Step
 from pipelines.judgement.checklist import ChecklistItem
-from pipelines.recording.reading import open_recording
+from pipelines.recording.growing import Growing
+from pipelines.recording.reading import Recording, open_recording
 from pipelines.reports.result import Calibration
 from pipelines.session import Session
 from pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
 from pipelines.solvers.incremental import Run
 
-# Steps of the last second of what is there may still change, see Problem.steps_after. s
-_UNSETTLED = 1.0
 # At least so long from one look to the next, s, and so many times what a look cost.
-_PAUSE, _REST = 1.0, 2.0
-# The file's size is looked at so often, s.
-_POLL = 0.2
+_PAUSE, _REST = 0.1, 2.0
+# The files' size is looked at so often, s.
+_POLL = 0.05
+# The end of a recording is read from so long before the first step taken of it, s: what is logged late, and samples and
+# pictures by which those beside them are judged. Where that is too little, more.
+_MARGINS = (2.0, 20.0)
+# First guesses serve until the recording is so many times as long.
+_LONG_AGO = 1.5
 # While a long recording is caught up with, the view is renewed this often, s.
 _VIEW = 1.0
 _FINGERPRINT = 4096
@@ -83,7 +89,11 @@ class Follower:
         self._resumable = settings.checkpoint is not None and settings.checkpoint.exists()
         self._shown = 0.0
         self._waiting = ""
-        self._checklist: tuple[ChecklistItem, ...] = ()
+        self._checklist: dict[str, ChecklistItem] = {}
+        self._growing = Growing()
+        self._session: Session | None = None  # as last read whole
+        self._delay_ns, self._attachments = 0, 0
+        self._guessed = 0.0  # from a recording of so many s
         if settings.checkpoint is not None and settings.window is None:
             raise InputError("--window all has no checkpoints: it forgets nothing; give seconds")
 
@@ -117,13 +127,49 @@ class Follower:
     def _look(self) -> None:
         """Take what is settled of what is there now."""
         try:
-            session = self._read()
-            problem = session.problem()
-            self._collect(session)
+            problem, steps = self._end_alone() or self._whole()
         except InputError as error:
             self._wait(str(error))
             return
-        self._take(problem, _settled(self._new_steps(session, problem)))
+        self._take(problem, _settled(steps, problem.unsettled))
+
+    def _whole(self) -> tuple[Problem, Iterator[Step]]:
+        """The graph of all there is, and its steps that were not taken yet."""
+        recording = Recording(self._growing.look(self.source.parts, None))
+        session = Session.read(recording, self.settings.method, self.settings.config)
+        problem = self._guessed_before(session) or _that_grows(session.problem(), session)
+        steps = self._new_steps(session, problem)
+        self._session, self._checklist = session, {}
+        self._delay_ns, self._attachments = recording.delay_ns, len(self._growing.attachments)
+        self._collect(session)
+        return problem, steps
+
+    def _guessed_before(self, session: Session) -> Problem | None:
+        """The graph from the first guesses of a look before, where that is not long ago: they take most of the time."""
+        run = self._run
+        if run is None or run.problem.onward is None or run.time > _LONG_AGO * self._guessed:
+            self._guessed = 0.0 if run is None else run.time
+            return None
+        return run.problem.onward(session.data, -np.inf)
+
+    def _end_alone(self) -> tuple[Problem, Iterator[Step]] | None:
+        """The graph from where the past was marginalised out, and its new steps; None where that is too little."""
+        run, session = self._run, self._session
+        if run is None or run.base is None or run.problem.onward is None or session is None:
+            return None
+        for margin in _MARGINS:
+            since = self._epoch_ns + self._delay_ns + round((run.base.time - margin) * 1e9)
+            recording = Recording(self._growing.look(self.source.parts, since), self._epoch_ns)
+            if len(self._growing.attachments) != self._attachments:
+                return None
+            late = session.again(recording)
+            problem = run.problem.onward(late.data, run.base.time)
+            if problem is not None and problem.steps_after is not None:
+                self._delay_ns = recording.delay_ns
+                self._collect(late)
+                run.update_problem(problem)
+                return problem, problem.steps_after(run.time)
+        return None
 
     def _wait(self, reason: str) -> None:
         """The recording cannot be read yet, or holds too little; raises InputError when it never will."""
@@ -133,9 +179,6 @@ class Follower:
         if reason != self._waiting:
             self._waiting = reason
             self._say(f"not enough yet: {reason}")
-
-    def _read(self) -> Session:
-        return Session.read(open_recording(self.source.where), self.settings.method, self.settings.config)
 
     def _new_steps(self, session: Session, problem: Problem) -> Iterator[Step]:
         """The steps not taken yet, for a run that is the one to take them: a new one if the past has changed."""
@@ -158,7 +201,11 @@ class Follower:
         return problem.steps_after(self._run.time)
 
     def _collect(self, session: Session) -> None:
-        self._checklist = tuple(session.method.checklist(session.data, session.config))
+        """What there is by now; what was enough once stays so."""
+        for item in session.method.checklist(session.data, session.config):
+            before = self._checklist.get(item.what)
+            if before is None or before.wanted or not item.wanted:
+                self._checklist[item.what] = item
 
     def _take(self, problem: Problem, steps: Iterable[Step]) -> None:
         run = self._run
@@ -174,7 +221,7 @@ class Follower:
 
     def _view(self) -> None:
         assert self._run is not None
-        self._show(view_of(self._epoch_ns, self._run, self._checklist))
+        self._show(view_of(self._epoch_ns, self._run, tuple(self._checklist.values())))
         self._shown = time.monotonic()
 
     # -- the checkpoint
@@ -218,12 +265,15 @@ class Follower:
             why = "stopped" if self._stopped() else f"nothing new for {self.settings.patience:g} s"
             self._say(f"{why}: the recording is not finished, the result is that of what is there")
         started = time.perf_counter()
-        session = self._read()
+        session = Session.read(open_recording(self.source.where), self.settings.method, self.settings.config)
         problem = session.problem()
         read = time.perf_counter() - started
         started = time.perf_counter()
         self._collect(session)
-        self._take(problem, self._new_steps(session, problem))
+        # What was never followed is solved as any finished recording.
+        followed = self._run is not None or self.settings.checkpoint is not None
+        growing = _that_grows(problem, session) if followed else problem
+        self._take(growing, self._new_steps(session, growing))
         assert self._run is not None
         estimate = self._run.finish(time.perf_counter() - started)
         (calibration,) = session.judged([(estimate, problem)], {"read": read})
@@ -237,10 +287,15 @@ def _first(steps: Iterable[Step]) -> Iterator[Step]:
         return
 
 
-def _settled(steps: Iterable[Step]) -> Iterator[Step]:
-    """The steps that are a second older than the last."""
+def _settled(steps: Iterable[Step], unsettled: float) -> Iterator[Step]:
+    """The steps that are so much older, s, than the last, which may still grow."""
     held: deque[Step] = deque()
     for step in steps:
         held.append(step)
-        while held[0].time <= step.time - _UNSETTLED:
+        while len(held) > 1 and held[0].time <= step.time - unsettled:
             yield held.popleft()
+
+
+def _that_grows(problem: Problem, session: Session) -> Problem:
+    """The graph of all data in the form in which a recording that grows is continued, if it has one."""
+    return (problem.onward and problem.onward(session.data, -np.inf)) or problem

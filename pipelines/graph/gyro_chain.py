@@ -23,6 +23,23 @@ def state(keyframe: int) -> int:
 
 
 @dataclass(frozen=True)
+class Trunk:
+    """What a chain over the end of a recording that grows goes on from.
+
+    Attributes:
+        keyframe: number of its first keyframe in the recording.
+        begun: (n,) s, where the nodes of the bias begin, the last in force there; empty at the start of a recording.
+    """
+
+    keyframe: int
+    begun: Array
+
+
+# Of a chain that begins with a recording that grows.
+ROOT = Trunk(0, np.empty(0))
+
+
+@dataclass(frozen=True)
 class GyroChain:
     """Attitudes aRm at K keyframes: m the gyro, a a frame that a chain of increments holds on to.
 
@@ -40,6 +57,7 @@ class GyroChain:
         errors: of the gyro, as factors.gyro has them; None: perfect.
         platform, platform_turns: the platform's gyro and its increments; None in an inertial frame.
         platform_errors: of that gyro, its bias first; None: perfect.
+        first: number of the first keyframe in the recording, where the chain is over its end alone.
     """
 
     time: Array
@@ -54,6 +72,7 @@ class GyroChain:
     platform: GyroPath | None = None
     platform_turns: Increments | None = None
     platform_errors: Parameter | None = None
+    first: int = 0
 
     @classmethod
     def over(
@@ -70,6 +89,7 @@ class GyroChain:
         errors: Parameter | None = None,
         platform: GyroPath | None = None,
         platform_errors: Parameter | None = None,
+        trunk: Trunk | None = None,
     ) -> GyroChain:
         """A chain over keyframes.
 
@@ -80,6 +100,7 @@ class GyroChain:
             walk: of the bias, rad/s/sqrt(s).
             scale_error: sigma of an increment per angle turned.
             errors, platform, platform_errors: as above.
+            trunk: of a recording that grows, where the first keyframe is known already; None: the whole is there.
         """
         turns = gyro.increments(time[:-1], time[1:], scale=errors is not None)
         unseen, platform_turns = turns.unseen, None
@@ -88,7 +109,10 @@ class GyroChain:
             unseen = unseen + platform_turns.unseen
         by_scale = scale_error * np.linalg.norm(so3.log(turns.wxyz), axis=1)
         middles = np.where(starts, time, 0.5 * (time + np.roll(time, 1)))
-        bias = WalkingBias.over(time[0], time[-1], middles, walk, density)
+        begun = None if trunk is None else time[:1]
+        if trunk is not None and len(trunk.begun):
+            begun, middles[0] = trunk.begun, trunk.begun[-1]
+        bias = WalkingBias.over(time[0], time[-1], middles, walk, density, begun)
         return cls(
             time=time,
             starts=starts,
@@ -102,7 +126,23 @@ class GyroChain:
             platform=platform,
             platform_turns=platform_turns,
             platform_errors=platform_errors,
+            first=0 if trunk is None else trunk.keyframe,
         )
+
+    def trunk(self, time: float) -> Trunk | None:
+        """What a chain over the end of the same recording goes on from at a keyframe; None if none is at the time."""
+        k = int(np.searchsorted(self.time, time))
+        if k == len(self.time) or self.time[k] != time:
+            return None
+        return Trunk(self.first + k, self.bias.edges[: self.nodes[k] + 1])
+
+    def state(self, keyframe: int) -> int:
+        """Variable of the attitude at a keyframe, Rot3."""
+        return state(self.first + keyframe)
+
+    def numbers(self, keyframes: range) -> range:
+        """The numbers of keyframes in the recording."""
+        return range(self.first + keyframes.start, self.first + keyframes.stop)
 
     def bias_keys(self, keyframes: Sequence[int] | NDArray[np.intp]) -> list[int]:
         """Variables of the bias in force up to keyframes."""
@@ -113,26 +153,26 @@ class GyroChain:
         """Variables of the gyros' errors: the last blocks of factors that the gyros carry."""
         return [p.key for p in (self.errors, self.platform_errors) if p is not None]
 
-    def add(self, step: Step) -> None:
-        """The attitudes at a step's keyframes, the increments that lead there, and the bias nodes that begin with them.
+    def add(self, step: Step, keyframes: range) -> None:
+        """The attitudes at keyframes, the increments that lead there, and the bias nodes that begin with them.
 
         What determines the attitude at the start of a chain, and the first bias, is the caller's to add.
         """
-        nodes, means = self._new(step.keyframes)
+        nodes, means = self._new(keyframes)
         for node in nodes:
             self.bias.begin(step, node, self.gyro.bias_hat)
         for node in means:
             self.bias.end(step, node, self.gyro.bias_hat)
-        now = int(self.nodes[step.keyframes[-1]])
+        now = int(self.nodes[keyframes[-1]])
         if self.bias.nodes > 1:
-            last = step.keyframes.stop == len(self.time)
+            last = keyframes.stop == len(self.time)
             step.current_keys[self.bias.key(0)] = self.bias.mean_key(now) if last else self.bias.key(now)
             before = max(nodes.start - 1, 0)
             self.bias.keep(step, range(before, now + 1), range(max(before - 1, 0), means.stop))
-        for k in step.keyframes:
-            step.initial.insert(state(k), so3.to_gtsam(self.initial[k]))
-            step.timestamps[state(k)] = float(self.time[k])
-        after = np.array([k for k in step.keyframes if not self.starts[k]], dtype=np.intp)
+        for k in keyframes:
+            step.initial.insert(self.state(k), so3.to_gtsam(self.initial[k]))
+            step.timestamps[self.state(k)] = float(self.time[k])
+        after = np.array([k for k in keyframes if not self.starts[k]], dtype=np.intp)
         if len(after):
             step.factors.extend(self._increments(after))
 
@@ -145,7 +185,7 @@ class GyroChain:
 
     def _increments(self, after: NDArray[np.intp]) -> list[Factor]:
         """Those that lead to keyframes: gtsam's native factors where all that they depend on is the bias."""
-        states = [state(k - 1) for k in after], [state(k) for k in after]
+        states = [self.state(k - 1) for k in after], [self.state(k) for k in after]
         bias, turns, variance = self.bias_keys(after), self.turns[after - 1], self.variance[after - 1]
         if self.errors is None and self.platform is None:
             native = ahrs_factors(*states, bias, turns, self.gyro.bias_hat, variance)
@@ -174,9 +214,9 @@ class GyroChain:
             if self.starts[k]:
                 attitude = seen(k, current)
             else:
-                before = (out if out.exists(state(k - 1)) else current).atRot3(state(k - 1))
+                before = (out if out.exists(self.state(k - 1)) else current).atRot3(self.state(k - 1))
                 attitude = so3.compose(so3.inverse(carrier), so3.from_gtsam([before])[0], turn)
-            out.insert(state(k), so3.to_gtsam(attitude))
+            out.insert(self.state(k), so3.to_gtsam(attitude))
         return out
 
     def _turned(self, keyframes: range, bias: Array, values: gtsam.Values) -> tuple[Array, Array]:
@@ -210,7 +250,7 @@ class GyroChain:
         middle = 0.5 * (start + stamps)
         errors, platform = self._errors(values, n)
         bias = np.array([values.atVector(key) for key in self.bias_keys(keyframes)]).reshape(n, 3)
-        attitude = so3.from_gtsam([values.atRot3(state(k)) for k in keyframes])
+        attitude = so3.from_gtsam([values.atRot3(self.state(k)) for k in keyframes])
         attitude = so3.multiply(attitude, carried(self.gyro, start, middle, at, bias, errors)[0])
         if self.platform is None:
             return attitude

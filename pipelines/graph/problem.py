@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -183,6 +183,11 @@ class Problem:
         premises: what is taken for granted and a reader has to know, sentences.
         steps_after: the steps of one measurement each that are later than a time, s, for graphs whose steps stay
             as they are while the recording grows, but for those of its last second. None: all may change.
+        onward: the graph of a recording that grows, from the data of its end and the time, s, of a keyframe of this
+            graph that is in them and from which on there are steps; -inf: from all data, with all steps. It agrees with
+            this one on variables, and its steps stay as they are, but for the last one and those of the last
+            `unsettled` s. None if there is no such keyframe. Not every graph can be built from the end alone.
+        unsettled: see `onward`, s.
     """
 
     method: str
@@ -195,6 +200,8 @@ class Problem:
     dropped: Mapping[str, int] = field(default_factory=dict)
     premises: tuple[str, ...] = ()
     steps_after: Callable[[float], Iterator[Step]] | None = None
+    onward: Callable[[Any, float], Problem | None] | None = None
+    unsettled: float = 1.0
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:

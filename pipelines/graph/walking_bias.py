@@ -48,7 +48,9 @@ class WalkingBias:
     stop: float
 
     @classmethod
-    def over(cls, start: float, stop: float, middles: Array, walk: float, density: float) -> WalkingBias:
+    def over(
+        cls, start: float, stop: float, middles: Array, walk: float, density: float, begun: Array | None = None
+    ) -> WalkingBias:
         """Stretches short enough for the walk (rad/s/sqrt(s)) to stay below gyro noise (rad/s/sqrt(Hz)).
 
         All are of one length, so that those behind stay as they are while a recording grows; but one that holds none
@@ -58,14 +60,18 @@ class WalkingBias:
             start, stop: s.
             middles: (n,) s, the times at which `node_at` will be asked, increasing; every node is in force at one.
             walk, density: as above.
+            begun: (n,) s, where the nodes before begin in a recording that still grows, the one in force at `start`
+                the last: the others follow, and the last of all is as short as it may be, lest it change.
         """
+        known = np.array([start]) if begun is None else begun
         if walk <= 0.0:
-            return cls(np.array([start, stop]), 0.0, density, stop)
+            return cls(np.array([known[0], stop]), 0.0, density, stop)
         length = max(min(_LONGEST, _FRACTION * np.sqrt(3.0) * density / walk), 1e-3)
-        count = max(1, int(np.ceil((stop - start) / length - _SHORTEST)))
-        edges = start + length * np.arange(count + 1)
-        asked = np.searchsorted(edges[1:-1], middles, side="right")
-        return cls(np.append(start, edges[np.append(np.unique(asked)[1:], count)]), walk, density, stop)
+        count = max(1, int(np.ceil((stop - known[-1]) / length - (_SHORTEST if begun is None else 0.0))))
+        edges = known[-1] + length * np.arange(count + 1)
+        asked = np.unique(np.searchsorted(edges[1:-1], middles, side="right"))
+        new = asked[1:] if begun is None else asked[asked > 0]
+        return cls(np.concatenate([known, edges[new], edges[count:]]), walk, density, stop)
 
     @property
     def nodes(self) -> int:

@@ -94,6 +94,13 @@ class Container(ABC):
         """Sentences about what is lost, and when in a session that starts at start_ns, Unix ns."""
 
     @property
+    def first_log_ns(self) -> int:
+        """Log time of the first messages, Unix ns; 0 if there are none."""
+        for rows in self.rows(set(self.channels)):
+            return int(rows.log_ns.min())
+        return 0
+
+    @property
     def missing(self) -> dict[str, int]:
         """Topic -> messages known to be lost."""
         return {}

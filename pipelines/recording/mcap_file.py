@@ -54,7 +54,8 @@ class McapFile(Container):
         self._lost: dict[int, int] = {}
         with self._open() as stream:
             self._check_magic(stream)
-            self._index = index = McapIndex(stream, str(path))
+            self._index = index = McapIndex(str(path))
+            index.read(stream)
             self.profile, self.channels, self.schemas = index.profile, index.channels, index.schemas
             self.losses: list[DataLoss] = index.losses
             self._blocks = index.blocks
@@ -96,19 +97,7 @@ class McapFile(Container):
         """
         with self._open() as stream:
             for block in self._blocks:
-                wanted = channels & block.counts.keys()
-                if not wanted:
-                    continue
-                try:
-                    buffer = self._load(stream, block)
-                    offsets, _ = self._locate(stream, block, buffer)
-                    if any(len(offsets.get(number, ())) != n for number, n in block.counts.items()):
-                        raise DamagedError("its message index is wrong")
-                except DamagedError as damaged:
-                    self._lose(block, damaged)
-                    continue
-                for number in sorted(wanted):
-                    yield _rows(number, buffer, offsets[number])
+                yield from self._block_rows(stream, block, channels & block.counts.keys())
 
     @property
     def attachments(self) -> tuple[str, ...]:
@@ -212,6 +201,20 @@ class McapFile(Container):
         counts = {number: len(found) for number, found in offsets.items()}
         if counts != block.counts:
             block.counts, block.index_at = counts, {}
+
+    def _block_rows(self, stream: BinaryIO, block: Block, wanted: set[int]) -> list[Rows]:
+        """The messages of these channels in a block; none if it is damaged."""
+        if not wanted:
+            return []
+        try:
+            buffer = self._load(stream, block)
+            offsets, _ = self._locate(stream, block, buffer)
+            if any(len(offsets.get(number, ())) != n for number, n in block.counts.items()):
+                raise DamagedError("its message index is wrong")
+        except DamagedError as damaged:
+            self._lose(block, damaged)
+            return []
+        return [_rows(number, buffer, offsets[number]) for number in sorted(wanted)]
 
     def _lose(self, block: Block, damaged: DamagedError) -> None:
         """Leave out a block from now on."""

@@ -50,14 +50,14 @@ class Block:
     start: int
     end: int
     is_chunk: bool
-    span: tuple[int, int] | None = None  # log times, ns, as the chunk states them
+    span: tuple[int, int] | None = None  # log times, ns, as the chunk or the messages state them
     counts: dict[int, int] = field(default_factory=dict)  # channel -> messages
     index_at: dict[int, int] = field(default_factory=dict)  # channel -> byte where its index entries start
     is_lost: bool = False  # found damaged within
 
 
 class McapIndex:
-    """The walk over an open file.
+    """The walk over a file, whole or as far as it has grown.
 
     Raises InputError when the file is hostile: more definitions than any recording has, or a decompression bomb.
 
@@ -71,8 +71,8 @@ class McapIndex:
         losses: what cannot be used.
     """
 
-    def __init__(self, stream: BinaryIO, name: str) -> None:
-        self.size = stream.seek(0, 2)
+    def __init__(self, name: str) -> None:
+        self.size = 0
         self.profile = ""
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
@@ -83,9 +83,19 @@ class McapIndex:
         self._name, self._text, self._unpacked = name, 0, 0
         self._chunk: Block | None = None
         self._data_end: tuple[int, int] | None = None  # byte and checksum
+        self._walked = len(MAGIC)  # up to this byte
+
+    def read(self, stream: BinaryIO) -> None:
+        """The whole file."""
+        self.size = stream.seek(0, 2)
         end = self._footer(stream)
         self._walk(stream, self.size if end is None else end)
         self._finish(stream, closed=end is not None)
+
+    def grow(self, stream: BinaryIO) -> None:
+        """What has come since the last time, up to the last whole record."""
+        self.size = stream.seek(0, 2)
+        self._walk(stream, self.size, grows=True)
 
     def define(self, opcode: int, record: bytes) -> None:
         """Take the definition in a schema or channel record, if it is the first of its id; of other records nothing.
@@ -152,13 +162,15 @@ class McapIndex:
         else:
             self.define(opcode, record)
 
-    def _walk(self, stream: BinaryIO, stop: int) -> None:
-        position = len(MAGIC)
+    def _walk(self, stream: BinaryIO, stop: int, grows: bool = False) -> None:
+        position = self._walked
         while position < stop and self._data_end is None:
             stream.seek(position)
             head = stream.read(MESSAGE_HEAD.itemsize)
             opcode, length = HEAD.unpack_from(head) if len(head) >= HEAD.size else (0, stop)
             end = position + HEAD.size + length
+            if grows and end > stop:
+                break
             try:
                 if end > stop:
                     raise DamagedError("a record is not whole")
@@ -166,6 +178,7 @@ class McapIndex:
             except DamagedError as damaged:
                 end = self._lose(stream, position, end, stop, str(damaged))
             position = end
+        self._walked = position
 
     def _lose(self, stream: BinaryIO, position: int, end: int, stop: int, reason: str) -> int:
         """Note what is lost at the position; returns where to go on."""
@@ -241,6 +254,9 @@ class McapIndex:
             block = Block(position, position, is_chunk=False)
             self.blocks.append(block)
         block.end = end
+        log_ns = int(message["log_ns"])
+        first, last = block.span or (log_ns, log_ns)
+        block.span = (min(first, log_ns), max(last, log_ns))
         channel = int(message["channel"])
         block.counts[channel] = block.counts.get(channel, 0) + 1
 

@@ -52,12 +52,15 @@ class MessageReader:
     Args:
         container: where they are.
         name: of the recording, for what is said about it.
+        epoch_ns: start of the session, if it is known.
 
     Attributes:
         topics: by name, sorted.
     """
 
-    def __init__(self, container: Container, name: str) -> None:
+    def __init__(self, container: Container, name: str, epoch_ns: int | None = None) -> None:
+        if epoch_ns is not None:
+            self.epoch_ns = epoch_ns
         self._container, self._name = container, name
         self._formats = {
             number: ChannelFormat(channel, container.schemas.get(channel.schema_id))
@@ -86,6 +89,12 @@ class MessageReader:
         """First and last log time, ns."""
         logged = [log_ns for _, log_ns in self.times.values() if len(log_ns)]
         return min((int(t.min()) for t in logged), default=0), max((int(t.max()) for t in logged), default=0)
+
+    @property
+    def delay_ns(self) -> int:
+        """How much later than their stamps messages were logged, at least, in the topics read by now; ns."""
+        delays = [int((log_ns - t_ns).min()) for t_ns, log_ns in self._times.values() if len(t_ns)]
+        return min(delays, default=0)
 
     @property
     def times(self) -> Mapping[str, Times]:

@@ -23,7 +23,7 @@ class Parts(Container):
 
     def __init__(self, path: Path, parts: Sequence[Container]) -> None:
         self.path, self.data = path, path
-        self.parts = sorted(parts, key=_first_log)
+        self.parts = sorted(parts, key=lambda part: part.first_log_ns)
         self.remarks = tuple(f"{part.path.name}: {remark}" for part in self.parts for remark in part.remarks)
         self.profile = next((part.profile for part in self.parts if part.profile), "")
         self.channels: Mapping[int, Channel] = {
@@ -84,10 +84,3 @@ class Parts(Container):
         for part in self.parts:
             digest.update(bytes.fromhex(part.sha256()))
         return digest.hexdigest()
-
-
-def _first_log(part: Container) -> int:
-    """Log time of the first message in a container, ns."""
-    for rows in part.rows(set(part.channels)):
-        return int(rows.log_ns.min())
-    return 0

@@ -47,12 +47,18 @@ def open_recording(where: Where, strict: bool = False) -> Recording:
 
 
 class Recording:
-    """A recording, whatever its form. Holds positions in the file and stamps, not the messages."""
+    """A recording, whatever its form. Holds positions in the file and stamps, not the messages.
 
-    def __init__(self, container: Container) -> None:
+    Args:
+        container: where its messages are.
+        epoch_ns: start of the session, Unix ns, where the container has not got its first messages.
+    """
+
+    def __init__(self, container: Container, epoch_ns: int | None = None) -> None:
         self.path = container.path
         self._container = container
-        self._reader = MessageReader(container, str(container.path))
+        self._epoch_ns = epoch_ns
+        self._reader = MessageReader(container, str(container.path), epoch_ns)
         self._made: dict[str, TopicSource] = {}
 
     @property
@@ -73,7 +79,7 @@ class Recording:
         """
         if columns:
             self._container = described(self._container, columns)
-            self._reader = MessageReader(self._container, str(self.path))
+            self._reader = MessageReader(self._container, str(self.path), self._epoch_ns)
         self._made = {source.name: source for source in sources if source.is_made}
 
     def sha256(self) -> str:
@@ -118,6 +124,11 @@ class Recording:
     def epoch_ns(self) -> int:
         """Start of the session, Unix ns: the earliest first stamp of a sensor topic, else the first log time."""
         return self._reader.epoch_ns
+
+    @property
+    def delay_ns(self) -> int:
+        """How much later than their stamps messages were logged, at least, in the topics read by now; ns."""
+        return self._reader.delay_ns
 
     @property
     def duration_s(self) -> float:

@@ -22,7 +22,7 @@ from factors.gyro import SCALE
 from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
 from pipelines.errors import InputError
-from pipelines.graph.gyro_chain import GyroChain, state
+from pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk
 from pipelines.graph.priors import rotation_prior, vector_prior
 from pipelines.graph.problem import Array, Attitudes, Factor, Problem, Step
 from pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, HeadParameters
@@ -49,6 +49,7 @@ class _Model:
     chain: GyroChain  # bRv at the keyframes
     pictures: NDArray[np.intp]  # (K + 1,) those of keyframe k are from pictures[k] to pictures[k + 1]
     stamps: Array  # (frames,)
+    origins: tuple[float, float, float]  # s: of `elapsed`, of the groups that share a keyframe, and how long these are
     elapsed: Array  # (frames,) since the recording's first stamp
     measured: Array  # (frames, 4) cRh
     first: Array  # (4,) cRh of the recording's first picture
@@ -64,7 +65,10 @@ def problem(data: HeadData, config: Config) -> Problem:
     Raises:
         InputError: fewer than ten vision frames lie within the helmet gyro's record.
     """
-    model = _prepare(data, config)
+    return _problem(config, data, _prepare(data, config))
+
+
+def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
     return Problem(
         method="head",
         parameters=model.parameters.all,
@@ -76,10 +80,24 @@ def problem(data: HeadData, config: Config) -> Problem:
         advice=_advice,
         dropped=data.dropped,
         premises=() if data.platform_t is not None else (_AT_REST,),
+        onward=partial(_onward, config, model),
+        unsettled=0.0,
     )
 
 
-def _prepare(data: HeadData, config: Config) -> _Model:
+def _onward(config: Config, model: _Model, data: HeadData, time: float) -> Problem | None:
+    """The graph of the end of a growing recording; see Problem.onward."""
+    trunk = ROOT if time == -np.inf else model.chain.trunk(time)
+    if trunk is None or (trunk is not ROOT and time < data.vision_t[0]):
+        return None
+    grown = _prepare(data, config, model, trunk, time)
+    return _problem(config, data, grown) if trunk is ROOT or grown.chain.time[0] == time else None
+
+
+def _prepare(
+    data: HeadData, config: Config, before: _Model | None = None, trunk: Trunk | None = None, start: float = -np.inf
+) -> _Model:
+    """The model of a recording, or of one that grows from a keyframe of its model until now on."""
     inside = (data.vision_t >= data.head_t[0]) & (data.vision_t <= data.head_t[-1])
     if data.platform_t is not None:
         inside &= (data.vision_t >= data.platform_t[0]) & (data.vision_t <= data.platform_t[-1])
@@ -100,11 +118,19 @@ def _prepare(data: HeadData, config: Config) -> _Model:
     parameters = HeadParameters.of(config, platform is not None, data.head_force is not None)
     sqrt_information = _sqrt_information(data.vision_cov, inside, config)
 
-    iRb = so3.identity(len(vision_t)) if platform is None else platform.attitude(vision_t)
     sigma = float(1.0 / np.median(np.linalg.norm(sqrt_information, axis=(1, 2)) / np.sqrt(3.0)))
-    bias_hat, vRh = _guess(data, vision_t, so3.multiply(iRb, measured), sigma)
-    negligible = (_NEGLIGIBLE * sigma) ** 2 / max(density**2 + platform_density**2, 1e-300)
-    time, pictures = _keyframes(vision_t, min(_SHARED, negligible))
+    if before is None:
+        iRb = so3.identity(len(vision_t)) if platform is None else platform.attitude(vision_t)
+        bias_hat, vRh = _guess(data, vision_t, so3.multiply(iRb, measured), sigma)
+        negligible = (_NEGLIGIBLE * sigma) ** 2 / max(density**2 + platform_density**2, 1e-300)
+        first, origins = data.vision_wxyz[0], (data.vision_t[0], vision_t[0], min(_SHARED, negligible))
+    else:
+        bias_hat, vRh, first, origins = before.chain.gyro.bias_hat, before.helmet_guess, before.first, before.origins
+    time, pictures = _keyframes(vision_t, *origins[1:])
+    late = int(np.searchsorted(time, start))
+    time, pictures = time[late:], pictures[late:] - pictures[late]
+    frames = slice(len(vision_t) - pictures[-1], None)
+    vision_t, measured, sqrt_information = vision_t[frames], measured[frames], sqrt_information[frames]
     sensitive = parameters.gyro is not None and len(parameters.gyro.quantities) > SCALE
     chain = GyroChain.over(
         time,
@@ -117,14 +143,16 @@ def _prepare(data: HeadData, config: Config) -> _Model:
         errors=parameters.gyro,
         platform=platform,
         platform_errors=parameters.platform,
+        trunk=trunk,
     )
     return _Model(
         chain=chain,
         pictures=pictures,
         stamps=vision_t,
-        elapsed=vision_t - data.vision_t[0],
+        origins=origins,
+        elapsed=vision_t - origins[0],
         measured=measured,
-        first=data.vision_wxyz[0],
+        first=first,
         sqrt_information=sqrt_information,
         loss=TruncatedLoss(gate(3)),
         parameters=parameters,
@@ -141,12 +169,13 @@ def _sqrt_information(covariance: Array | None, inside: NDArray[np.bool_], confi
     return np.swapaxes(root, 1, 2)
 
 
-def _keyframes(stamps: Array, shared: float) -> tuple[Array, NDArray[np.intp]]:
+def _keyframes(stamps: Array, origin: float, shared: float) -> tuple[Array, NDArray[np.intp]]:
     """Times (K,) of the keyframes and, (K + 1,), where the pictures of each begin; some, in gaps, have none.
 
-    Pictures share one as long as they are within `shared` s; it is the one in their middle.
+    Pictures share one as long as they are within the same `shared` s, counted from `origin`; it is the one in their
+    middle.
     """
-    group = np.floor((stamps - stamps[0]) / shared) if shared > 0.0 else np.arange(len(stamps))
+    group = np.floor((stamps - origin) / shared) if shared > 0.0 else np.arange(len(stamps))
     begins = np.flatnonzero(np.diff(group, prepend=-1.0))
     middles = stamps[(begins + np.append(begins[1:], len(stamps)) - 1) // 2]
     bridges = [
@@ -204,11 +233,11 @@ def _step(model: _Model, keyframes: range) -> Step:
     step = Step(
         time=float(chain.time[keyframes[-1]]),
         predict=partial(chain.predict, keyframes, lambda k, _: chain.initial[k]),
-        keyframes=keyframes,
+        keyframes=chain.numbers(keyframes),
     )
-    if keyframes.start == 0:
+    if chain.first + keyframes.start == 0:
         _begin(model, step)
-    chain.add(step)
+    chain.add(step, keyframes)
     step.factors.extend(_vision_factor(model, keyframes))
     return step
 
@@ -249,14 +278,14 @@ def _vision_factor(model: _Model, keyframes: range) -> list[Factor]:
         elapsed=model.elapsed[rows] if p.clock else None,
         first=np.broadcast_to(model.first, (len(rows), 4)) if p.clock else None,
     )
-    states = [state(k) for k in of]
+    states = [chain.state(k) for k in of]
     keys = p.camera.key, p.helmet.key, p.picture.key, *chain.error_keys
     return [Factor.of("vision", seen.on(states, chain.bias_keys(of), *keys, loss=model.loss))]
 
 
 def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) -> Attitudes:
     """bRv at the pictures' true times on the gyro's clock."""
-    rows, of = _pictures(model, keyframes)
+    rows, of = _pictures(model, [k - model.chain.first for k in keyframes])
     if len(rows) == 0:
         return Attitudes(np.empty(0), np.empty((0, 4)))
     offset, *skew = values.atVector(model.parameters.picture.key)[:2]

@@ -16,7 +16,7 @@ _NOD, _MANOEUVRE = np.deg2rad(10.0), np.deg2rad(5.0)
 
 def checklist(data: HeadData, _: Config) -> Sequence[ChecklistItem]:
     """Motion of the head, and of the platform where there is one."""
-    found = [ChecklistItem("vision", f"{len(data.vision_t)} attitudes over {np.ptp(data.vision_t):.0f} s")]
+    found = [ChecklistItem("vision", f"{1.0 / np.median(np.diff(data.vision_t)):.3g} attitudes/s")]
     found += motion("head", turned(data.head_t, data.head_gyro), _NOD, "turn the head about its")
     if data.platform_t is not None and data.platform_gyro is not None:
         found += motion(

@@ -20,7 +20,7 @@ from factors.chi_square import gate
 from factors.los import SMOOTHING, GimbalPath, LocalMotion, LosDirectionFactor
 from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
-from pipelines.graph.gyro_chain import GyroChain, state
+from pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk
 from pipelines.graph.priors import vector_prior
 from pipelines.graph.problem import Array, Factor, Parameter, Problem, Step
 from pipelines.methods.los.guess import camera, guess, initial_attitudes, seen
@@ -32,6 +32,8 @@ from pipelines.settings import DEFAULT_NOISE, Config, first_given
 # Sigmas, rad, of a chain's first attitude about t's axes: wide where pictures tell. Its turn about the line of sight is
 # free when no picture tells the camera's roll (it only turns t), and held for the sake of the arithmetic.
 _WIDE, _HELD = 0.3, 1e-3
+# Gimbal angles at a picture are settled this long after it, s.
+_SETTLED = 0.05
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,10 @@ def problem(data: LosData, config: Config) -> Problem:
         InputError: an unknown parameter in the config, only one of delta_pz and delta_gz, or fewer than ten pictures
             within the records of gyro and gimbal.
     """
-    model, dropped = _prepare(data, config)
+    return _problem(config, data, *_prepare(data, config))
+
+
+def _problem(config: Config, data: LosData, model: _Model, dropped: Mapping[str, int]) -> Problem:
     return Problem(
         method="los",
         parameters=model.parameters,
@@ -69,10 +74,25 @@ def problem(data: LosData, config: Config) -> Problem:
         loss=model.loss,
         advice=_advice,
         dropped=dropped,
+        # Errors from pictures are against the first picture of a target, which the end of a recording does not show.
+        onward=partial(_onward, config, model) if data.error_cov is None else None,
+        unsettled=_SETTLED if model.motion is None else SMOOTHING,
     )
 
 
-def _prepare(data: LosData, config: Config) -> tuple[_Model, dict[str, int]]:
+def _onward(config: Config, model: _Model, data: LosData, time: float) -> Problem | None:
+    """The graph of the end of a growing recording; see Problem.onward."""
+    trunk = ROOT if time == -np.inf else model.chain.trunk(time)
+    if trunk is None or (trunk is not ROOT and time not in data.image_t):
+        return None
+    grown, dropped = _prepare(data, config, model, trunk, time)
+    return _problem(config, data, grown, dropped) if trunk is ROOT or grown.chain.time[0] == time else None
+
+
+def _prepare(
+    data: LosData, config: Config, before: _Model | None = None, trunk: Trunk | None = None, start: float = -np.inf
+) -> tuple[_Model, dict[str, int]]:
+    """The model of a recording, or of one that grows from a keyframe of its model until now on."""
     parameters = los_parameters(config)
     noise = config.noise
     density = first_given(noise.gyro_density, data.gyro_density, DEFAULT_NOISE.gyro_density)
@@ -80,11 +100,17 @@ def _prepare(data: LosData, config: Config) -> tuple[_Model, dict[str, int]]:
     covariance = _covariance(data, gimbal, config)
     has_offset = len(parameters) == 3
     rows, starts, dropped = select_pictures(data, np.sqrt(covariance[:, 0, 0]), SMOOTHING if has_offset else 0.0)
+    late = data.image_t[rows] >= start
+    rows, starts = rows[late], starts[late]
+    starts[:1] = True
     time, measured = data.image_t[rows], data.error[rows]
     angles = gimbal.at(time)
     chains = np.split(np.arange(len(time)), np.flatnonzero(starts)[1:])
     sigma = float(np.sqrt(np.median(covariance[rows, 0, 0])))
-    mount, bias_hat = guess(chains, time, angles, measured, gyro, parameters, sigma)
+    if before is None:
+        mount, bias_hat = guess(chains, time, angles, measured, gyro, parameters, sigma)
+    else:
+        mount, bias_hat = before.mount, before.chain.gyro.bias_hat
     names = tuple(q.name for q in parameters[0].quantities)
     gyro = GyroPath(data.gyro_t, data.gyro, bias_hat)
     motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal) if has_offset else None
@@ -96,6 +122,7 @@ def _prepare(data: LosData, config: Config) -> tuple[_Model, dict[str, int]]:
         density=density,
         walk=first_given(noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk),
         scale_error=first_given(noise.gyro_scale, DEFAULT_NOISE.gyro_scale),
+        trunk=trunk,
     )
     model = _Model(
         chain=chain,
@@ -152,15 +179,15 @@ def _step(model: _Model, keyframes: range) -> Step:
     step = Step(
         time=float(chain.time[keyframes[-1]]),
         predict=partial(chain.predict, keyframes, partial(_found, model)),
-        keyframes=keyframes,
+        keyframes=chain.numbers(keyframes),
     )
-    if keyframes.start == 0:
+    if chain.first + keyframes.start == 0:
         step.initial.insert(ANGLES_KEY, model.mount)
         if model.motion is not None:
             step.initial.insert(OFFSET_KEY, np.zeros(1))
         step.factors.extend(vector_prior(p, np.zeros(len(p.quantities))) for p in model.parameters)
     step.factors.extend(_start_factor(model, k) for k in keyframes if chain.starts[k])
-    chain.add(step)
+    chain.add(step, keyframes)
     step.factors.extend(_picture_factors(model, keyframes))
     return step
 
@@ -177,7 +204,7 @@ def _start_factor(model: _Model, k: int) -> Factor:
     sigmas = np.array([_WIDE, _WIDE if rolls else _HELD, _WIDE])
     initial = model.chain.initial[k]
     noise = gtsam.noiseModel.Gaussian.SqrtInformation(so3.matrix(initial) / sigmas[:, None], False)
-    return Factor("prior", gtsam.PriorFactorRot3(state(k), so3.to_gtsam(initial), noise))
+    return Factor("prior", gtsam.PriorFactorRot3(model.chain.state(k), so3.to_gtsam(initial), noise))
 
 
 def _picture_factors(model: _Model, keyframes: range) -> list[Factor]:
@@ -200,7 +227,7 @@ def _picture_factor(model: _Model, k: NDArray[np.intp], rows: int, family: str) 
         model.names,
         None if model.motion is None else model.motion[k],
     )
-    columns: list[int | list[int]] = [[state(i) for i in k], ANGLES_KEY]
+    columns: list[int | list[int]] = [[model.chain.state(i) for i in k], ANGLES_KEY]
     if model.motion is not None:
         columns += [model.chain.bias_keys(k), OFFSET_KEY]
     return Factor.of(family, rows_model.on(*columns, loss=model.loss))

@@ -16,7 +16,7 @@ _SWAY = np.deg2rad(2.0)
 
 def checklist(data: LosData, _: Config) -> Sequence[ChecklistItem]:
     """Sway about each axis of the carrier, and whether the target was in sight."""
-    seen = f"{len(data.image_t)} LOS errors over {np.ptp(data.image_t):.0f} s"
+    seen = f"{1.0 / np.median(np.diff(data.image_t)):.3g} LOS errors/s"
     sway = turned(data.gyro_t, data.gyro)
     spread = np.rad2deg(np.ptp(data.gimbal, axis=0))
     return (

@@ -1,0 +1,86 @@
+"""Graphs of the end of a recording that grows: the steps are those of the graph of the whole."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipelines.graph.problem import Problem, Step
+from pipelines.methods import method
+from pipelines.settings import Config
+
+
+def _between(name: str, data: Any, start: float, stop: float) -> Any:
+    """What was measured in between."""
+    cut: dict[str, Any] = {}
+    for stamps, carried in method(name).hypotheses().streams.items():
+        t = getattr(data, stamps)
+        inside = (t >= start) & (t < stop)
+        cut |= {field: getattr(data, field)[inside] for field in (stamps, *carried) if getattr(data, field) is not None}
+    return dataclasses.replace(data, **cut)
+
+
+def _assert_same(step: Step, wanted: Step) -> None:
+    assert (step.time, step.keyframes, step.timestamps, step.current_keys) == (
+        wanted.time,
+        wanted.keyframes,
+        wanted.timestamps,
+        wanted.current_keys,
+    )
+    assert [f.family for f in step.factors] == [f.family for f in wanted.factors]
+    assert [list(f.factor.keys()) for f in step.factors] == [list(f.factor.keys()) for f in wanted.factors]
+
+
+def _values(problem: Problem) -> Any:
+    values: Any = None
+    for step in problem.steps(1):
+        if values is None:
+            values = step.initial
+        else:
+            values.insert(step.initial)
+    return values
+
+
+@pytest.mark.parametrize(
+    ("name", "rates"),
+    [
+        ("los", {"image_rate_hz": 4.0, "gyro_rate_hz": 50.0, "gimbal_rate_hz": 50.0}),
+        ("head", {"gyro_rate_hz": 50.0, "platform_gyro_rate_hz": 50.0, "vision_rate_hz": 5.0}),
+    ],
+)
+def test_the_steps_of_the_end_are_those_of_the_whole(name: str, rates: dict[str, Any]) -> None:
+    chosen = method(name)
+    settings = chosen.settings().model_copy(update={"duration_s": 60.0, **rates})
+    data = chosen.simulate(settings, 3).data
+    config = Config()
+    start = chosen.problem(data, config)
+    assert start.onward is not None
+    whole = start.onward(data, -np.inf)
+    assert whole is not None
+    assert whole.onward is not None
+    assert whole.steps_after is not None
+    values, wanted = _values(whole), {step.time: step for step in whole.steps(1)}
+    times = list(wanted)
+    # Where the next stretch of the bias begins.
+    problem, base = whole, next(t for t in times if t >= times[0] + 10.0)
+    taken = 0
+    for stop in (22.0, 31.0, 45.5, 60.1):
+        assert problem.onward is not None
+        grown = problem.onward(_between(name, data, base - 2.0, stop), base)
+        assert grown is not None
+        assert grown.steps_after is not None
+        steps = list(grown.steps_after(base))
+        # The last one may still grow.
+        for step in steps if stop > 60.0 else steps[:-1]:
+            _assert_same(step, wanted[step.time])
+            for mine, its in zip(step.factors, wanted[step.time].factors, strict=True):
+                ours, theirs = (f.factor.linearize(values).augmentedJacobian() for f in (mine, its))
+                np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-6 * np.abs(theirs).max())
+            taken += 1
+        problem, base = grown, steps[-5].time
+    assert taken > 0.7 * len(times)
+    assert problem.onward is not None
+    assert problem.onward(data, base + 1e-4) is None, "there is no keyframe"
