@@ -15,8 +15,8 @@ import pytest
 
 from pipelines.methods.head.recording import HeadData, write_head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from pipelines.settings import IDEAL
 from pipelines.simulation.scenario import load_scenario
+from tests.builders import IDEAL
 from tests.command import Command, Run
 
 

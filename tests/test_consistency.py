@@ -28,8 +28,9 @@ from pipelines.methods.head.recording import write_head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.settings import IDEAL, Config, Sensors
+from pipelines.settings import Config, Sensors
 from pipelines.simulation.motion import EulerMotion, Swing
+from tests.builders import IDEAL
 
 Case = tuple[Method, Any, Config]
 

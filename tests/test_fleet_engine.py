@@ -23,7 +23,7 @@ from pipelines.fleet.fleet import Settings, calibrate_fleet
 from pipelines.fleet.recordings import find
 from pipelines.methods.head.recording import write_head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from pipelines.settings import IDEAL
+from tests.builders import IDEAL
 
 pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
 pytest.importorskip("arro3.io", reason="needs the extra alidade[fleet]")
