@@ -1,8 +1,8 @@
-"""A sweep over what sensors may be off: python -m benchmarks.effects METHOD [--seeds N] [--out FILE].
+"""A sweep over what sensors may be off: python -m benchmarks.effects METHOD [--only EFFECT ...] [--seeds N] ...
 
 Every assumption of a method in turn, from a third of its prior to ten times that, with a random sign for each of its
-numbers; what the calibration's status was, how far the worst of the parameters that matter was off in its sigmas and in
-what is required of it, and what the headline named first.
+numbers, and nothing at all; what the calibration's status was, how far the worst of the parameters that matter was off
+in its sigmas and in what is required of it, what the headline named first, and whether something was said to change.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import numpy as np
 from pipelines import methods
 from pipelines.session import Session
 
+NOTHING = "nothing"
 SIZES = (0.3, 1.0, 3.0, 6.0, 10.0)
 # Errors beyond the first are wrong, up to the second and half of what is required right.
 WRONG, RIGHT = 4.0, 3.0
@@ -54,6 +55,7 @@ class Found:
         sigmas: the largest error of a parameter that is no assumption, in its sigmas.
         required: likewise, in what is required.
         determined: whether the recording told a number of the effect to better than half of its prior.
+        changed: whether something was said to have changed over the recording.
         named: whether the first sentence of the headline names the effect, alone or with what it cannot be told from.
         headline: whole.
     """
@@ -63,6 +65,7 @@ class Found:
     sigmas: float
     required: float
     determined: bool
+    changed: bool
     named: bool
     headline: str
 
@@ -71,7 +74,7 @@ def effects(method: str, scenario: str | None) -> dict[str, dict[str, float]]:
     """Effect -> the parameters it consists of, with their priors."""
     chosen = methods.method(method)
     session = Session.of(chosen, chosen.simulate(chosen.settings(scenario), 0))
-    found: dict[str, dict[str, float]] = {}
+    found: dict[str, dict[str, float]] = {NOTHING: {}}
     for q in session.problem().quantities:
         if q.group == "assumption" and q.prior_sigma:
             found.setdefault(_AXES.sub("", q.name), {})[q.name] = q.prior_sigma
@@ -102,6 +105,7 @@ def run(case: Case, numbers: Mapping[str, float]) -> Found:
         max((sigmas for sigmas, _ in off), default=0.0),
         max((required for _, required in off), default=0.0),
         any(told),
+        calibration.stability is not None and calibration.stability.changed,
         any(name in first for name in numbers),
         headline,
     )
@@ -132,6 +136,9 @@ def report(found: Sequence[Found]) -> Iterator[str]:
     )
     yield f"named first from {NAMED_FROM:g} times the prior on, where told: {sum(f.named for f in far)} of {len(far)}"
     refused = sum(f.status == "inconsistent" for f in right)
+    changed = [f.changed for f in found if f.case.effect == NOTHING]
+    if changed:
+        yield f"without any effect said to have changed: {sum(changed)} of {len(changed)}"
     yield f"within the priors inconsistent although right: {refused} of {len(right)}"
 
 
@@ -140,6 +147,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.effects", description=__doc__.split("\n\n")[1])
     parser.add_argument("method")
     parser.add_argument("--scenario", help="default: the nominal one")
+    parser.add_argument(
+        "--only", nargs="+", metavar="EFFECT", help=f"default: all; {NOTHING}: sensors as they should be"
+    )
     parser.add_argument("--solver", default="batch", choices=("batch", "incremental"))
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--jobs", type=int, default=1)
@@ -148,7 +158,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     swept = effects(options.method, options.scenario)
     cases = [
         Case(options.method, options.scenario, options.solver, effect, size, seed)
-        for effect, size, seed in product(swept, SIZES, range(options.seeds))
+        for effect in options.only or swept
+        for size, seed in product((0.0,) if effect == NOTHING else SIZES, range(options.seeds))
     ]
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as processes:
         found = list(processes.map(run, cases, [swept[case.effect] for case in cases]))

@@ -27,4 +27,5 @@ def test_within_its_prior_it_is_right_and_far_beyond_it_is_named(tmp_path: Path)
     assert within.sigmas < 4.0
     assert not within.named
     assert (far.status, far.determined, far.named) == ("inconsistent", True, True)
+    assert not far.changed
     assert "named first from 6 times the prior on, where told: 1 of 1" in list(report(found))

@@ -55,6 +55,23 @@ def test_a_change_is_found_where_it_is() -> None:
     assert next(iter(found.departures)) == "a"
 
 
+def test_a_value_far_beyond_its_prior_is_no_change() -> None:
+    """The mean of readings of 10, with a prior of 0 +- 1: as precise as one of them."""
+    rng = np.random.default_rng(2)
+    n = 40
+    k = np.arange(1, n + 1)
+    values = np.cumsum(rng.normal(10.0, 1.0, n)) / (k + 1)
+    P = np.asarray(1.0 / (k + 1.0), dtype=float)
+    history = History(k.astype(float), values[:, None], np.sqrt(P)[:, None], P[:, None, None], np.array([True]))
+    estimate = Estimate("batch", ("a",), values[-1:], np.array([[P[-1]]]), True, "", history=history)
+    found = stability(estimate, [Quantity("a", "rad", 1.0, 1.0, 1.0)])
+    assert found is not None
+    assert not found.changed
+    taken_for_true = stability(estimate, [Quantity("a", "rad", None, 1.0, 1.0)])
+    assert taken_for_true is not None
+    assert taken_for_true.changed
+
+
 def test_what_walks_or_is_fixed_may_change() -> None:
     estimate, quantities = walk(np.random.default_rng(1), change=3.0)
     history = estimate.history

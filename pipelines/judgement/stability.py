@@ -4,6 +4,9 @@ If nothing changed, the estimate from what was recorded until t differs from the
 covariance P(t) - P(T): the later estimate uses all that the earlier one does, and more (Hausman 1978, for an estimator
 that is efficient). The largest such difference over the recording is held against what chance does: paths drawn with
 the same covariances, whose steps from moment to moment are independent.
+
+That takes the priors for true. A parameter far beyond its prior departs from it as it becomes known, and nothing has
+changed: such priors are widened to what was found before anything is compared.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipelines.graph.assumptions import pull
 from pipelines.graph.problem import Array, Estimate, Quantity
 from pipelines.judgement.halves import Halves
 
@@ -24,6 +28,8 @@ _PATHS, _BATCH = 4000, 500
 _LEAST = 1e-3
 # A step between the sides of a change is more than chance beyond so many sigmas.
 _STEP = 3.0
+# Priors are widened to what was found from so many sigmas on.
+_BEYOND = 3.0
 # Two moments make no path.
 _FEWEST_MOMENTS = 5
 
@@ -103,8 +109,9 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
     kept = np.flatnonzero(history.steady & np.array([q.prior_sigma != 0.0 for q in quantities], dtype=bool))
     if len(history.time) < _FEWEST_MOMENTS or not len(kept):
         return None
-    P = history.covariance[:, kept[:, None], kept]
-    difference = history.values[:-1, kept] - history.values[-1, kept]
+    values, covariance = _with_priors_as_found(estimate, quantities, history.values, history.covariance)
+    P = covariance[:, kept[:, None], kept]
+    difference = values[:-1, kept] - values[-1, kept]
     whitening = [_whitening(P[i], P[-1]) for i in range(len(P) - 1)]
     ranks = np.array([len(rows) for rows in whitening])
     sizes = _as_normal(np.array([((W @ d) ** 2).sum() for W, d in zip(whitening, difference, strict=True)]), ranks)
@@ -114,6 +121,25 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
     by_size = np.argsort(-np.abs(difference[worst] / sigmas))
     departures = {quantities[kept[j]].name: float(difference[worst, j] / sigmas[j]) for j in by_size}
     return Stability(float(sizes[worst]), beyond, float(history.time[worst]), departures)
+
+
+def _with_priors_as_found(
+    estimate: Estimate, quantities: Sequence[Quantity], values: Array, P: Array
+) -> tuple[Array, Array]:
+    """The history (k, n), (k, n, n) as it is when no parameter lies far beyond its prior.
+
+    Widening one prior changes the information by a number on the diagonal (Sherman, Morrison 1950).
+    """
+    for i, q in enumerate(quantities):
+        prior = q.prior_sigma or 0.0
+        size = pull(q, float(estimate.values[i]), float(estimate.sigmas[i]))
+        if size is None or abs(size) < _BEYOND:
+            continue
+        added = 1.0 / (size * prior) ** 2 - 1.0 / prior**2
+        column = P[:, :, i] / (1.0 + added * P[:, i, i])[:, None]
+        values = values - added * (values[:, i] - q.prior_mean)[:, None] * column
+        P = P - added * column[:, :, None] * P[:, i, None, :]
+    return values, P
 
 
 def _whitening(P: Array, last: Array) -> Array:
