@@ -59,7 +59,7 @@ class Bridge:
                     context=self._context,
                 )
         self.subscribed: set[str] = set()
-        self.played = threading.Event()
+        self._played: float | None = None
         self.came: dict[int, float] = {}  # log time -> when it was played
         self._ready, self._over = threading.Event(), threading.Event()
         self._server = self._serve(0)
@@ -73,6 +73,11 @@ class Bridge:
     def __exit__(self, *_: object) -> None:
         self._over.set()
         self._server.stop()
+
+    @property
+    def is_over(self) -> bool:
+        """Whether all has been played, and had time to come."""
+        return self._played is not None and time.monotonic() - self._played > 0.5
 
     def on_subscribe(self, _: object, channel: Any) -> None:
         self.subscribed.add(channel.topic)
@@ -99,7 +104,7 @@ class Bridge:
                 assert self._ready.wait(30.0), "nobody came back"
             self._channels[channel.topic].log(data, log_time=log_ns)
             self.came[log_ns] = time.monotonic()
-        self.played.set()
+        self._played = time.monotonic()
 
 
 def write(whole: Iterator[Message] | list[Message], out: BinaryIO, chunk_size: int = 20_000) -> None:

@@ -7,7 +7,7 @@ import json
 import os
 import struct
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -64,11 +64,13 @@ def batch(whole: Path) -> Calibration:
     return calibrate(whole, ["incremental"])[0]
 
 
-def follow(source: Source, settings: Settings) -> tuple[Calibration, list[View], list[str]]:
+def follow(
+    source: Source, settings: Settings, stopped: Callable[[], bool] = lambda: False
+) -> tuple[Calibration, list[View], list[str]]:
     views: list[View] = []
     said: list[str] = []
     with source:
-        return Follower(source, settings, views.append, said.append, lambda: False).follow(), views, said
+        return Follower(source, settings, views.append, said.append, stopped).follow(), views, said
 
 
 def agree(calibration: Calibration, batch: Calibration, sigmas: float = 0.05) -> None:
@@ -136,9 +138,9 @@ def test_a_bridge_that_hangs_up_and_comes_back(whole: Path, config: Path, tmp_pa
     said: list[str] = []
     with Bridge(messages(whole), 4.0, drop_at=0.5) as bridge:
         kept = tmp_path / "kept"
-        settings = Settings(config=config, patience=1.5)
-        calibration, views, _ = follow(source_of(bridge.url, kept, said.append), settings)
-    assert bridge.played.is_set()
+        calibration, views, _ = follow(
+            source_of(bridge.url, kept, said.append), Settings(config=config), lambda: bridge.is_over
+        )
     truth = {"delta_px", "delta_gx", "delta_gy"}
     assert truth <= set(calibration.parameters)
     again = calibrate(next(kept.glob("*.mcap")), ["incremental"], None, config)[0]
@@ -156,7 +158,7 @@ def test_a_bridge_is_asked_for_sensors_alone(whole: Path, config: Path) -> None:
     text = replace(schema, name="std_msgs/msg/String", data=b"string data")
     other = text, replace(channel, topic="/chatter"), log_ns, b"\0\1\0\0\2\0\0\0a\0"
     with Bridge([other, *sent], 8.0, also=("/chatter",)) as bridge:
-        follow(source_of(bridge.url, None, lambda _: None), Settings(config=config, patience=1.0))
+        follow(source_of(bridge.url, None, lambda _: None), Settings(config=config), lambda: bridge.is_over)
         assert bridge.subscribed == {"/imu", "/gimbal/joint_states", "/los/error"}
 
 
