@@ -163,16 +163,21 @@ def validate(
     config: _ConfigFile = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the page; default: SESSION-validation.")] = None,
     strict: _Strict = False,
+    as_json: _Json = False,
     quiet: _Quiet = False,
 ) -> None:
     """Errors of a recording before and after compensation with a calibration made on another one."""
     from pipelines import progress, terminal
+    from pipelines.reports.plain_json import validation_json
     from pipelines.validate import table, write_validation
     from pipelines.validate import validate as run
 
-    with progress.shown(quiet), progress.doing("validating"):
+    with progress.shown(quiet or as_json), progress.doing("validating"):
         validated = run(session, calibration, method, config, strict)
         written = write_validation(out or _beside(session, "validation"), validated)
+    if as_json:
+        print(validation_json(validated))
+        return
     for line in table(validated):
         terminal.say(line)
     for note in validated.notes:
@@ -207,18 +212,24 @@ def plan(
     config: _ConfigFile = None,
     require: Annotated[list[str] | None, typer.Option(help="NAME=SIGMA wanted, SI; may be repeated.")] = None,
     out: Annotated[Path | None, typer.Option(help="File for the better motion, as a scenario.")] = None,
+    as_json: _Json = False,
     quiet: _Quiet = False,
 ) -> None:
     """How well a planned motion would determine each parameter, and a better one. Exit code 3 if less than required."""
     from pipelines import progress, terminal
     from pipelines.planning import make_plan, requirements, write_scenario
+    from pipelines.reports.plain_json import plan_json
 
-    with progress.shown(quiet):
+    with progress.shown(quiet or as_json):
         planned = make_plan(method, scenario, config, requirements(require or []))
-    terminal.show_plan(planned)
     if out is not None:
         write_scenario(out, planned)
-        terminal.say(f"The better motion is in {out}")
+    if as_json:
+        print(plan_json(planned))
+    else:
+        terminal.show_plan(planned)
+        if out is not None:
+            terminal.say(f"The better motion is in {out}")
     raise typer.Exit(exit_codes.OF_STATUS[planned.now.assessment.status])
 
 
@@ -306,22 +317,27 @@ def montecarlo(
     scheduler: _Scheduler = None,
     jobs: _Jobs = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: METHOD-montecarlo.")] = None,
+    as_json: _Json = False,
     quiet: _Quiet = False,
 ) -> None:
     """Simulate and solve many recordings: are the sigmas true? The same command goes on after an interruption."""
     from pipelines import progress, terminal
     from pipelines.fleet.montecarlo import SOLVERS, run_study
     from pipelines.fleet.write import write_study
+    from pipelines.reports.plain_json import study_json
 
     folder = out or Path(f"{method}-montecarlo")
     chosen = SOLVERS if solvers == "all" else tuple(solvers.split(","))
     seeds = range(seed, seed + runs)
-    with progress.shown(quiet):
+    with progress.shown(quiet or as_json):
         study = run_study(method, scenario, seeds, chosen, folder, scheduler, jobs, _seconds(window))
     written = write_study(folder, study)
-    for line in study.summary:
+    for line in () if as_json else study.summary:
         terminal.say(line)
-    terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
+    if as_json:
+        print(study_json(study))
+    else:
+        terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
     if study.interrupted:
         raise typer.Exit(exit_codes.INTERRUPTED)
 
@@ -337,6 +353,7 @@ def fleet(
     scheduler: _Scheduler = None,
     jobs: _Jobs = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("alidade-fleet"),
+    as_json: _Json = False,
     quiet: _Quiet = False,
 ) -> None:
     """Calibrate many recordings and compare units and dates. The same command goes on after an interruption."""
@@ -345,14 +362,19 @@ def fleet(
     from pipelines.fleet.fleet import Settings, calibrate_fleet
     from pipelines.fleet.recordings import find
     from pipelines.fleet.write import write_fleet
+    from pipelines.reports.plain_json import fleet_json
 
     settings = Settings.of(method, config, solver.value, _seconds(window))
-    with progress.shown(quiet):
+    with progress.shown(quiet or as_json):
         outcome = calibrate_fleet(find(recordings), settings, out, scheduler, jobs, names)
-    written = write_fleet(out, outcome, populations(outcome.results))
-    for line in outcome.summary:
+    found = populations(outcome.results)
+    written = write_fleet(out, outcome, found)
+    for line in () if as_json else outcome.summary:
         terminal.say(line)
-    terminal.say(f"Results in {out}: {', '.join(p.name for p in written)}")
+    if as_json:
+        print(fleet_json(outcome, found))
+    else:
+        terminal.say(f"Results in {out}: {', '.join(p.name for p in written)}")
     if outcome.interrupted:
         raise typer.Exit(exit_codes.INTERRUPTED)
 
@@ -362,17 +384,23 @@ def export(
     calibration: Annotated[Path, typer.Argument(metavar="CALIBRATION.yaml", help="The calibration.")],
     form: Annotated[str, typer.Option("--format", help="Of a cube: px4, ardupilot, ros2 or kalibr.")],
     out: Annotated[Path | None, typer.Option(help="The file to write; default: printed.")] = None,
+    as_json: _Json = False,
 ) -> None:
     """A calibration as the parameters of another program, in its own conventions."""
     from pipelines import terminal
     from pipelines.reports.calibration import load_calibration
     from pipelines.reports.export import exported
+    from pipelines.reports.plain_json import plain_json
 
-    text = exported(load_calibration(calibration), form)
-    if out is None:
+    saved = load_calibration(calibration)
+    text = exported(saved, form)
+    if out is not None:
+        _write(out, text)
+    if as_json:
+        print(plain_json("export", {"method": saved.method, "format": form, "text": text}))
+    elif out is None:
         print(text, end="")
     else:
-        _write(out, text)
         terminal.say(f"Wrote {out}")
 
 

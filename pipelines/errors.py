@@ -7,6 +7,8 @@ from collections.abc import Iterable
 
 # Longer lines help nobody; names in a hostile recording can be as long as it likes.
 _LONGEST = 2000
+# What people call a noise density.
+_DENSITY = ("noise", "sigma")
 
 
 class InputError(Exception):
@@ -30,5 +32,12 @@ def printable(text: str, longest: int = 200) -> str:
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """A phrase that names the known name nearest to a wrong one."""
-    found = difflib.get_close_matches(name, list(known), n=1, cutoff=0.0)
+    names = list(known)
+    meant = [other for word in _DENSITY if (other := name.replace(word, "density")) in names]
+    found = meant or difflib.get_close_matches(name, names, n=1, cutoff=0.0)
     return f"; the nearest known key is {found[0]}" if found else ""
+
+
+def nearest_three(name: str, known: Iterable[str]) -> str:
+    """A phrase that names the known names nearest to a wrong one."""
+    return f"the nearest are {', '.join(difflib.get_close_matches(name, list(known), n=3, cutoff=0.0))}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -73,6 +74,10 @@ def test_study_goes_on_and_sums_up(
     said = capsys.readouterr().out
     assert "6 of 6 runs, 4 from an earlier run" in said
     assert "batch: mean NEES" in said
+    assert alidade(monkeypatch, *common, "--runs", 6, "--out", out, "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["schema"], told["wanted"], told["interrupted"]) == ("alidade.montecarlo/1", 6, False)
+    assert {run["seed"] for run in told["runs"]} == set(range(6))
     page = (out / "montecarlo.html").read_text()
     assert "default-src 'none'" in page
     for text in ("mean NEES", "gyro_bias_x", "batch: NEES", "batch: errors in sigmas"):
@@ -86,7 +91,7 @@ def test_study_goes_on_and_sums_up(
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["gyro"], "no method 'gyro'; the methods are los"),
+        (["gyro"], "no method 'gyro'; the nearest are "),
         (["head", "--scenario", "nothing"], "no scenario file nothing"),
         (["head", "--solvers", "magic"], "no solver 'magic'; the solvers are published, batch, incremental, or all"),
         (["head", "--runs", "0"], "at least one run"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
 import zipfile
 from collections.abc import Iterator
@@ -102,6 +103,22 @@ def calibrated(forty: Path, scheduler: str, tmp_path_factory: pytest.TempPathFac
     with pytest.MonkeyPatch.context() as monkeypatch:
         assert alidade(monkeypatch, "fleet", forty / "*.mcap", *NAMES, "--scheduler", scheduler, "--out", out) == 0
     return out
+
+
+def test_the_table_as_json(
+    calibrated: Path,
+    forty: Path,
+    scheduler: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    common = ("fleet", forty / "*.mcap", *NAMES, "--scheduler", scheduler, "--out", calibrated)
+    assert alidade(monkeypatch, *common, "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["schema"], told["wanted"], told["interrupted"]) == ("alidade.fleet/1", 40, False)
+    rows = {row["recording"]: row for row in rows_of(calibrated / "fleet.csv")}
+    assert {row["recording"]: row["status"] for row in told["recordings"]} == {k: v["status"] for k, v in rows.items()}
+    assert any(change["unit"] == "U33" for change in told["changes"])
 
 
 def test_the_table_is_complete(calibrated: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from pipelines.methods.cube.scenario import CubeScenario
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from pipelines.planning import Prediction, make_plan, predict, requirements, write_scenario
+from pipelines.reports.plain_json import plan_json
 from pipelines.settings import Sensors
 from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.simulation.scenario import load_scenario
@@ -82,6 +84,9 @@ def test_what_is_weak_gets_advice_and_a_motion_that_mends_it(tmp_path: Path) -> 
         " carrier: {roll: [{amplitude_deg: 6, frequency_hz: 0.21}], pitch: [{amplitude_deg: 5, frequency_hz: 0.17}]}}",
     )
     plan = make_plan("los", weak, require={"delta_px": 5e-4}, most_steps=2)
+    told = json.loads(plan_json(plan))
+    assert (told["schema"], told["status"], len(told["changes"])) == ("alidade.plan/1", "weak", len(plan.steps))
+    assert told["missing"].keys() == plan.now.missing.keys()
     assert plan.now.assessment.status in ("weak", "unobservable")
     assert any("azimuth" in direction.advice for direction in plan.now.assessment.directions)
     assert plan.steps

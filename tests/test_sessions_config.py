@@ -81,6 +81,7 @@ def test_the_file_overrides_key_by_key(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("nois: {}", "unknown key nois; the nearest known key is noise"),
+        ("noise: {gyro_noise: 1}", r"unknown key noise\.gyro_noise; the nearest known key is gyro_density"),
         ("noise: {gyro_densty: 1}", r"unknown key noise\.gyro_densty; the nearest known key is gyro_density"),
         ("cube: {tags: {16: {size: 1, rotaton: []}}}", r"unknown key cube\.tags\.16\.rotaton; .* is rotation"),
         ("cube: {tags: {16: {sise: 1}}}", r"unknown key cube\.tags\.16\.sise; the nearest known key is size"),

@@ -17,7 +17,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from pipelines.errors import InputError
+from pipelines.errors import InputError, nearest_three
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -174,7 +174,7 @@ def method(name: str) -> Method:
         return found
     entry = _brought().get(name)
     if entry is None:
-        raise InputError(f"no method {name!r}; the methods are {', '.join(names())}")
+        raise InputError(f"no method {name!r}; {nearest_three(name, names())}")
     try:
         made = entry.load()()
     except Exception as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import reprlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from pipelines.errors import InputError, nearest
+from pipelines.errors import InputError, nearest, nearest_three
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -50,8 +49,7 @@ def _find(name_or_path: str | Path, folders: Sequence[Path]) -> Path:
     shipped = {p.stem: p for folder in folders for p in sorted(folder.glob("*.yaml"))}
     if str(name_or_path) in shipped:
         return shipped[str(name_or_path)]
-    near = difflib.get_close_matches(str(name_or_path), sorted(shipped), n=3, cutoff=0.0)
-    raise InputError(f"no scenario file {name_or_path}; the nearest are {', '.join(near)}")
+    raise InputError(f"no scenario file {name_or_path}; {nearest_three(str(name_or_path), sorted(shipped))}")
 
 
 def explain(error: ErrorDetails, model: type[BaseModel]) -> str:

@@ -1,0 +1,115 @@
+"""What commands print with --json: SI, and null where a number is not finite."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from pipelines.judgement.validation import peak, rms
+
+if TYPE_CHECKING:
+    from pipelines.fleet.analysis import Population
+    from pipelines.fleet.fleet import Outcome
+    from pipelines.fleet.montecarlo import Study
+    from pipelines.planning import Plan
+    from pipelines.validate import Validated
+
+
+def plain_json(kind: str, content: Mapping[str, Any]) -> str:
+    """The text, under its schema `alidade.<kind>/1`."""
+    return json.dumps({"schema": f"alidade.{kind}/1", **_finite(content)}, indent=1, allow_nan=False)
+
+
+def validation_json(validated: Validated) -> str:
+    """Of `validate`: RMS and peak of every kind of error, before and after."""
+    return plain_json(
+        "validation",
+        {
+            "recording": validated.recording,
+            "method": validated.calibration.method,
+            "validations": [
+                {"name": v.name, "unit": v.unit}
+                | {
+                    size.__name__: {"before": size(v.before), "after": size(v.after)}  # both of lengths of errors
+                    for size in (rms, peak)
+                }
+                for v in validated.validations
+            ],
+            "notes": validated.notes,
+        },
+    )
+
+
+def plan_json(plan: Plan) -> str:
+    """Of `plan`: sigmas as predicted, now and with all changes, what is missing, and the changes."""
+    now, best = plan.now, plan.best
+    return plain_json(
+        "plan",
+        {
+            "method": plan.method,
+            "status": now.assessment.status,
+            "duration_s": now.duration,
+            "parameters": [
+                {
+                    "name": q.name,
+                    "unit": q.unit,
+                    "require": q.require,
+                    "sigma": now.sigmas[q.name],
+                    "sigma_with_changes": best.sigmas[q.name],
+                    "verdict": now.assessment.verdicts[q.name],
+                }
+                for q in now.quantities
+                if q.judged
+            ],
+            "directions": [
+                {"verdict": d.verdict, "label": d.label, "advice": d.advice} for d in now.assessment.directions
+            ],
+            "changes": [{"change": step.change, "gain": step.gain} for step in plan.steps],
+            "missing": now.missing,
+            "missing_with_changes": best.missing,
+            "scenario": plan.scenario_text,
+        },
+    )
+
+
+def fleet_json(outcome: Outcome, fleet: Sequence[Population]) -> str:
+    """Of `fleet`: the rows of fleet.csv and changes.csv."""
+    from pipelines.fleet.analysis import change_table, table
+
+    return plain_json(
+        "fleet",
+        {
+            "recordings": table(outcome.results, fleet),
+            "changes": change_table(fleet),
+            "wanted": outcome.recordings,
+            "interrupted": outcome.interrupted,
+        },
+    )
+
+
+def study_json(study: Study) -> str:
+    """Of `montecarlo`: the rows of runs.csv and summary.csv."""
+    from pipelines.fleet.montecarlo import run_table, summary_table
+
+    return plain_json(
+        "montecarlo",
+        {
+            "method": study.method,
+            "scenario": study.scenario,
+            "runs": run_table(study),
+            "summary": summary_table(study),
+            "wanted": study.seeds,
+            "interrupted": study.interrupted,
+        },
+    )
+
+
+def _finite(value: Any) -> Any:
+    """Without NaN and infinity, which JSON has not got."""
+    if isinstance(value, Mapping):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
