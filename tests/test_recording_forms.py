@@ -16,16 +16,17 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from pipelines.config import load_config
 from pipelines.errors import InputError
-from pipelines.methods import simulate
+from pipelines.methods import method, simulate
 from pipelines.methods.head.topics import VISION_ATTITUDE
 from pipelines.recording import messages, series
+from pipelines.recording.checks import density
 from pipelines.recording.gyro import read_gyro
 from pipelines.recording.reading import Recording, open_recording
 from pipelines.recording.sources import TopicSource, inverted
 from pipelines.recording.topics import IMU
 from pipelines.recording.writing import write_session
 from pipelines.session import calibrate
-from tests import forms
+from tests import forms, live
 from tests.recorded import T0, assert_same, session
 from tests.turning import turning, write_csv
 
@@ -678,6 +679,41 @@ def test_messages_without_a_stamp_are_told_with_the_jitter_of_what_stands_in(tmp
     (note,) = recording.notes
     assert note.startswith("topic /v: 400 of 400 messages have no stamp; the log times stand in")
     assert 0.3 < float(note.split("jitter by ")[1].split(" ms")[0]) < 0.5
+    assert recording.stamp_sigma_s == pytest.approx(np.hypot(0.01, 4e-4), rel=0.01)
+
+
+def test_log_times_in_place_of_stamps_stand_in_the_sigma_of_the_time_offset(tmp_path: Path) -> None:
+    """Vision without stamps, logged 8 ms late: the offset reported is 8 ms off, and says that it may be."""
+    chosen, few = method("head"), {"gyro_rate_hz": 100.0, "platform_gyro_rate_hz": 100.0, "vision_rate_hz": 10.0}
+    simulated = chosen.simulate(chosen.settings("head_mounts").model_copy(update={"duration_s": 10.0, **few}), 2)
+    chosen.write(tmp_path / "s.mcap", simulated)
+    late = 8_000_000
+
+    def unstamped(message: live.Message) -> live.Message:
+        schema, channel, log_ns, data = message
+        if channel.topic != "/vision/attitude":
+            return message
+        return schema, channel, log_ns + late, data[:4] + bytes(8) + data[12:]
+
+    whole = sorted(map(unstamped, live.messages(tmp_path / "s.mcap")), key=lambda message: message[2])
+    with (tmp_path / "late.mcap").open("wb") as out:
+        live.write(whole, out)
+    config = tmp_path / "c.yaml"
+    config.write_bytes(open_recording(tmp_path / "s.mcap").attachment("alidade.yaml") or b"")
+    offset = calibrate(tmp_path / "late.mcap", ["batch"], None, config)[0].parameters["time_offset"]
+    assert simulated.truth["time_offset"] - offset.value == pytest.approx(8e-3, abs=2e-3)
+    assert 0.01 < offset.sigma < 0.012
+
+
+@pytest.mark.parametrize(
+    ("variance", "least", "believed"), [(1e-6, 1e-7, 1e-4), (1e-12, 1e-6, None), (-1.0, 1e-7, None), (0.0, 1e-7, None)]
+)
+def test_covariances_that_no_sensor_has_are_not_believed(variance: float, least: float, believed: float | None) -> None:
+    dropped: dict[str, int] = {}
+    covariance = np.broadcast_to(np.diag([variance, *(2 * [abs(variance)])]), (50, 3, 3))
+    found = density("/imu", 0.01 * np.arange(50.0), covariance, least, dropped)
+    assert found == (None if believed is None else pytest.approx(believed))
+    assert sum(dropped.values()) == (50 if variance in (1e-12, -1.0) else 0)
 
 
 def test_a_covariance_no_gyro_has_is_not_believed(tmp_path: Path) -> None:
@@ -688,7 +724,7 @@ def test_a_covariance_no_gyro_has_is_not_believed(tmp_path: Path) -> None:
         dropped: dict[str, int] = {}
         _, _, density = read_gyro(open_recording(tmp_path / "s.mcap"), "/imu", T0, dropped)
         assert density == (None if believed is None else pytest.approx(believed))
-        assert (500 in dropped.values()) == (variance == 1e-12)
+        assert (500 in dropped.values()) == (variance in (1e-12, -1.0))
 
 
 def test_the_same_calibration_out_of_another_form(tmp_path: Path) -> None:

@@ -16,6 +16,9 @@ Array = NDArray[np.float64]
 MAX_RATE_RAD_S = 35.0
 # Quaternions further from unit length are not rounding but another quantity.
 MAX_NORM_ERROR = 1e-3
+# The best sensors there are have more noise, rad/s/sqrt(Hz), m/s^2/sqrt(Hz) and T/sqrt(Hz). Drivers that know nothing
+# write a variance of 1e-12, say.
+LEAST_GYRO, LEAST_ACCEL, LEAST_MAG = 2e-7, 1e-6, 1e-12
 # A few stamps out of place are a recorder's hiccup, more are a broken time base.
 MAX_BAD_STAMPS = 0.01
 
@@ -98,15 +101,30 @@ def check_overlap(spans: Mapping[str, Array]) -> None:
         raise InputError(f"no stretch of time is covered by all of: {described}; are the clocks the same?")
 
 
-def gyro_density(t: Array, covariance: Array) -> float | None:
-    """Noise density, rad/s/sqrt(Hz), from the covariances (N, 3, 3) of samples: sigma/sqrt(rate); None if unknown.
+def density(topic: str, t: Array, covariance: Array, least: float, dropped: dict[str, int]) -> float | None:
+    """Noise density, per sqrt(Hz), from the covariances (N, 3, 3) of samples: sigma/sqrt(rate); None if unknown.
 
-    Unknown is what the messages say with zero or -1.
+    Unknown is what the messages say with zero, with -1, or with less than `least`, a density that no sensor has; the
+    last two are counted in `dropped`.
     """
+    step = float(np.median(np.diff(t)))
+    covariance = believed(topic, covariance, least**2 / step, dropped)
     variance = float(np.trace(covariance.mean(axis=0))) / 3.0
-    if not np.isfinite(variance) or variance <= 0.0:
-        return None
-    return float(np.sqrt(variance * np.median(np.diff(t))))
+    return float(np.sqrt(variance * step)) if np.isfinite(variance) and variance > 0.0 else None
+
+
+def believed(topic: str, covariance: Array, least: float, dropped: dict[str, int]) -> Array:
+    """Covariances (N, 3, 3), zero in place of those that start with -1 or have a smaller mean variance than `least`.
+
+    Both are what drivers write that know nothing; they are counted in `dropped`.
+    """
+    absent = covariance[:, 0, 0] == -1.0
+    variance = np.trace(covariance, axis1=1, axis2=2) / 3.0
+    tiny = ~absent & (variance > 0.0) & (variance < least)
+    count(dropped, f"{topic}: covariance of -1, not believed (kept)", int(np.count_nonzero(absent)))
+    count(dropped, f"{topic}: covariance too small for any sensor, not believed (kept)", int(np.count_nonzero(tiny)))
+    unknown = absent | tiny
+    return np.where(unknown[:, None, None], 0.0, covariance) if unknown.any() else covariance
 
 
 def count(dropped: dict[str, int], reason: str, number: int) -> None:

@@ -5,15 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.recording.checks import check_gyro, clean, count, gyro_density
+from pipelines.recording.checks import LEAST_GYRO, check_gyro, clean, count, density
 from pipelines.recording.faults import drop_faults
 from pipelines.recording.reading import Recording
 from pipelines.recording.series import ImuSeries
 
 Array = NDArray[np.float64]
-
-# rad/s/sqrt(Hz); the best gyros there are have three times as much. Drivers that know nothing write 1e-12, say.
-_LEAST_DENSITY = 1e-7
 
 
 def read_gyro(
@@ -25,11 +22,7 @@ def read_gyro(
     """
     imu = recording.imu(topic)
     t, keep = usable(topic, imu, epoch_ns, dropped)
-    density = gyro_density(t, imu.gyro_cov[keep])
-    if density is not None and density < _LEAST_DENSITY:
-        count(dropped, f"{topic}: covariance too small for any gyro, not believed (kept)", len(t))
-        density = None
-    return t, imu.gyro[keep], density
+    return t, imu.gyro[keep], density(topic, t, imu.gyro_cov[keep], LEAST_GYRO, dropped)
 
 
 def read_imu(
@@ -43,7 +36,7 @@ def read_imu(
     t, keep = usable(topic, imu, epoch_ns, dropped)
     force = imu.accel[keep]
     told = np.isfinite(force).all() and force.any() and not (imu.accel_cov[keep, 0, 0] == -1.0).any()
-    return t, imu.gyro[keep], gyro_density(t, imu.gyro_cov[keep]), force if told else None
+    return t, imu.gyro[keep], density(topic, t, imu.gyro_cov[keep], LEAST_GYRO, dropped), force if told else None
 
 
 def usable(

@@ -33,6 +33,9 @@ from pipelines.recording.table_topics import TableTopic, described
 # Pairs of frames an error lists.
 _MOST_PAIRS = 30
 
+# How late messages usually are when they are logged, s.
+_LATE = 0.01
+
 AnySeries = TypeVar("AnySeries", bound=series.Series)
 
 
@@ -52,6 +55,9 @@ class Recording:
     Args:
         container: where its messages are.
         epoch_ns: start of the session, Unix ns, where the container has not got its first messages.
+
+    Attributes:
+        stamp_sigma_s: how well the stamps read by now are known, s: 0, but where log times stand in for them.
     """
 
     def __init__(self, container: Container, epoch_ns: int | None = None) -> None:
@@ -60,6 +66,7 @@ class Recording:
         self._epoch_ns = epoch_ns
         self._reader = MessageReader(container, str(container.path), epoch_ns)
         self._made: dict[str, TopicSource] = {}
+        self.stamp_sigma_s = 0.0
 
     @property
     def topics(self) -> Mapping[str, Topic]:
@@ -351,9 +358,11 @@ class Recording:
             return
         steps = np.diff(t_ns)
         jitter = 1.4826 / np.sqrt(2.0) * float(np.median(np.abs(steps - np.median(steps)))) if len(steps) else 0.0
+        self.stamp_sigma_s = max(self.stamp_sigma_s, float(np.hypot(_LATE, jitter * 1e-9)))
         sentence = (
             f"topic {topic}: {by_log} of {len(t_ns)} messages have no stamp; the log times stand in, which are "
-            f"late by a delay that nobody knows and jitter by {jitter * 1e-6:.2g} ms (sigma)"
+            f"late by a delay that nobody knows (taken for {1e3 * _LATE:.0f} ms, one sigma) and jitter by "
+            f"{jitter * 1e-6:.2g} ms (sigma)"
         )
         if sentence not in self._container.remarks:
             self.remark(sentence)

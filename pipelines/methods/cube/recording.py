@@ -11,10 +11,24 @@ from pipelines.methods.cube.data import Array, CubeData, nominal
 from pipelines.methods.cube.sightings import read_camera, read_sightings
 from pipelines.methods.cube.topics import MAG, REFERENCE_FIX, REFERENCE_IMU, TAG_DETECTIONS, CubeConfig
 from pipelines.methods.cube.units import check_accel, check_mag
-from pipelines.recording.checks import check_gyro, check_overlap, clean, count, gyro_density, unit_quaternions
+from pipelines.recording.checks import (
+    LEAST_ACCEL,
+    LEAST_GYRO,
+    LEAST_MAG,
+    believed,
+    check_gyro,
+    check_overlap,
+    clean,
+    count,
+    density,
+    unit_quaternions,
+)
 from pipelines.recording.reading import Recording
 from pipelines.recording.topics import IMAGE, IMU, wanted
 from pipelines.settings import Config, first_given
+
+# rad^2; no reference is as good.
+_LEAST_VARIANCE = 1e-11
 
 _NUMBERS = (IMU, MAG, REFERENCE_IMU, REFERENCE_FIX)
 
@@ -37,7 +51,8 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
     gyro, accel = imu.gyro[keep], imu.accel[keep]
     check_gyro(name, imu_t, nominal(gyro, config.section(CubeConfig).raw.gyro))
     check_accel(name, nominal(accel, config.section(CubeConfig).raw.accel))
-    densities = gyro_density(imu_t, imu.gyro_cov), gyro_density(imu_t, imu.accel_cov)
+    gyro_density = density(name, imu_t, imu.gyro_cov[keep], LEAST_GYRO, dropped)
+    accel_density = density(name, imu_t, imu.accel_cov[keep], LEAST_ACCEL, dropped)
     spans = {name: imu_t}
 
     mag_t = mag = mag_density = None
@@ -45,7 +60,7 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
     if wanted(recording, config, MAG):
         field_ = recording.magnetic(name)
         mag_t, keep = clean(name, field_.t_ns, epoch, field_.field, dropped)
-        mag, mag_density = field_.field[keep], gyro_density(mag_t, field_.field_cov)
+        mag, mag_density = field_.field[keep], density(name, mag_t, field_.field_cov[keep], LEAST_MAG, dropped)
         check_mag(name, nominal(mag, config.section(CubeConfig).raw.mag))
         spans[name] = mag_t
 
@@ -70,8 +85,8 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
         longitude=longitude,
         height=height,
         camera=read_camera(recording, config) if _has_camera(recording, config) else None,
-        gyro_density=densities[0],
-        accel_density=densities[1],
+        gyro_density=gyro_density,
+        accel_density=accel_density,
         mag_density=mag_density,
         dropped=dropped,
     )
@@ -99,6 +114,7 @@ def _reference(
         )
     t, keep = clean(topic, imu.t_ns, epoch_ns, imu.wxyz, dropped, least=1)
     wxyz, cov = unit_quaternions(topic, t, imu.wxyz[keep]), imu.wxyz_cov[keep]
+    cov = believed(topic, cov, _LEAST_VARIANCE, dropped)
     known = (np.linalg.eigvalsh(0.5 * (cov + cov.swapaxes(1, 2)))[:, 0] > 0.0).all()
     return t, wxyz, cov if known else None
 

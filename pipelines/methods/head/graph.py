@@ -115,7 +115,7 @@ def _prepare(
         platform_density = first_given(
             config.noise.platform_gyro_density, data.platform_gyro_density, DEFAULT_NOISE.platform_gyro_density
         )
-    parameters = HeadParameters.of(config, platform is not None, data.head_force is not None)
+    parameters = HeadParameters.of(config, platform is not None, data.head_force is not None, data.stamp_sigma)
     sqrt_information = _sqrt_information(data.vision_cov, inside, config)
 
     sigma = float(1.0 / np.median(np.linalg.norm(sqrt_information, axis=(1, 2)) / np.sqrt(3.0)))

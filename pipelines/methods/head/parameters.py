@@ -52,13 +52,14 @@ class HeadParameters:
     platform: Parameter | None
 
     @classmethod
-    def of(cls, config: Config, platform: bool, accelerometer: bool) -> HeadParameters:
+    def of(cls, config: Config, platform: bool, accelerometer: bool, stamp_sigma: float = 0.0) -> HeadParameters:
         """With the priors in force; a camera without a moving platform is fixed by default.
 
         Args:
             config: priors, data sheets, accuracies wanted.
             platform: whether there is a platform gyro.
             accelerometer: whether the helmet's IMU measures specific force.
+            stamp_sigma: s, how well the stamps are known.
         """
         if config.noise.gyro_scale:
             figure = config.noise.gyro_scale
@@ -78,7 +79,7 @@ class HeadParameters:
 
         bias = triple(BIAS, "rad/s", 0.05, 2e-3, extra=0.0 if platform else EARTH_RATE)
         mounts = triple(HELMET, "rad", 0.35, 1e-2), triple(CAMERA, "rad", 0.35, 1e-2, fixed=not platform)
-        offset = quantity(OFFSET, "s", 0.05, 5e-3, False, 0.0)
+        offset = quantity(OFFSET, "s", 0.05, 5e-3, False, stamp_sigma)
         assumed = chain.from_iterable(quantities(each, config) for each in ASSUMPTIONS)
         known = [q.name for q in (*bias, *mounts[0], *mounts[1], offset, *assumed)]
         check_names(config.priors, known, "priors")

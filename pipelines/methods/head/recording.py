@@ -13,6 +13,7 @@ from pipelines.errors import InputError
 from pipelines.methods.head.topics import HEAD_IMU, PLATFORM_IMU, TRUTH_ATTITUDE, VISION_ATTITUDE, HeadConfig
 from pipelines.recording import series
 from pipelines.recording.checks import (
+    believed,
     check_overlap,
     clean,
     count,
@@ -29,6 +30,8 @@ from pipelines.vision.recorded import camera_of
 Array = NDArray[np.float64]
 
 _NUMBERS = (HEAD_IMU, PLATFORM_IMU, VISION_ATTITUDE, TRUTH_ATTITUDE)
+# rad^2; no tracker on a helmet is as good. Drivers that know nothing write 1e-12, say.
+_LEAST_VARIANCE = 1e-11
 _ROTATION = slice(3, 6)  # of the 6x6 covariance of a pose
 
 
@@ -41,7 +44,8 @@ class HeadData:
     vision_cov (K, 3, 3) rad^2: covariance of delta in R*Exp(delta), delta in h; None if unknown. truth_t (T,),
     truth_wxyz (T, 4): bRv, for scoring only, or None. gyro_density, platform_gyro_density, rad/s/sqrt(Hz): from the
     covariances of the messages, None if they say nothing. head_force (N, 3) m/s^2: specific force by the helmet's
-    accelerometer in v, at head_t; None if it has none. dropped: reason -> messages.
+    accelerometer in v, at head_t; None if it has none. dropped: reason -> messages. stamp_sigma, s: how well the stamps
+    are known, 0 where they are those of the sensors.
     """
 
     epoch_ns: int
@@ -58,6 +62,7 @@ class HeadData:
     platform_gyro_density: float | None = None
     head_force: Array | None = None
     dropped: dict[str, int] = field(default_factory=dict)
+    stamp_sigma: float = 0.0
 
 
 def read_head(recording: Recording, config: Config) -> HeadData:
@@ -106,6 +111,7 @@ def read_head(recording: Recording, config: Config) -> HeadData:
         platform_density,
         head_force,
         dropped,
+        recording.stamp_sigma_s,
     )
 
 
@@ -181,6 +187,7 @@ def _vision(
     t, keep = clean(topic, poses.t_ns, epoch_ns, poses.wxyz, dropped)
     wxyz = unit_quaternions(topic, t, poses.wxyz[keep])
     cov = poses.cov[keep][:, _ROTATION, _ROTATION]
+    cov = believed(topic, cov, _LEAST_VARIANCE, dropped)
     known = np.abs(cov).max(axis=(1, 2)) > 0.0
     if not known.any():
         return t, wxyz, None

@@ -14,10 +14,11 @@ from pipelines.errors import InputError
 from pipelines.methods.indexer.topics import FIX, INDEXER
 from pipelines.recording import series
 from pipelines.recording.checks import (
+    LEAST_GYRO,
     check_overlap,
     clean,
     count,
-    gyro_density,
+    density,
     nanoseconds,
     unit_quaternions,
 )
@@ -86,7 +87,7 @@ def read_indexer(recording: Recording, config: Config) -> IndexerData:
         inner,
         _latitude(recording, config),
         attitude,
-        gyro_density(gyro_t, imu.gyro_cov),
+        density(imu_topic, gyro_t, imu.gyro_cov[keep], LEAST_GYRO, dropped),
         dropped,
     )
 
