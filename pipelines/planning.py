@@ -37,12 +37,14 @@ class Prediction:
         duration: of the recording, s.
         quantities: what is estimated.
         assessment: its sigmas and verdicts are the predicted ones.
+        budget: parameter -> source -> its share of the variance.
     """
 
     scenario: Scenario
     duration: float
     quantities: tuple[Quantity, ...]
     assessment: Assessment
+    budget: Mapping[str, Mapping[str, float]]
 
     @property
     def sigmas(self) -> dict[str, float]:
@@ -142,11 +144,11 @@ def predict(method_name: str, scenario: Scenario, config_file: Path | None, requ
     config = session.config.model_copy(update={"require": {**session.config.require, **require}})
     problem = method.problem(session.data, config)
     try:
-        estimate = solve_batch(problem)
+        estimate = solve_batch(problem, budget=True)
     except IndeterminateError as error:
         raise InputError(f"scenario: {error}") from error
     assessment = assess(problem.quantities, estimate.covariance, None, problem.advice)
-    return Prediction(scenario, session.facts.duration_s, problem.quantities, assessment)
+    return Prediction(scenario, session.facts.duration_s, problem.quantities, assessment, estimate.budget or {})
 
 
 def requirements(given: Sequence[str]) -> dict[str, float]:

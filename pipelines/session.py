@@ -32,6 +32,7 @@ from pipelines.methods import Method
 from pipelines.recording.info import SessionFacts, facts_of, lacking
 from pipelines.recording.message_reader import ENCODING
 from pipelines.recording.reading import Recording, open_recording
+from pipelines.reports.budget import limits
 from pipelines.reports.result import Calibration
 from pipelines.reports.units import human_unit, to_digits_of
 from pipelines.settings import TRUTH, Config
@@ -235,7 +236,7 @@ class Session:
                         causes = find_causes(self.method, self.data, self.config, estimate)
                 assessment = assessment.explained(_first(causes, _not_as_assumed(strained(estimate, quantities))))
             elif ours:
-                assessment = assessment.remarked(rejection_sentence(estimate.residuals))
+                assessment = assessment.remarked(rejection_sentence(estimate.residuals), _weakness(estimate, quantities))
                 assessment = assessment.explained(_not_as_assumed(strained(estimate, quantities)))
             if moved is not None and change is not None:
                 sentence = f"{change.sentence}{_told(moved, quantities)}"
@@ -282,7 +283,7 @@ class Session:
         from pipelines.solvers.batch import solve_batch
 
         with progress.doing("solving"):
-            return solve_batch(problem), problem
+            return solve_batch(problem, budget=True), problem
 
     def _published(self) -> Estimate | None:
         """The published solver's estimate, where it can serve the recording: it needs more than the graphs."""
@@ -369,6 +370,13 @@ def _check_sheets(method: Method, config: Config) -> None:
         if any(getattr(sheet, figure) != 0.0 for figure in sheet.model_fields_set):
             used = ", ".join(f"sensors.{each}" for each in method.sheets) or "no data sheet"
             raise InputError(f"sensors.{name}: method {method.name} has no use for it; it uses {used}")
+
+
+def _weakness(estimate: Estimate, quantities: Sequence[Quantity]) -> str:
+    """What most of the variance comes from of the parameter that falls shortest of what is required; empty if none."""
+    ratios = {q.name: sigma / q.require for q, sigma in zip(quantities, estimate.sigmas, strict=True) if q.judged}
+    short = [limit for limit in limits(estimate.budget or {}, quantities) if ratios.get(limit.name, 0.0) > 1.0]
+    return f"{max(short, key=lambda limit: ratios[limit.name]).sentence}." if short else ""
 
 
 def _first(tried: Sequence[Cause], assumed: Sequence[Cause]) -> list[Cause]:

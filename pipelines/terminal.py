@@ -163,20 +163,25 @@ def _show_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:
 
 def show_plan(plan: Plan) -> None:
     """Predicted sigmas of a motion and of the better one, what falls short, and what to change."""
+    from pipelines.reports.budget import limits
     from pipelines.reports.units import human_unit
 
+    limited = {limit.name: limit for limit in limits(plan.best.budget, plan.best.quantities)}
     table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
     table.add_column("parameter", no_wrap=True)
     table.add_column("unit", no_wrap=True)
     for column in ("required", "predicted", *(["with changes"] if plan.steps else [])):
         table.add_column(column, justify="right", no_wrap=True)
     table.add_column("verdict", no_wrap=True)
+    table.add_column("limited by")
     now, best = plan.now.sigmas, plan.best.sigmas
     for q in filter(lambda q: q.judged, plan.now.quantities):
         unit, factor = human_unit(q)
         cells = [f"{factor * sigma:.2g}" for sigma in (q.require, now[q.name], best[q.name])]
         verdict = plan.now.assessment.verdicts[q.name]
-        table.add_row(q.name, unit, *cells[: 3 if plan.steps else 2], f"[{COLOURS[verdict]}]{verdict}[/]")
+        most = limited[q.name].parts[0] if q.name in limited else ("", 0.0)
+        limit = f"{most[0]}, {100.0 * most[1]:.0f} %" if most[0] else ""
+        table.add_row(q.name, unit, *cells[: 3 if plan.steps else 2], f"[{COLOURS[verdict]}]{verdict}[/]", limit)
     console.print(table)
     for direction in plan.now.assessment.directions:
         say(f"  {direction.verdict}: {direction.label}: {direction.advice}")

@@ -267,6 +267,7 @@ class Estimate:
         smoothed: values and sigmas at each moment from the whole recording, where parameters move along; the others
             are as they are at the end.
         attitudes: the trajectory, if the method has one.
+        budget: quantity -> source -> its share of the quantity's variance, the largest first; None: not asked for.
         rejected: family -> number of measurements rejected as outliers.
         seconds: phase -> wall time.
     """
@@ -282,6 +283,7 @@ class Estimate:
     history: History | None = None
     smoothed: History | None = None
     attitudes: Attitudes | None = None
+    budget: Mapping[str, Mapping[str, float]] | None = None
     rejected: Mapping[str, int] = field(default_factory=dict)
     seconds: Mapping[str, float] = field(default_factory=dict)
 

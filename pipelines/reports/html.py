@@ -10,6 +10,7 @@ import datetime
 from dataclasses import dataclass
 
 from pipelines.judgement.observability import by_advice
+from pipelines.reports.budget import Limit, limits
 from pipelines.reports.plots import common_plots
 from pipelines.reports.result import Calibration, Plot, Table, quantities_of, truth_errors
 from pipelines.reports.templating import environment
@@ -42,6 +43,7 @@ def report_html(calibration: Calibration) -> str:
     own = list(calibration.plots(calibration)) if calibration.plots else []
     plots = [*(each for each in own if isinstance(each, Plot)), *common_plots(calibration)]
     facts, rows = calibration.facts, _rows(calibration)
+    found = limits(calibration.budget or {}, calibration.problem.quantities)
     return (
         environment("pipelines.reports")
         .get_template("report.html")
@@ -52,12 +54,23 @@ def report_html(calibration: Calibration) -> str:
             start=datetime.datetime.fromtimestamp(facts.epoch_ns // 1_000_000_000, datetime.UTC),
             rows=[row for row in rows if not row.assumed],
             assumptions=[row for row in rows if row.assumed],
+            limits=found,
+            advised=_short_of(calibration, found),
             formulas=[formula.text for formula in calibration.formulas],
             tables=[each for each in own if isinstance(each, Table)],
             plots=[(plot.title, plot.caption, _div(plot, i)) for i, plot in enumerate(plots)],
             plotly_js=get_plotlyjs() if plots else "",
         )
     )
+
+
+def _short_of(calibration: Calibration, found: list[Limit]) -> list[str]:
+    """What limits the parameters that are not as accurate as required; where all are, the one that is nearest to it."""
+    of = {p.name: p.sigma / p.require for p in calibration.parameters.values() if p.require}
+    known = [limit for limit in found if limit.name in of]
+    short = [limit for limit in known if of[limit.name] > 1.0]
+    told = short or sorted(known, key=lambda limit: -of[limit.name])[:1]
+    return [limit.sentence for limit in told]
 
 
 def notebook_html(calibration: Calibration) -> str:

@@ -121,6 +121,14 @@ class Calibration:
         }
 
     @property
+    def budget(self) -> dict[str, Mapping[str, float]] | None:
+        """Parameter -> source -> its share of the variance, without assumptions; None if the solver does not tell."""
+        if self.estimate.budget is None:
+            return None
+        calibrated = [q.name for q in quantities_of(self.problem, self.estimate) if q.group is None]
+        return {name: self.estimate.budget[name] for name in calibrated if name in self.estimate.budget}
+
+    @property
     def status(self) -> str:
         """calibrated, weak, unobservable or inconsistent."""
         return self.assessment.status
@@ -401,6 +409,7 @@ class Result(_Record):
     innovations: dict[str, InnovationsResult]
     learning: dict[str, LearningResult]
     stability: StabilityResult | None
+    budget: dict[str, dict[str, float]] | None
     findings: dict[str, list[dict[str, object]]]
     truth: dict[str, TruthResult] | None = None
 
@@ -427,6 +436,7 @@ def result(calibration: Calibration) -> Result:
         innovations={family: InnovationsResult(**asdict(found)) for family, found in c.innovations.items()},
         learning={name: LearningResult(**asdict(found)) for name, found in c.learning.items()},
         stability=_stability(c.stability),
+        budget=None if c.budget is None else {name: dict(shares) for name, shares in c.budget.items()},
         findings={name: [dict(row) for row in rows] for name, rows in c.findings.items()},
         truth=truth_errors(c) if c.truth is not None else None,
     )

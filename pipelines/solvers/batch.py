@@ -20,7 +20,8 @@ from factors.vectorized import Ensemble
 from pipelines.graph.problem import Estimate, Factor, Problem, Residuals
 from pipelines.solvers.assembly import Assembly
 from pipelines.solvers.history import sequential_history
-from pipelines.solvers.marginals import chi_square, joint_covariance, ordering_of, reported, smoothed
+from pipelines.solvers.influence import influence, uncertainty_budget
+from pipelines.solvers.marginals import chi_square, eliminated, joint_covariance, ordering_of, reported, smoothed
 
 # Frames in one vectorised factor: past this the Jacobians' zeros cost more than the Python calls they save.
 CHUNK = 20
@@ -113,7 +114,7 @@ class Solution:
     iterations: int
 
 
-def solve_batch(problem: Problem, most: int = _MOST_ITERATIONS) -> Estimate:
+def solve_batch(problem: Problem, most: int = _MOST_ITERATIONS, budget: bool = False) -> Estimate:
     """The maximum a-posteriori estimate with the joint marginal covariance of its parameters.
 
     Outliers are found by graduated non-convexity on the problem's truncated loss: the final solution is plain least
@@ -122,6 +123,7 @@ def solve_batch(problem: Problem, most: int = _MOST_ITERATIONS) -> Estimate:
     Args:
         problem: to be solved.
         most: iterations of each minimisation, after which it counts as not converged.
+        budget: also where the variance of each number comes from.
 
     Raises:
         IndeterminateError: states other than the parameters are not determined; names the variable.
@@ -136,8 +138,13 @@ def solve_batch(problem: Problem, most: int = _MOST_ITERATIONS) -> Estimate:
     past = sequential_history(problem, linear, ordering, values, whole.boundaries)
     marginal = past[1] if past else joint_covariance(problem, linear, ordering, values, whole.current_keys)
     residuals = system.residuals(values)
+    bayes_net = eliminated(linear, ordering)
     with system.at(values):
-        summary = chi_square(problem, whole.factors, linear, ordering, values, marginal)
+        summary = chi_square(problem, whole.factors, linear, bayes_net, values, marginal)
+    sources = None
+    if budget:
+        found = influence(problem, whole.factors, linear, bayes_net, values, whole.current_keys)
+        sources = uncertainty_budget(problem, found)
     # Times from which on other variables held the parameters than before; after the last one they are those reported.
     ends = whole.boundaries
     changes = [
@@ -157,6 +164,7 @@ def solve_batch(problem: Problem, most: int = _MOST_ITERATIONS) -> Estimate:
         history=past[0] if past else None,
         smoothed=smooth,
         attitudes=problem.attitudes(whole.keyframes, values) if problem.attitudes else None,
+        budget=sources,
         rejected={family: int((~r.used).sum()) for family, r in residuals.items()},
         seconds={"build": built - start, "solve": solved - built, "marginals": done - solved},
     )

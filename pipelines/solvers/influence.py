@@ -19,7 +19,6 @@ import gtsam
 import numpy as np
 
 from pipelines.graph.problem import Array, Factor, Problem
-from pipelines.solvers.marginals import IndeterminateError, explain
 
 # Family of the priors, which are told one by one.
 _PRIOR = "prior"
@@ -55,7 +54,7 @@ def influence(
     problem: Problem,
     factors: Sequence[Factor],
     linear: gtsam.GaussianFactorGraph,
-    ordering: gtsam.Ordering,
+    bayes_net: gtsam.GaussianBayesNet,
     values: gtsam.Values,
     current_keys: Mapping[int, int],
 ) -> Influence:
@@ -65,35 +64,29 @@ def influence(
         problem: names the reported numbers.
         factors: of the graph.
         linear: the same, linearised and whitened.
-        ordering: of the elimination.
+        bayes_net: their triangular factor.
         values: the estimate.
         current_keys: parameter key -> variable that holds its value, for parameters that move along.
-
-    Raises:
-        IndeterminateError: a variable is not determined.
     """
-    try:
-        bayes_net = linear.eliminateSequential(ordering, gtsam.EliminateQR)
-        zero = bayes_net.optimize()
-    except RuntimeError as error:
-        raise IndeterminateError(explain(str(error))) from None
-    keys = [ordering.at(i) for i in range(ordering.size())]
-    sizes = {key: len(zero.at(key)) for key in keys}
+    zero = gtsam.VectorValues.Zero(bayes_net.optimize())
+    keys = sorted(linear.keyVector())
+    ends = np.cumsum([len(zero.at(key)) for key in keys]).tolist()
     names: list[str] = []
-    solved: list[gtsam.VectorValues] = []
+    solved: list[Array] = []
     gradients: list[tuple[int, Array]] = []
     for p in problem.parameters:
         key = current_keys.get(p.key, p.key)
         for quantity, gradient in zip(p.quantities, p.coordinates(values, key)[1], strict=True):
             if quantity.prior_sigma == 0.0:
                 continue
-            right = gtsam.VectorValues()
-            for other in keys:
-                right.insert(other, gradient if other == key else np.zeros(sizes[other]))
-            solved.append(bayes_net.backSubstitute(bayes_net.backSubstituteTranspose(right)))
+            right, own = gtsam.VectorValues(zero), gtsam.VectorValues()
+            own.insert(key, gradient)
+            right.update(own)
+            solved.append(bayes_net.backSubstitute(bayes_net.backSubstituteTranspose(right)).vector(keys))
             names.append(quantity.name)
             gradients.append((key, gradient))
-    solutions = {key: np.array([x.at(key) for x in solved]).T.reshape(sizes[key], -1) for key in keys}
+    whole = np.array(solved).reshape(len(names), -1).T
+    solutions = {key: whole[start:stop] for key, start, stop in zip(keys, [0, *ends[:-1]], ends, strict=True)}
     covariance = np.array([gradient @ solutions[key] for key, gradient in gradients]).reshape(len(names), -1)
     return Influence(tuple(names), factors, linear, solutions, 0.5 * (covariance + covariance.T))
 

@@ -135,11 +135,22 @@ def coordinate_inverse(parameters: Sequence[Parameter], values: gtsam.Values, ke
     return inverse
 
 
+def eliminated(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.GaussianBayesNet:
+    """The triangular factor of a linear system. Raises IndeterminateError, naming a variable that is not determined."""
+    try:
+        # By QR: tight processes beside loose priors cost Cholesky its digits, and with them the whole system.
+        bayes_net = linear.eliminateSequential(ordering, gtsam.EliminateQR)
+        bayes_net.optimize()
+        return bayes_net
+    except RuntimeError as error:
+        raise IndeterminateError(explain(str(error))) from None
+
+
 def chi_square(
     problem: Problem,
     factors: Sequence[Factor],
     linear: gtsam.GaussianFactorGraph,
-    ordering: gtsam.Ordering,
+    bayes_net: gtsam.GaussianBayesNet,
     values: gtsam.Values,
     covariance: Array,
 ) -> ChiSquare:
@@ -159,7 +170,7 @@ def chi_square(
             value[f.family] = value.get(f.family, 0.0) + _square(f, values)
     counted = sum(count for f, count in zip(factors, rows, strict=True) if f.family != "prior")
     dof = counted - values.dim() + _from_priors(problem, covariance)
-    families = _family_dof(factors, rows, linear, ordering)
+    families = _family_dof(factors, rows, linear, bayes_net)
     largest = max(value, key=lambda family: families[family])
     families[largest] = dof - sum(families[family] for family in value if family != largest)
     return ChiSquare(sum(value.values()), dof, {family: (value[family], families[family]) for family in value})
@@ -184,7 +195,10 @@ def _from_priors(problem: Problem, covariance: Array) -> float:
 
 
 def _family_dof(
-    factors: Sequence[Factor], rows: Sequence[int], linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
+    factors: Sequence[Factor],
+    rows: Sequence[int],
+    linear: gtsam.GaussianFactorGraph,
+    bayes_net: gtsam.GaussianBayesNet,
 ) -> dict[str, float]:
     """Expected sum of squares of each family: that of random signs after solving for the same unknowns.
 
@@ -194,17 +208,9 @@ def _family_dof(
         factors: of the graph.
         rows: how many each stands for, rejected measurements left out.
         linear: the factors linearised; a compressed one has fewer rows than it stands for.
-        ordering: of the elimination.
-
-    Raises:
-        IndeterminateError: a variable is undetermined.
+        bayes_net: the system's triangular factor.
     """
-    try:
-        # By QR: tight processes beside loose priors cost Cholesky its digits, and with them the whole system.
-        bayes_net = linear.eliminateSequential(ordering, gtsam.EliminateQR)
-        origin = bayes_net.optimize()
-    except RuntimeError as error:
-        raise IndeterminateError(explain(str(error))) from None
+    origin = bayes_net.optimize()
     keys = sorted(linear.keyVector())
     ends = np.cumsum([len(origin.at(key)) for key in keys]).tolist()
     # Nonzero elements of the system: rows in the order of the factors, columns in that of the keys, then those of b.
