@@ -236,7 +236,8 @@ class Session:
                         causes = find_causes(self.method, self.data, self.config, estimate)
                 assessment = assessment.explained(_first(causes, _not_as_assumed(strained(estimate, quantities))))
             elif ours:
-                assessment = assessment.remarked(rejection_sentence(estimate.residuals), _weakness(estimate, quantities))
+                assessment = assessment.remarked(rejection_sentence(estimate.residuals))
+                assessment = assessment.remarked(_weakness(estimate, quantities))
                 assessment = assessment.explained(_not_as_assumed(strained(estimate, quantities)))
             if moved is not None and change is not None:
                 sentence = f"{change.sentence}{_told(moved, quantities)}"

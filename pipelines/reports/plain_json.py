@@ -43,7 +43,7 @@ def validation_json(validated: Validated) -> str:
 
 
 def plan_json(plan: Plan) -> str:
-    """Of `plan`: sigmas as predicted, now and with all changes, what is missing, and the changes."""
+    """Of `plan`: sigmas as predicted, now and with all changes, with the budget of these; what is missing; changes."""
     now, best = plan.now, plan.best
     return plain_json(
         "plan",
@@ -59,6 +59,7 @@ def plan_json(plan: Plan) -> str:
                     "sigma": now.sigmas[q.name],
                     "sigma_with_changes": best.sigmas[q.name],
                     "verdict": now.assessment.verdicts[q.name],
+                    "budget": dict(best.budget.get(q.name, {})),
                 }
                 for q in now.quantities
                 if q.judged
