@@ -15,6 +15,7 @@ from pipelines.recording import messages
 from pipelines.recording.info import lacking
 from pipelines.recording.pairing import Pairing, pair
 from pipelines.recording.reading import Recording
+from pipelines.recording.series import ImuSeries
 from pipelines.recording.sources import TopicSource
 from pipelines.recording.topics import Setting, Topic
 from pipelines.settings import Config
@@ -24,7 +25,7 @@ _BELONGS = 0.7
 # Names are alike above this ratio of difflib.
 _ALIKE = 0.6
 # Delays worth a word, s.
-_DELAY = 0.005
+_DELAY = 0.002
 
 
 @dataclass(frozen=True)
@@ -188,7 +189,17 @@ def _paired(recording: Recording, gyro: str, attitude: str) -> Pairing | None:
         rates, poses = recording.imu(gyro), recording.poses(attitude)
     except InputError:
         return None
-    return pair(rates.t_ns, rates.gyro, poses.t_ns, poses.wxyz)
+    there = (name for name, topic in recording.topics.items() if topic.type == messages.IMU and name != gyro)
+    others = filter(None, (_rates(recording, name) for name in there))
+    carriers = [(other.t_ns, other.gyro) for other in others]
+    return pair(rates.t_ns, rates.gyro, poses.t_ns, poses.wxyz, carriers)
+
+
+def _rates(recording: Recording, topic: str) -> ImuSeries | None:
+    try:
+        return recording.imu(topic)
+    except InputError:
+        return None
 
 
 def _by_name(recording: Recording, topic: Topic, used: set[str], is_needed: bool) -> str | None:

@@ -7,10 +7,14 @@ attitude is that of the gyro's body; of its inverse the rates are along axes of 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from pipelines.recording.sources import matrices
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -19,6 +23,8 @@ Stamps = NDArray[np.int64]
 _LARGEST_DELAY, _FINEST, _MOST = 2.0, 0.002, 1 << 17
 # Attitudes are differenced over this long, s.
 _INTERVAL = 0.1
+# A delay is refined within so much, s, in smaller and smaller reach, from so many rates at least.
+_WITHIN, _REACHES, _FEWEST = 0.1, (0.05, 0.02, 0.02), 30
 # Rates that vary less, rad/s, or are known for less time, s, tell nothing.
 _LEAST_MOTION, _SHORTEST = 0.02, 3.0
 # An interval of an attitude so many times the usual one is a gap.
@@ -42,26 +48,46 @@ class Pairing:
     fit: float
 
 
-def pair(gyro_t: Stamps, gyro: Array, attitude_t: Stamps, wxyz: Array) -> Pairing | None:
-    """Rates (N, 3) rad/s at stamps in ns, against unit quaternions (M, 4); None where there is too little motion."""
+class _Gyro:
+    """Mean rates of a gyro over intervals, from rates (N, 3) rad/s at stamps; times are s from `start_ns`."""
+
+    def __init__(self, t_ns: Stamps, rates: Array, start_ns: int) -> None:
+        order = np.argsort(t_ns, kind="stable")
+        t = (t_ns[order] - start_ns) * 1e-9
+        usable = np.isfinite(rates[order]).all(axis=1) & (np.diff(t, prepend=-1.0) > 0.0)
+        self.t, rates = t[usable], rates[order][usable]
+        turned = 0.5 * (rates[1:] + rates[:-1]) * np.diff(self.t)[:, None]
+        self._turned = np.concatenate([np.zeros((min(1, len(rates)), 3)), np.cumsum(turned, axis=0)])
+
+    def mean(self, a: Array, b: Array) -> Array:
+        """(n, 3) from a to b (n,)."""
+        ends = [np.stack([np.interp(x, self.t, column) for column in self._turned.T], axis=1) for x in (a, b)]
+        return (ends[1] - ends[0]) / (b - a)[:, None]
+
+    def covers(self, a: Array, b: Array) -> NDArray[np.bool_]:
+        """Which intervals it was recorded in."""
+        return (a >= self.t[0]) & (b <= self.t[-1]) if len(self.t) else np.zeros(len(a), dtype=bool)
+
+
+def pair(
+    gyro_t: Stamps,
+    gyro: Array,
+    attitude_t: Stamps,
+    wxyz: Array,
+    others: Sequence[tuple[Stamps, Array]] = (),
+) -> Pairing | None:
+    """Rates (N, 3) rad/s at stamps in ns, against unit quaternions (M, 4); None where there is too little motion.
+
+    `others` are further gyros, one of which may sit on what carries both and turn the reference of the attitude.
+    """
     start = int(min(gyro_t.min(initial=np.iinfo(np.int64).max), attitude_t.min(initial=np.iinfo(np.int64).max)))
-    order = np.argsort(gyro_t, kind="stable")
-    t = (gyro_t[order] - start) * 1e-9
-    finite = np.isfinite(gyro[order]).all(axis=1) & (np.diff(t, prepend=-1.0) > 0.0)
-    t, rates = t[finite], gyro[order][finite]
+    ours = _Gyro(gyro_t, gyro, start)
     order = np.argsort(attitude_t, kind="stable")
     at, quaternions = (attitude_t[order] - start) * 1e-9, wxyz[order]
     known = np.isfinite(quaternions).all(axis=1) & (np.diff(at, prepend=-1.0) > 0.0)
     at, quaternions = at[known], quaternions[known]
-    if len(t) < 10 or len(at) < 10 or min(t[-1], at[-1]) - max(t[0], at[0]) < _SHORTEST:
+    if len(ours.t) < 10 or len(at) < 10 or min(ours.t[-1], at[-1]) - max(ours.t[0], at[0]) < _SHORTEST:
         return None
-    turned = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (rates[1:] + rates[:-1]) * np.diff(t)[:, None], axis=0)])
-
-    def mean_rate(a: Array, b: Array) -> Array:
-        """Of the gyro over intervals."""
-        ends = [np.stack([np.interp(x, t, column) for column in turned.T], axis=1) for x in (a, b)]
-        return (ends[1] - ends[0]) / (b - a)[:, None]
-
     # Over several samples, for the noise of an attitude weighs by one over the interval.
     stride = max(1, round(_INTERVAL / float(np.median(np.diff(at)))))
     if len(at) < 10 * stride:
@@ -69,39 +95,81 @@ def pair(gyro_t: Stamps, gyro: Array, attitude_t: Stamps, wxyz: Array) -> Pairin
     steps = at[stride:] - at[:-stride]
     whole = steps < _GAP * np.median(steps)
     a, b = at[:-stride][whole], at[stride:][whole]
-    ways = [
-        _rates(one[:-stride], one[stride:], steps)[whole]
-        for one in (quaternions, quaternions * [1.0, -1.0, -1.0, -1.0])
-    ]
-    offset, correlation = _delay(0.5 * (a + b), np.linalg.norm(ways[0], axis=1), a, b, mean_rate, (t[0], t[-1]))
+    directions = quaternions, quaternions * [1.0, -1.0, -1.0, -1.0]
+    ways = [_rates(one[:-stride], one[stride:], steps)[whole] for one in directions]
+    offset, correlation = _delay(0.5 * (a + b), np.linalg.norm(ways[0], axis=1), a, b, ours)
     if correlation is None:
         return None
 
     def fits(later: float) -> list[float]:
         """Of both ways, at a delay."""
-        inside = (a + later >= t[0]) & (b + later <= t[-1])
-        against = mean_rate(a[inside] + later, b[inside] + later)
+        inside = ours.covers(a + later, b + later)
+        against = ours.mean(a[inside] + later, b[inside] + later)
         return [_fit(one[inside], against) for one in ways]
 
     way = int(np.argmax(fits(offset)))
-    # Near its greatest value the fit is a parabola of the delay.
-    delays = offset + np.linspace(-_INTERVAL, _INTERVAL, 9)
-    c2, c1, _ = np.polyfit(delays - offset, [fits(delay)[way] for delay in delays], 2)
-    if c2 < 0.0 and abs(c1) < 2.0 * _INTERVAL * abs(c2):
-        offset -= float(c1 / (2.0 * c2))
+    middle = directions[way][stride // 2 :][: len(steps)][whole]
+    seen = _Seen(a, b, ways[way], matrices(middle).swapaxes(1, 2))
+    offset = _refined(offset, seen, ours, [_Gyro(t_ns, rates, start) for t_ns, rates in others])
     return Pairing(correlation, offset, way == 1, fits(offset)[way])
 
 
-def _delay(
-    middle: Array, norm: Array, a: Array, b: Array, mean_rate: object, span: tuple[float, float]
-) -> tuple[float, float | None]:
+class _Seen(NamedTuple):
+    """What an attitude tells: rates (n, 3) from a to b (n,), and what turns vectors from its frame into the body."""
+
+    a: Array
+    b: Array
+    rates: Array
+    to_body: Array
+
+
+def _refined(offset: float, seen: _Seen, gyro: _Gyro, others: Sequence[_Gyro]) -> float:
+    """The delay at which the gyro's rates explain the attitude's best, besides those of what carries both, if any.
+
+    An attitude on a carrier that turns as well is against the carrier: its rate is that of the gyro less the carrier's,
+    in the body. All is linear in how the sensors are turned against each other and in their biases.
+    """
+
+    def inside(one: _Gyro) -> NDArray[np.bool_]:
+        return one.covers(seen.a + offset - _WITHIN, seen.b + offset + _WITHIN)
+
+    rows = inside(gyro)
+    others = [other for other in others if (inside(other) | ~rows).all()]
+    if rows.sum() < _FEWEST:
+        return offset
+    a, b, to_body = seen.a[rows], seen.b[rows], seen.to_body[rows]
+    rates, ones = seen.rates[rows].ravel(), np.tile(np.eye(3), (int(rows.sum()), 1))
+
+    def missed(delay: float, carrier: _Gyro | None) -> float:
+        """Sum of the squared rates that stay unexplained."""
+        columns = [ones, _by_axes(gyro.mean(a + delay, b + delay), np.eye(3)[None])]
+        if carrier is not None:
+            columns.append(_by_axes(carrier.mean(a + delay, b + delay), to_body))
+        A = np.hstack(columns)
+        return float(np.sum((rates - A @ np.linalg.lstsq(A, rates)[0]) ** 2))
+
+    carrier = min([None, *others], key=lambda one: missed(offset, one))
+    start = offset
+    for reach in _REACHES:
+        delays = np.linspace(-reach, reach, 7)
+        c2, c1, _ = np.polyfit(delays, [missed(offset + delay, carrier) for delay in delays], 2)
+        if c2 > 0.0:
+            offset = float(np.clip(offset - np.clip(c1 / (2.0 * c2), -reach, reach), start - _WITHIN, start + _WITHIN))
+    return offset
+
+
+def _by_axes(rates: Array, turned: Array) -> Array:
+    """(3 n, 9) that takes the rows of a matrix M to the vectors (n, 3) turned M rates, one after the other."""
+    return np.einsum("nij,nk->nijk", np.broadcast_to(turned, (len(rates), 3, 3)), rates).reshape(-1, 9)
+
+
+def _delay(middle: Array, norm: Array, a: Array, b: Array, gyro: _Gyro) -> tuple[float, float | None]:
     """What to add to the attitude's times, and the correlation there; None where nothing moves."""
-    assert callable(mean_rate)
     step = max(_FINEST, float(np.median(b - a)) / 2.0, (middle[-1] - middle[0]) / _MOST)
-    grid = np.arange(max(middle[0], span[0]), min(middle[-1], span[1]), step)
+    grid = np.arange(max(middle[0], gyro.t[0]), min(middle[-1], gyro.t[-1]), step)
     half = 0.5 * float(np.median(b - a))
     ours = np.interp(grid, middle, norm)
-    theirs = np.linalg.norm(mean_rate(grid - half, grid + half), axis=1)
+    theirs = np.linalg.norm(gyro.mean(grid - half, grid + half), axis=1)
     if min(ours.std(), theirs.std()) < _LEAST_MOTION or len(grid) < 20:
         return 0.0, None
     most = min(int(_LARGEST_DELAY / step), len(grid) // 3)

@@ -83,7 +83,7 @@ def inverted(poses: series.PoseSeries) -> series.PoseSeries:
     The covariance of the rotation is that of delta in R*Exp(delta) before and after: of R' = R^T it is R*cov*R^T.
     Positions' covariances are left out, zero.
     """
-    rotation = _matrices(poses.wxyz)
+    rotation = matrices(poses.wxyz)
     cov = np.zeros_like(poses.cov)
     cov[:, 3:, 3:] = rotation @ poses.cov[:, 3:, 3:] @ rotation.swapaxes(1, 2)
     position = -np.einsum("nji,nj->ni", rotation, poses.position)
@@ -107,7 +107,7 @@ def joined(gyro: series.VectorSeries, accel: series.VectorSeries | None) -> seri
     return series.ImuSeries(gyro.t_ns, gyro.vector, values, stamped_by_log=by_log)
 
 
-def _matrices(wxyz: Array) -> Array:
+def matrices(wxyz: Array) -> Array:
     """Rotation matrices (N, 3, 3) of unit quaternions."""
     w, x, y, z = wxyz.T
     rows = [
