@@ -393,8 +393,9 @@ def _not_as_assumed(found: Sequence[Strained]) -> list[Cause]:
         q, (unit, factor) = each.quantity, human_unit(each.quantity)
         like = f" (or {', '.join(each.others)}, which it cannot be told from)" if each.others else ""
         sigma, prior = factor * each.sigma, factor * (q.prior_sigma or 0.0)
-        found_ = f"{to_digits_of(factor * each.value, sigma)} ± {sigma:.1g} {unit}".strip()
-        assumed = f"{to_digits_of(factor * q.prior_mean, prior)} ± {prior:.2g} {unit}".strip()
+        value, mean = factor * each.value, factor * q.prior_mean
+        found_ = f"{to_digits_of(value, sigma) if mean else f'{value:.3g}'} ± {sigma:.1g} {unit}".strip()
+        assumed = f"{to_digits_of(mean, prior) if mean else '0'} ± {prior:.2g} {unit}".strip()
         evidence = f"estimated as {found_} where {assumed} was assumed, a pull of {abs(each.pull):.1f}"
         causes.append(Cause(f"{each.quantity.name} is not what was assumed{like}", evidence))
     return causes

@@ -41,7 +41,7 @@ def head() -> Case:
     return head_of(15.0)
 
 
-def head_of(duration_s: float, sensors: Sensors | None = IDEAL) -> Case:
+def head_of(duration_s: float, sensors: Sensors | None = IDEAL, moving: bool = True) -> Case:
     known = [f"{mount}_{axis}" for mount in ("helmet_mount", "camera_mount") for axis in "xyz"]
     scenario = HeadScenario(
         duration_s=duration_s,
@@ -50,7 +50,9 @@ def head_of(duration_s: float, sensors: Sensors | None = IDEAL) -> Case:
         platform_gyro_rate_hz=100,
         platform=EulerMotion(
             yaw=[Swing(amplitude_deg=10, frequency_hz=0.3)], pitch=[Swing(amplitude_deg=12, frequency_hz=0.2)]
-        ),
+        )
+        if moving
+        else None,
         priors={**dict.fromkeys(known, 0.0), "time_offset": 0.0},
         sensors=sensors,
     )
@@ -111,6 +113,74 @@ def test_sign_of_the_platform_gyro(head: Case) -> None:
     find, data, config = head
     wrong = replace(data, platform_gyro=data.platform_gyro * np.array([1.0, -1.0, 1.0]))
     assert first_cause((find, wrong, config)) == "the sign of the platform gyro's y is wrong"
+
+
+def test_faults_of_the_head_are_mended(head: Case) -> None:
+    """What each trial changes, changed back by the same."""
+    find, data, config = head
+    inverted, swapped, moving = find.hypotheses().faults
+    once = inverted.mended(data, config)
+    assert once is not None
+    np.testing.assert_allclose(once[0].vision_wxyz, so3.inverse(data.vision_wxyz))
+    again = inverted.mended(*once)
+    assert again is not None
+    np.testing.assert_allclose(again[0].vision_wxyz, data.vision_wxyz)
+    np.testing.assert_allclose(again[0].vision_cov, data.vision_cov, atol=1e-18)
+    once = swapped.mended(data, config)
+    assert once is not None
+    assert once[0].head_gyro is data.platform_gyro
+    assert once[0].platform_gyro_density == data.gyro_density
+    alone = replace(data, platform_t=None, platform_gyro=None)
+    assert swapped.mended(alone, config) is None
+    assert moving.mended(data, config) is None
+    assert moving.mended(alone, config) is not None
+    assert moving.last
+
+
+@pytest.mark.slow
+def test_inverted_attitudes(head: Case) -> None:
+    """Of vision: hRc where cRh is wanted, with the covariance of its error in the other frame."""
+    find, data, config = head
+    R = so3.matrix(data.vision_wxyz)
+    covariance = R @ data.vision_cov @ np.swapaxes(R, 1, 2)
+    wrong = replace(data, vision_wxyz=so3.inverse(data.vision_wxyz), vision_cov=covariance)
+    assert first_cause((find, wrong, config)).startswith("the attitudes of vision are inverted")
+
+
+@pytest.mark.slow
+def test_swapped_topics(head: Case) -> None:
+    """The platform's IMU recorded as the helmet's and the other way round."""
+    find, data, config = head
+    wrong = replace(
+        data,
+        head_t=data.platform_t,
+        head_gyro=data.platform_gyro,
+        head_force=None,
+        platform_t=data.head_t,
+        platform_gyro=data.head_gyro,
+    )
+    assert first_cause((find, wrong, config)) == "the topics of helmet and platform IMU are swapped"
+
+
+@pytest.mark.slow
+def test_a_platform_that_moves_without_a_topic(head: Case) -> None:
+    find, data, config = head
+    wrong = replace(data, platform_t=None, platform_gyro=None, platform_gyro_density=None)
+    assert first_cause((find, wrong, config)).startswith("the platform moves, and no topic tells how")
+
+
+@pytest.mark.slow
+def test_without_a_platform_topic_what_else_is_wrong_is_still_named() -> None:
+    """A bias that may follow a platform would mend much: it is tried last."""
+    find, data, config = head_of(15.0, moving=False)
+    assert find_causes(find, data, config) == ()
+    flipped = replace(data, head_gyro=data.head_gyro * [1.0, -1.0, 1.0])
+    assert first_cause((find, flipped, config)) == "the sign of the helmet gyro's y is wrong"
+    assert first_cause((find, data, with_noise(config, vision_attitude=1.0 / 3.0))).startswith(
+        "the noise vision_attitude"
+    )
+    late = replace(data, vision_t=data.vision_t - 0.03)
+    assert first_cause((find, late, config)).startswith("a time offset of ")
 
 
 def test_delay_of_20_ms_with_the_time_offset_fixed(head: Case) -> None:

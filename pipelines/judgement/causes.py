@@ -9,7 +9,7 @@ noise: noise large enough fits anything.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ from pipelines.judgement.hypotheses import Hypotheses
 from pipelines.judgement.observability import Cause
 from pipelines.judgement.outcome import Outcome, outcome, quick_score
 from pipelines.judgement.rejection import too_many_rejected
-from pipelines.judgement.trials import OFFSET, Trial, trials
+from pipelines.judgement.trials import OFFSET, Trial, faults, trials
 from pipelines.settings import DEFAULT_NOISE, Config
 
 if TYPE_CHECKING:
@@ -64,17 +64,25 @@ def find_causes(method: Method, data: Any, config: Config, estimate: Estimate | 
         before = outcome(method, data, config)
     if before is None or (before.fits and not too_many_rejected(before.estimate.residuals)):
         return ()
-    found: list[tuple[Outcome, str]] = []
-    for label, changed, changed_config in _screened(method, data, config, before):
-        after = outcome(method, changed, changed_config)
-        if after is not None and _explains(before, after):
-            found.append((after, _named(label, after)))
-    found.sort(key=lambda each: each[0].factor)
+    found = _explaining(method, _screened(method, data, config, before), before)
     if any(after.fits for after, _ in found):
         found = [each for each in found if each[0].fits]
     elif not found:
         found = _noise(method, hypotheses, data, config, before)
+    if not found:
+        last = _explaining(method, faults(hypotheses, data, config, last=True), before)
+        found = [each for each in last if each[0].fits]
     return tuple(Cause(label, _evidence(before, after)) for after, label in found[:_MOST_NAMED])
+
+
+def _explaining(method: Method, tried: Iterable[Trial], before: Outcome) -> list[tuple[Outcome, str]]:
+    """The changes that explain the misfit, the best first, each with what is wrong in words."""
+    found = []
+    for label, changed, config in tried:
+        after = outcome(method, changed, config)
+        if after is not None and _explains(before, after):
+            found.append((after, _named(label, after)))
+    return sorted(found, key=lambda each: each[0].factor)
 
 
 def _screened(method: Method, data: Any, config: Config, before: Outcome) -> list[Trial]:

@@ -26,6 +26,21 @@ class Scaling:
 
 
 @dataclass(frozen=True)
+class Fault:
+    """A fault of its own kind.
+
+    Attributes:
+        label: in words.
+        mended: data and config -> both without it; None where it cannot be.
+        last: whether what mends it would mend much else, so that it counts only where nothing else does.
+    """
+
+    label: str
+    mended: Callable[[Any, Config], tuple[Any, Config] | None]
+    last: bool = False
+
+
+@dataclass(frozen=True)
 class Hypotheses:
     """Faults to be tried by solving again, told by the names of the data's fields.
 
@@ -36,6 +51,7 @@ class Hypotheses:
         offset: whether the method has a parameter `time_offset`.
         clock: stamps that may be late, and how people call their source.
         scalings: numbers of the config that may be off by a factor.
+        faults: of other kinds.
         cut: whether a stretch of the recording is a recording.
     """
 
@@ -45,4 +61,5 @@ class Hypotheses:
     offset: bool = False
     clock: tuple[str, str] | None = None
     scalings: Sequence[Scaling] = ()
+    faults: Sequence[Fault] = ()
     cut: bool = True

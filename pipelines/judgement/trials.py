@@ -27,13 +27,21 @@ Trial = tuple[str, Any, Config]
 
 
 def trials(method: Method, data: Any, config: Config) -> Iterator[Trial]:
-    """All that is tried."""
+    """All that is tried, but for what counts only where nothing else does."""
     hypotheses = method.hypotheses()
+    yield from faults(hypotheses, data, config)
     yield from flips(hypotheses, data, config)
     yield from turned(hypotheses, data, config)
     yield from units(hypotheses, data, config)
     yield from offset(method, hypotheses, data, config)
     yield from scaled(method, hypotheses, data, config)
+
+
+def faults(hypotheses: Hypotheses, data: Any, config: Config, last: bool = False) -> Iterator[Trial]:
+    """The method's own, those that count last or the others."""
+    for fault in hypotheses.faults:
+        if fault.last is last and (mended := fault.mended(data, config)) is not None:
+            yield fault.label, *mended
 
 
 def flips(hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]:

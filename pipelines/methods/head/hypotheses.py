@@ -2,7 +2,52 @@
 
 from __future__ import annotations
 
-from pipelines.judgement.hypotheses import AXES, Hypotheses
+from dataclasses import replace
+
+import numpy as np
+
+from factors import so3
+from pipelines.judgement.hypotheses import AXES, Fault, Hypotheses
+from pipelines.methods.head.recording import HeadData
+from pipelines.settings import Config
+
+# A platform's rate, taken for a bias, wanders by this much, rad/s/sqrt(s): an aircraft's manoeuvres.
+_MANOEUVRES = 0.3
+
+
+def _inverted(data: HeadData, config: Config) -> tuple[HeadData, Config]:
+    """Attitudes hRc where cRh is wanted; their errors turn with them."""
+    covariance = data.vision_cov
+    if covariance is not None:
+        R = so3.matrix(data.vision_wxyz)
+        covariance = R @ covariance @ np.swapaxes(R, 1, 2)
+    return replace(data, vision_wxyz=so3.inverse(data.vision_wxyz), vision_cov=covariance), config
+
+
+def _swapped(data: HeadData, config: Config) -> tuple[HeadData, Config] | None:
+    """Helmet and platform the other way round; nobody has read the force in the platform."""
+    if data.platform_t is None or data.platform_gyro is None:
+        return None
+    swapped = replace(
+        data,
+        head_t=data.platform_t,
+        head_gyro=data.platform_gyro,
+        gyro_density=data.platform_gyro_density,
+        head_force=None,
+        platform_t=data.head_t,
+        platform_gyro=data.head_gyro,
+        platform_gyro_density=data.gyro_density,
+    )
+    return swapped, config
+
+
+def _moving(data: HeadData, config: Config) -> tuple[HeadData, Config] | None:
+    """A bias free to follow the rate of a platform that nobody measured."""
+    if data.platform_t is not None:
+        return None
+    noise = config.noise.model_copy(update={"gyro_bias_walk": _MANOEUVRES})
+    return data, config.model_copy(update={"noise": noise})
+
 
 HYPOTHESES = Hypotheses(
     streams={
@@ -18,4 +63,9 @@ HYPOTHESES = Hypotheses(
         "platform_gyro_density": ("platform_gyro_density", ("gyro",)),
     },
     offset=True,
+    faults=(
+        Fault("the attitudes of vision are inverted: they map the camera's frame to the markers', not back", _inverted),
+        Fault("the topics of helmet and platform IMU are swapped", _swapped),
+        Fault("the platform moves, and no topic tells how: record /platform/imu", _moving, last=True),
+    ),
 )
