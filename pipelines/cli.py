@@ -5,14 +5,17 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
+from typer.core import TyperGroup
 
 from pipelines import exit_codes
+from pipelines.options import ConfigFile, Quiet, RecordingPath
 
 if TYPE_CHECKING:
     from pipelines.reports.result import Calibration
@@ -20,7 +23,31 @@ if TYPE_CHECKING:
 # Errors that are told in one line, by name: to import the second takes gtsam's quarter of a second.
 _TROUBLE = {"InputError": exit_codes.BAD_INPUT, "IndeterminateError": exit_codes.UNDETERMINED}
 
+
+class _WithMethods(TyperGroup):
+    """The commands below and those that methods bring: methods take long to import, and are asked last."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return [*super().list_commands(ctx), *_of_methods()]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        return super().get_command(ctx, cmd_name) or _of_methods().get(cmd_name)
+
+
+@cache
+def _of_methods() -> Mapping[str, Any]:
+    from pipelines import methods
+
+    own = typer.Typer(rich_markup_mode=None)
+    own.callback()(lambda: None)
+    for name in methods.names():
+        for word, command in methods.method(name).commands.items():
+            own.command(word)(command)
+    return typer.main.get_group(own).commands
+
+
 app = typer.Typer(
+    cls=_WithMethods,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -37,14 +64,11 @@ class Solver(StrEnum):
     published = "published"
 
 
-_Session = Annotated[Path, typer.Argument(metavar="RECORDING", help="A file, a bag folder, or a pattern in quotes.")]
 _METHODS = "los, indexer, head, cube or one installed"
 _MethodName = Annotated[str | None, typer.Option("--method", help=f"{_METHODS}; by default what fits.")]
-_ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML that overrides the recording's own config.")]
 _Scheduler = Annotated[str | None, typer.Option(help="Of a dask cluster, tcp://host:8786; default: this machine.")]
 _Jobs = Annotated[int | None, typer.Option(help="Local worker processes; default: one a core.")]
 _PictureJobs = Annotated[int | None, typer.Option("--jobs", help="Processes for many pictures; default: one a core.")]
-_Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars.")]
 _Strict = Annotated[bool, typer.Option("--strict", help="Refuse a recording of which anything is lost.")]
 _AutoTopics = Annotated[bool, typer.Option("--auto-topics", help="Take the topics that `info` suggests.")]
 _Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")]
@@ -67,9 +91,9 @@ def _options(
 
 @app.command()
 def calibrate(
-    session: _Session,
+    session: RecordingPath,
     method: _MethodName = None,
-    config: _ConfigFile = None,
+    config: ConfigFile = None,
     solver: Annotated[Solver, typer.Option(help="How to solve.")] = Solver.batch,
     window: _Window = "1",
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: SESSION-SOLVER.")] = None,
@@ -77,7 +101,7 @@ def calibrate(
     auto_topics: _AutoTopics = False,
     jobs: _PictureJobs = None,
     as_json: _Json = False,
-    quiet: _Quiet = False,
+    quiet: Quiet = False,
 ) -> None:
     """Calibrate a recording. Exit code 0 calibrated, 2 unusable input, 3 weak or unobservable, 4 inconsistent."""
     from pipelines import progress
@@ -95,15 +119,15 @@ def calibrate(
 
 @app.command()
 def compare(
-    session: _Session,
+    session: RecordingPath,
     method: _MethodName = None,
-    config: _ConfigFile = None,
+    config: ConfigFile = None,
     window: _Window = "1",
     out: Annotated[Path | None, typer.Option(help="Folder for compare.html, which also splits the recording.")] = None,
     strict: _Strict = False,
     auto_topics: _AutoTopics = False,
     as_json: _Json = False,
-    quiet: _Quiet = False,
+    quiet: Quiet = False,
 ) -> None:
     """The published, batch and incremental solvers side by side, with errors where the truth is known."""
     from pipelines import progress, terminal
@@ -132,7 +156,7 @@ def follow(
         typer.Argument(metavar="SOURCE", help="A file or folder being written, ws://host:port, - for standard input."),
     ],
     method: _MethodName = None,
-    config: _ConfigFile = None,
+    config: ConfigFile = None,
     window: _Window = "1",
     patience: Annotated[float, typer.Option(help="Seconds without anything new that end an unfinished file.")] = 30.0,
     checkpoint: Annotated[Path | None, typer.Option(help="File to save the run in, and to go on from.")] = None,
@@ -157,14 +181,14 @@ def follow(
 
 @app.command()
 def validate(
-    session: _Session,
+    session: RecordingPath,
     calibration: Annotated[Path, typer.Option(help="The calibration.yaml to try on the recording.")],
     method: _MethodName = None,
-    config: _ConfigFile = None,
+    config: ConfigFile = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the page; default: SESSION-validation.")] = None,
     strict: _Strict = False,
     as_json: _Json = False,
-    quiet: _Quiet = False,
+    quiet: Quiet = False,
 ) -> None:
     """Errors of a recording before and after compensation with a calibration made on another one."""
     from pipelines import progress, terminal
@@ -192,7 +216,7 @@ def simulate(
     scenario: Annotated[str | None, typer.Option(help="YAML file or the name of a shipped one.")] = None,
     seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
     images: Annotated[bool, typer.Option("--images", help="Pictures instead of what is measured in them.")] = False,
-    quiet: _Quiet = False,
+    quiet: Quiet = False,
 ) -> None:
     """Simulate a recording with its truth."""
     from pipelines import progress, terminal
@@ -209,11 +233,11 @@ def plan(
     scenario: Annotated[
         str | None, typer.Option(help="The planned motion: YAML file or a name, as simulate has.")
     ] = None,
-    config: _ConfigFile = None,
+    config: ConfigFile = None,
     require: Annotated[list[str] | None, typer.Option(help="NAME=SIGMA wanted, SI; may be repeated.")] = None,
     out: Annotated[Path | None, typer.Option(help="File for the better motion, as a scenario.")] = None,
     as_json: _Json = False,
-    quiet: _Quiet = False,
+    quiet: Quiet = False,
 ) -> None:
     """How well a planned motion would determine each parameter, and a better one. Exit code 3 if less than required."""
     from pipelines import progress, terminal
@@ -235,11 +259,11 @@ def plan(
 
 @app.command()
 def info(
-    session: _Session,
-    config: _ConfigFile = None,
+    session: RecordingPath,
+    config: ConfigFile = None,
     strict: _Strict = False,
     as_json: _Json = False,
-    quiet: _Quiet = False,
+    quiet: Quiet = False,
 ) -> None:
     """What can be calibrated from a recording, with which topics, what is missing, and what is in it."""
     from pipelines import progress, terminal
@@ -261,11 +285,11 @@ def info(
 
 @app.command()
 def noise(
-    session: _Session,
+    session: RecordingPath,
     out: Annotated[Path | None, typer.Option(help="Folder for noise.html and noise.json.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print noise.json and nothing else.")] = False,
     strict: _Strict = False,
-    quiet: _Quiet = False,
+    quiet: Quiet = False,
 ) -> None:
     """The noise of gyros, accelerometers and magnetometers from their time at rest, and the config's section for it."""
     from pipelines import progress, terminal
@@ -286,7 +310,7 @@ def noise(
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the recording and its results.")] = Path("alidade-demo"),
-    quiet: _Quiet = False,
+    quiet: Quiet = False,
 ) -> None:
     """Simulate a helmet on a manoeuvring platform, calibrate it with all three solvers, say where the report is."""
     from pipelines import progress, terminal
@@ -318,7 +342,7 @@ def montecarlo(
     jobs: _Jobs = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: METHOD-montecarlo.")] = None,
     as_json: _Json = False,
-    quiet: _Quiet = False,
+    quiet: Quiet = False,
 ) -> None:
     """Simulate and solve many recordings: are the sigmas true? The same command goes on after an interruption."""
     from pipelines import progress, terminal
@@ -346,7 +370,7 @@ def montecarlo(
 def fleet(
     recordings: Annotated[list[str], typer.Argument(metavar="FILES", help="Paths or patterns, 'recordings/*.mcap'.")],
     method: _MethodName = None,
-    config: _ConfigFile = None,
+    config: ConfigFile = None,
     solver: Annotated[Solver, typer.Option(help="How to solve.")] = Solver.batch,
     window: _Window = "1",
     names: Annotated[str | None, typer.Option(help="What file names tell: '{unit}_{date}*'.")] = None,
@@ -354,7 +378,7 @@ def fleet(
     jobs: _Jobs = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("alidade-fleet"),
     as_json: _Json = False,
-    quiet: _Quiet = False,
+    quiet: Quiet = False,
 ) -> None:
     """Calibrate many recordings and compare units and dates. The same command goes on after an interruption."""
     from pipelines import progress, terminal
@@ -391,52 +415,18 @@ def export(
     from pipelines.reports.calibration import load_calibration
     from pipelines.reports.export import exported
     from pipelines.reports.plain_json import plain_json
+    from pipelines.reports.whole import write_file
 
     saved = load_calibration(calibration)
     text = exported(saved, form)
     if out is not None:
-        _write(out, text)
+        write_file(out, text)
     if as_json:
         print(plain_json("export", {"method": saved.method, "format": form, "text": text}))
     elif out is None:
         print(text, end="")
     else:
         terminal.say(f"Wrote {out}")
-
-
-@app.command("cube-layout")
-def cube_layout(
-    session: _Session,
-    out: Annotated[Path, typer.Option(help="The config to write, with where the tags are.")],
-    config: _ConfigFile = None,
-    quiet: _Quiet = False,
-) -> None:
-    """Where the tags are on a cube, from pictures of it on all sides; the config gives their ids and sizes."""
-    from pipelines import progress, terminal
-    from pipelines.config import recorded_config
-    from pipelines.methods.cube.layout import cube_layout as estimate
-    from pipelines.methods.cube.layout import layout_yaml
-    from pipelines.recording.reading import open_recording
-
-    with progress.shown(quiet), progress.doing("finding where the tags are"):
-        recording = open_recording(session)
-        layout = estimate(recording, recorded_config(recording, config))
-    _write(out, layout_yaml(layout))
-    terminal.say(f"Wrote {out}")
-
-
-@app.command("cube-print")
-def cube_print(
-    edge: Annotated[float, typer.Option(help="Of the cube, m.")],
-    out: Annotated[Path, typer.Option(help="The PDF to write.")],
-    first_id: Annotated[int, typer.Option(help="Tag on the top face; the others follow.")] = 16,
-) -> None:
-    """Sheets with the six faces of a tag cube, true to scale."""
-    from pipelines import terminal
-    from pipelines.methods.cube.printing import print_cube
-
-    print_cube(out, edge, first_id)
-    terminal.say(f"Wrote {out}: print at 100 % and check the ruler")
 
 
 def _beside(session: Path, what: str) -> Path:
@@ -463,15 +453,6 @@ def _tell(calibration: Calibration, folder: Path, written: Sequence[Path], as_js
         terminal.show([calibration])
         terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
     raise typer.Exit(exit_codes.OF_STATUS[calibration.assessment.status])
-
-
-def _write(path: Path, text: str) -> None:
-    from pipelines.errors import InputError
-
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 def _seconds(window: str) -> float | None:

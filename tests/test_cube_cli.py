@@ -191,3 +191,16 @@ def test_from_recording_to_other_programs(alidade: Command, tmp_path: Path, data
     assert (told["schema"], told["method"]) == ("alidade.validation/1", "cube")
     force = next(v for v in told["validations"] if "specific force" in v["name"])
     assert force["rms"]["after"] < force["rms"]["before"] < force["peak"]["before"]
+
+
+def test_a_methods_own_commands_are_the_command_lines(alidade: Command, tmp_path: Path) -> None:
+    """They are listed, run, and refuse what they cannot use in one line."""
+    _, out, _ = alidade("--help")
+    assert "cube-layout" in out
+    code, _, _ = alidade("cube-print", "--edge", "0.16", "--out", tmp_path / "cube.pdf")
+    assert code == 0
+    assert (tmp_path / "cube.pdf").read_bytes().startswith(b"%PDF")
+    code, _, err = alidade("cube-layout", tmp_path / "none.mcap", "--out", tmp_path / "l.yaml")
+    assert code == 2
+    assert "none.mcap" in err
+    assert not (tmp_path / "l.yaml").exists()

@@ -156,6 +156,13 @@ class Method(ABC):
         """Format -> what writes a calibration in it; may raise InputError."""
         return {}
 
+    # -- the command line
+
+    @property
+    def commands(self) -> Mapping[str, Callable[..., None]]:
+        """Word -> a command of its own, a function as typer takes it; may raise InputError."""
+        return {}
+
 
 _BUILT_IN = ("los", "indexer", "head", "cube")
 

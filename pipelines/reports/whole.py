@@ -49,6 +49,14 @@ def write_page(out_dir: Path, name: str, text: str) -> Path:
     return path
 
 
+def write_file(path: Path, text: str) -> None:
+    """Text that belongs to nothing else. Raises InputError when it cannot be written."""
+    try:
+        _write_text(path, text)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+
+
 def _write_text(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8")
 

@@ -113,5 +113,11 @@ class Cube(Method):
 
         return FORMATS
 
+    @property
+    def commands(self) -> Mapping[str, Callable[..., None]]:
+        from pipelines.methods.cube.commands import cube_layout, cube_print
+
+        return {"cube-layout": cube_layout, "cube-print": cube_print}
+
 
 METHOD = Cube()
