@@ -227,14 +227,16 @@ class Session:
                 estimate.chi_square,
                 problem.advice,
             )
-            if ours and not estimate.converged:
-                assessment = assessment.unsolved(estimate.message)
-            elif ours and (assessment.status == "inconsistent" or too_many_rejected(estimate.residuals)):
-                assessment = assessment.misfit(rejection_sentence(estimate.residuals))
+            misfit = assessment.status == "inconsistent" or too_many_rejected(estimate.residuals)
+            if ours and causes is None and (misfit or not estimate.converged):
                 with progress.doing("looking for causes"):
-                    if causes is None:
-                        causes = find_causes(self.method, self.data, self.config, estimate)
-                assessment = assessment.explained(_first(causes, _not_as_assumed(strained(estimate, quantities))))
+                    causes = find_causes(self.method, self.data, self.config, estimate)
+            if ours and not estimate.converged:
+                assessment = assessment.unsolved(estimate.message).explained(causes or ())
+            elif ours and misfit:
+                assessment = assessment.misfit(rejection_sentence(estimate.residuals))
+                assumed = _not_as_assumed(strained(estimate, quantities))
+                assessment = assessment.explained(_first(causes or (), assumed))
             elif ours:
                 assessment = assessment.remarked(rejection_sentence(estimate.residuals))
                 assessment = assessment.remarked(_weakness(estimate, quantities))
