@@ -6,6 +6,7 @@ The numbers are for the axes as recorded. Where a format has no place for a part
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from io import StringIO
 from typing import Any
 
@@ -55,55 +56,70 @@ def symmetric_part(K: Array) -> tuple[Array, float]:
     return (vt.T * s) @ vt, angle
 
 
-def _px4(saved: SavedCalibration) -> str:
-    """QGroundControl's parameter file: vehicle, component, name, value, type (9: float).
+@dataclass(frozen=True)
+class _Autopilot:
+    """An autopilot's names, X, Y, Z in place of {}: scale (raw - offset), raw - offset, and symmetric (raw - offset).
 
-    accelerometer: scale (raw - offset); gyro: raw - offset; magnetometer, in gauss: symmetric matrix (raw - offset).
+    Attributes:
+        accel, gyro, mag: of the accelerometer (offset, scale), the gyro (offset) and the magnetometer (offset, the
+            matrix on its diagonal and off it: xy, xz, yz).
+        mag_offset: the unit of the magnetometer's offset in a tesla, negative where it is added.
     """
-    triads = _in_si(saved)
-    rows: list[tuple[str, float]] = []
-    notes = []
-    if "accel" in triads:
-        K, b = triads["accel"]
-        rows += _xyz("CAL_ACC0_{}OFF", zero_offset(K, b)) + _xyz("CAL_ACC0_{}SCALE", np.diag(K))
-        notes.append(_lost("accelerometer", K - np.diag(np.diag(K))))
-    if "gyro" in triads:
-        K, b = triads["gyro"]
-        rows += _xyz("CAL_GYRO0_{}OFF", zero_offset(K, b))
-        notes.append(_lost("gyro", K - np.eye(3)))
-    if "mag" in triads:
-        K, b = triads["mag"]
-        S, angle = symmetric_part(K)
-        rows += _xyz("CAL_MAG0_{}OFF", _GAUSS * zero_offset(K, b)) + _xyz("CAL_MAG0_{}SCALE", np.diag(S))
-        rows += _xyz("CAL_MAG0_{}ODIAG", S[[0, 0, 1], [1, 2, 2]])
-        notes.append(_turned(angle))
-    lines = [f"# {note}" for note in notes] + [f"1\t1\t{name}\t{value:.9g}\t9" for name, value in rows]
-    return "\n".join(["# Calibrated by alidade; give CAL_*0_ID the ids of the sensors.", *lines, ""])
+
+    accel: tuple[str, str]
+    gyro: str
+    mag: tuple[str, str, str]
+    mag_offset: float
+
+    def parameters(self, saved: SavedCalibration) -> tuple[list[tuple[str, float]], list[str]]:
+        """Names and values, and comments on what has no place. Raises InputError for sensors recorded in counts."""
+        rows: list[tuple[str, float]] = []
+        notes = []
+        triads = _in_si(saved)
+        if "accel" in triads:
+            K, b = triads["accel"]
+            rows += _xyz(self.accel[0], zero_offset(K, b)) + _xyz(self.accel[1], np.diag(K))
+            notes.append(_lost("accelerometer", K - np.diag(np.diag(K))))
+        if "gyro" in triads:
+            K, b = triads["gyro"]
+            rows += _xyz(self.gyro, zero_offset(K, b))
+            notes.append(_lost("gyro", K - np.eye(3)))
+        if "mag" in triads:
+            K, b = triads["mag"]
+            S, angle = symmetric_part(K)
+            values = self.mag_offset * zero_offset(K, b), np.diag(S), S[[0, 0, 1], [1, 2, 2]]
+            rows += [row for name, three in zip(self.mag, values, strict=True) for row in _xyz(name, three)]
+            notes.append(_turned(angle))
+        return rows, [f"# {note}" for note in notes]
+
+
+_PX4 = _Autopilot(
+    accel=("CAL_ACC0_{}OFF", "CAL_ACC0_{}SCALE"),
+    gyro="CAL_GYRO0_{}OFF",
+    mag=("CAL_MAG0_{}OFF", "CAL_MAG0_{}SCALE", "CAL_MAG0_{}ODIAG"),
+    mag_offset=_GAUSS,
+)
+_ARDUPILOT = _Autopilot(
+    accel=("INS_ACCOFFS_{}", "INS_ACCSCAL_{}"),
+    gyro="INS_GYROFFS_{}",
+    mag=("COMPASS_OFS_{}", "COMPASS_DIA_{}", "COMPASS_ODI_{}"),
+    mag_offset=-_MILLIGAUSS,
+)
+
+
+def _px4(saved: SavedCalibration) -> str:
+    """QGroundControl's parameter file: vehicle, component, name, value, type (9: float)."""
+    rows, notes = _PX4.parameters(saved)
+    lines = [f"1\t1\t{name}\t{value:.9g}\t9" for name, value in rows]
+    return "\n".join(["# Calibrated by alidade; give CAL_*0_ID the ids of the sensors.", *notes, *lines, ""])
 
 
 def _ardupilot(saved: SavedCalibration) -> str:
-    """A parameter file NAME,value.
-
-    accelerometer: scale (raw - offset); gyro: raw - offset; compass, in milligauss: symmetric matrix (raw + offset).
-    """
-    triads = _in_si(saved)
-    rows: list[tuple[str, float]] = []
-    notes = []
-    if "accel" in triads:
-        K, b = triads["accel"]
-        rows += _xyz("INS_ACCOFFS_{}", zero_offset(K, b)) + _xyz("INS_ACCSCAL_{}", np.diag(K))
-        notes.append(_lost("accelerometer", K - np.diag(np.diag(K))))
-    if "gyro" in triads:
-        K, b = triads["gyro"]
-        rows += _xyz("INS_GYROFFS_{}", zero_offset(K, b))
-        notes.append(_lost("gyro", K - np.eye(3)))
-    if "mag" in triads:
-        K, b = triads["mag"]
-        S, angle = symmetric_part(K)
-        rows += _xyz("COMPASS_OFS_{}", -_MILLIGAUSS * zero_offset(K, b)) + _xyz("COMPASS_DIA_{}", np.diag(S))
-        rows += [*_xyz("COMPASS_ODI_{}", S[[0, 0, 1], [1, 2, 2]]), ("COMPASS_SCALE", 1.0)]
-        notes.append(_turned(angle))
-    return "\n".join([*(f"# {note}" for note in notes), *(f"{name},{value:.9g}" for name, value in rows), ""])
+    """A parameter file NAME,value."""
+    rows, notes = _ARDUPILOT.parameters(saved)
+    if "mag_k11" in saved.parameters:
+        rows.append(("COMPASS_SCALE", 1.0))
+    return "\n".join([*notes, *(f"{name},{value:.9g}" for name, value in rows), ""])
 
 
 def _ros2(saved: SavedCalibration) -> str:
