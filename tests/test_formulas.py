@@ -199,6 +199,10 @@ def test_a_calibration_applies_itself() -> None:
     assert left < 0.3 * off
     assert found["bRv"].shape == (3, 4)
     feels = method("head").formulas(["gyro_g_xx"], Config())
+    # No g-sensitivity was determined: the specific force, given all the same, is not looked at.
+    assert not any("accel" in formula.measured for formula in calibration.formulas)
+    same = calibration.apply(gyro=data.head_gyro, accel=data.head_force)
+    np.testing.assert_array_equal(same["w_iv"], found["w_iv"])
     with pytest.raises(InputError, match="apply: gyro serves only together with accel"):
         apply(feels, {}, {"gyro": np.zeros(3)})
     with pytest.raises(InputError, match="nothing is computed from giro; measurements are gyro, cRh, stamp"):

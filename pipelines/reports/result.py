@@ -168,7 +168,8 @@ class Calibration:
 
             calibration.apply(gyro=w)["w_iv"]
 
-        What the solver does not know counts as zero, and so do assumptions that it does not determine.
+        What the solver does not know counts as zero, and so do assumptions that it does not determine: what would be
+        measured for these alone is not looked at.
 
         Args:
             measured: by the names in the formulas: numbers, vectors (..., 3), quaternions w, x, y, z (..., 4); SI.
@@ -180,7 +181,12 @@ class Calibration:
 
         values = {name: parameter.value for name, parameter in self.parameters.items() if name in self._applied}
         unknown = dict.fromkeys((q.name for q in self.problem.quantities), 0.0)
-        return apply(self.formulas, {**unknown, **values}, measured)
+        needed, possible = (
+            {name for formula in formulas for name in formula.measured}
+            for formulas in (self.formulas, self.method.formulas(list(unknown), self.config))
+        )
+        given = {name: value for name, value in measured.items() if name in needed or name not in possible}
+        return apply(self.formulas, {**unknown, **values}, given)
 
     def __repr__(self) -> str:
         """One line."""
