@@ -10,9 +10,10 @@ from typing import Any
 
 _HOMES = {
     "attitude": ("VisionAttitudeFactor", "ahrs_factors"),
+    "gimbal": ("GimbalPath", "LocalMotion"),
     "gyro": ("GyroIncrementFactor",),
     "indexer": ("AxisPath", "IndexerAverageFactor"),
-    "los": ("GimbalPath", "LocalMotion", "LosDirectionFactor", "LosRateFactor"),
+    "los": ("LosDirectionFactor", "LosRateFactor", "Surroundings"),
     "loss": ("TruncatedLoss",),
     "model": ("POSE3", "ROT3", "Model"),
     "preintegration": ("GyroPath", "Increments"),

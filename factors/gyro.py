@@ -119,7 +119,7 @@ def carried(
     turns = gyro.increments(start, stop)
     rate = turns.rate if errors is None else gyro.rate(middle)
     force = None if errors is None or errors.shape[1] == SCALE else gyro.specific_force(middle)
-    excess, by_excess = _rate_error(bias - gyro.bias_hat, errors, rate, force)
+    excess, by_excess = rate_error(bias - gyro.bias_hat, errors, rate, force)
     phi = _apply(turns.bias_jacobian, excess)
     to_end = so3.right_jacobian(phi)
     # The gyro's rate seen through the correction, and the correction's own growth.
@@ -196,8 +196,15 @@ class GyroIncrementFactor(Model):
         return error * weight, jacobians
 
 
-def _rate_error(bias_error: Array, errors: Array | None, rate: Array, force: Array | None) -> tuple[Array, Derivatives]:
-    """What a gyro reads too much (n, 3), rad/s, given what it reads and the specific force, and its derivatives."""
+def rate_error(bias_error: Array, errors: Array | None, rate: Array, force: Array | None) -> tuple[Array, Derivatives]:
+    """What a gyro reads too much (n, 3), rad/s, given what it reads and the specific force, and its derivatives.
+
+    Args:
+        bias_error: (n, 3), the bias beyond what was taken off the rates.
+        errors: (n, 6 or 15); None for a perfect gyro.
+        rate: (n, 3) as read.
+        force: (n, 3), needed where G is among the errors.
+    """
     if errors is None:
         return bias_error, lambda: (np.eye(3),)
     S, N, _ = _inverse(errors)

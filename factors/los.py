@@ -1,8 +1,8 @@
 """Factors of the los method: where a fixed target stands in the camera of a gyro-stabilised two-axis gimbal.
 
 Frames: m gyro (IMU) on the carrier; b carrier; c camera on the gimbal, x right, y along the line of sight (LOS), z up;
-t target, y towards it, z up its texture. The target does not turn, so t serves as the inertial frame: where the target
-stands is part of the attitudes tRm, and a new target is a new chain of attitudes.
+t target, y towards it, z up its texture, as it stood when it was found. So t serves as the inertial frame: where the
+target stands is part of the attitudes tRm, and a new target is a new chain of attitudes.
 
 With the passive matrices Rx(a) = Exp(a ex)^T of CN102288133B, azimuth eta and elevation eps,
 
@@ -14,15 +14,23 @@ page, section 1.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from factors import so3
+from factors.gimbal import GimbalPath, LocalMotion
+from factors.gyro import rate_error
 from factors.model import ROT3, Array, Block, Model, Residuals
+
+# What else than the mounting spoils LOS errors, in the order of their block: s and rad/s, s and c of encoders rad.
+SIGHT_ERRORS = (
+    *("time_offset", "clock_skew", "los_scale", "target_rate_x", "target_rate_z"),
+    *("azimuth sin", "azimuth cos", "elevation sin", "elevation cos", "encoder_delay"),
+)
 
 # The turns of cRm, right to left, and their axes.
 _TURNS = {
@@ -34,9 +42,6 @@ _TURNS = {
     "collimation": 2,
     "camera_roll": 1,
 }
-# Motion around a picture is smoothed over this time to either side, s: long against noise, short against sway.
-SMOOTHING = 0.2
-
 # Which turn an angle adds to, and its sign.
 _PLACES = {
     "delta_px": ("elevation", 1.0),
@@ -51,99 +56,54 @@ _PLACES = {
 }
 
 
-class GimbalPath:
-    """Gimbal angles at any time: the cubic through the two encoder samples on either side.
-
-    Args:
-        t: (G,) stamps, s, increasing, G >= 4.
-        angles: (G, 2) azimuth and elevation, rad, continuous.
-    """
-
-    def __init__(self, t: ArrayLike, angles: ArrayLike) -> None:
-        self.t = np.asarray(t, dtype=float)
-        self.angles = np.asarray(angles, dtype=float)
-        if len(self.t) < 4 or self.angles.shape != (len(self.t), 2):
-            raise ValueError(f"needs stamps (G,) and angles (G, 2), G >= 4; got {self.t.shape} and {self.angles.shape}")
-
-    def weights(self, at: ArrayLike) -> tuple[NDArray[np.intp], Array]:
-        """The four samples (n, 4) around each time and their weights (n, 4), Lagrange's polynomials."""
-        at = np.asarray(at, dtype=float)
-        first = np.clip(np.searchsorted(self.t, at, side="right") - 2, 0, len(self.t) - 4)
-        samples = first[:, None] + np.arange(4)
-        nodes = self.t[samples]
-        away, apart = at[:, None] - nodes, nodes[:, :, None] - nodes[:, None, :] + np.eye(4)
-        factors = np.where(np.eye(4, dtype=bool), 1.0, away[:, None, :] / apart)
-        return samples, factors.prod(axis=2)
-
-    def at(self, at: ArrayLike) -> Array:
-        """Angles (n, 2), rad, at the times."""
-        samples, weights = self.weights(at)
-        return np.einsum("nk,nki->ni", weights, self.angles[samples])
-
-
 @dataclass(frozen=True)
-class LocalMotion:
-    """How gyro and gimbal move around the stamps of n pictures, smoothed.
-
-    A time offset must not be read off the noise of the sensors: what the stabilisation leaves of the picture's motion
-    is no larger than what noise puts into rates from sample to sample.
+class Surroundings:
+    """What n pictures need of their surroundings when errors of the sensors are variables.
 
     Attributes:
-        rate, acceleration: (n, 3) of the gyro, rad/s and rad/s^2.
-        gimbal_rate, gimbal_acceleration: (n, 2) of azimuth and elevation, rad/s and rad/s^2.
+        motion: of gyro and gimbal around the stamps.
+        elapsed: (n,) since the recording's first stamp, s.
+        watched: (n,) since their target was found, s.
+        foreseen: (n, 2) phx, phz as first guessed, rad, with none of the picture's own noise.
     """
 
-    rate: Array
-    acceleration: Array
-    gimbal_rate: Array
-    gimbal_acceleration: Array
-    stacked: ClassVar = ("rate", "acceleration", "gimbal_rate", "gimbal_acceleration")
+    motion: LocalMotion
+    elapsed: Array
+    watched: Array
+    foreseen: Array
+    stacked: ClassVar = ("motion", "elapsed", "watched", "foreseen")
 
-    @classmethod
-    def around(cls, at: Array, gyro_t: Array, gyro: Array, gimbal: GimbalPath) -> LocalMotion:
-        """From polynomials fitted to the samples within about SMOOTHING s: of degree 2 to rates, 3 to angles."""
-        rates = _local_polynomials(at, gyro_t, gyro, 2)
-        angles = _local_polynomials(at, gimbal.t, gimbal.angles, 3)
-        return cls(rates[:, 0], rates[:, 1], angles[:, 1], 2.0 * angles[:, 2])
-
-    def __getitem__(self, rows: Any) -> LocalMotion:
-        """The motion around some of the pictures."""
-        return LocalMotion(
-            self.rate[rows], self.acceleration[rows], self.gimbal_rate[rows], self.gimbal_acceleration[rows]
-        )
-
-
-def _local_polynomials(at: Array, t: Array, values: Array, degree: int) -> Array:
-    """Coefficients (n, degree + 1, d), lowest first, of polynomials about the times fitted to the samples."""
-    count = int(np.clip(2.0 * SMOOTHING / np.median(np.diff(t)), 2 * degree + 1, len(t)))
-    scale = SMOOTHING ** np.arange(degree + 1)
-    out = np.empty((len(at), degree + 1, values.shape[1]))
-    for some in np.array_split(np.arange(len(at)), len(at) // 2000 + 1):
-        first = np.clip(np.searchsorted(t, at[some]) - count // 2, 0, len(t) - count)
-        samples = first[:, None] + np.arange(count)
-        powers = ((t[samples] - at[some, None]) / SMOOTHING)[..., None] ** np.arange(degree + 1)
-        transposed = np.swapaxes(powers, 1, 2)
-        out[some] = np.linalg.solve(transposed @ powers, transposed @ values[samples]) / scale[:, None]
-    return out
+    def __getitem__(self, rows: Any) -> Surroundings:
+        """Those of some of the pictures."""
+        return Surroundings(self.motion[rows], self.elapsed[rows], self.watched[rows], self.foreseen[rows])
 
 
 @dataclass(frozen=True)
 class LosDirectionFactor(Model):
-    """LOS errors of one fixed target, exact for mounting angles of any size.
+    """LOS errors of one target, exact for mounting angles of any size.
 
     Predicted: phz = atan2(dx, dy), phx = -atan2(dz, dy) with d = cRm tRm^T ey and, as a third row, the camera's roll
     about its line of sight, the twist about y that takes the target's texture to its picture: the rotation part of the
     picture's local similarity. Blocks: tRm at the stamps (rotations), the mounting angles `names` (rad), and with
-    `motion` the gyro bias (3, rad/s) and the time offset (1, s; positive when the picture was taken later than its
-    stamp says).
+    `around` the gyro bias (3, rad/s), SIGHT_ERRORS and, unless the gyro is perfect, its errors (6 or 15), see
+    factors.gyro. With those errors
+
+    - a picture was taken at stamp + time_offset - clock_skew * elapsed, and an encoder read its axis encoder_delay
+      later than it is stamped; gyro and gimbal carry attitude and angles there;
+    - an encoder reads angle + s sin(angle) + c cos(angle);
+    - phx and phz are measured larger by los_scale times what was foreseen. Scaling what the attitudes predict instead
+      would reward small attitude changes, which cost the gyro less, with a large scale: the mode of all variables
+      together lacks the determinant that pays for it;
+    - the target's frame turns at (target_rate_x, 0, target_rate_z), about its own axes, from where it was found.
 
     Attributes:
         time: (n,) stamps of the pictures, s.
         measured: (n, 2) phx, phz, or (n, 3) with the roll, rad.
         sqrt_information: (n, 2, 2) or (n, 3, 3), 1/rad.
-        gimbal: (n, 2) azimuth and elevation at the stamps, rad.
+        gimbal: (n, 2) azimuth and elevation as read at the stamps, rad.
         names: the mounting angles that are variables; all others are zero.
-        motion: around the stamps, when the time offset is a variable.
+        around: the pictures' surroundings, when errors of the sensors are variables.
+        errors: numbers of the gyro's errors: 6, 15, or 0 for a perfect gyro.
     """
 
     time: Array
@@ -151,8 +111,9 @@ class LosDirectionFactor(Model):
     sqrt_information: Array
     gimbal: Array
     names: tuple[str, ...] = ("delta_px", "delta_gx", "delta_gy", "delta_z")
-    motion: LocalMotion | None = None
-    stacked: ClassVar = ("time", "measured", "sqrt_information", "gimbal", "motion")
+    around: Surroundings | None = None
+    errors: int = 0
+    stacked: ClassVar = ("time", "measured", "sqrt_information", "gimbal", "around")
 
     @property
     def rows(self) -> int:
@@ -161,32 +122,72 @@ class LosDirectionFactor(Model):
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """tRm, the angles and, with motion, bias and time offset."""
-        return (ROT3, len(self.names)) if self.motion is None else (ROT3, len(self.names), 3, 1)
+        """tRm, the angles and, with surroundings, bias, SIGHT_ERRORS and the gyro's errors."""
+        if self.around is None:
+            return ROT3, len(self.names)
+        return ROT3, len(self.names), 3, len(SIGHT_ERRORS), *([self.errors] if self.errors else [])
 
-    def __call__(self, tRm: Array, angles: Array, bias: Array | None = None, dt: Array | None = None) -> Residuals:
+    def __call__(
+        self,
+        tRm: Array,
+        angles: Array,
+        bias: Array | None = None,
+        sight: Array | None = None,
+        errors: Array | None = None,
+    ) -> Residuals:
         """Residual sqrt_information * (measured - predicted), (n, 2) or (n, 3)."""
-        if self.motion is None or bias is None or dt is None:
-            return self._residuals(tRm, angles, self.gimbal)
-        move = self.motion
-        gimbal_rate = move.gimbal_rate + move.gimbal_acceleration * dt
-        gimbal = self.gimbal + (move.gimbal_rate + 0.5 * move.gimbal_acceleration * dt) * dt
-        rate = move.rate + move.acceleration * dt - bias
-        arc = (move.rate + 0.5 * move.acceleration * dt - bias) * dt
-        turn = so3.exp(arc)
-        residual, late_jacobians = self._residuals(so3.multiply(tRm, turn), angles, gimbal, gimbal_rate)
+        if self.around is None or bias is None or sight is None:
+            residual, derivatives = self._residuals(tRm, angles, self.gimbal, 0.0)
+            return residual, lambda: derivatives()[:2]
+        motion, elapsed, watched = self.around.motion, self.around.elapsed, self.around.watched
+        late = sight[:, 0] - sight[:, 1] * elapsed
+        turn, by_late, by_gyro = _carried(motion, late, bias, errors)
+        gimbal, gimbal_rate, by_encoder = self._gimbal(motion, sight[:, 5:9], late - sight[:, 9])
+        moved = np.stack([sight[:, 3], np.zeros_like(late), sight[:, 4]], axis=1) * watched[:, None]
+        carried = so3.multiply(tRm, turn)
+        seen = so3.multiply(so3.exp(-moved), carried)
+        foreseen = self.around.foreseen
+        residual, derivatives = self._residuals(seen, angles, gimbal, sight[:, 2:3] * foreseen)
 
         def jacobians() -> tuple[Array, ...]:
-            by_attitude, by_angles, by_gimbal = late_jacobians()
-            by_arc = by_attitude @ so3.right_jacobian(arc)
+            by_attitude, by_angles, by_gimbal = derivatives()
+            by_delay = -by_gimbal @ gimbal_rate[..., None]
+            by_time = by_attitude @ by_late - by_delay
+            moving = -so3.matrix(so3.inverse(carried)) @ so3.right_jacobian(-moved) * watched[:, None, None]
+            by_sight = [
+                by_time,
+                by_time * -elapsed[:, None, None],
+                -self.sqrt_information[:, :, :2] @ foreseen[..., None],
+                by_attitude @ moving[:, :, ::2],
+                (by_gimbal[..., None] * by_encoder[:, None]).reshape(*by_gimbal.shape[:2], 4),
+                by_delay,
+            ]
             return (
                 by_attitude @ so3.matrix(so3.inverse(turn)),
                 by_angles,
-                by_arc * -dt[:, :, None],
-                by_arc @ rate[..., None] + by_gimbal,
+                by_attitude @ by_gyro[0],
+                np.concatenate(by_sight, axis=2),
+                *(by_attitude @ each for each in by_gyro[1:]),
             )
 
         return residual, jacobians
+
+    def _gimbal(self, move: LocalMotion, encoder: Array, late: Array) -> tuple[Array, Array, Array]:
+        """Angles and their rates (n, 2) at times `late` (n,) after the stamps, and derivatives (n, 2, 2) by s and c.
+
+        The errors (n, 4) are s and c of each encoder; angle + s sin(angle) + c cos(angle) = reading is solved by a step
+        of fixed-point iteration and one of Newton's, which leaves s^4.
+        """
+        late = late[:, None]
+        read = self.gimbal + (move.gimbal_rate + 0.5 * move.gimbal_acceleration * late) * late
+        s, c = encoder[:, ::2], encoder[:, 1::2]
+        angle = read - s * np.sin(read) - c * np.cos(read)
+        sine, cosine = np.sin(angle), np.cos(angle)
+        angle = angle - (angle + s * sine + c * cosine - read) / (1.0 + s * cosine - c * sine)
+        sine, cosine = np.sin(angle), np.cos(angle)
+        gain = 1.0 / (1.0 + s * cosine - c * sine)
+        rate = gain * (move.gimbal_rate + move.gimbal_acceleration * late)
+        return angle, rate, -np.stack([gain * sine, gain * cosine], axis=2)
 
     def camera(self, angles: Array) -> Array:
         """cRm (n, 4) at the stamps and mounting angles (n, d), rad."""
@@ -226,26 +227,41 @@ class LosDirectionFactor(Model):
             out[axis, 3 + i] = 1.0
         return out
 
-    def _residuals(self, tRm: Array, angles: Array, gimbal: Array, gimbal_rate: Array | None = None) -> Residuals:
-        """Residuals; Jacobians by tRm, by the angles and, given the gimbal's rates, by time through the gimbal."""
+    def _residuals(
+        self, tRm: Array, angles: Array, gimbal: Array, excess: Array | float
+    ) -> tuple[Array, Callable[[], tuple[Array, Array, Array]]]:
+        """Residuals with phx, phz measured too large by `excess`, and derivatives by tRm, angles and gimbal angles."""
         camera = self._camera(tRm, angles, gimbal)
         error = self.measured - _picture(camera[:, :3])[:, : self.rows]
+        error[:, :2] -= excess
         if self.rows == 3:
             error[:, 2] = (error[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
 
-        def jacobians() -> tuple[Array, ...]:
+        def derivatives() -> tuple[Array, Array, Array]:
             turns, places = self._places
             # A passive turn by da moves the picture by Exp(-da axis), a right perturbation of tRm by Exp(-cRm delta).
             cRt = camera[:, :3].transpose(2, 0, 1)
             weighted = self.sqrt_information @ _picture_jacobian(camera[:, :3])[:, : self.rows]
             by_turn = weighted @ camera[:, 3:].transpose(2, 0, 1)
-            blocks = weighted @ cRt @ so3.matrix(tRm), by_turn @ places
-            if gimbal_rate is None:
-                return blocks
             columns = [turns.index("azimuth"), turns.index("elevation")]
-            return *blocks, by_turn[:, :, columns] @ gimbal_rate[..., None]
+            return weighted @ cRt @ so3.matrix(tRm), by_turn @ places, by_turn[:, :, columns]
 
-        return np.einsum("nij,nj->ni", self.sqrt_information, error), jacobians
+        return np.einsum("nij,nj->ni", self.sqrt_information, error), derivatives
+
+
+def _carried(motion: LocalMotion, late: Array, bias: Array, errors: Array | None) -> tuple[Array, Array, list[Array]]:
+    """Turns (n, 4) of the gyro from the stamps to times `late` (n,) after them, and how they turn on (on the right).
+
+    Returns:
+        The turns, and their derivatives by `late` (n, 3, 1) and by bias and errors.
+    """
+    late = late[:, None]
+    excess, by_excess = rate_error(bias, errors, motion.rate, motion.force)
+    rate = motion.rate + motion.acceleration * late - excess
+    arc = (motion.rate + 0.5 * motion.acceleration * late - excess) * late
+    to_end = so3.right_jacobian(arc)
+    by_gyro = [-late[..., None] * (to_end @ each) for each in by_excess()]
+    return so3.exp(arc), to_end @ rate[..., None], by_gyro
 
 
 def _picture(cRt: Array) -> Array:

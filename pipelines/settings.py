@@ -112,9 +112,13 @@ class PlatformGyroSheet(Sheet):
 
 
 class CameraSheet(Sheet):
-    """Of a camera, or of what makes angles of its pictures: scale of the angles, no unit."""
+    """Of a camera, or of what makes angles of its pictures.
+
+    scale of the angles, no unit; roll, rad: about its line of sight as it is mounted.
+    """
 
     scale: SigmaOrZero | None = None
+    roll: SigmaOrZero | None = None
 
 
 class EncoderSheet(Sheet):
@@ -125,8 +129,9 @@ class EncoderSheet(Sheet):
 
 
 class ClockSheet(Sheet):
-    """Of the pictures' clock against the gyro's: skew, s/s."""
+    """Of the pictures' clock against the gyro's: offset, s, of a tracker that was not calibrated; skew, s/s."""
 
+    offset: SigmaOrZero | None = None
     skew: SigmaOrZero | None = None
 
 
@@ -149,6 +154,19 @@ class FieldSheet(Sheet):
     model_error: Sigma | None = None
 
 
+class GimbalSheet(Sheet):
+    """Of a gimbal: collimation, the optical axis against the elevation axis, and its axes not perpendicular, rad."""
+
+    collimation: SigmaOrZero | None = None
+    nonperpendicularity: SigmaOrZero | None = None
+
+
+class TargetSheet(Sheet):
+    """Of a target: rate at which the direction to it turns, rad/s."""
+
+    rate: SigmaOrZero | None = None
+
+
 class Sensors(Section):
     """Data sheets of the sensors; what they do not say is as in sensors of the usual grade."""
 
@@ -160,6 +178,8 @@ class Sensors(Section):
     encoder: EncoderSheet = EncoderSheet()
     reference: ReferenceSheet = ReferenceSheet()
     field: FieldSheet = FieldSheet()
+    gimbal: GimbalSheet = GimbalSheet()
+    target: TargetSheet = TargetSheet()
 
 
 def _ideal(value: object) -> object:

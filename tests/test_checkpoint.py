@@ -24,13 +24,16 @@ from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
 from pipelines.solvers.incremental import Run, solve_incremental
 from pipelines.solvers.smoother import Smoother
+from tests.builders import IDEAL
 
 BRISK = EulerMotion(
     roll=[Swing(amplitude_deg=6, frequency_hz=0.31)],
     pitch=[Swing(amplitude_deg=5, frequency_hz=0.27)],
     yaw=[Swing(amplitude_deg=6, frequency_hz=0.23)],
 )
-SCENARIO = LosScenario(duration_s=66.0, carrier=BRISK, image_rate_hz=8.0, gyro_rate_hz=100.0, gimbal_rate_hz=100.0)
+SCENARIO = LosScenario(
+    duration_s=66.0, carrier=BRISK, image_rate_hz=8.0, gyro_rate_hz=100.0, gimbal_rate_hz=100.0, sensors=IDEAL
+)
 IDENTITY = {"recording": "first", "config": "{}"}
 
 RESUME = """

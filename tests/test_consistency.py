@@ -64,7 +64,7 @@ def head_of(duration_s: float, sensors: Sensors | None = IDEAL, moving: bool = T
 @pytest.fixture(scope="module")
 def los() -> Case:
     """15 s of sway about three axes."""
-    scenario = LosScenario(duration_s=15, image_rate_hz=20, gyro_rate_hz=200)
+    scenario = LosScenario(duration_s=15, image_rate_hz=20, gyro_rate_hz=200, sensors=IDEAL)
     data, _ = simulate_los(scenario, 1)
     return method("los"), data, load_config(los_config(scenario).encode())
 
@@ -204,11 +204,21 @@ def test_delay_of_20_ms_of_the_los_pictures() -> None:
         axis: [Swing(amplitude_deg=5, frequency_hz=f), Swing(amplitude_deg=2, frequency_hz=3 * f)]
         for axis, f in (("roll", 0.21), ("pitch", 0.27), ("yaw", 0.33))
     }
-    scenario = LosScenario(duration_s=15, image_rate_hz=30, carrier=EulerMotion(**sway), time_offset_s=0.02)
+    motion = EulerMotion(**sway)
+    scenario = LosScenario(
+        duration_s=15, image_rate_hz=30, carrier=motion, sensors=IDEAL, effects={"time_offset": 0.02}
+    )
     data, _ = simulate_los(scenario, 1)
     label = first_cause((method("los"), data, load_config(los_config(scenario).encode())))
     assert label.startswith("a time offset of ")
     assert float(label.split()[4]) == pytest.approx(20.0, abs=2.0)
+
+
+def test_encoders_read_20_ms_late(los: Case) -> None:
+    find, data, config = los
+    label = first_cause((find, replace(data, gimbal_t=data.gimbal_t - 0.02), config))
+    assert label.startswith("the encoders were read ")
+    assert float(label.split()[4]) == pytest.approx(20.0, abs=0.3)
 
 
 @pytest.mark.parametrize("key", [pytest.param("los_error", marks=pytest.mark.slow), "gyro_density"])

@@ -28,6 +28,7 @@ from pipelines.methods.los.simulation import LosScenario, los_config, simulate_l
 from pipelines.reports.result import Calibration
 from pipelines.session import calibrate
 from pipelines.simulation.motion import EulerMotion, Swing
+from tests.builders import IDEAL
 
 ROOT = Path(__file__).resolve().parents[1]
 BRISK = EulerMotion(
@@ -36,7 +37,9 @@ BRISK = EulerMotion(
     yaw=[Swing(amplitude_deg=6, frequency_hz=0.23)],
 )
 # Longer than it takes until the past is marginalised out for the first time, 40 s.
-SCENARIO = LosScenario(duration_s=49.0, carrier=BRISK, image_rate_hz=6.0, gyro_rate_hz=50.0, gimbal_rate_hz=50.0)
+SCENARIO = LosScenario(
+    duration_s=49.0, carrier=BRISK, image_rate_hz=6.0, gyro_rate_hz=50.0, gimbal_rate_hz=50.0, sensors=IDEAL
+)
 
 # Another process that records: what is in one file, into another, in pieces; from some time on it waits for a file.
 RECORDER = """

@@ -86,6 +86,17 @@ CASES: dict[str, tuple[str, Collection[str]]] = {
             *("axis_nonperpendicularity", "gyro_bias_x", "gyro_bias_y", "gyro_bias_z", "time_offset"),
         ),
     ),
+    "los of real sensors": (
+        "los",
+        (
+            *("delta_px", "delta_gx", "delta_gy", "delta_z", "camera_roll", "collimation", "gyro_bias_x"),
+            *("gyro_bias_y", "gyro_bias_z", "time_offset", "clock_skew", "los_scale", "encoder_delay"),
+            *(f"encoder_{joint}_{part}" for joint in ("azimuth", "elevation") for part in ("sin", "cos")),
+            *(f"gyro_scale_{axis}" for axis in "xyz"),
+            *(f"gyro_skew_{axes}" for axes in ("xy", "xz", "yz")),
+            *(f"gyro_g_{row}{column}" for row in "xyz" for column in "xyz"),
+        ),
+    ),
     "indexer": ("indexer", tuple(f"{name}_{axis}" for name in ("theta", "gyro_bias") for axis in "xyz")),
     "indexer with options": (
         "indexer",
@@ -120,7 +131,7 @@ CASES: dict[str, tuple[str, Collection[str]]] = {
     "cube in counts": ("cube", (*CUBE, *CUBE_ERRORS)),
 }
 ROTATIONS = {"cRh", "nRm", "camera_rotation", "rotation_17", "nRB_said", "CRT", "bodyRtag"}
-NUMBERS = {"azimuth", "elevation", "outer", "inner", "stamp"}
+NUMBERS = {"measured_error", "azimuth", "elevation", "outer", "inner", "stamp", "first_stamp"}
 
 
 def _config(case: str) -> Config:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from factors import so3
-from factors.los import GimbalPath, LocalMotion, LosDirectionFactor, LosRateFactor, rate_matrix, roll_rate
+from factors.gimbal import GimbalPath, LocalMotion, command
+from factors.los import SIGHT_ERRORS, LosDirectionFactor, LosRateFactor, Surroundings, rate_matrix, roll_rate
 from factors.model import Array
 from factors.testing import assert_jacobians
 from tests.numerics import assert_rows_are_independent
@@ -21,63 +22,115 @@ ALL = (
 )
 
 
-def _paths() -> tuple[GimbalPath, LocalMotion]:
-    t = np.arange(0.0, 6.0, 0.005)
-    rate = 0.8 * np.sin(np.array([1.1, 0.7, 1.9]) * t[:, None] + np.array([0.0, 1.0, 2.0]))
-    angles = np.stack([0.4 * np.sin(1.3 * t), 0.5 + 0.2 * np.cos(0.9 * t)], axis=1)
-    gimbal = GimbalPath(t, angles)
-    return gimbal, LocalMotion.around(TIMES, t, rate, gimbal)
+def _rates(t: Array) -> Array:
+    return np.asarray(0.8 * np.sin(np.array([1.1, 0.7, 1.9]) * t[:, None] + np.array([0.0, 1.0, 2.0])))
 
 
-GIMBAL, MOTION = _paths()
+def _gimbal(t: Array) -> Array:
+    return np.stack([0.4 * np.sin(1.3 * t), 0.5 + 0.2 * np.cos(0.9 * t)], axis=1)
+
+
+STAMPS = np.arange(0.0, 6.0, 0.005)
+FORCE = np.array([0.5, -1.0, 9.7])
+FORESEEN = 0.02 * np.random.default_rng(4).normal(size=(N, 2))
+GIMBAL = GimbalPath(STAMPS, _gimbal(STAMPS))
+MOTION = LocalMotion.around(TIMES, STAMPS, _rates(STAMPS), GIMBAL, np.tile(FORCE, (len(STAMPS), 1)))
 
 
 def _passive(axis: int, angle: float) -> Array:
     return so3.matrix(so3.exp(-angle * np.eye(3)[axis]))
 
 
-def _blocks(names: tuple[str, ...], size: float, off: float, dt: float | None) -> list[Array]:
+def _blocks(
+    names: tuple[str, ...], size: float, off: float, sight: float | None = None, gyro_errors: int = 0
+) -> list[Array]:
     """Attitudes that see the target within `off` rad of the line of sight at mounting angles of `size` rad."""
     rng = np.random.default_rng(2)
     angles = np.broadcast_to(size * rng.normal(size=len(names)), (N, len(names)))
     level = LosDirectionFactor(TIMES, np.zeros((N, 3)), np.tile(np.eye(3), (N, 1, 1)), GIMBAL.at(TIMES), names)
     tRm = so3.multiply(so3.exp(off * rng.normal(size=(N, 3))), level.camera(angles))
-    if dt is None:
+    if sight is None:
         return [tRm, angles]
-    return [tRm, angles, rng.normal(scale=0.02, size=(N, 3)), np.full((N, 1), dt)]
+    shared = np.broadcast_to(sight * rng.normal(size=len(SIGHT_ERRORS)), (N, len(SIGHT_ERRORS)))
+    errors = np.broadcast_to(0.01 * rng.normal(size=gyro_errors), (N, gyro_errors))
+    return [tRm, angles, rng.normal(scale=0.02, size=(N, 3)), shared, *([errors] if gyro_errors else [])]
 
 
-def _factor(rows: np.ndarray, names: tuple[str, ...], width: int, offset: bool) -> LosDirectionFactor:
+def _factor(
+    rows: np.ndarray, names: tuple[str, ...], width: int, sight: bool = False, gyro_errors: int = 0
+) -> LosDirectionFactor:
     rng = np.random.default_rng(3)
     root = rng.normal(size=(N, width, width)) + 3 * np.eye(width)
     measured = 0.05 * rng.normal(size=(N, width))
-    motion = MOTION[rows] if offset else None
-    return LosDirectionFactor(TIMES[rows], measured[rows], root[rows], GIMBAL.at(TIMES)[rows], names, motion)
+    around = Surroundings(MOTION, TIMES, TIMES - 0.2, FORESEEN)[rows] if sight else None
+    return LosDirectionFactor(
+        TIMES[rows], measured[rows], root[rows], GIMBAL.at(TIMES)[rows], names, around, gyro_errors
+    )
 
 
 @pytest.mark.parametrize("names", [CORE, ALL], ids=["core", "all"])
 @pytest.mark.parametrize("width", [2, 3], ids=["without roll", "with roll"])
 @pytest.mark.parametrize("size", [0.5, 1e-6], ids=["large angles", "near zero"])
 @pytest.mark.parametrize("off", [0.3, 1e-7], ids=["off axis", "on axis"])
-@pytest.mark.parametrize("dt", [None, 0.0, 0.0123, -0.03])
-def test_direction_jacobians(names: tuple[str, ...], width: int, size: float, off: float, dt: float | None) -> None:
-    blocks = _blocks(names, size, off, dt)
-    steps = [1e-5, 1e-5, *([] if dt is None else [1e-4, 1e-6])]
-    model = _factor(np.arange(N), names, width, dt is not None)
+@pytest.mark.parametrize(("sight", "gyro"), [(None, 0), (0.0, 15), (0.01, 0), (0.01, 6), (-0.02, 15)])
+def test_direction_jacobians(
+    names: tuple[str, ...], width: int, size: float, off: float, sight: float | None, gyro: int
+) -> None:
+    blocks = _blocks(names, size, off, sight, gyro)
+    steps = [1e-5, 1e-5, *([] if sight is None else [1e-4, 1e-6, *([1e-4] if gyro else [])])]
+    model = _factor(np.arange(N), names, width, sight is not None, gyro)
     assert_jacobians(model, blocks, steps)
 
 
-@pytest.mark.parametrize("dt", [None, 0.01])
-def test_direction_rows_are_independent(dt: float | None) -> None:
-    blocks = _blocks(ALL, 0.3, 0.2, dt)
-    assert_rows_are_independent(lambda rows: _factor(rows, ALL, 3, dt is not None), blocks)
+@pytest.mark.parametrize("sight", [None, 0.01])
+def test_direction_rows_are_independent(sight: float | None) -> None:
+    gyro = 0 if sight is None else 15
+    blocks = _blocks(ALL, 0.3, 0.2, sight, gyro)
+    assert_rows_are_independent(lambda rows: _factor(rows, ALL, 3, sight is not None, gyro), blocks)
+
+
+@pytest.mark.parametrize("name", SIGHT_ERRORS)
+def test_an_error_does_what_its_definition_says(name: str) -> None:
+    """Each alone, written out: the picture of a target seen through an axis, a clock or a lens with that error."""
+    size = {"target_rate_x": 0.02, "target_rate_z": 0.02, "clock_skew": 2e-3}.get(name, 5e-3)
+    tRm, angles, bias, _, errors = _blocks(CORE, 0.1, 0.05, 0.0, 15)
+    sight = np.zeros((N, len(SIGHT_ERRORS)))
+    sight[:, SIGHT_ERRORS.index(name)] = size
+    model = _factor(np.arange(N), CORE, 3, True, 15)
+    root_inverse = np.linalg.inv(model.sqrt_information)
+    picture = model.measured - np.einsum("nij,nj->ni", root_inverse, model(tRm, angles, bias, sight, errors)[0])
+
+    late = {"time_offset": size + 0.0 * TIMES, "clock_skew": -size * TIMES}.get(name, 0.0 * TIMES)
+    gimbal = _gimbal(TIMES + late - (size if name == "encoder_delay" else 0.0))
+    read = _gimbal(TIMES)
+    for i, joint in enumerate(("azimuth", "elevation")):
+        for part, function in (("sin", np.sin), ("cos", np.cos)):
+            if name == f"{joint} {part}":
+                # What is read is angle + size f(angle): here the angle that is read as `read`.
+                for _ in range(50):
+                    gimbal[:, i] = read[:, i] - size * function(gimbal[:, i])
+    x, y, z, xy, xz, yz = errors[0, :6]
+    gain = np.eye(3) + [[x, xy, xz], [xy, y, yz], [xz, yz, z]]
+    G = errors[0, 6:].reshape(3, 3)
+    middle = _rates(TIMES + 0.5 * late)
+    true = (middle - bias - G @ FORCE) @ np.linalg.inv(gain).T
+    target = np.zeros((N, 3))
+    for i, axis in enumerate("xz"):
+        if name == f"target_rate_{axis}":
+            target[:, 2 * i] = size * (TIMES - 0.2)
+    seen = so3.compose(so3.exp(-target), tRm, so3.exp(true * late[:, None]))
+    level = LosDirectionFactor(TIMES, model.measured, model.sqrt_information, gimbal, CORE)
+    expected = level.predict(seen, angles)
+    if name == "los_scale":
+        expected[:, :2] += size * FORESEEN
+    np.testing.assert_allclose(picture, expected, atol=3e-6)
 
 
 def test_prediction_is_the_published_chain() -> None:
     """d_l = Rx(eps + px) Rz(eta + pz) d_b, the gyro turned by Ry(gy) Rx(gx) Rz(gz), written out."""
-    blocks = _blocks(ALL, 0.1, 0.05, None)
+    blocks = _blocks(ALL, 0.1, 0.05)
     px, gx, gy, pz, gz, roll, collimation, skew = blocks[1][0]
-    model = _factor(np.arange(N), ALL, 3, False)
+    model = _factor(np.arange(N), ALL, 3)
     for k, (azimuth, elevation) in enumerate(model.gimbal):
         mRb = _passive(1, gy) @ _passive(0, gx) @ _passive(2, gz)
         gimbal = _passive(0, elevation + px) @ _passive(1, skew) @ _passive(2, azimuth + pz)
@@ -88,8 +141,8 @@ def test_prediction_is_the_published_chain() -> None:
 
 
 def test_only_the_difference_of_pz_and_gz_counts() -> None:
-    blocks = _blocks(ALL, 0.1, 0.05, None)
-    model = _factor(np.arange(N), ALL, 3, False)
+    blocks = _blocks(ALL, 0.1, 0.05)
+    model = _factor(np.arange(N), ALL, 3)
     turned = blocks[1] + 0.2 * np.array([name in ("delta_pz", "delta_gz") for name in ALL])
     np.testing.assert_allclose(model(blocks[0], turned)[0], model(*blocks)[0], atol=1e-12)
 
@@ -126,17 +179,31 @@ def test_gimbal_path_is_exact_for_cubics() -> None:
     np.testing.assert_allclose(path.at(at), np.stack([p(at) for p in angles], axis=1), atol=1e-9)
 
 
-def test_local_motion_is_exact_for_cubics() -> None:
-    t, angles = _cubics(4)
-    path = GimbalPath(t, np.stack([p(t) for p in angles], axis=1))
-    rate = np.poly1d([0.3, -0.2, 0.1])
-    at = np.random.default_rng(9).uniform(t[0], t[-1], 50)
-    motion = LocalMotion.around(at, t, np.stack([rate(t)] * 3, axis=1), path)
-    np.testing.assert_allclose(motion.rate, np.stack([rate(at)] * 3, axis=1), atol=1e-7)
-    np.testing.assert_allclose(motion.acceleration, np.stack([rate.deriv()(at)] * 3, axis=1), atol=1e-6)
-    np.testing.assert_allclose(motion.gimbal_rate, np.stack([p.deriv()(at) for p in angles], axis=1), atol=1e-6)
-    second = np.stack([p.deriv(2)(at) for p in angles], axis=1)
-    np.testing.assert_allclose(motion.gimbal_acceleration, second, atol=1e-4)
+def test_local_motion_is_that_of_smooth_paths() -> None:
+    rates, step = _rates(TIMES), 1e-4
+    np.testing.assert_allclose(MOTION.rate, rates, atol=1e-4)
+    np.testing.assert_allclose(MOTION.acceleration, (_rates(TIMES + step) - rates) / step, atol=3e-2)
+    np.testing.assert_allclose(MOTION.gimbal, _gimbal(TIMES), atol=5e-5)
+    ahead, back = _gimbal(TIMES + step), _gimbal(TIMES - step)
+    np.testing.assert_allclose(MOTION.gimbal_rate, (ahead - back) / (2.0 * step), atol=2e-4)
+    second = (ahead - 2.0 * _gimbal(TIMES) + back) / step**2
+    np.testing.assert_allclose(MOTION.gimbal_acceleration, second, atol=3e-2)
+    assert MOTION.force is not None
+    np.testing.assert_allclose(MOTION.force, np.tile(FORCE, (N, 1)))
+
+
+def test_the_noise_that_a_gimbal_follows_is_no_motion_of_the_line_of_sight() -> None:
+    """A gimbal driven by a noisy gyro: its smoothed rate is the command at the gyro's smoothed rate."""
+    gyro = 0.2 * _rates(STAMPS) + 0.01 * np.random.default_rng(11).normal(size=(len(STAMPS), 3))
+    angles = np.zeros((len(STAMPS), 2))
+    for k, rate in enumerate(0.5 * (gyro[1:] + gyro[:-1])):
+        middle = angles[k] + 0.0025 * command(rate[None], angles[k : k + 1])[0]
+        angles[k + 1] = angles[k] + 0.005 * command(rate[None], middle[None])[0]
+    gimbal = GimbalPath(STAMPS, angles)
+    motion = LocalMotion.around(TIMES, STAMPS, gyro, gimbal)
+    left = motion.gimbal_rate - command(motion.rate, gimbal.at(TIMES))
+    assert np.abs(motion.rate - 0.2 * _rates(TIMES)).max() > 2e-3
+    assert np.abs(left).max() < 1e-4
 
 
 def _los_rate(X: Array, gimbal: Array, w_b: Array) -> tuple[Array, float]:

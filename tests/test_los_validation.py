@@ -15,6 +15,7 @@ from pipelines.methods.los.validation import validate
 from pipelines.settings import Config
 from pipelines.simulation.scenario import load_scenario
 from pipelines.solvers.batch import solve_batch
+from tests.builders import IDEAL
 
 SILENT = LosNoise(gyro_density=0.0, gyro_bias_walk=0.0, encoder=0.0, los_error=0.0, los_roll=0.0)
 
@@ -38,7 +39,7 @@ def test_replay_with_nothing_compensated_is_the_recording() -> None:
 
 @pytest.mark.parametrize("name", ["los_nominal", "los_outliers"])
 def test_second_recording_is_stabilised_by_the_angles_of_the_first(name: str) -> None:
-    scenario = load_scenario(LosScenario, name).model_copy(update={"image_rate_hz": 25.0})
+    scenario = load_scenario(LosScenario, name).model_copy(update={"image_rate_hz": 25.0, "sensors": IDEAL})
     first, _ = simulate_los(scenario, 1)
     config = load_config(los_config(scenario).encode())
     estimate = solve_batch(problem(first, config))

@@ -25,7 +25,7 @@ from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.simulation.scenario import load_scenario
 from pipelines.solvers.batch import solve_batch
 
-LOS = LosScenario(duration_s=12, image_rate_hz=10, gyro_rate_hz=100, gimbal_rate_hz=100)
+LOS = LosScenario(duration_s=12, image_rate_hz=10, gyro_rate_hz=100, gimbal_rate_hz=100, sensors=Sensors())
 SWAY = EulerMotion(
     yaw=[Swing(amplitude_deg=20, frequency_hz=0.3)],
     pitch=[Swing(amplitude_deg=15, frequency_hz=0.4)],
@@ -66,7 +66,7 @@ def test_plan_against_outcome(scenario: LosScenario | HeadScenario) -> None:
     name = "los" if isinstance(scenario, LosScenario) else "head"
     prediction = predict(name, scenario.model_dump(), None, {})
     scatter = np.sqrt((errors_in_sigmas(scenario, prediction, 12) ** 2).mean())
-    # 12 runs of 7 or 10 numbers, correlated: the mean square of as many independent ones is known to 10 %.
+    # 12 runs of 35 numbers, correlated.
     assert scatter == pytest.approx(1.0, abs=0.2)
 
 
@@ -98,8 +98,8 @@ def test_what_is_weak_gets_advice_and_a_motion_that_mends_it(tmp_path: Path) -> 
 
 
 def test_a_motion_that_tells_everything_is_left_as_it_is(tmp_path: Path) -> None:
-    good = scenario_file(tmp_path, "{duration_s: 12, image_rate_hz: 10, gyro_rate_hz: 100, gimbal_rate_hz: 100}")
-    plan = make_plan("los", good)
+    motion = "duration_s: 12, image_rate_hz: 10, gyro_rate_hz: 100, gimbal_rate_hz: 100"
+    plan = make_plan("los", scenario_file(tmp_path, f"{{{motion}, sensors: ideal}}"))
     assert plan.now.assessment.status == "calibrated"
     assert plan.steps == ()
     assert plan.best is plan.now

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factors.los import GimbalPath, LosRateFactor
+from factors.gimbal import GimbalPath
+from factors.los import LosRateFactor
 from pipelines.errors import InputError
 from pipelines.methods.los.graph import problem
 from pipelines.methods.los.published import NAMES, published_estimate, rates, recursive_least_squares

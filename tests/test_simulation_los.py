@@ -10,6 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 from factors import so3
+from pipelines.methods.los.parameters import ASSUMPTIONS
 from pipelines.methods.los.simulation import (
     LosAngles,
     LosNoise,
@@ -25,11 +26,12 @@ from pipelines.simulation.motion import EulerMotion
 SILENT = LosNoise(gyro_density=0.0, gyro_bias_walk=0.0, encoder=0.0, los_error=0.0, los_roll=0.0)
 STRAIGHT = LosAngles(delta_px=0, delta_pz=0, delta_gx=0, delta_gy=0, delta_gz=0)
 IDEAL: dict[str, Any] = {"noise": SILENT, "gyro_turn_on_bias": 0.0, "duration_s": 20.0, "acquisition_error": 0.0}
+PERFECT = {name: 0.0 for each in ASSUMPTIONS for name in each.names}
 
 
 def test_gyro_samples_multiply_to_the_carriers_attitude() -> None:
     scenario = LosScenario(**IDEAL, angles_deg=STRAIGHT, latitude_deg=40.0)
-    motion = simulate_motion(scenario, np.random.default_rng(0))
+    motion = simulate_motion(scenario, PERFECT, np.random.default_rng(0))
     attitude = carrier_attitude(scenario, motion.edges)
     q = attitude[0]
     for sample in motion.gyro:
@@ -51,7 +53,7 @@ def test_drift_follows_the_exact_kinematics_to_first_order() -> None:
     small = LosAngles(delta_px=0.02, delta_pz=0.01, delta_gx=-0.015, delta_gy=0.02, delta_gz=-0.01)
     scenario = LosScenario(**IDEAL, angles_deg=small, gyro_rate_hz=1000, image_rate_hz=100)
     data, truth = simulate_los(scenario, 1)
-    motion = simulate_motion(scenario, np.random.default_rng(1))
+    motion = simulate_motion(scenario, PERFECT, np.random.default_rng(1))
     middle = 0.5 * (data.image_t[1:] + data.image_t[:-1])
     azimuth, elevation = motion.gimbal_at(middle).T
     wx, wy, wz = (np.interp(middle, motion.gyro_t, motion.gyro[:, i]) for i in range(3))
@@ -120,11 +122,12 @@ def test_earth_rate_is_part_of_the_bias() -> None:
 
 def test_pictures_later_than_their_stamps() -> None:
     early, _ = simulate_los(LosScenario(**IDEAL), 1)
-    late, _ = simulate_los(LosScenario(**IDEAL, time_offset_s=0.02), 1)
+    late, _ = simulate_los(LosScenario(**IDEAL, effects={"time_offset": 0.02}), 1)
     moved = early.error[1:, :2] - early.error[1, :2]
     # Another target, another roll of the picture about it: alike to a part in a hundred.
-    assert np.abs(late.error[:-1, :2] - moved).max() < 0.01 * np.abs(moved).max()
-    assert np.abs(late.error[:, :2] - early.error[:, :2]).max() > 0.02 * np.abs(moved).max()
+    assert len(late.error) == len(moved)
+    assert np.abs(late.error[:, :2] - moved).max() < 0.01 * np.abs(moved).max()
+    assert np.abs(late.error[:, :2] - early.error[:-1, :2]).max() > 0.02 * np.abs(moved).max()
 
 
 def test_roll_is_right_handed_about_the_line_of_sight() -> None:

@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipelines.graph.problem import Parameter, Quantity
+from pipelines.graph.problem import Findings, Parameter, Quantity
 from pipelines.settings import Config
 
 # What is left free has a prior so many times the one in force.
@@ -64,7 +64,9 @@ def quantities(assumption: Assumption, config: Config) -> tuple[Quantity, ...]:
         prior = config.priors.get(name, sheet)
         if prior is None:
             prior = _FREE * usual
-        return Quantity(name, assumption.unit, prior, usual, config.require.get(name, math.inf), group="assumption")
+        figure = f"{assumption.sheet}.{assumption.figure}"
+        require = config.require.get(name, math.inf)
+        return Quantity(name, assumption.unit, prior, usual, require, group="assumption", sheet=figure)
 
     return tuple(map(quantity, assumption.names))
 
@@ -73,6 +75,14 @@ def parameter(key: int, assumptions: Sequence[Assumption], config: Config) -> Pa
     """One variable of several assumptions; None if all are fixed, so that the graph can do without."""
     all_of_them = tuple(q for assumption in assumptions for q in quantities(assumption, config))
     return Parameter(key, all_of_them) if any(q.prior_sigma for q in all_of_them) else None
+
+
+def fixed_without_force(assumption: Assumption, config: Config, topic: str) -> Findings:
+    """The row of `fixed_assumptions` of a g-sensitivity that an Imu without acceleration gives no hold on."""
+    if parameter(0, (assumption,), config) is None:
+        return {}
+    names = f"{assumption.names[0]} to {assumption.names[-1]}"
+    return {"fixed_assumptions": [{"parameters": names, "value": 0.0, "why": f"{topic} has no acceleration"}]}
 
 
 def pull(quantity: Quantity, value: float, sigma: float) -> float | None:

@@ -85,7 +85,6 @@ class GyroChain:
         density: float,
         other_density: float = 0.0,
         walk: float,
-        scale_error: float = 0.0,
         errors: Parameter | None = None,
         platform: GyroPath | None = None,
         platform_errors: Parameter | None = None,
@@ -98,7 +97,6 @@ class GyroChain:
             density: of the gyro's white noise, rad/s/sqrt(Hz).
             other_density: what else an increment is uncertain by, as of another gyro that it is made relative to.
             walk: of the bias, rad/s/sqrt(s).
-            scale_error: sigma of an increment per angle turned.
             errors, platform, platform_errors: as above.
             trunk: of a recording that grows, where the first keyframe is known already; None: the whole is there.
         """
@@ -107,7 +105,6 @@ class GyroChain:
         if platform is not None:
             platform_turns = platform.increments(time[:-1], time[1:], scale=platform_errors is not None)
             unseen = unseen + platform_turns.unseen
-        by_scale = scale_error * np.linalg.norm(so3.log(turns.wxyz), axis=1)
         middles = np.where(starts, time, 0.5 * (time + np.roll(time, 1)))
         begun = None if trunk is None else time[:1]
         if trunk is not None and len(trunk.begun):
@@ -119,7 +116,7 @@ class GyroChain:
             initial=initial,
             gyro=gyro,
             turns=turns,
-            variance=(density**2 + other_density**2) * turns.duration + by_scale**2 + unseen,
+            variance=(density**2 + other_density**2) * turns.duration + unseen,
             bias=bias,
             nodes=bias.node_at(middles),
             errors=errors,

@@ -58,6 +58,7 @@ class Quantity:
         group: "assumption" for a systematic effect that is a parameter only lest it spoil the others; None for what
             is calibrated.
         nuisance: calibrated, but beside the purpose: a value far beyond its prior is a fault, as of an assumption.
+        sheet: of an assumption, the data sheet's figure that its prior comes from, as in the config: "gyro.scale".
     """
 
     name: str
@@ -69,6 +70,7 @@ class Quantity:
     prior_mean: float = 0.0
     group: Literal["assumption"] | None = None
     nuisance: bool = False
+    sheet: str = ""
 
     @property
     def assumed(self) -> bool:
@@ -207,6 +209,11 @@ class Problem:
     def quantities(self) -> tuple[Quantity, ...]:
         """All reported numbers, in order."""
         return tuple(q for p in self.parameters for q in p.quantities)
+
+    @property
+    def assumed(self) -> tuple[int, ...]:
+        """Keys of the variables that hold assumptions alone."""
+        return tuple(p.key for p in self.parameters if all(q.group is not None for q in p.quantities))
 
 
 @dataclass(frozen=True)

@@ -1,17 +1,21 @@
-"""Assumptions that do not hold: systematic effects that the recording finds far beyond what their priors allow."""
+"""What assumptions do to a verdict: those that do not hold, and those that cost the accuracy wanted."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from pipelines.graph.assumptions import pull
-from pipelines.graph.problem import Estimate, Quantity
+from pipelines.graph.problem import Array, Estimate, Quantity
 
 # A pull beyond this is no chance ...
 _FAR = 4.0
 # ... and assumptions correlated beyond this are one: which of them it is the recording does not determine.
 _ALIKE = 0.9
+# A data sheet's figure that makes at least this part of a variance is worth stating better, and so many are named.
+_COSTLY, _MOST_COSTS = 0.2, 3
 
 
 @dataclass(frozen=True)
@@ -58,3 +62,31 @@ def strained(estimate: Estimate, quantities: Sequence[Quantity]) -> tuple[Strain
         found.append(Strained(quantities[worst], value, sigma, pulls[worst], others))
         left = [i for i in left[1:] if i not in alike]
     return tuple(found)
+
+
+def costs(quantities: Sequence[Quantity], covariance: Array) -> str:
+    """A sentence that names the data sheets' figures that cost weak parameters most; empty if there are none.
+
+    What a figure costs is the share of a variance that goes when the numbers it is about are known.
+
+    Args:
+        quantities: of the covariance, in its order.
+        covariance: (n, n).
+    """
+    variances = np.diag(covariance)
+    weak = [i for i, q in enumerate(quantities) if q.judged and variances[i] > q.require**2]
+    figures: dict[str, list[int]] = {}
+    for i, q in enumerate(quantities):
+        if q.sheet and variances[i] > 0.0:
+            figures.setdefault(q.sheet, []).append(i)
+    shares = {}
+    for figure, rows in figures.items():
+        across = covariance[np.ix_(weak, rows)]
+        known = across @ np.linalg.pinv(covariance[np.ix_(rows, rows)], hermitian=True) @ across.T
+        shares[figure] = max(np.diag(known) / variances[weak], default=0.0)
+    named = [f for f in sorted(shares, key=lambda f: -shares[f]) if shares[f] > _COSTLY][:_MOST_COSTS]
+    if not named:
+        return ""
+    because = " and ".join(figure.replace(".", " ").replace("_", " ") for figure in named)
+    now = [f"sensors.{f} (now {quantities[figures[f][0]].scale:.2g})" for f in named]
+    return f"That is because of {because}: state {', '.join(now)} if the data sheet is better."

@@ -21,7 +21,7 @@ from pipelines.judgement.hypotheses import Hypotheses
 from pipelines.judgement.observability import Cause
 from pipelines.judgement.outcome import Outcome, outcome, quick_score
 from pipelines.judgement.rejection import too_many_rejected
-from pipelines.judgement.trials import OFFSET, Trial, faults, trials
+from pipelines.judgement.trials import Trial, faults, trials
 from pipelines.settings import DEFAULT_NOISE, Config
 
 if TYPE_CHECKING:
@@ -109,11 +109,9 @@ def _worst_stretch(residuals: Mapping[str, Residuals], length: float) -> tuple[f
 
 
 def _named(label: str, after: Outcome) -> str:
-    if "{" not in label:
-        return label
-    i = after.estimate.names.index(OFFSET)
-    value, sigma = 1e3 * after.estimate.values[i], 1e3 * after.estimate.sigmas[i]
-    return label.format(time_offset=f"{value:.3g} ± {sigma:.2g} ms")
+    """With the delays that were found, which stand in it by name."""
+    found = zip(after.estimate.names, after.estimate.values, after.estimate.sigmas, strict=True)
+    return label.format(**{name: f"{1e3 * value:.3g} ± {1e3 * sigma:.2g} ms" for name, value, sigma in found})
 
 
 def _explains(before: Outcome, after: Outcome) -> bool:

@@ -99,7 +99,7 @@ def held_out(problem: Problem) -> dict[str, float]:
     kept = [f for f in whole.factors if id(f) not in left]
     if not any(f.measurement is not None for f in kept):
         return {}
-    solution = optimize(kept, whole.initial, whole.shared(problem), problem.loss)
+    solution = optimize(kept, whole.initial, whole.shared(problem), problem.loss, held=problem.assumed)
     if not solution.converged:
         return {}
     return {family: robust_sigma(r.whitened) for family, r in residuals_of(out, solution.values).items()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -49,6 +49,7 @@ class Hypotheses:
         signs: readings (n,) or (n, k) -> how people call them, and their columns.
         noise: key of the config's noise -> the field that holds the messages' own, if any, and the families it is of.
         offset: whether the method has a parameter `time_offset`.
+        delays: other parameters that are delays -> the fault in words, with the parameter's name in braces.
         clock: stamps that may be late, and how people call their source.
         scalings: numbers of the config that may be off by a factor.
         faults: of other kinds.
@@ -59,6 +60,7 @@ class Hypotheses:
     signs: Mapping[str, tuple[str, Sequence[str]]]
     noise: Mapping[str, tuple[str | None, Sequence[str]]]
     offset: bool = False
+    delays: Mapping[str, str] = field(default_factory=dict)
     clock: tuple[str, str] | None = None
     scalings: Sequence[Scaling] = ()
     faults: Sequence[Fault] = ()

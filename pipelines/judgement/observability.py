@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from factors.chi_square import quantile
 from pipelines.graph.problem import Array, ChiSquare, History, Quantity, Residuals
+from pipelines.judgement.assumptions import costs
 
 Verdict = Literal["fixed", "observable", "prior", "weak", "unobservable"]
 Status = Literal["calibrated", "weak", "inconsistent", "unobservable"]
@@ -321,6 +322,8 @@ def assess(
     consistency = _consistency(chi_square)
     status = _status([*verdicts.values(), *(d.verdict for d in directions)], consistency)
     headline = _headline(status, verdicts, directions, consistency)
+    if status == "weak":
+        headline = " ".join(filter(None, [headline, costs(quantities, covariance)]))
     return Assessment(status, verdicts, directions, covariance, consistency, headline)
 
 

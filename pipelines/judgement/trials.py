@@ -16,8 +16,8 @@ from pipelines.settings import Config
 if TYPE_CHECKING:
     from pipelines.methods import Method
 
-OFFSET = "time_offset"
-_OFFSET_PRIOR = 0.05
+_OFFSET = "time_offset"
+_DELAY_PRIOR = 0.05
 # Stamps are moved by this much first, s, and numbers scaled by this much; then so many times to the bottom of a
 # parabola.
 _FIRST_SHIFT, _FIRST_SCALING, _PARABOLAS = 0.01, 0.01, 4
@@ -94,10 +94,10 @@ def units(hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]:
 
 
 def offset(method: Method, hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]:
-    """The time offset as a parameter, or the stamps that may be late moved to where residuals are smallest."""
-    if hypotheses.offset:
-        free = config.model_copy(update={"priors": {**config.priors, OFFSET: _OFFSET_PRIOR}})
-        yield "a time offset of {time_offset} is taken for known", data, free
+    """Delays as parameters with wide priors, or the stamps that may be late moved to where residuals are smallest."""
+    known = {_OFFSET: "a time offset of {time_offset} is taken for known"} if hypotheses.offset else {}
+    for name, label in {**known, **hypotheses.delays}.items():
+        yield label, data, config.model_copy(update={"priors": {**config.priors, name: _DELAY_PRIOR}})
     if hypotheses.clock is None:
         return
     stamps, source = hypotheses.clock

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from factors import so3
+from factors.gyro import symmetric
 from pipelines.errors import InputError
 from pipelines.graph.problem import Array
 
@@ -70,6 +71,31 @@ def symmetric_text(names: Sequence[str], known: Collection[str]) -> str:
 def numbers_of(space: Any, names: Sequence[str]) -> Array:
     """Values of parameters, 0 for those that are not there."""
     return np.array([getattr(space, name, 0.0) for name in names])
+
+
+def gyro_rate(
+    known: Collection[str], s: Sequence[str], g: Sequence[str]
+) -> tuple[str, tuple[str, ...], Callable[[Any], Array]]:
+    """The true rate w from what a gyro reads, (I + S) w + G f + gyro_bias: text, what it measures, the same as code.
+
+    Args:
+        known: parameters that are applied.
+        s, g: names of the numbers of S, xx yy zz xy xz yz, and of those of G by rows.
+    """
+    feels, scaled = (any(name in known for name in names) for names in (g, s))
+
+    def compute(v: Any) -> Array:
+        rate = v.gyro - v.gyro_bias
+        if feels:
+            rate = rate - v.accel @ numbers_of(v, g).reshape(3, 3).T
+        return np.asarray(rate @ np.linalg.inv(np.eye(3) + symmetric(numbers_of(v, s))))
+
+    text = f"gyro - {matrix_text([g[:3], g[3:6], g[6:]], known)} * accel - gyro_bias" if feels else "gyro - gyro_bias"
+    return (
+        f"inverse({symmetric_text(s, known)}) * ({text})" if scaled else text,
+        ("gyro", "accel") if feels else ("gyro",),
+        compute,
+    )
 
 
 def apply(formulas: Sequence[Formula], values: Mapping[str, float], measured: Mapping[str, Any]) -> dict[str, Array]:

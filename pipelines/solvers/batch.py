@@ -17,7 +17,7 @@ import numpy as np
 
 from factors.loss import TruncatedLoss
 from factors.vectorized import Ensemble
-from pipelines.graph.problem import Estimate, Factor, Problem, Residuals
+from pipelines.graph.problem import Array, Estimate, Factor, Problem, Residuals
 from pipelines.solvers.assembly import Assembly
 from pipelines.solvers.history import sequential_history
 from pipelines.solvers.influence import influence, uncertainty_budget
@@ -43,6 +43,9 @@ _ROUGH_TOLERANCE = 1e-3
 # Below this mean pull of outliers on plain least squares, in sigmas a measurement, good measurements stay inside the
 # gate and the outliers can be cut off at once.
 _MILD_PULL = 0.5
+# What is held is held this tightly, in the units of its variable; where something may be, plain least squares that
+# takes more iterations than this has run into outliers.
+_TIED, _MOST_PLAIN = 1e-9, 10
 # Outliers are a minority. If the gate would leave less than this share, it is the noise or the model that is wrong:
 # nothing is rejected then, and chi-square says so.
 _FEWEST_USED = 0.5
@@ -131,7 +134,8 @@ def solve_batch(problem: Problem, most: int = _MOST_ITERATIONS, budget: bool = F
     start = time.perf_counter()
     whole = Assembly.of(problem.steps(CHUNK))
     built = time.perf_counter()
-    solution = optimize(whole.factors, whole.initial, whole.shared(problem), problem.loss, most)
+    shared = whole.shared(problem)
+    solution = optimize(whole.factors, whole.initial, shared, problem.loss, most, held=problem.assumed)
     solved = time.perf_counter()
     values, system, ordering = solution.values, solution.system, solution.system.ordering
     linear = system.linearize(values)
@@ -202,17 +206,27 @@ def optimize(
     loss: TruncatedLoss | None,
     most: int = _MOST_ITERATIONS,
     most_damping: float = _MOST_DAMPING,
+    held: Sequence[int] = (),
 ) -> Solution:
-    """Minimise; with a loss: plain least squares first, and the graduated relaxation only if it leaves outliers."""
+    """Minimise; with a loss: plain least squares first, and the graduated relaxation only if it leaves outliers.
+
+    The relaxation begins where plain least squares leads when the vectors `held` stay as they are: outliers taken for
+    measurements would drive small effects, which priors hold by no more than measurements count, out of all bounds.
+    """
     unweighed = System.of(factors, shared, None)
     if loss is None:
         return _minimize(unweighed, values, most=most, most_damping=most_damping)
     measurements = sum(len(f.measurement.model.time) for f in factors if f.measurement is not None)
-    plain = _minimize(unweighed, values, _ROUGH_TOLERANCE * measurements, most)
+    start = values
+    plain = _minimize(unweighed, start, _ROUGH_TOLERANCE * measurements, min(most, _MOST_PLAIN) if held else most)
     values, iterations = plain.values, plain.iterations
     norms = np.concatenate([np.linalg.norm(r.whitened, axis=1) for r in unweighed.residuals(values).values()])
     outlying = norms[norms > loss.gate]
     if outlying.sum() > _MILD_PULL * len(norms):
+        if held:
+            tied = System.of([*factors, *(_tie(key, start.atVector(key)) for key in held)], shared, None)
+            plain_but_held = _minimize(tied, start, _ROUGH_TOLERANCE * measurements, most)
+            values, iterations = plain_but_held.values, iterations + plain_but_held.iterations
         mu = loss.gate**2 / (2.0 * float(outlying.max()) ** 2 - loss.gate**2)
         while mu < 1e3:
             relaxed = _minimize(unweighed.under(replace(loss, mu=mu)), values, most=2)
@@ -224,6 +238,11 @@ def optimize(
     if used.mean() < _FEWEST_USED:
         final = _minimize(unweighed, plain.values, most=most)
     return replace(final, iterations=iterations + final.iterations)
+
+
+def _tie(key: int, at: Array) -> Factor:
+    """Holds a vector where it is."""
+    return Factor("prior", gtsam.PriorFactorVector(key, at, gtsam.noiseModel.Isotropic.Sigma(len(at), _TIED)))
 
 
 def _minimize(

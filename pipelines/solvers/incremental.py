@@ -246,7 +246,7 @@ class Run:
             whole.factors.append(self.base.factor)
             whole.initial.insert(self.base.estimate)
             whole.timestamps = {**self.base.stamps, **whole.timestamps}
-        solution = optimize(whole.factors, whole.initial, self.keys, self.problem.loss)
+        solution = optimize(whole.factors, whole.initial, self.keys, self.problem.loss, held=self.problem.assumed)
         if not solution.converged:
             require_sound(whole.factors, whole.initial, self.time)
         self._trouble = "" if solution.converged else f"the first {self.time:.1f} s: {solution.message}"

@@ -9,11 +9,10 @@ import numpy as np
 
 from factors import so3
 from factors.gyro import symmetric
-from pipelines.methods.formula import Formula, matrix_text, numbers_of, symmetric_text, vector_text
+from pipelines.methods.formula import Formula, gyro_rate, numbers_of, symmetric_text, vector_text
 from pipelines.methods.head.parameters import CLOCK_SKEW, PLATFORM_BIAS, PLATFORM_SCALE, SCALE, SENSITIVITY
 
 _S, _PLATFORM_S = (tuple(name for each in scale for name in each.names) for scale in (SCALE, PLATFORM_SCALE))
-_G = [SENSITIVITY.names[i : i + 3] for i in (0, 3, 6)]
 
 
 def formulas(parameters: Collection[str]) -> list[Formula]:
@@ -21,7 +20,7 @@ def formulas(parameters: Collection[str]) -> list[Formula]:
     return [
         Formula("markers to helmet IMU", "vRh", "Exp(helmet_mount)", (), lambda v: so3.exp(v.helmet_mount)),
         Formula("platform to camera", "cRb", "Exp(camera_mount)", (), lambda v: so3.exp(v.camera_mount)),
-        _helmet_rate(parameters),
+        Formula("rate of the helmet, rad/s in v", "w_iv", *gyro_rate(parameters, _S, SENSITIVITY.names)),
         *_platform_rate(parameters),
         Formula(
             "attitude of the helmet on the platform from a camera measurement cRh",
@@ -32,21 +31,6 @@ def formulas(parameters: Collection[str]) -> list[Formula]:
         ),
         _time(parameters),
     ]
-
-
-def _helmet_rate(parameters: Collection[str]) -> Formula:
-    """With the specific force that the helmet's accelerometer measures, if the gyro feels it."""
-    feels = any(name in parameters for name in SENSITIVITY.names)
-
-    def compute(v: Any) -> so3.Array:
-        rate = v.gyro - v.gyro_bias
-        if feels:
-            rate = rate - v.accel @ numbers_of(v, SENSITIVITY.names).reshape(3, 3).T
-        return np.asarray(rate @ np.linalg.inv(np.eye(3) + symmetric(numbers_of(v, _S))))
-
-    felt = f"gyro - {matrix_text(_G, parameters)} * accel - gyro_bias" if feels else "gyro - gyro_bias"
-    text, measured = _scaled(felt, _S, parameters), ("gyro", "accel") if feels else ("gyro",)
-    return Formula("rate of the helmet, rad/s in v", "w_iv", text, measured, compute)
 
 
 def _platform_rate(parameters: Collection[str]) -> list[Formula]:

@@ -10,7 +10,7 @@ from pipelines.methods import Method, Scenario
 from pipelines.methods.los.topics import NEEDS, TOPICS
 
 if TYPE_CHECKING:
-    from pipelines.graph.problem import Estimate, Problem
+    from pipelines.graph.problem import Estimate, Findings, Problem
     from pipelines.judgement.checklist import ChecklistItem
     from pipelines.judgement.hypotheses import Hypotheses
     from pipelines.judgement.validation import Validation
@@ -30,6 +30,7 @@ class Los(Method):
     title = "Line of sight"
     topics = TOPICS
     needs = NEEDS
+    sheets = ("gyro", "camera", "encoder", "clock", "gimbal", "target")
 
     @property
     def data(self) -> type[LosData]:
@@ -95,6 +96,11 @@ class Los(Method):
         from pipelines.methods.los.formulas import formulas
 
         return formulas(parameters)
+
+    def findings(self, data: LosData, config: Config, estimate: Estimate) -> Findings:
+        from pipelines.methods.los.findings import findings
+
+        return findings(data, config, estimate)
 
     def figures(self, data: LosData, calibration: Calibration) -> Sequence[Plot]:
         from pipelines.methods.los.figures import los_plots

@@ -9,12 +9,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from factors.los import SMOOTHING, GimbalPath
+from factors.gimbal import SMOOTHING
 from factors.preintegration import GyroPath
 from pipelines.graph.problem import Array
 from pipelines.judgement.robust import robust_sigma
+from pipelines.methods.los.corrected import angles, rates, taken
 from pipelines.methods.los.guess import camera, carried_errors
-from pipelines.methods.los.parameters import ANGLES
+from pipelines.methods.los.parameters import ANGLES, OFFSET
 from pipelines.methods.los.pictures import select_pictures
 from pipelines.methods.los.recording import LosData
 from pipelines.reports.plots import COLORS, add_line, add_points, figure
@@ -33,16 +34,15 @@ def los_plots(data: LosData, calibration: Calibration) -> list[Plot]:
     config = calibration.config
     values = dict(zip(calibration.estimate.names, calibration.estimate.values.tolist(), strict=True))
     sigma = first_given(config.noise.los_error, DEFAULT_NOISE.los_error)
-    margin = SMOOTHING if "time_offset" in values else 0.0
+    margin = SMOOTHING if OFFSET in values else 0.0
     rows, starts, _ = select_pictures(data, np.full(len(data.image_t), sigma), margin)
     time, measured = data.image_t[rows], data.error[rows]
     chains = np.split(np.arange(len(rows)), np.flatnonzero(starts)[1:])
-    bias_alone = {name: value for name, value in values.items() if name not in ANGLES}
-    gyro = GyroPath(data.gyro_t, data.gyro, [values.get(f"gyro_bias_{axis}", 0.0) for axis in "xyz"])
-    gimbal = GimbalPath(data.gimbal_t, data.gimbal)
+    unmounted = {name: value for name, value in values.items() if name not in ANGLES}
+    gyro = GyroPath(data.gyro_t, rates(data, values))
     with_angles, without = (
-        np.concatenate([_predicted(gyro, gimbal, time[chain], measured[chain], v) for chain in chains])
-        for v in (values, bias_alone)
+        np.concatenate([_predicted(data, gyro, time[chain], measured[chain], v) for chain in chains])
+        for v in (values, unmounted)
     )
     return [
         _measured_and_predicted(time, measured[:, :2], with_angles),
@@ -50,12 +50,14 @@ def los_plots(data: LosData, calibration: Calibration) -> list[Plot]:
     ]
 
 
-def _predicted(gyro: GyroPath, gimbal: GimbalPath, time: Array, measured: Array, values: Mapping[str, float]) -> Array:
+def _predicted(data: LosData, gyro: GyroPath, time: Array, measured: Array, values: Mapping[str, float]) -> Array:
     """phx, phz (n, 2) of one target's pictures as carried on from the first, rad."""
     names = tuple(name for name in ANGLES if name in values)
-    at = np.clip(time + values.get("time_offset", 0.0), gyro.t[0], gyro.t[-1])
-    cRm = camera(gimbal.at(at), np.array([values[name] for name in names]), names)
-    return carried_errors(at, cRm, measured, gyro)
+    at = taken(data, time, values)
+    cRm = camera(angles(data, at, values), np.array([values[name] for name in names]), names)
+    scale = np.array([1.0 + values.get("los_scale", 0.0)] * 2 + [1.0])
+    target_rate = np.array([values.get("target_rate_x", 0.0), 0.0, values.get("target_rate_z", 0.0)])
+    return scale[:2] * carried_errors(at, cRm, measured / scale, gyro, target_rate)
 
 
 def _measured_and_predicted(time: Array, measured: Array, predicted: Array) -> Plot:

@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from typing import Any
 
 import numpy as np
 
 from factors import so3
-from pipelines.methods.formula import Formula, passive
+from pipelines.methods.formula import Formula, gyro_rate, numbers_of, passive
+from pipelines.methods.los.parameters import (
+    CLOCK_SKEW,
+    DELAY,
+    LOS_SCALE,
+    OFFSET,
+    ONCE_PER_TURN,
+    SCALE,
+    SENSITIVITY,
+)
+from pipelines.methods.los.topics import JOINTS
 
 _LEFT, _MIDDLE = ("camera_roll", "collimation"), "axis_nonperpendicularity"
+S = tuple(name for each in SCALE for name in each.names)
 
 
 def formulas(parameters: Collection[str]) -> list[Formula]:
-    """With the options that are among the parameters."""
+    """With the errors of the sensors that are among the parameters."""
     found = []
     if "delta_pz" in parameters:
         found.append(
             Formula("azimuth zero", "delta_z", "delta_pz - delta_gz", (), lambda v: np.array(v.delta_pz - v.delta_gz))
         )
+    true, measured, rate = gyro_rate(parameters, S, SENSITIVITY.names)
     found += [
         Formula(
             "IMU to carrier, Rx(a) = transpose(Exp(a ex)), Ry and Rz likewise",
@@ -27,54 +40,87 @@ def formulas(parameters: Collection[str]) -> list[Formula]:
             (),
             lambda v: so3.compose(passive(2, v.delta_z), passive(0, -v.delta_gx), passive(1, -v.delta_gy)),
         ),
-        Formula(
-            "rate of the carrier, rad/s",
-            "w_b",
-            "M * (gyro - gyro_bias)",
-            ("gyro",),
-            lambda v: so3.rotate(v.M, v.gyro - v.gyro_bias),
-        ),
+        Formula("rate of the carrier, rad/s", "w_b", f"M * ({true})", measured, lambda v: so3.rotate(v.M, rate(v))),
+        *_axes(parameters),
         _camera(parameters),
         Formula(
             "a direction d_b of the carrier in the line-of-sight frame",
             "d_l",
             "lRb * d_b",
-            ("azimuth", "elevation", "d_b"),
+            (*JOINTS, "d_b"),
             lambda v: so3.rotate(v.lRb, v.d_b),
         ),
     ]
-    if "time_offset" in parameters:
+    if LOS_SCALE.names[0] in parameters:
         found.append(
             Formula(
-                "time of a picture on the gyro's clock, s",
-                "time",
-                "stamp + time_offset",
-                ("stamp",),
-                lambda v: v.stamp + v.time_offset,
+                "LOS error, rad, from the one measured",
+                "los_error",
+                "measured_error / (1 + los_scale)",
+                ("measured_error",),
+                lambda v: np.asarray(v.measured_error / (1.0 + v.los_scale)),
             )
         )
-    return found
+    return [*found, *_clock(parameters)]
+
+
+def _axes(parameters: Collection[str]) -> list[Formula]:
+    """The axes' angles from what the encoders read."""
+    late = f", {DELAY.names[0]} s after the stamp of the reading" if DELAY.names[0] in parameters else ""
+
+    def angle(joint: str, names: Sequence[str]) -> Formula:
+        def compute(v: Any) -> so3.Array:
+            (sine, cosine), read = numbers_of(v, names), np.asarray(getattr(v, joint))
+            return np.asarray(read - sine * np.sin(read) - cosine * np.cos(read))
+
+        sine, cosine = (name if name in parameters else "0" for name in names)
+        expression = f"{joint} - {sine} * sin({joint}) - {cosine} * cos({joint})"
+        return Formula(f"angle of the {joint} axis, rad{late}", f"{joint}_angle", expression, (joint,), compute)
+
+    names = ONCE_PER_TURN.names
+    return [angle(JOINTS[0], names[:2]), angle(JOINTS[1], names[2:])] if _corrected(parameters) else []
+
+
+def _corrected(parameters: Collection[str]) -> bool:
+    return any(name in parameters for name in (*ONCE_PER_TURN.names, *DELAY.names))
+
+
+def _clock(parameters: Collection[str]) -> list[Formula]:
+    """When a picture was taken."""
+    offset, skew = OFFSET in parameters, CLOCK_SKEW.names[0] in parameters
+    if not (offset or skew):
+        return []
+    less = f", and less by {CLOCK_SKEW.names[0]} for each second since the first stamp" if skew else ""
+    return [
+        Formula(
+            f"time of a picture on the gyro's clock, s{less}",
+            "time",
+            "stamp + time_offset" if offset else "stamp",
+            ("stamp",),
+            lambda v: v.stamp + numbers_of(v, [OFFSET])[0] * offset,
+        )
+    ]
 
 
 def _camera(parameters: Collection[str]) -> Formula:
     """The camera in the carrier, with those turns that are calibrated."""
     roll, collimation, tilt = (name in parameters for name in (*_LEFT, _MIDDLE))
+    azimuth, elevation = (f"{joint}_angle" if _corrected(parameters) else joint for joint in JOINTS)
     turns = [
         *(["Ry(camera_roll)"] if roll else []),
         *(["Rz(collimation)"] if collimation else []),
-        "Rx(elevation + delta_px)",
+        f"Rx({elevation} + delta_px)",
         *(["Ry(axis_nonperpendicularity)"] if tilt else []),
-        "Rz(azimuth)",
+        f"Rz({azimuth})",
     ]
 
-    def compute(v: object) -> so3.Array:
-        given = vars(v)
+    def compute(v: Any) -> so3.Array:
         return so3.compose(
-            passive(1, given.get("camera_roll", 0.0)),
-            passive(2, given.get("collimation", 0.0)),
-            passive(0, given["elevation"] + given["delta_px"]),
-            passive(1, given.get("axis_nonperpendicularity", 0.0)),
-            passive(2, given["azimuth"]),
+            *([passive(1, v.camera_roll)] if roll else []),
+            *([passive(2, v.collimation)] if collimation else []),
+            passive(0, getattr(v, elevation) + v.delta_px),
+            *([passive(1, v.axis_nonperpendicularity)] if tilt else []),
+            passive(2, getattr(v, azimuth)),
         )
 
-    return Formula("carrier to line of sight", "lRb", " * ".join(turns), ("azimuth", "elevation"), compute)
+    return Formula("carrier to line of sight", "lRb", " * ".join(turns), JOINTS, compute)

@@ -1,8 +1,8 @@
 """The los method: mounting angles of the gyro and the camera of a gyro-stabilised line of sight.
 
 The graph's states are tRm, the gyro's attitude in the frame of the target, at the pictures: gtsam's native AHRSFactor
-joins them, LosDirectionFactor ties them to the picture and the gimbal. Where a target stands is part of its first
-attitude, so a target found anew starts a new chain. Methods page, section 1.
+joins them, or with errors of the gyro GyroIncrementFactor; LosDirectionFactor ties them to the picture and the gimbal.
+Where a target stands is part of its first attitude, so a target found anew starts a new chain. Methods page, section 1.
 """
 
 from __future__ import annotations
@@ -17,14 +17,16 @@ from numpy.typing import NDArray
 
 from factors import so3
 from factors.chi_square import gate
-from factors.los import SMOOTHING, GimbalPath, LocalMotion, LosDirectionFactor
+from factors.gimbal import SMOOTHING, GimbalPath, LocalMotion
+from factors.gyro import SCALE
+from factors.los import LosDirectionFactor, Surroundings
 from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
 from pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk
 from pipelines.graph.priors import vector_prior
-from pipelines.graph.problem import Array, Factor, Parameter, Problem, Step
-from pipelines.methods.los.guess import camera, guess, initial_attitudes, seen
-from pipelines.methods.los.parameters import ANGLES_KEY, BIAS, OFFSET, OFFSET_KEY, SPLIT, los_parameters
+from pipelines.graph.problem import Array, Factor, Problem, Step
+from pipelines.methods.los.guess import camera, foreseen, guess, initial_attitudes, seen
+from pipelines.methods.los.parameters import BIAS, OFFSET, SPLIT, LosParameters
 from pipelines.methods.los.pictures import select_pictures
 from pipelines.methods.los.recording import LosData
 from pipelines.settings import DEFAULT_NOISE, Config, first_given
@@ -45,14 +47,9 @@ class _Model:
     measured: Array  # (K, 3) phx, phz, roll
     sqrt_information: Array  # (K, 3, 3), zero rows for a roll not measured
     angles: Array  # (K, 2) azimuth, elevation
-    motion: LocalMotion | None  # around the keyframes, when the time offset is a variable
+    around: Surroundings | None  # of the keyframes, when errors of the sensors are variables
     loss: TruncatedLoss
-    parameters: tuple[Parameter, ...]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The mounting angles that are variables."""
-        return tuple(q.name for q in self.parameters[0].quantities)
+    parameters: LosParameters
 
 
 def problem(data: LosData, config: Config) -> Problem:
@@ -68,7 +65,7 @@ def problem(data: LosData, config: Config) -> Problem:
 def _problem(config: Config, data: LosData, model: _Model, dropped: Mapping[str, int]) -> Problem:
     return Problem(
         method="los",
-        parameters=model.parameters,
+        parameters=model.parameters.all,
         steps=partial(_steps, model),
         steps_after=partial(_steps, model, 1),
         loss=model.loss,
@@ -76,7 +73,7 @@ def _problem(config: Config, data: LosData, model: _Model, dropped: Mapping[str,
         dropped=dropped,
         # Errors from pictures are against the first picture of a target, which the end of a recording does not show.
         onward=partial(_onward, config, model) if data.error_cov is None else None,
-        unsettled=_SETTLED if model.motion is None else SMOOTHING,
+        unsettled=_SETTLED if model.around is None else SMOOTHING,
     )
 
 
@@ -93,13 +90,13 @@ def _prepare(
     data: LosData, config: Config, before: _Model | None = None, trunk: Trunk | None = None, start: float = -np.inf
 ) -> tuple[_Model, dict[str, int]]:
     """The model of a recording, or of one that grows from a keyframe of its model until now on."""
-    parameters = los_parameters(config)
+    parameters = LosParameters.of(config, data.force is not None)
     noise = config.noise
     density = first_given(noise.gyro_density, data.gyro_density, DEFAULT_NOISE.gyro_density)
     gimbal, gyro = GimbalPath(data.gimbal_t, data.gimbal), GyroPath(data.gyro_t, data.gyro)
     covariance = _covariance(data, gimbal, config)
-    has_offset = len(parameters) == 3
-    rows, starts, dropped = select_pictures(data, np.sqrt(covariance[:, 0, 0]), SMOOTHING if has_offset else 0.0)
+    margin = SMOOTHING if parameters.sight else 0.0
+    rows, starts, dropped = select_pictures(data, np.sqrt(covariance[:, 0, 0]), margin)
     late = data.image_t[rows] >= start
     rows, starts = rows[late], starts[late]
     starts[:1] = True
@@ -108,29 +105,42 @@ def _prepare(
     chains = np.split(np.arange(len(time)), np.flatnonzero(starts)[1:])
     sigma = float(np.sqrt(np.median(covariance[rows, 0, 0])))
     if before is None:
-        mount, bias_hat = guess(chains, time, angles, measured, gyro, parameters, sigma)
+        known = parameters.angles, parameters.bias
+        mount, bias_hat = guess(chains, time, angles, measured, gyro, known, sigma)
     else:
         mount, bias_hat = before.mount, before.chain.gyro.bias_hat
-    names = tuple(q.name for q in parameters[0].quantities)
-    gyro = GyroPath(data.gyro_t, data.gyro, bias_hat)
-    motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal) if has_offset else None
+    cRm = camera(angles, mount, parameters.names)
+    sensitive = parameters.gyro is not None and len(parameters.gyro.quantities) > SCALE
     chain = GyroChain.over(
         time,
         starts,
-        initial_attitudes(chains, time, camera(angles, mount, names), measured, gyro),
-        gyro,
+        initial_attitudes(chains, time, cRm, measured, gyro),
+        GyroPath(data.gyro_t, data.gyro, bias_hat, data.force if sensitive else None),
         density=density,
         walk=first_given(noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk),
-        scale_error=first_given(noise.gyro_scale, DEFAULT_NOISE.gyro_scale),
+        errors=parameters.gyro,
         trunk=trunk,
     )
+    around = None
+    if parameters.sight is not None:
+        motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal, data.force if sensitive else None)
+        begun, found = data.image_t[0], time[starts]
+        if before is not None and before.around is not None and start > -np.inf:
+            # The data are the recording's end, and its first target may have been found before.
+            k = int(np.searchsorted(before.chain.time, start))
+            begun = start - before.around.elapsed[k]
+            found[0] = start - before.around.watched[k]
+        watched = time - found[np.cumsum(starts) - 1]
+        smooth = camera(motion.gimbal, mount, parameters.names)
+        errors = foreseen(chains, time, smooth, measured, chain.gyro)
+        around = Surroundings(motion, time - begun, watched, errors)
     model = _Model(
         chain=chain,
         mount=mount,
         measured=measured,
         sqrt_information=_sqrt_information(covariance[rows]),
         angles=angles,
-        motion=motion,
+        around=around,
         loss=TruncatedLoss(gate(3 if np.isfinite(measured[:, 2]).any() else 2)),
         parameters=parameters,
     )
@@ -182,10 +192,12 @@ def _step(model: _Model, keyframes: range) -> Step:
         keyframes=chain.numbers(keyframes),
     )
     if chain.first + keyframes.start == 0:
-        step.initial.insert(ANGLES_KEY, model.mount)
-        if model.motion is not None:
-            step.initial.insert(OFFSET_KEY, np.zeros(1))
-        step.factors.extend(vector_prior(p, np.zeros(len(p.quantities))) for p in model.parameters)
+        p = model.parameters
+        step.initial.insert(p.angles.key, model.mount)
+        for errors in (p.sight, p.gyro):
+            if errors is not None:
+                step.initial.insert(errors.key, np.zeros(len(errors.quantities)))
+        step.factors.extend(vector_prior(each, np.zeros(len(each.quantities))) for each in p.all)
     step.factors.extend(_start_factor(model, k) for k in keyframes if chain.starts[k])
     chain.add(step, keyframes)
     step.factors.extend(_picture_factors(model, keyframes))
@@ -194,7 +206,7 @@ def _step(model: _Model, keyframes: range) -> Step:
 
 def _found(model: _Model, k: int, current: gtsam.Values) -> Array:
     """tRm (4,) where a target is found, with the mounting angles as estimated by now."""
-    cRm = camera(model.angles[k : k + 1], current.atVector(ANGLES_KEY), model.names)
+    cRm = camera(model.angles[k : k + 1], current.atVector(model.parameters.angles.key), model.parameters.names)
     return seen(cRm, model.measured[k : k + 1])[0]
 
 
@@ -219,17 +231,19 @@ def _picture_factors(model: _Model, keyframes: range) -> list[Factor]:
 
 
 def _picture_factor(model: _Model, k: NDArray[np.intp], rows: int, family: str) -> Factor:
+    p = model.parameters
     rows_model = LosDirectionFactor(
         model.chain.time[k],
         model.measured[k, :rows],
         model.sqrt_information[k, :rows, :rows],
         model.angles[k],
-        model.names,
-        None if model.motion is None else model.motion[k],
+        p.names,
+        None if model.around is None else model.around[k],
+        len(p.gyro.quantities) if p.gyro is not None and p.sight is not None else 0,
     )
-    columns: list[int | list[int]] = [[model.chain.state(i) for i in k], ANGLES_KEY]
-    if model.motion is not None:
-        columns += [model.chain.bias_keys(k), OFFSET_KEY]
+    columns: list[int | list[int]] = [[model.chain.state(i) for i in k], p.angles.key]
+    if p.sight is not None:
+        columns += [model.chain.bias_keys(k), p.sight.key, *model.chain.error_keys]
     return Factor.of(family, rows_model.on(*columns, loss=model.loss))
 
 

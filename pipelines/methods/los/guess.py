@@ -20,6 +20,8 @@ from pipelines.graph.problem import Array, Parameter
 # Pictures so far apart, s, are compared, long against their noise, and no more than so many pairs of them.
 _SPAN, _MOST_PAIRS = 1.0, 2000
 _PASSES = 5
+# Between the knots of a line that follows what the gyro's noise and bias add up to, s.
+_SLOW = 30.0
 _STEP = 1e-6
 
 
@@ -69,10 +71,30 @@ def _carried(time: Array, cRm: Array, measured: Array, gyro: GyroPath) -> Array:
     return so3.compose(seen(cRm[:1], measured[:1]), so3.inverse(turned[:1]), turned)
 
 
-def carried_errors(time: Array, cRm: Array, measured: Array, gyro: GyroPath) -> Array:
-    """phx, phz (n, 2), rad, that one target's pictures would show if the gyro told all since the first of them."""
+def carried_errors(time: Array, cRm: Array, measured: Array, gyro: GyroPath, target_rate: Array) -> Array:
+    """phx, phz (n, 2), rad, that one target's pictures would show if the gyro told all since the first of them.
+
+    The target's frame turns at `target_rate` (3,), rad/s.
+    """
     tRm = _carried(time, cRm, measured, gyro)
-    return los_error(so3.rotate(so3.multiply(cRm, so3.inverse(tRm)), [0.0, 1.0, 0.0]))
+    target = so3.rotate(so3.exp((time - time[0])[:, None] * target_rate), [0.0, 1.0, 0.0])
+    return los_error(so3.rotate(so3.multiply(cRm, so3.inverse(tRm)), target))
+
+
+def foreseen(chains: Sequence[NDArray[np.intp]], time: Array, cRm: Array, measured: Array, gyro: GyroPath) -> Array:
+    """phx, phz (n, 2), rad, as gyro and gimbal carry them on, brought near the measured ones by slow broken lines.
+
+    The lines have so few numbers that next to nothing of a picture's noise is in them; cRm (n, 4) are to be of smoothed
+    gimbal angles, without the encoders' noise.
+    """
+    out = np.empty((len(time), 2))
+    for chain in chains:
+        t = time[chain]
+        carried = carried_errors(t, cRm[chain], measured[chain], gyro, np.zeros(3))
+        knots = np.linspace(t[0], t[-1], 2 + int((t[-1] - t[0]) / _SLOW))
+        hats = np.stack([np.interp(t, knots, each) for each in np.eye(len(knots))], axis=1)
+        out[chain] = carried + hats @ np.linalg.lstsq(hats, measured[chain, :2] - carried)[0]
+    return out
 
 
 def guess(

@@ -1,43 +1,123 @@
-"""The parameters of the los method: their names, variables and priors."""
+"""What the los method calibrates and what it assumes: names, variables, priors and accuracies of the contract."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import gtsam
 
 from pipelines.errors import InputError
+from pipelines.graph.assumptions import (
+    Assumption,
+    parameter,
+    quantities,
+    scale_assumptions,
+    sensitivity_assumption,
+)
 from pipelines.graph.problem import Parameter, Quantity
 from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
+from pipelines.methods.los.topics import JOINTS
 from pipelines.settings import Config, check_names
 
 _ANGLES = ("delta_px", "delta_gx", "delta_gy")
 SPLIT = ("delta_pz", "delta_gz")
-_OPTIONS = ("camera_roll", "collimation", "axis_nonperpendicularity")
 BIAS = ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")
 OFFSET = "time_offset"
-# Everything but gyro bias and time offset: the angles by which gyro, gimbal axes and camera are mounted.
-ANGLES = (*_ANGLES, "delta_z", *SPLIT, *_OPTIONS)
-NAMES = (*ANGLES, *BIAS, OFFSET)
 
-ANGLES_KEY, OFFSET_KEY = int(gtsam.symbol("a", 0)), int(gtsam.symbol("T", 0))
-_PRIOR_ANGLE, _PRIOR_BIAS, _PRIOR_OFFSET = 0.1, 0.02, 0.05
+# What data sheets state, one sigma: good MEMS gyros after factory calibration, a camera whose focal length was measured
+# roughly, machined gimbals.
+SCALE = scale_assumptions("gyro", "gyro", 3e-3)
+SENSITIVITY = sensitivity_assumption("gyro", "gyro", 2e-5)
+ROLL = Assumption(("camera_roll",), "rad", "camera", "roll", 1e-2)
+COLLIMATION = Assumption(("collimation",), "rad", "gimbal", "collimation", 1e-3)
+AXES = Assumption(("axis_nonperpendicularity",), "rad", "gimbal", "nonperpendicularity", 1e-3)
+TIME_OFFSET = Assumption((OFFSET,), "s", "clock", "offset", 1e-2)
+CLOCK_SKEW = Assumption(("clock_skew",), "", "clock", "skew", 1e-4)
+LOS_SCALE = Assumption(("los_scale",), "", "camera", "scale", 5e-3)
+TARGET_RATE = Assumption(("target_rate_x", "target_rate_z"), "rad/s", "target", "rate", 1e-5)
+ONCE_PER_TURN = Assumption(
+    tuple(f"encoder_{joint}_{part}" for joint in JOINTS for part in ("sin", "cos")),
+    "rad",
+    "encoder",
+    "once_per_turn",
+    2e-4,
+)
+DELAY = Assumption(("encoder_delay",), "s", "encoder", "delay", 1e-3)
+
+# Of the mounting, one by one; and those of factors.los.SIGHT_ERRORS, in its order.
+MOUNTED, SIGHT = (ROLL, COLLIMATION, AXES), (TIME_OFFSET, CLOCK_SKEW, LOS_SCALE, TARGET_RATE, ONCE_PER_TURN, DELAY)
+ASSUMPTIONS = (*SCALE, SENSITIVITY, *MOUNTED, *SIGHT)
+# The angles by which gyro, gimbal axes and camera are mounted.
+ANGLES = (*_ANGLES, "delta_z", *SPLIT, *(name for each in MOUNTED for name in each.names))
+
+_PRIOR_ANGLE, _PRIOR_BIAS, _REQUIRE = 0.1, 0.02, 1e-3
 
 
-def los_parameters(config: Config) -> tuple[Parameter, ...]:
-    """The method's parameters with their priors; options only where the config gives them a prior other than 0."""
-    check_names(config.priors, NAMES, "priors")
-    check_names(config.require, NAMES, "require")
-    given = [name for name in SPLIT if name in config.priors]
-    if len(given) == 1:
-        raise InputError(f"priors: {given[0]} alone; delta_pz and delta_gz are given both, or neither for delta_z")
+@dataclass(frozen=True)
+class LosParameters:
+    """The variables that all measurements share.
 
-    def quantity(name: str, unit: str, scale: float) -> Quantity:
-        return Quantity(name, unit, config.priors.get(name, scale), scale, config.require.get(name, 1e-3))
+    Attributes:
+        angles: of the mounting.
+        bias: of the gyro (3), rad/s, its first node.
+        sight: factors.los.SIGHT_ERRORS; None when all are fixed.
+        gyro: S of the gyro (6), or S and G (15); None for a perfect one.
+    """
 
-    names = (*_ANGLES, *(SPLIT if given else ("delta_z",)), *(n for n in _OPTIONS if config.priors.get(n, 0.0) != 0.0))
-    parameters = [
-        Parameter(ANGLES_KEY, tuple(quantity(name, "rad", _PRIOR_ANGLE) for name in names)),
-        Parameter(FIRST_BIAS, tuple(quantity(name, "rad/s", _PRIOR_BIAS) for name in BIAS)),
-    ]
-    if config.priors.get(OFFSET, 0.0) != 0.0:
-        parameters.append(Parameter(OFFSET_KEY, (quantity(OFFSET, "s", _PRIOR_OFFSET),)))
-    return tuple(parameters)
+    angles: Parameter
+    bias: Parameter
+    sight: Parameter | None
+    gyro: Parameter | None
+
+    @classmethod
+    def of(cls, config: Config, accelerometer: bool) -> LosParameters:
+        """With the priors in force.
+
+        Args:
+            config: priors, data sheets, accuracies wanted.
+            accelerometer: whether the gyro's IMU measures specific force.
+        """
+        if config.noise.gyro_scale:
+            figure = config.noise.gyro_scale
+            raise InputError(
+                f"noise.gyro_scale: los estimates the gyro's scale; write sensors: {{gyro: {{scale: {figure:g}, "
+                f"skew: {figure:g}}}}} instead"
+            )
+        assumed = {q.name: q for each in ASSUMPTIONS for q in quantities(each, config)}
+        known = (*_ANGLES, "delta_z", *SPLIT, *BIAS, *assumed)
+        check_names(config.priors, known, "priors")
+        check_names(config.require, known, "require")
+        given = [name for name in SPLIT if name in config.priors]
+        if len(given) == 1:
+            raise InputError(f"priors: {given[0]} alone; delta_pz and delta_gz are given both, or neither for delta_z")
+
+        def calibrated(names: Sequence[str], unit: str, scale: float) -> tuple[Quantity, ...]:
+            return tuple(
+                Quantity(name, unit, config.priors.get(name, scale), scale, config.require.get(name, _REQUIRE))
+                for name in names
+            )
+
+        angles = calibrated((*_ANGLES, *(SPLIT if given else ("delta_z",))), "rad", _PRIOR_ANGLE)
+        mounted = tuple(assumed[name] for each in MOUNTED for name in each.names if assumed[name].prior_sigma != 0.0)
+        sensitive = accelerometer and parameter(_key("G"), (SENSITIVITY,), config) is not None
+        return cls(
+            angles=Parameter(_key("a"), (*angles, *mounted)),
+            bias=Parameter(FIRST_BIAS, calibrated(BIAS, "rad/s", _PRIOR_BIAS)),
+            sight=parameter(_key("S"), SIGHT, config),
+            gyro=parameter(_key("G"), (*SCALE, SENSITIVITY) if sensitive else SCALE, config),
+        )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The mounting angles that are variables."""
+        return tuple(q.name for q in self.angles.quantities)
+
+    @property
+    def all(self) -> tuple[Parameter, ...]:
+        """In reporting order."""
+        return tuple(each for each in (self.angles, self.bias, self.sight, self.gyro) if each is not None)
+
+
+def _key(letter: str) -> int:
+    return int(gtsam.symbol(letter, 0))

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import InputError
-from pipelines.methods.los.topics import GIMBAL, LOS_ERROR
+from pipelines.methods.los.topics import GIMBAL, JOINTS, LOS_ERROR
 from pipelines.recording import series
 from pipelines.recording.checks import check_overlap, clean, count, nanoseconds
-from pipelines.recording.gyro import read_gyro
+from pipelines.recording.gyro import read_imu
 from pipelines.recording.reading import Recording
 from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU
 from pipelines.recording.writing import attached, write_session
@@ -22,8 +22,6 @@ from pipelines.settings import Config
 from pipelines.vision.recorded import camera_of
 
 Array = NDArray[np.float64]
-
-JOINTS = ("azimuth", "elevation")
 
 # Beyond this elevation the azimuth axis would have to turn sec(elevation) > 5.8 times as fast as the sway.
 _STEEPEST = np.deg2rad(80.0)
@@ -42,7 +40,8 @@ class LosData:
     gyro_t (N,), gyro (N, 3) rad/s: carrier gyro in m. gimbal_t (G,), gimbal (G, 2) rad: azimuth (continuous) and
     elevation. image_t (K,), error (K, 3) rad: phx, phz and the camera's roll since its target was found, NaN where the
     roll was not measured. error_cov (K, 3, 3) rad^2: the tracker's covariance, None if unknown. gyro_density,
-    rad/s/sqrt(Hz): from the covariances of the messages, None if they say nothing. dropped: reason -> messages.
+    rad/s/sqrt(Hz): from the covariances of the messages, None if they say nothing. force (N, 3) m/s^2: specific force
+    by the IMU's accelerometer in m, at gyro_t; None if it has none. dropped: reason -> messages.
     """
 
     epoch_ns: int
@@ -54,6 +53,7 @@ class LosData:
     error: Array
     error_cov: Array | None = None
     gyro_density: float | None = None
+    force: Array | None = None
     dropped: dict[str, int] = field(default_factory=dict)
 
 
@@ -69,7 +69,7 @@ def read_los(recording: Recording, config: Config) -> LosData:
     gyro_name, gimbal_name, error_name = map(config.topic, (IMU, GIMBAL, LOS_ERROR))
     from_pictures = error_name not in recording.topics and config.topic(IMAGE) in recording.topics
     recording.read_together({gyro_name: (), gimbal_name: JOINTS, error_name: ()})
-    gyro_t, gyro, density = read_gyro(recording, gyro_name, epoch, dropped)
+    gyro_t, gyro, density, force = read_imu(recording, gyro_name, epoch, dropped)
     gimbal_t, gimbal = _gimbal(recording, gimbal_name, epoch, dropped)
     covariance = None
     if from_pictures and LOS_ERROR.key not in config.topics:
@@ -78,7 +78,7 @@ def read_los(recording: Recording, config: Config) -> LosData:
     else:
         image_t, error = _error(recording, error_name, epoch, dropped)
     check_overlap({gyro_name: gyro_t, gimbal_name: gimbal_t, error_name: image_t})
-    data = LosData(epoch, gyro_t, gyro, gimbal_t, gimbal, image_t, error, covariance, density, dropped)
+    data = LosData(epoch, gyro_t, gyro, gimbal_t, gimbal, image_t, error, covariance, density, force, dropped)
     check_gimbal(gimbal_name, data)
     check_signs(gyro_name, data)
     return data
@@ -101,8 +101,9 @@ def write_los(
         return nanoseconds(t, data.epoch_ns)
 
     variance = 0.0 if data.gyro_density is None else data.gyro_density**2 / np.median(np.diff(data.gyro_t))
+    accel = np.zeros(3) if data.force is None else data.force
     topics: dict[str, series.Topic] = {
-        IMU.name: series.ImuSeries(ns(data.gyro_t), data.gyro, gyro_cov=variance * np.eye(3), frame_id="imu"),
+        IMU.name: series.ImuSeries(ns(data.gyro_t), data.gyro, accel, gyro_cov=variance * np.eye(3), frame_id="imu"),
         GIMBAL.name: series.JointSeries(ns(data.gimbal_t), data.gimbal, JOINTS, frame_id="gimbal"),
     }
     if pictures is None:

@@ -5,12 +5,13 @@ East-North-Up, i which does not turn and is n at t = 0. The carrier's attitude i
 sample is Log of the exact rotation over its interval, centred on its stamp, divided by the interval. The stabilisation
 loop runs at the gyro's rate: it turns every sample, noise and bias included, into the two gimbal rates that would hold
 the line of sight still if the gyro and the camera were mounted straight, and the gimbal turns at these rates until the
-next sample. Gimbal angles are therefore known exactly at any time.
+next sample. Gimbal angles are therefore known exactly at any time. Sensors may have errors: the loop holds on to what
+its gyro reads, errors included.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from io import StringIO
 from math import cos, sin
@@ -21,12 +22,16 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from factors import so3
-from factors.earth import earth_rate
+from factors.earth import earth_rate, gravity
 from pipelines.errors import InputError
+from pipelines.methods.los.parameters import ASSUMPTIONS
 from pipelines.methods.los.recording import LosData
+from pipelines.methods.los.topics import JOINTS
 from pipelines.recording import series
 from pipelines.recording.checks import nanoseconds
+from pipelines.settings import SensorSheets
 from pipelines.simulation.motion import EulerMotion, Swing, sample_times
+from pipelines.simulation.sensors import read_by, true_values
 from pipelines.simulation.simulated import Simulated
 
 Array = NDArray[np.float64]
@@ -47,6 +52,7 @@ class LosNoise(BaseModel):
 
     gyro_density: NotNegative = 3e-5  # rad/s/sqrt(Hz)
     gyro_bias_walk: NotNegative = 2e-7  # rad/s/sqrt(s)
+    accel_density: NotNegative = 1e-3  # m/s^2/sqrt(Hz)
     encoder: NotNegative = 5e-6  # rad
     los_error: NotNegative = 2e-5  # rad per axis
     los_roll: NotNegative = 2e-4  # rad
@@ -62,9 +68,6 @@ class LosAngles(BaseModel):
     delta_gx: float = -0.5
     delta_gy: float = 0.5
     delta_gz: float = -0.25
-    camera_roll: float = 0.0
-    collimation: float = 0.0
-    axis_nonperpendicularity: float = 0.0
 
 
 class Loss(BaseModel):
@@ -111,7 +114,6 @@ class LosScenario(BaseModel):
     gyro_turn_on_bias: NotNegative = 1e-4  # rad/s, sigma per axis of the bias at the start
     encoder_step: NotNegative = 0.0  # rad, quantisation
     latitude_deg: float | None = None  # of a target on the turning earth; null: nothing turns
-    time_offset_s: float = 0.0  # positive: the picture was taken later than its stamp says
     measures_roll: bool = False
     gyro_rate_hz: Positive = 500.0
     gimbal_rate_hz: Positive = 200.0
@@ -124,6 +126,10 @@ class LosScenario(BaseModel):
     camera: LosCamera = LosCamera()
     outlier_share: Share = 0.0
     outlier_size: NotNegative = 5e-3  # rad, sigma per axis
+    # Data sheets that errors of the sensors are drawn from, passed on to the config; ideal: there are none; null: none
+    # either, but the config does not know.
+    sensors: SensorSheets | None = None
+    effects: dict[str, float] = {}  # assumptions by name and their true values, whatever the data sheets
     priors: dict[str, float | None] = {}  # passed on to the recording's config
 
     @model_validator(mode="after")
@@ -147,6 +153,8 @@ class LosMotion:
         gimbal: (N + 1, 2) azimuth and elevation there, rad; linear in between.
         gyro_t, gyro: (N,), (N, 3) the gyro's samples, noise and bias included, rad/s.
         bias: (N, 3) of the gyro, rad/s.
+        force: (N, 3) specific force at the gyro's samples, in m, m/s^2.
+        effects: errors of the sensors by name.
     """
 
     edges: Array
@@ -154,28 +162,35 @@ class LosMotion:
     gyro_t: Array
     gyro: Array
     bias: Array
+    force: Array
+    effects: Mapping[str, float]
 
     def gimbal_at(self, t: Array) -> Array:
         """Azimuth and elevation (n, 2), rad."""
         return np.stack([np.interp(t, self.edges, self.gimbal[:, k]) for k in range(2)], axis=1)
 
+    def covers(self, t: Array) -> NDArray[np.bool_]:
+        """Which of the times (n,) lie in what happened."""
+        return np.asarray((t >= self.edges[0]) & (t <= self.edges[-1]))
+
 
 def simulate_los(scenario: LosScenario, seed: int) -> tuple[LosData, dict[str, float]]:
     """A session and the true values of its parameters (rad, rad/s, s; the bias is its mean over the session)."""
-    rng = np.random.default_rng(seed)
-    motion = simulate_motion(scenario, rng)
+    # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
+    rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
+    effects = true_values(ASSUMPTIONS, scenario.sensors, scenario.effects, rng_of_sensors)
+    motion = simulate_motion(scenario, effects, rng)
     image_t, cRt = targets(scenario, motion, rng)
     noise = scenario.noise
-    gimbal_t = sample_times(scenario.duration_s, scenario.gimbal_rate_hz, scenario.gimbal_phase)
-    gimbal = motion.gimbal_at(gimbal_t) + noise.encoder * rng.standard_normal((len(gimbal_t), 2))
-    if scenario.encoder_step > 0.0:
-        gimbal = np.round(gimbal / scenario.encoder_step) * scenario.encoder_step
+    gimbal_t, gimbal = _encoders(scenario, motion, rng)
     exact = picture_of(cRt)
+    exact[:, :2] *= 1.0 + motion.effects["los_scale"]
     error = exact + rng.standard_normal(exact.shape) * [noise.los_error, noise.los_error, noise.los_roll]
     outlying = rng.random(len(error)) < scenario.outlier_share
     error[outlying, :2] += scenario.outlier_size * rng.standard_normal((int(outlying.sum()), 2))
     if not scenario.measures_roll:
         error[:, 2] = np.nan
+    shaken = noise.accel_density * np.sqrt(scenario.gyro_rate_hz) * rng_of_sensors.standard_normal(motion.force.shape)
     data = LosData(
         epoch_ns=EPOCH_NS,
         gyro_t=motion.gyro_t,
@@ -185,23 +200,46 @@ def simulate_los(scenario: LosScenario, seed: int) -> tuple[LosData, dict[str, f
         image_t=image_t,
         error=error,
         gyro_density=noise.gyro_density or None,
+        force=motion.force + shaken,
     )
     return data, _truth(scenario, motion)
 
 
-def simulate_motion(scenario: LosScenario, rng: np.random.Generator) -> LosMotion:
-    """The carrier's sway as the gyro sees it, and what the stabilisation loop makes of that."""
+def simulate_motion(scenario: LosScenario, effects: Mapping[str, float], rng: np.random.Generator) -> LosMotion:
+    """The carrier's sway as the gyro sees it, and what the stabilisation loop makes of that.
+
+    Errors of the sensors by name are all ASSUMPTIONS.
+    """
     rate_hz = scenario.gyro_rate_hz
     gyro_t = sample_times(scenario.duration_s, rate_hz)
     edges = np.asarray((np.arange(len(gyro_t) + 1) - 0.5) / rate_hz)
     iRm = so3.multiply(carrier_attitude(scenario, edges), _gyro_mount(scenario))
     exact = so3.log(so3.multiply(so3.inverse(iRm[:-1]), iRm[1:])) * rate_hz
+    # The carrier turns about a point at rest.
+    nRm = so3.multiply(scenario.carrier.attitude(gyro_t), _gyro_mount(scenario))
+    up = np.array([0.0, 0.0, float(gravity(np.deg2rad(scenario.latitude_deg or 0.0)))])
+    force = so3.rotate(so3.inverse(nRm), up)
     start = scenario.gyro_turn_on_bias * rng.standard_normal(3)
     steps = scenario.noise.gyro_bias_walk / np.sqrt(rate_hz) * rng.standard_normal(exact.shape)
     bias = np.asarray(start + np.cumsum(steps, axis=0))
-    gyro = exact + bias + scenario.noise.gyro_density * np.sqrt(rate_hz) * rng.standard_normal(exact.shape)
+    gyro = read_by(exact, "gyro", effects, force) + bias
+    gyro = gyro + scenario.noise.gyro_density * np.sqrt(rate_hz) * rng.standard_normal(exact.shape)
     first = np.deg2rad(scenario.azimuth_deg), np.deg2rad(scenario.elevation_deg)
-    return LosMotion(edges, _stabilise(gyro, _slew(scenario, gyro_t), 1.0 / rate_hz, *first), gyro_t, gyro, bias)
+    gimbal = _stabilise(gyro, _slew(scenario, gyro_t), 1.0 / rate_hz, *first)
+    return LosMotion(edges, gimbal, gyro_t, gyro, bias, force, effects)
+
+
+def _encoders(scenario: LosScenario, motion: LosMotion, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Stamps and readings (n, 2) of the encoders, rad; what would be read beyond the recording's ends is left out."""
+    t = sample_times(scenario.duration_s, scenario.gimbal_rate_hz, scenario.gimbal_phase)
+    at = t + motion.effects["encoder_delay"]
+    t, at = t[motion.covers(at)], at[motion.covers(at)]
+    angle = motion.gimbal_at(at)
+    s, c = (np.array([motion.effects[f"encoder_{joint}_{part}"] for joint in JOINTS]) for part in ("sin", "cos"))
+    read = angle + s * np.sin(angle) + c * np.cos(angle) + scenario.noise.encoder * rng.standard_normal((len(t), 2))
+    if scenario.encoder_step > 0.0:
+        read = np.round(read / scenario.encoder_step) * scenario.encoder_step
+    return t, np.asarray(read)
 
 
 def carrier_attitude(scenario: LosScenario, t: Array) -> Array:
@@ -212,17 +250,16 @@ def carrier_attitude(scenario: LosScenario, t: Array) -> Array:
     return so3.multiply(so3.exp(t[:, None] * earth_rate(np.deg2rad(scenario.latitude_deg))), nRb)
 
 
-def camera_attitude(scenario: LosScenario, gimbal: Array) -> Array:
-    """bRc, shape (N, 4), at true gimbal angles (N, 2)."""
-    angles = np.deg2rad(list(scenario.angles_deg.model_dump().values()))
-    named = dict(zip(scenario.angles_deg.model_dump(), angles.tolist(), strict=True))
+def camera_attitude(scenario: LosScenario, gimbal: Array, effects: Mapping[str, float]) -> Array:
+    """bRc, shape (N, 4), at true gimbal angles (N, 2) and with the gimbal's and the camera's own errors, rad."""
+    px, pz = np.deg2rad([scenario.angles_deg.delta_px, scenario.angles_deg.delta_pz])
     # Each passive matrix of cRb is Exp(a e)^T, so the inverse has them the other way round and active.
     return so3.compose(
-        _about(2, gimbal[:, 0] + named["delta_pz"]),
-        _about(1, named["axis_nonperpendicularity"]),
-        _about(0, gimbal[:, 1] + named["delta_px"]),
-        _about(2, named["collimation"]),
-        _about(1, named["camera_roll"]),
+        _about(2, gimbal[:, 0] + pz),
+        _about(1, effects["axis_nonperpendicularity"]),
+        _about(0, gimbal[:, 1] + px),
+        _about(2, effects["collimation"]),
+        _about(1, effects["camera_roll"]),
     )
 
 
@@ -240,7 +277,9 @@ def simulated(scenario: LosScenario, seed: int, images: bool = False) -> Simulat
 def simulate_pictures(scenario: LosScenario, seed: int) -> tuple[series.CameraInfo, series.ImageSeries]:
     """The pictures behind the LOS errors of `simulate_los` with the same seed; drawn one by one as they are taken."""
     rng = np.random.default_rng(seed)
-    stamps, cRt = targets(scenario, simulate_motion(scenario, rng), rng)
+    effects = true_values(ASSUMPTIONS, scenario.sensors, scenario.effects, np.random.default_rng([seed, 1]))
+    motion = simulate_motion(scenario, effects, rng)
+    stamps, cRt = targets(scenario, motion, rng)
     if scenario.losses:
         raise InputError("losses: pictures are simulated of a single target; leave out --images")
     camera = scenario.camera
@@ -258,7 +297,10 @@ def simulate_pictures(scenario: LosScenario, seed: int) -> tuple[series.CameraIn
         np.hstack([K, np.zeros((3, 1))]),
         "camera",
     )
-    return info, series.ImageSeries(t_ns, _exposures(camera, K, cRt, rng), "jpeg", "camera")
+    # The lens magnifies by more than CameraInfo knows.
+    magnified = 1.0 + motion.effects["los_scale"]
+    lens = K * np.array([magnified, magnified, 1.0])
+    return info, series.ImageSeries(t_ns, _exposures(camera, lens, cRt, rng), "jpeg", "camera")
 
 
 def _exposures(settings: LosCamera, K: Array, cRt: Array, rng: np.random.Generator) -> Iterator[bytes]:
@@ -299,7 +341,9 @@ def los_config(scenario: LosScenario, images: bool = False) -> str:
     noise = {name: value for name, value in scenario.noise.model_dump().items() if value > 0.0}
     if images:
         noise = {name: value for name, value in noise.items() if name not in ("los_error", "los_roll")}
-    config = {"method": "los", "noise": noise, "priors": scenario.priors}
+    config: dict[str, object] = {"method": "los", "noise": noise, "priors": scenario.priors}
+    if scenario.sensors is not None:
+        config["sensors"] = scenario.model_dump()["sensors"]
     text = StringIO()
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style = False
@@ -345,16 +389,21 @@ def targets(scenario: LosScenario, motion: LosMotion, rng: np.random.Generator) 
     for start, end in scenario.gaps:
         seen &= (stamps < start) | (stamps >= end)
     stamps = stamps[seen]
-    t = stamps + scenario.time_offset_s
+    effects = motion.effects
+    t = stamps + effects["time_offset"] - effects["clock_skew"] * (stamps - stamps[0])
+    # What would be taken beyond the recording's ends is left out.
+    stamps, t = stamps[motion.covers(t)], t[motion.covers(t)]
     nRb = scenario.carrier.attitude(t)
-    nRc = so3.multiply(nRb, camera_attitude(scenario, motion.gimbal_at(t)))
+    nRc = so3.multiply(nRb, camera_attitude(scenario, motion.gimbal_at(t), effects))
+    turning = np.array([effects["target_rate_x"], 0.0, effects["target_rate_z"]])
     target = np.searchsorted(np.sort([loss.end_s for loss in scenario.losses]), stamps, side="right")
     cRt = np.empty((len(stamps), 4))
     for k in np.unique(target):
         mine = np.flatnonzero(target == k)
         off = np.array([*(scenario.acquisition_error * rng.standard_normal(2)), 0.0])[[0, 2, 1]]
         nRt = so3.multiply(nRc[mine[0]], so3.exp(off))
-        cRt[mine] = so3.multiply(so3.inverse(nRc[mine]), nRt)
+        moved = so3.exp((t[mine] - t[mine[0]])[:, None] * turning)
+        cRt[mine] = so3.compose(so3.inverse(nRc[mine]), nRt, moved)
     return stamps, cRt
 
 
@@ -394,4 +443,4 @@ def _truth(scenario: LosScenario, motion: LosMotion) -> dict[str, float]:
         nRm = so3.multiply(scenario.carrier.attitude(motion.gyro_t), _gyro_mount(scenario))
         bias = bias + so3.rotate(so3.inverse(nRm), earth_rate(np.deg2rad(scenario.latitude_deg))).mean(axis=0)
     truth |= {f"gyro_bias_{axis}": float(b) for axis, b in zip("xyz", bias, strict=True)}
-    return truth | {"time_offset": scenario.time_offset_s}
+    return {**truth, **motion.effects}

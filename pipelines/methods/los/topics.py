@@ -8,5 +8,8 @@ from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, Need, Topic
 GIMBAL = Topic("gimbal", "/gimbal/joint_states", (messages.JOINT_STATE,))
 LOS_ERROR = Topic("los_error", "/los/error", (messages.VECTOR,))
 
+# The gimbal's axes, as its messages name them.
+JOINTS = ("azimuth", "elevation")
+
 TOPICS = (IMU, GIMBAL, LOS_ERROR, IMAGE, CAMERA_INFO)
 NEEDS: tuple[Need, ...] = (((IMU,),), ((GIMBAL,),), ((LOS_ERROR,), (IMAGE, CAMERA_INFO)))

@@ -2,7 +2,8 @@
 
 The recording is replayed. On top of what the gimbal did it is turned by the integral of compensated less uncompensated
 commands, and the target's recorded direction is carried over from the gimbal as it was to the gimbal as it would have
-been. Compensated commands hold the frame Rx(eps + px) Rz(eta) still against w_b = Rz(dz) Rx(-gx) Ry(-gy) (gyro - bias):
+been. Compensated commands hold the frame Rx(eps + px) Rz(eta) still against w_b = Rz(dz) Rx(-gx) Ry(-gy) w, w the rate
+of the gyro with its errors taken off:
 
     eps' = -(cos(eta) wx + sin(eta) wy),  eta' = tan(eps + px) (cos(eta) wy - sin(eta) wx) - wz.
 
@@ -17,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import so3
-from factors.los import GimbalPath
+from factors.gimbal import GimbalPath, command
 from pipelines.graph.problem import Array
 from pipelines.judgement.validation import Validation
+from pipelines.methods.los.corrected import rates
 from pipelines.methods.los.guess import los_direction, los_error
 from pipelines.methods.los.pictures import select_pictures
 from pipelines.methods.los.recording import LosData
@@ -37,7 +39,7 @@ def validate(data: LosData, config: Config, values: Mapping[str, float]) -> tupl
     Args:
         data: the session.
         config: of the session.
-        values: calibrated parameters by name, rad and rad/s; those not there are zero.
+        values: calibrated parameters by name, SI; those not there are zero.
 
     Raises:
         InputError: too few pictures within the records of gyro and gimbal.
@@ -78,29 +80,24 @@ def _replayed(data: LosData, chain: NDArray[np.intp], values: Mapping[str, float
     t = data.image_t[chain]
     inside = (data.gyro_t > t[0]) & (data.gyro_t < t[-1])
     at = np.concatenate([t[:1], data.gyro_t[inside], t[-1:]])
-    gyro = np.stack([np.interp(at, data.gyro_t, data.gyro[:, i]) for i in range(3)], axis=1)
+    gyro, true = (
+        np.stack([np.interp(at, data.gyro_t, each) for each in samples.T], axis=1)
+        for samples in (data.gyro, rates(data, values))
+    )
     gimbal = GimbalPath(data.gimbal_t, data.gimbal)
     recorded = gimbal.at(at)
-    bias = np.array([values.get(f"gyro_bias_{axis}", 0.0) for axis in "xyz"])
     px = values.get("delta_px", 0.0)
-    rate = so3.rotate(_carrier_from_gyro(values), gyro - bias)
-    uncompensated = _commands(gyro, recorded, 0.0)
+    rate = so3.rotate(_carrier_from_gyro(values), true)
+    uncompensated = command(gyro, recorded)
     extra = np.zeros_like(recorded)
     for _ in range(_PASSES):
-        difference = _commands(rate, recorded + extra, px) - uncompensated
+        difference = command(rate, recorded + extra + [0.0, px]) - uncompensated
         steps = 0.5 * np.diff(at)[:, None] * (difference[1:] + difference[:-1])
         extra = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
     was = gimbal.at(t)
     would = was + np.stack([np.interp(t, at, extra[:, k]) for k in range(2)], axis=1)
     cRc = so3.multiply(_camera(would, px), so3.inverse(_camera(was, px)))
     return los_error(so3.rotate(cRc, los_direction(data.error[chain])))
-
-
-def _commands(rate: Array, gimbal: Array, px: float) -> Array:
-    """Rates of azimuth and elevation (n, 2) that hold the line of sight still at carrier rates (n, 3)."""
-    s, c = np.sin(gimbal[:, 0]), np.cos(gimbal[:, 0])
-    wx, wy, wz = rate.T
-    return np.stack([np.tan(gimbal[:, 1] + px) * (c * wy - s * wx) - wz, -c * wx - s * wy], axis=1)
 
 
 def _carrier_from_gyro(values: Mapping[str, float]) -> Array:

@@ -1,0 +1,42 @@
+"""What the sensors of a los recording measured, with the errors that a calibration found taken off.
+
+`values` are calibrated parameters by name, SI; those that are not there are zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import SimpleNamespace
+
+import numpy as np
+
+from factors.gimbal import GimbalPath
+from pipelines.graph.problem import Array
+from pipelines.methods.formula import gyro_rate
+from pipelines.methods.los.formulas import S
+from pipelines.methods.los.parameters import BIAS, ONCE_PER_TURN, SENSITIVITY
+from pipelines.methods.los.recording import LosData
+
+
+def rates(data: LosData, values: Mapping[str, float]) -> Array:
+    """True rates (N, 3) at the gyro's samples, rad/s; without an accelerometer the g-sensitivity stays in."""
+    known = {name: value for name, value in values.items() if data.force is not None or name not in SENSITIVITY.names}
+    bias = np.array([values.get(name, 0.0) for name in BIAS])
+    measured = SimpleNamespace(**known, gyro=data.gyro, gyro_bias=bias, accel=data.force)
+    return gyro_rate(known, S, SENSITIVITY.names)[2](measured)
+
+
+def taken(data: LosData, stamps: Array, values: Mapping[str, float]) -> Array:
+    """When pictures were taken (n,), s, no further than gyro and gimbal were recorded."""
+    skew = values.get("clock_skew", 0.0) * (stamps - data.image_t[0])
+    delay = values.get("encoder_delay", 0.0)
+    first = max(data.gyro_t[0], data.gimbal_t[0] + delay)
+    last = min(data.gyro_t[-1], data.gimbal_t[-1] + delay)
+    return np.clip(stamps + values.get("time_offset", 0.0) - skew, first, last)
+
+
+def angles(data: LosData, at: Array, values: Mapping[str, float]) -> Array:
+    """Angles of azimuth and elevation (n, 2), rad, at true times."""
+    read = GimbalPath(data.gimbal_t, data.gimbal).at(at - values.get("encoder_delay", 0.0))
+    s, c = np.array([values.get(name, 0.0) for name in ONCE_PER_TURN.names]).reshape(2, 2).T
+    return np.asarray(read - s * np.sin(read) - c * np.cos(read))
