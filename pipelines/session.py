@@ -32,7 +32,6 @@ from pipelines.methods import Method
 from pipelines.recording.info import SessionFacts, facts_of, lacking
 from pipelines.recording.message_reader import ENCODING
 from pipelines.recording.reading import Recording, open_recording
-from pipelines.reports.budget import limits
 from pipelines.reports.result import Calibration
 from pipelines.reports.units import human_unit, to_digits_of
 from pipelines.settings import TRUTH, Config
@@ -239,7 +238,6 @@ class Session:
                 assessment = assessment.explained(_first(causes or (), assumed))
             elif ours:
                 assessment = assessment.remarked(rejection_sentence(estimate.residuals))
-                assessment = assessment.remarked(_weakness(estimate, quantities))
                 assessment = assessment.explained(_not_as_assumed(strained(estimate, quantities)))
             if moved is not None and change is not None:
                 sentence = f"{change.sentence}{_told(moved, quantities)}"
@@ -373,13 +371,6 @@ def _check_sheets(method: Method, config: Config) -> None:
         if any(getattr(sheet, figure) != 0.0 for figure in sheet.model_fields_set):
             used = ", ".join(f"sensors.{each}" for each in method.sheets) or "no data sheet"
             raise InputError(f"sensors.{name}: method {method.name} has no use for it; it uses {used}")
-
-
-def _weakness(estimate: Estimate, quantities: Sequence[Quantity]) -> str:
-    """What most of the variance comes from of the parameter that falls shortest of what is required; empty if none."""
-    ratios = {q.name: sigma / q.require for q, sigma in zip(quantities, estimate.sigmas, strict=True) if q.judged}
-    short = [limit for limit in limits(estimate.budget or {}, quantities) if ratios.get(limit.name, 0.0) > 1.0]
-    return f"{max(short, key=lambda limit: ratios[limit.name]).sentence}." if short else ""
 
 
 def _first(tried: Sequence[Cause], assumed: Sequence[Cause]) -> list[Cause]:
