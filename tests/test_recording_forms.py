@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from functools import partial
@@ -59,6 +60,8 @@ def read_topics(recording: Recording, names: Any) -> dict[str, Any]:
 FORMS: dict[str, Callable[[Path, Path], Path]] = {
     "rosbag2 sqlite": lambda s, f: forms.rosbag2(s, f / "bag", SQLITE),
     "rosbag2 mcap": lambda s, f: forms.rosbag2(s, f / "bag", MCAP),
+    "rosbag2 mcap, compressed by message": lambda s, f: forms.rosbag2(s, f / "bag", MCAP, CompressionMode.MESSAGE),
+    "rosbag2 sqlite, compressed by message": lambda s, f: forms.rosbag2(s, f / "bag", SQLITE, CompressionMode.MESSAGE),
     "rosbag2 sqlite, compressed by file": lambda s, f: forms.rosbag2(s, f / "bag", SQLITE, CompressionMode.FILE),
     "rosbag2 split": lambda s, f: forms.split(s, f / "bag"),
     "db3": lambda s, f: forms.rosbag2(s, f / "bag", SQLITE) / "bag.db3",
@@ -86,6 +89,14 @@ def test_the_same_arrays_out_of_every_form(form: str, source: Path, tmp_path: Pa
     assert len(recording.sha256()) == 64
     for name, (t_ns, _) in open_recording(source).times.items():
         np.testing.assert_array_equal(recording.times[name][0], t_ns)
+
+
+def test_messages_that_are_not_compressed_as_said_are_one_line(source: Path, tmp_path: Path) -> None:
+    bag = forms.rosbag2(source, tmp_path / "bag", MCAP)
+    said = (bag / "metadata.yaml").read_text()
+    (bag / "metadata.yaml").write_text(re.sub("compression_mode: .*", "compression_mode: MESSAGE", said))
+    with pytest.raises(InputError, match="topic /imu: a compressed message is damaged"):
+        open_recording(bag).imu("/imu")
 
 
 def test_a_list_of_parts_in_any_order_is_one_recording(source: Path, tmp_path: Path) -> None:
@@ -736,3 +747,18 @@ def test_the_same_calibration_out_of_another_form(tmp_path: Path) -> None:
     assert ours.assessment.status == theirs.assessment.status == "calibrated"
     np.testing.assert_equal(ours.estimate.values, theirs.estimate.values)
     np.testing.assert_array_equal(ours.estimate.covariance, theirs.estimate.covariance)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["los", "indexer", "cube"])
+def test_the_same_calibration_of_every_method_out_of_other_forms(name: str, tmp_path: Path) -> None:
+    simulate(name, None, 2, tmp_path / "s.mcap")
+    config = tmp_path / "c.yaml"
+    config.write_bytes(open_recording(tmp_path / "s.mcap").attachment("alidade.yaml") or b"")
+    ours = calibrate(tmp_path / "s.mcap", ["batch"], name, config)[0]
+    for form in ("rosbag2 sqlite", "ros 1 bz2", "mcap protobuf"):
+        (tmp_path / form).mkdir()
+        theirs = calibrate(FORMS[form](tmp_path / "s.mcap", tmp_path / form), ["batch"], name, config)[0]
+        assert theirs.assessment.status == ours.assessment.status
+        np.testing.assert_equal(theirs.estimate.values, ours.estimate.values)
+        np.testing.assert_array_equal(theirs.estimate.covariance, ours.estimate.covariance)

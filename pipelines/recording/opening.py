@@ -7,6 +7,7 @@ import re
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import zstandard
 
@@ -126,7 +127,8 @@ def _unpacked(path: Path, strict: bool) -> Container:
 
 def _folder(path: Path, strict: bool) -> Container:
     """A folder: of a bag with its metadata.yaml, of the parts of one recording, or of a data set in EuRoC's form."""
-    listed = _listed(path / _METADATA)
+    metadata = _metadata(path / _METADATA)
+    listed = _listed(metadata)
     if listed:
         there = [found for name in listed if (found := _stored(path / name)) is not None]
         lost = [name for name in listed if _stored(path / name) is None]
@@ -135,7 +137,12 @@ def _folder(path: Path, strict: bool) -> Container:
         remarks = [f"{len(lost)} of {len(listed)} parts are not there: {', '.join(lost)}"] if lost else []
         if remarks and strict:
             raise InputError(f"{path}: {remarks[0]}; --strict reads nothing of which anything is lost")
-        return _together(there, strict, path, remarks)
+        whole = _together(there, strict, path, remarks)
+        if str(metadata.get("compression_mode")).lower() != "message":
+            return whole
+        from pipelines.recording.packed import PackedMessages
+
+        return PackedMessages(whole)
     from pipelines.recording.euroc import find_euroc, read_euroc
 
     root = find_euroc(path)
@@ -150,19 +157,24 @@ def _folder(path: Path, strict: bool) -> Container:
     return _together(there, strict, path)
 
 
-def _listed(metadata: Path) -> list[str]:
-    """The files that a bag's metadata.yaml names, in their order; none if it is not there or is something else."""
-    if not metadata.is_file() or metadata.stat().st_size > _LONGEST_METADATA:
-        return []
+def _metadata(path: Path) -> dict[str, Any]:
+    """What a bag's metadata.yaml says; nothing if it is not there or is something else."""
+    if not path.is_file() or path.stat().st_size > _LONGEST_METADATA:
+        return {}
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
     try:
-        content = YAML(typ="safe", pure=True).load(metadata.read_text(errors="replace"))
-        names = content["rosbag2_bagfile_information"]["relative_file_paths"]
-        return [Path(name).name for name in names]
+        content = YAML(typ="safe", pure=True).load(path.read_text(errors="replace"))
+        return dict(content["rosbag2_bagfile_information"])
     except (YAMLError, ValueError, KeyError, TypeError, RecursionError):
-        return []
+        return {}
+
+
+def _listed(metadata: dict[str, Any]) -> list[str]:
+    """The files that it names, in their order."""
+    names = metadata.get("relative_file_paths")
+    return [Path(str(name)).name for name in names] if isinstance(names, list) else []
 
 
 def _stored(path: Path) -> Path | None:
@@ -172,7 +184,7 @@ def _stored(path: Path) -> Path | None:
 
 def _part_of(paths: Sequence[Path]) -> Sequence[str]:
     """A sentence if the files are parts of a bag, and others of it lie beside them."""
-    listed = _listed(paths[0].with_name(_METADATA))
+    listed = _listed(_metadata(paths[0].with_name(_METADATA)))
     here = [i for i, name in enumerate(listed, start=1) if name in {path.name for path in paths}]
     if not here or len(here) == len(listed):
         return ()
