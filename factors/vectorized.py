@@ -140,6 +140,17 @@ class VectorizedFactor:
         other.loss = loss
         return other
 
+    def only(self, kept: NDArray[np.bool_]) -> VectorizedFactor:
+        """The factor on some of its n measurements. Only for a model that names what is `stacked`, uncompressed."""
+        rows = np.flatnonzero(kept)
+        tied = [column if isinstance(column, int) else [column[i] for i in rows] for column in self.columns]
+        return VectorizedFactor(_take(self.model, rows), tied, self.loss, noise=self.noise)
+
+    @property
+    def divisible(self) -> bool:
+        """Whether `only` serves."""
+        return hasattr(self.model, "stacked") and not self.compress
+
     @property
     def _loss_in_force(self) -> TruncatedLoss | None:
         return self.loss if self._given is None else self._given[1]
@@ -369,6 +380,13 @@ def _stack(parts: Sequence[Any]) -> Any:
     if isinstance(first, np.ndarray):
         return np.concatenate(parts)
     return replace(first, **{name: _stack([getattr(part, name) for part in parts]) for name in first.stacked})
+
+
+def _take(whole: Any, rows: NDArray[np.intp]) -> Any:
+    """An array or dataclass of some measurements."""
+    if whole is None or isinstance(whole, np.ndarray):
+        return whole if whole is None else whole[rows]
+    return replace(whole, **{name: _take(getattr(whole, name), rows) for name in whole.stacked})
 
 
 def _square(residuals: Array) -> float:

@@ -8,7 +8,7 @@ is by QR: tight processes beside loose priors cost Cholesky its digits, and QR c
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
@@ -31,13 +31,13 @@ _MOST_DAMPING = 1e8
 # An error (unit: half a squared sigma) less than this above the minimum has nothing more than 0.005 sigma off. What a
 # linearisation foresaw wrongly of its step is about what is left for the next one.
 _ERROR_TOLERANCE = 1e-5
-# A step that was to lower the error by less than this, half a sigma, and does by less than a tenth of it has only
+# A step that was to lower the error by less than this, half a sigma, and does by less than a third of it has only
 # to do with what is of second order: noise, which is all that a sensor at rest tells of a mount or a delay.
 _LITTLE = 0.15
 # Parts of a step along it that are tried, and how many steps the states have to return to the floor.
 _SHARES, _MOST_RETURNS = (1.0, 0.3, 0.1, 0.03), 2
 # Shared variables are held by so many times their information.
-_HELD = 1e6
+HELD = 1e6
 # So much a measurement is near enough to tell which ones lie outside the gate: on average they move by 0.05 sigma yet.
 _ROUGH_TOLERANCE = 1e-3
 # Below this mean pull of outliers on plain least squares, in sigmas a measurement, good measurements stay inside the
@@ -98,7 +98,7 @@ class System:
 
     def holding_shared(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
         """The linear system about the values in which the shared variables stay where they are."""
-        return _damped(self.linearize(values), _HELD, self.shared)
+        return held(self.linearize(values), HELD, {key: np.zeros(values.dims()[key]) for key in self.shared})
 
     def residuals(self, values: gtsam.Values) -> dict[str, Residuals]:
         """Residuals of all measurements, by family."""
@@ -279,7 +279,7 @@ def _minimize(
                 return Solution(system, values, False, f"no step lowers the error of {error:.6g}", iteration)
         fall, rounding = error - new_error, 1e-13 * error + 1e-10 * new_error
         values, error = candidate, new_error
-        small = foreseen < _LITTLE and fall < 0.1 * _LITTLE
+        small = foreseen < _LITTLE and fall < 0.3 * foreseen
         if damping == 0.0 and (small or min(fall, abs(fall - foreseen)) < tolerance + rounding):
             return Solution(system, values, True, f"converged after {iteration} iterations", iteration)
         damping = damping / 10.0 if damping > 1e-6 else 0.0
@@ -313,17 +313,17 @@ def _step(
     """One (damped) step, None if the system is singular, and by how much it should lower the error."""
     try:
         if damping > 0.0:
-            linear = _damped(linear, damping)
+            linear = held(linear, damping)
         delta = linear.optimize(ordering, gtsam.EliminateQR)
         return delta, -0.5 * linear.gradientAtZero().dot(delta)
     except RuntimeError:
         return None, 0.0
 
 
-def _damped(
-    linear: gtsam.GaussianFactorGraph, damping: float, keys: Sequence[int] | None = None
+def held(
+    linear: gtsam.GaussianFactorGraph, weight: float, at: Mapping[int, Array] | None = None
 ) -> gtsam.GaussianFactorGraph:
-    """The system with unknowns (all, or those named) held by `damping` times their own information."""
+    """The system with each unknown held where it is by `weight` times its own information, or some at moves (d,)."""
     gradient = linear.gradientAtZero()
     diagonal = {key: np.zeros(len(gradient.at(key))) for key in linear.keyVector()}
     for i in range(linear.size()):
@@ -334,10 +334,11 @@ def _damped(
             diagonal[key] += squares[:size]
             squares = squares[size:]
     out = linear.clone()
-    for key in diagonal if keys is None else keys:
-        scale = np.sqrt(damping * np.maximum(diagonal[key], 1e-6))
+    for key in diagonal if at is None else at:
+        scale = np.sqrt(weight * np.maximum(diagonal[key], 1e-6))
         noise = gtsam.noiseModel.Unit.Create(len(scale))
-        out.add(gtsam.JacobianFactor(key, np.diag(scale), np.zeros(len(scale)), noise))
+        aim = np.zeros(len(scale)) if at is None else scale * at[key]
+        out.add(gtsam.JacobianFactor(key, np.diag(scale), aim, noise))
     return out
 
 

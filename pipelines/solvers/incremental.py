@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -20,24 +21,30 @@ from pipelines.graph.problem import Array, Attitudes, ChiSquare, Estimate, Facto
 from pipelines.solvers.assembly import Assembly
 from pipelines.solvers.batch import CHUNK, Solution, optimize
 from pipelines.solvers.innovations import Innovations, Prediction
+from pipelines.solvers.linearity import is_linear
 from pipelines.solvers.marginals import IndeterminateError, reported, reported_covariance
 from pipelines.solvers.rows import Rows
-from pipelines.solvers.smoother import Smoother, linearized, unweighed
+from pipelines.solvers.smoother import Smoother, linearized, unweighed, used_part
 from pipelines.solvers.state import State, explained, require_known, require_sound
 
 DEFAULT_WINDOW = 1.0
 
-# At these times since the first step, s, everything so far is solved in batch and the smoother starts again from there:
-# factors that leave the window keep their last linearisation point for good, so it has to be a good one, and outliers
-# of the first moments cannot be told from innovations. Later the calibration moves too little to matter.
-_BATCH_TIMES = (2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 10.0, 20.0, 40.0)
-# From then on the past is marginalised out this often, s.
+# A run is young until what it has seen may be folded into a Gaussian. From _FIRST s on everything so far is solved in
+# batch again whenever it has grown by _GROWTH, so that nothing stays linearised where little was known, and outliers of
+# the first moments, which innovations cannot tell, are judged by all there is.
+_FIRST, _GROWTH = 1.0, 1.25
+# It is so at least for _YOUNG s, then until the error is quadratic as far as parameters may still move, but not longer
+# than _OLDEST s, lest the cost grow for ever where something never moves.
+_YOUNG, _OLDEST = 40.0, 600.0
+# ... and for so many steps: few large ones cost little to solve again.
+_FEW_STEPS = 100
+# It is solved at once, if there is _MORE to go by than before, when parameters have moved by _MOVED of the sigmas they
+# had then and by _FAR of their priors', or when ...
+_MORE, _MOVED, _FAR = 1.02, 0.2, 0.02
+# ... so many steps in a row were rejected, or more than this share of measurements: the run may have lost its way.
+_DOUBTED, _TOO_MANY = 5, 0.25
+# Later the past is marginalised out this often, s.
 MARGINALIZE_EVERY = 20.0
-# After so many rejections in a row the smoother may have lost its way: until the last of the batch times, start it anew
-# at once ...
-_DOUBTED = 5
-# ... unless that was tried when there was hardly less, by this factor, to go by.
-_MORE = 1.2
 # Estimates kept for plots, at most so many a second.
 _HISTORY_RATE = 5.0
 
@@ -61,6 +68,22 @@ def solve_incremental(problem: Problem, window: float | None = DEFAULT_WINDOW) -
     for step in problem.steps(1):
         run.add_step(step)
     return run.finish(time.perf_counter() - start)
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """A batch solution of a young run.
+
+    Attributes:
+        since: s, from the first step to the last.
+        steps: their number.
+        values, sigmas: (n,) of the reported numbers.
+    """
+
+    since: float
+    steps: int
+    values: Array
+    sigmas: Array
 
 
 class Run:
@@ -90,15 +113,16 @@ class Run:
         self.attitudes = Rows()
         self._smoother: Smoother | None = None  # None before the first batch solution
         self._stamps: dict[int, float] = {}  # of the variables held that age
-        self._batch_times = list(_BATCH_TIMES)
-        self._solved_steps = 0  # by the last batch solution
+        self._young = True
+        self._solved: _Solved | None = None  # the last batch solution while young
+        self._looked = 0.0  # from so many s on it is to be seen again whether the past may be folded
         self._trouble = ""
 
     @classmethod
     def resumed(cls, problem: Problem, window: float, base: State) -> Run:
         """A run that goes on from what another one knew."""
         run = cls(problem, window)
-        run._batch_times = []
+        run._young = False
         run._continue_from(base)
         return run
 
@@ -138,12 +162,8 @@ class Run:
         else:
             self._stamps.update(step.timestamps)
         since = step.time - (self.past[0].time if self.base is None else self.base.time)
-        if self._batch_times:
-            due = since >= self._batch_times[0]
-            if due:
-                self._batch_times.pop(0)
-            doubted = self.innovations.rejected_in_a_row >= _DOUBTED and len(self.past) > _MORE * self._solved_steps
-            if due or doubted:
+        if self._young:
+            if self._due(since):
                 self._reinitialize()
         elif since >= MARGINALIZE_EVERY and self._smoother is not None:
             alive = self._alive(self._smoother.estimate(), self._stamps)
@@ -171,6 +191,8 @@ class Run:
 
     def finish(self, seconds: float) -> Estimate:
         """The estimate after the last step added. More steps may follow."""
+        if self._young and self._solved is not None and len(self.past) > self._solved.steps:
+            self._reinitialize()
         values, covariance = self.values(), self.covariance()
         if not (np.isfinite(values).all() and np.isfinite(covariance).all()):
             raise IndeterminateError(f"the estimate at {self.time:.3f} s is not a finite number")
@@ -205,7 +227,14 @@ class Run:
             values = smoother.estimate()
             new = step.initial if step.predict is None else step.predict(values)
             values.insert(new)
-            smoother.update(self._accepted(smoother, step, values, new), new, step.timestamps)
+            point, begins = values, new
+            if self._fixed:
+                # Linearised all about one value of each parameter: else what they cannot be told apart by would seem to
+                # be known (first-estimates Jacobians, Huang, Mourikis and Roumeliotis 2010).
+                point = smoother.point()
+                begins = step.initial if step.predict is None else step.predict(point)
+                point.insert(begins)
+            smoother.update(self._accepted(smoother, step, values, new, point), begins, step.timestamps)
         except (RuntimeError, np.linalg.LinAlgError):
             # Singular, if only by rounding. The smoother is spoilt, but all it knew is in the base and the steps since.
             self._reinitialize()
@@ -214,8 +243,10 @@ class Run:
         self._stamps = {k: t for k, t in {**self._stamps, **step.timestamps}.items() if values.exists(k)}
         self._record(step.keyframes, values)
 
-    def _accepted(self, smoother: Smoother, step: Step, values: gtsam.Values, new: gtsam.Values) -> list[Factor]:
-        """The step's processes and those of its measurements that are to be used."""
+    def _accepted(
+        self, smoother: Smoother, step: Step, values: gtsam.Values, new: gtsam.Values, point: gtsam.Values
+    ) -> list[Factor]:
+        """The step's processes and those of its measurements that are to be used, linear about a point."""
         processes = [f for f in step.factors if f.measurement is None]
         require_sound(processes, values, step.time)
         prediction = Prediction(smoother, processes, values, new)
@@ -223,10 +254,11 @@ class Run:
         for f in step.factors:
             if f.measurement is not None:
                 require_known([f], values, step.time)
-                if self.innovations.accept(f, prediction, gated=self.problem.loss is not None):
-                    measurements.append(unweighed(f))
-        if self.window is not None and self.innovations.rejected_in_a_row == 0:
-            measurements = [linearized(f, values) for f in measurements]
+                used = self.innovations.accept(f, prediction, gated=self.problem.loss is not None)
+                if used is not None:
+                    measurements.append(unweighed(used))
+        if self._fixed or (self.window is not None and self.innovations.rejected_in_a_row == 0):
+            measurements = [linearized(f, point) for f in measurements]
         return processes + measurements
 
     def _record(self, keyframes: Sequence[int], values: gtsam.Values) -> None:
@@ -251,17 +283,45 @@ class Run:
             require_sound(whole.factors, whole.initial, self.time)
         self._trouble = "" if solution.converged else f"the first {self.time:.1f} s: {solution.message}"
         values = solution.values
-        if self._smoother is None:
+        if from_start:
             with solution.system.at(values):
-                for f in whole.factors:
-                    if f.measurement is not None:
-                        self.innovations.note(f, f.measurement.residuals(values), f.measurement.used(values))
+                self.innovations.revise(whole.factors, values)
         last = self.past[-1].keyframes if self.past else range(0)
+        since = 0.0 if self.base is not None or not self.past else self.time - self.past[0].time
+        if self._young and since >= max(_YOUNG, self._looked) and len(self.past) >= _FEW_STEPS:
+            self._looked = _GROWTH * since
+            foldable = self.window is None or since >= _OLDEST
+            self._young = not (foldable or is_linear(self.problem, solution, self.keys))
         self._restart(solution, whole.timestamps)
         if from_start:
             self.attitudes.clear()
         self._record(whole.keyframes if from_start else last, values)
-        self._solved_steps, self.innovations.rejected_in_a_row = len(self.past), 0
+        self._solved = _Solved(since, len(self.past), self.values(), np.sqrt(np.diag(self.covariance())))
+        self.innovations.begin_count()
+
+    def _due(self, since: float) -> bool:
+        """Whether a young run is to be solved in batch again, `since` s after its first step."""
+        solved = self._solved
+        if solved is None:
+            return since >= _FIRST
+        if since >= _GROWTH * solved.since:
+            return True
+        if len(self.past) < _MORE * solved.steps:
+            return False
+        if self.innovations.doubtful(_DOUBTED, _TOO_MANY):
+            return True
+        moved = np.abs(self.values() - solved.values)
+        return bool((moved > np.maximum(_MOVED * solved.sigmas, _FAR * self._scales)).any())
+
+    @property
+    def _scales(self) -> Array:
+        """(n,) of the priors; of assumptions, which are small whatever they are, none."""
+        return np.array([np.inf if q.group == "assumption" else q.scale for q in self.problem.quantities])
+
+    @property
+    def _fixed(self) -> bool:
+        """Whether the smoother leaves everything linearised where the last batch solution has it."""
+        return self._young and self.window is not None
 
     def _since_base(self) -> Iterator[Step]:
         """The steps since the base; those since the start with many measurements in each, which solve faster."""
@@ -278,13 +338,12 @@ class Run:
         values, loss = solution.values, solution.system.loss
         alive = self._alive(values, stamps)
         if alive is None:
-            factors = [f for step in self.past for f in step.factors]
-            used = [f for f in factors if f.measurement is None or f.measurement.under(loss).used(values).all()]
-            self._start([unweighed(f) for f in used], values, stamps)
+            factors = [used_part(f, values, loss) for step in self.past for f in step.factors]
+            self._start([unweighed(f) for f in factors if f is not None], values, stamps)
             return
         state = State.of(self.time, solution.system.linearize(values), values, alive, stamps)
-        if self._batch_times:
-            self._start([state.factor], state.estimate, state.stamps)
+        if self._young:
+            self._start([state.factor], state.values, state.stamps)
         else:
             self._continue_from(state)
 
@@ -294,7 +353,7 @@ class Run:
         self._start([state.factor], state.estimate, state.stamps)
 
     def _start(self, factors: Sequence[Factor], values: gtsam.Values, stamps: Mapping[int, float]) -> None:
-        self._smoother = Smoother(self.window)
+        self._smoother = Smoother(self.window, self._fixed)
         self._stamps = dict(stamps)
         try:
             self._smoother.update(factors, values, stamps)

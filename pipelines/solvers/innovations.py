@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from factors.chi_square import gate
 from pipelines.graph.problem import Array, ChiSquare, Factor, Residuals
-from pipelines.solvers.batch import graph_of
+from pipelines.solvers.batch import graph_of, residuals_of
 from pipelines.solvers.marginals import ordering_of
 from pipelines.solvers.rows import Rows
 from pipelines.solvers.smoother import Smoother
@@ -72,29 +72,51 @@ class Innovations:
             squared is the NIS.
         unusable: family -> number of measurements left out because they gave no finite numbers.
         rejected_in_a_row: until now.
+        tried, refused: measurements, and those rejected, since `begin_count`.
     """
 
     families: dict[str, Rows] = field(default_factory=dict)
     unusable: dict[str, int] = field(default_factory=dict)
     rejected_in_a_row: int = 0
+    tried: int = 0
+    refused: int = 0
 
-    def accept(self, factor: Factor, prediction: Prediction, gated: bool) -> bool:
-        """Whether a measurement is to be used: its innovation lies within the gate, if there is one; notes it."""
+    def begin_count(self) -> None:
+        """Count rejections from now on."""
+        self.rejected_in_a_row = self.tried = self.refused = 0
+
+    def doubtful(self, in_a_row: int, share: float) -> bool:
+        """Whether so many were rejected in a row, or more than a share by more than chance, since `begin_count`."""
+        chance = 2.0 * np.sqrt(share * (1.0 - share) * self.tried)
+        return self.rejected_in_a_row >= in_a_row or self.refused > share * self.tried + chance
+
+    def accept(self, factor: Factor, prediction: Prediction, gated: bool) -> Factor | None:
+        """What of a factor is to be used, the measurements whose innovation lies within the gate; notes all of them."""
         measurement = factor.measurement
         assert measurement is not None
         error, A = measurement.rows(prediction.values)
+        n = len(measurement.model.time)
         if not (np.isfinite(error).all() and np.isfinite(A).all()):
-            self.unusable[factor.family] = self.unusable.get(factor.family, 0) + len(measurement.model.time)
-            return False
+            self.unusable[factor.family] = self.unusable.get(factor.family, 0) + n
+            return None
         S = A @ prediction.covariance(measurement.keys) @ A.T + np.eye(len(error))
-        whitened = np.linalg.solve(np.linalg.cholesky(S), error)
-        accepted = not gated or bool(whitened @ whitened < gate(len(error)) ** 2)
-        self.rejected_in_a_row = 0 if accepted else self.rejected_in_a_row + 1
+        parts = n if measurement.divisible else 1
+        size = len(error) // parts
+        spans = [slice(i, i + size) for i in range(0, len(error), size)]
+        squares = np.array([error[i] @ np.linalg.solve(S[i, i], error[i]) for i in spans])
+        used = squares < gate(size) ** 2 if gated else np.ones(parts, dtype=bool)
+        self.rejected_in_a_row = 0 if used.any() else self.rejected_in_a_row + 1
         if self.rejected_in_a_row > _MOST_REJECTED:
-            accepted, self.rejected_in_a_row = True, 0
-        rows = whitened.reshape(-1, measurement.model.rows)
-        self.note(factor, rows, np.full(len(rows), accepted))
-        return accepted
+            used[:], self.rejected_in_a_row = True, 0
+        self.tried, self.refused = self.tried + parts, self.refused + int((~used).sum())
+        whitened = np.zeros(len(error))
+        together = np.flatnonzero(np.repeat(used, size))
+        for rows in (together, *(np.arange(len(error))[spans[i]] for i in np.flatnonzero(~used))):
+            whitened[rows] = np.linalg.solve(np.linalg.cholesky(S[np.ix_(rows, rows)]), error[rows])
+        self.note(factor, whitened.reshape(n, -1), np.repeat(used, n // parts))
+        if used.all() or not used.any():
+            return factor if used.all() else None
+        return Factor.of(factor.family, measurement.only(used))
 
     def note(self, factor: Factor, whitened: Array, used: NDArray[np.bool_]) -> None:
         """Add the innovations (n, m) of a measurement."""
@@ -102,6 +124,18 @@ class Innovations:
         time = factor.measurement.model.time
         rows = self.families.setdefault(factor.family, Rows())
         rows.add(np.column_stack([time, used, whitened.reshape(len(time), -1)]))
+
+    def revise(self, factors: Sequence[Factor], values: gtsam.Values) -> None:
+        """Take a solution's word for which measurements are used, and its residuals where innovations had it else."""
+        solved = residuals_of(factors, values)
+        for family, found in solved.items():
+            rows = np.column_stack([found.time, found.used, found.whitened])
+            live = self.families.setdefault(family, Rows()).array
+            if len(live):
+                known = len(live)
+                kept = (live[:, 1] > 0.0) & found.used[:known]
+                rows[:known][kept] = live[kept]
+            self.families[family] = Rows(rows)
 
     def chi_square(self) -> ChiSquare:
         """The sum of the squared innovations of the measurements used."""

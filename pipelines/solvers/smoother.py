@@ -8,6 +8,7 @@ from typing import Any, cast
 import gtsam
 import numpy as np
 
+from factors.loss import TruncatedLoss
 from pipelines.graph.problem import Array, Factor
 from pipelines.solvers.batch import graph_of
 
@@ -16,10 +17,16 @@ _RELINEARIZE = 1e-2
 
 
 class Smoother:
-    """iSAM2 with a window (s) or without (None), behind one face."""
+    """iSAM2 with a window (s) or without (None), behind one face.
 
-    def __init__(self, window: float | None) -> None:
+    Args:
+        window: s.
+        fixed: each variable stays linearised where it began.
+    """
+
+    def __init__(self, window: float | None, fixed: bool = False) -> None:
         params = gtsam.ISAM2Params()
+        params.enableRelinearization = not fixed
         params.setRelinearizeThreshold(_RELINEARIZE)
         params.relinearizeSkip = 1
         params.findUnusedFactorSlots = True
@@ -45,6 +52,11 @@ class Smoother:
             stamps = {**stamps, **dict.fromkeys(self._kept, max(stamps.values()))}
         self._lagged.update(graph_of(factors), values, cast(Any, stamps))
         self._estimate = self._lagged.calculateEstimate()
+
+    def point(self) -> gtsam.Values:
+        """The values about which the variables are linearised; the caller may add to them."""
+        isam = self._plain if self._lagged is None else self._lagged.getISAM2()
+        return gtsam.Values(isam.getLinearizationPoint())
 
     def estimate(self) -> gtsam.Values:
         """Current values of all variables held; the caller may add to them."""
@@ -82,3 +94,15 @@ def unweighed(factor: Factor) -> Factor:
     if measurement is None or measurement.loss is None:
         return factor
     return Factor.of(factor.family, measurement.under(None))
+
+
+def used_part(factor: Factor, values: gtsam.Values, loss: TruncatedLoss | None) -> Factor | None:
+    """The factor on the measurements that the loss lets count at the values; None if there are none."""
+    if factor.measurement is None:
+        return factor
+    used = factor.measurement.under(loss).used(values)
+    if used.all():
+        return factor
+    if not used.any() or not factor.measurement.divisible:
+        return None
+    return Factor.of(factor.family, factor.measurement.only(used))

@@ -1,0 +1,51 @@
+"""Whether a linearised system stands for the real one as far as the parameters may still move."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+
+from pipelines.graph.problem import Problem
+from pipelines.solvers.batch import HELD, Solution, held
+from pipelines.solvers.marginals import coordinate_inverse, ordering_of
+
+# So many points about the estimate are tried, in pairs.
+_PAIRS = 4
+# The error there may differ by so much (unit: half a squared sigma) from what the linear system foresees.
+_BENT = 0.5
+
+
+def is_linear(problem: Problem, solution: Solution, keys: Sequence[int]) -> bool:
+    """Whether the error is what its linearisation foresees at parameters drawn from their covariance, states following.
+
+    Where it is not, the past must not be folded into a Gaussian: motion to come may move the parameters so far.
+
+    Args:
+        problem: the graph's.
+        solution: its minimum.
+        keys: variables that hold the parameters.
+    """
+    values, system = solution.values, solution.system
+    linear, error = system.linearize(values), system.error(values)
+    ends = np.cumsum([values.dims()[key] for key in keys])
+    rest = [key for i in range(system.ordering.size()) if (key := system.ordering.at(i)) not in set(keys)]
+    generator = np.random.default_rng(0)
+    try:
+        remaining = linear.eliminatePartialMultifrontal(ordering_of(rest), gtsam.EliminateQR)[1] if rest else linear
+        information = remaining.hessian(ordering_of(keys))[0]
+        free = np.flatnonzero([q.prior_sigma != 0.0 for q in problem.quantities])
+        scale = np.array([q.scale for q in problem.quantities])[free]
+        unit = coordinate_inverse(problem.parameters, values, keys)[:, free] * scale
+        eigenvalues, vectors = np.linalg.eigh(unit.T @ information @ unit)
+        root = unit @ vectors / np.sqrt(np.maximum(eigenvalues, 1e-12))
+        for drawn in generator.standard_normal((_PAIRS, len(free))):
+            for z in (drawn, -drawn):
+                moves = dict(zip(keys, np.split(root @ z, ends[:-1]), strict=True))
+                delta = held(linear, HELD, moves).optimize(system.ordering, gtsam.EliminateQR)
+                if not abs(system.error(values.retract(delta)) - error - 0.5 * z @ z) < _BENT:
+                    return False
+    except (RuntimeError, np.linalg.LinAlgError):
+        return False
+    return True
