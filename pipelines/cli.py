@@ -72,6 +72,7 @@ _PictureJobs = Annotated[int | None, typer.Option("--jobs", help="Processes for 
 _Strict = Annotated[bool, typer.Option("--strict", help="Refuse a recording of which anything is lost.")]
 _AutoTopics = Annotated[bool, typer.Option("--auto-topics", help="Take the topics that `info` suggests.")]
 _Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")]
+_NoCheck = Annotated[bool, typer.Option("--no-check", help="Do not hold an incremental result against batch.")]
 _Window = Annotated[str, typer.Option(help="Of the incremental solver: seconds kept, or 'all'.")]
 
 
@@ -100,6 +101,7 @@ def calibrate(
     strict: _Strict = False,
     auto_topics: _AutoTopics = False,
     jobs: _PictureJobs = None,
+    no_check: _NoCheck = False,
     as_json: _Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -111,7 +113,9 @@ def calibrate(
 
     folder = out or _beside(session, solver.value)
     with progress.shown(quiet or as_json), parallel.processes(jobs):
-        (calibration,) = run(session, [solver.value], method, config, _seconds(window), strict, auto_topics)
+        (calibration,) = run(
+            session, [solver.value], method, config, _seconds(window), strict, auto_topics, not no_check
+        )
         with progress.doing("writing"):
             written = write_results(folder, calibration)
     _tell(calibration, folder, written, as_json)
@@ -166,13 +170,14 @@ def follow(
         Path | None, typer.Option(help="Folder to keep what comes by ws:// or -; a later run goes on in it.")
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: SOURCE-incremental.")] = None,
+    no_check: _NoCheck = False,
 ) -> None:
     """Calibrate a recording while it is being written, and say what is still missing. Ctrl-C ends it."""
     from pipelines.follow.follow import follow as run
     from pipelines.follow.follower import Settings
     from pipelines.reports.write import write_results
 
-    settings = Settings(method, config, _seconds(window), patience, checkpoint)
+    settings = Settings(method, config, _seconds(window), patience, checkpoint, not no_check)
     calibration = run(source, settings, port if serve else None, record)
     folder = out or _beside(Path(_file_name(source)), "incremental")
     written = write_results(folder, calibration)

@@ -27,6 +27,7 @@ from pipelines.judgement.causes import find_causes
 from pipelines.judgement.halves import Halves, held_out, span, split_at, split_halves
 from pipelines.judgement.observability import Cause, assess
 from pipelines.judgement.rejection import rejection_sentence, too_many_rejected
+from pipelines.judgement.self_check import SelfCheck
 from pipelines.judgement.stability import Moved, Stability, stability
 from pipelines.methods import Method
 from pipelines.recording.info import SessionFacts, facts_of, lacking
@@ -188,18 +189,24 @@ class Session:
         """What went in."""
         return self.origin.facts(self.config)
 
-    def calibrate(self, solver: str = "batch", window: float | None = 1.0) -> Calibration:
+    def calibrate(self, solver: str = "batch", window: float | None = 1.0, check: bool = False) -> Calibration:
         """The calibration by one of SOLVERS; `window` in s is the incremental one's, None keeps the whole history.
+
+        With `check` the incremental one is held against batch.
 
         Raises:
             InputError: no such solver, or the data cannot be used.
             IndeterminateError: states other than the parameters are not determined.
         """
-        (calibration,) = self.calibrations([solver], window)
+        (calibration,) = self.calibrations([solver], window, check=check)
         return calibration
 
     def calibrations(
-        self, solvers: Sequence[str], window: float | None = 1.0, seconds: Mapping[str, float] | None = None
+        self,
+        solvers: Sequence[str],
+        window: float | None = 1.0,
+        seconds: Mapping[str, float] | None = None,
+        check: bool = False,
     ) -> list[Calibration]:
         """One calibration a solver; `seconds` is what came before (phase -> s). Raises as `calibrate` does."""
         if isinstance(solvers, str):
@@ -207,10 +214,18 @@ class Session:
         for solver in solvers:
             if solver not in SOLVERS:
                 raise InputError(f"no solver {solver!r}; there are {', '.join(SOLVERS)}")
-        return self.judged((self._solve(solver, window) for solver in solvers), seconds or {})
+        return self.judged((self._solve(solver, window) for solver in solvers), seconds or {}, check)
 
-    def judged(self, solved: Iterable[tuple[Estimate, Problem]], seconds: Mapping[str, float]) -> list[Calibration]:
-        """Estimates, each with the problem it solves, ready to be reported; `seconds` is what reading took."""
+    def judged(
+        self, solved: Iterable[tuple[Estimate, Problem]], seconds: Mapping[str, float], check: bool = False
+    ) -> list[Calibration]:
+        """Estimates, each with the problem it solves, ready to be reported.
+
+        Args:
+            solved: as above.
+            seconds: what reading took.
+            check: hold incremental estimates against batch.
+        """
         sha256, truth = self.origin.sha256(), self.origin.truth()
         found = []
         causes: tuple[Cause, ...] | None = None
@@ -243,6 +258,10 @@ class Session:
                 sentence = f"{change.sentence}{_told(moved, quantities)}"
                 small = moved.small(quantities)
                 assessment = assessment.remarked(sentence) if small else assessment.misfit(sentence)
+            checked = None
+            if check and estimate.solver == "incremental":
+                checked = SelfCheck.of(estimate, self._solve("batch", None)[0])
+                assessment = assessment.remarked(checked.sentence if checked else "")
             if ours:
                 assessment = assessment.remarked(*problem.premises)
             found.append(
@@ -260,6 +279,7 @@ class Session:
                     plots=partial(self.method.figures, self.data),
                     beside=cache(self._published) if estimate.solver == "incremental" else None,
                     stability=change,
+                    self_check=checked,
                     findings=self.method.findings(self.data, self.config, estimate),
                 )
             )
@@ -302,6 +322,7 @@ def calibrate(
     window: float | None = 1.0,
     strict: bool = False,
     auto_topics: bool = False,
+    check: bool = False,
 ) -> list[Calibration]:
     """One calibration a solver, from one reading of the recording.
 
@@ -313,6 +334,7 @@ def calibrate(
         window: s, of the incremental solver; None keeps the whole history.
         strict: refuse a recording of which anything is lost.
         auto_topics: take the topics that `alidade info` suggests where those of the method are not there.
+        check: hold an incremental calibration against batch.
 
     Raises:
         InputError: recording or config cannot be used, or there is no such solver.
@@ -321,7 +343,7 @@ def calibrate(
     start = time.perf_counter()
     with progress.doing("reading"):
         session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics)
-    return session.calibrations(solvers, window, {"read": time.perf_counter() - start})
+    return session.calibrations(solvers, window, {"read": time.perf_counter() - start}, check)
 
 
 def self_agreement(

@@ -53,6 +53,7 @@ class Settings:
         window: s, of the incremental solver; None keeps the whole history.
         patience: s, without anything new, after which what is there is taken as all there will be.
         checkpoint: file the run is saved in from time to time, and resumed from.
+        check: hold the result against batch.
     """
 
     method: str | None = None
@@ -60,6 +61,7 @@ class Settings:
     window: float | None = 1.0
     patience: float = 30.0
     checkpoint: Path | None = None
+    check: bool = False
 
 
 class Follower:
@@ -276,7 +278,7 @@ class Follower:
         self._take(growing, self._new_steps(session, growing))
         assert self._run is not None
         estimate = self._run.finish(time.perf_counter() - started)
-        (calibration,) = session.judged([(estimate, problem)], {"read": read})
+        (calibration,) = session.judged([(estimate, problem)], {"read": read}, self.settings.check)
         return calibration
 
 

@@ -20,6 +20,7 @@ from pipelines.graph.assumptions import determined, pull
 from pipelines.graph.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
 from pipelines.judgement.observability import Assessment, Fit, Innovations, Learning, Status, Verdict, learning
 from pipelines.judgement.rejection import rejection_sentence
+from pipelines.judgement.self_check import SelfCheck
 from pipelines.judgement.stability import Stability
 from pipelines.recording.info import SessionFacts
 from pipelines.settings import Config
@@ -80,6 +81,7 @@ class Calibration:
         beside: tells the published solver's estimate of the same recording, where the report shows it too; None when
             that solver cannot serve the recording.
         stability: whether what was calibrated stayed as it was; None where that cannot be said.
+        self_check: an incremental estimate beside batch's; None where it was not made.
         findings: what the method found beside its parameters.
     """
 
@@ -97,6 +99,7 @@ class Calibration:
     plots: Callable[[Calibration], Sequence[Plot | Table]] | None = None
     beside: Callable[[], Estimate | None] | None = None
     stability: Stability | None = None
+    self_check: SelfCheck | None = None
     findings: Findings = field(default_factory=dict)
 
     @property
@@ -395,6 +398,14 @@ class TruthResult(_Record):
     error_sigmas: float | None
 
 
+class SelfCheckResult(_Record):
+    """An incremental estimate beside batch's, in sigmas."""
+
+    parameter: str
+    difference: float
+    sigma_ratio: float
+
+
 class Result(_Record):
     """result.json."""
 
@@ -415,6 +426,7 @@ class Result(_Record):
     innovations: dict[str, InnovationsResult]
     learning: dict[str, LearningResult]
     stability: StabilityResult | None
+    self_check: SelfCheckResult | None
     budget: dict[str, dict[str, float]] | None
     findings: dict[str, list[dict[str, object]]]
     truth: dict[str, TruthResult] | None = None
@@ -442,6 +454,7 @@ def result(calibration: Calibration) -> Result:
         innovations={family: InnovationsResult(**asdict(found)) for family, found in c.innovations.items()},
         learning={name: LearningResult(**asdict(found)) for name, found in c.learning.items()},
         stability=_stability(c.stability),
+        self_check=None if c.self_check is None else SelfCheckResult(**asdict(c.self_check)),
         budget=None if c.budget is None else {name: dict(shares) for name, shares in c.budget.items()},
         findings={name: [dict(row) for row in rows] for name, rows in c.findings.items()},
         truth=truth_errors(c) if c.truth is not None else None,
