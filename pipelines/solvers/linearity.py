@@ -13,8 +13,8 @@ from pipelines.solvers.marginals import coordinate_inverse, ordering_of
 
 # So many points about the estimate are tried, in pairs.
 _PAIRS = 4
-# The error there may differ by so much (unit: half a squared sigma) from what the linear system foresees.
-_BENT = 0.5
+# By this part the error there may differ from what the linear system foresees: sigmas are then wrong by half as much.
+_BENT = 0.15
 
 
 def is_linear(problem: Problem, solution: Solution, keys: Sequence[int]) -> bool:
@@ -44,7 +44,8 @@ def is_linear(problem: Problem, solution: Solution, keys: Sequence[int]) -> bool
             for z in (drawn, -drawn):
                 moves = dict(zip(keys, np.split(root @ z, ends[:-1]), strict=True))
                 delta = held(linear, HELD, moves).optimize(system.ordering, gtsam.EliminateQR)
-                if not abs(system.error(values.retract(delta)) - error - 0.5 * z @ z) < _BENT:
+                foreseen = 0.5 * float(z @ z)
+                if not abs(system.error(values.retract(delta)) - error - foreseen) < _BENT * foreseen:
                     return False
     except (RuntimeError, np.linalg.LinAlgError):
         return False
