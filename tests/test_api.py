@@ -113,7 +113,8 @@ def test_a_plan_needs_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         raise AssertionError("a file was asked for")
 
     monkeypatch.setattr(tempfile, "TemporaryDirectory", refuse)
-    (tmp_path / "s.yaml").write_text("{duration_s: 12, gyro_rate_hz: 100, image_rate_hz: 10, gimbal_rate_hz: 100}")
+    rates = "gyro_rate_hz: 100, image_rate_hz: 10, gimbal_rate_hz: 100"
+    (tmp_path / "s.yaml").write_text(f"{{duration_s: 12, {rates}, sensors: ideal}}")
     plan = alidade.plan("los", tmp_path / "s.yaml")
     assert plan.now.assessment.status == "calibrated"
 

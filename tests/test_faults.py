@@ -119,8 +119,10 @@ def cases() -> dict[str, Case]:
     # What a fault does to the gyro's samples it does not do to the accelerometer's: without them.
     data, truth = simulate_head(HEAD, 3)
     head_case = replace(data, head_force=None), truth, head_config(HEAD)
+    los_data, los_truth = simulate_los(LOS, 3)
+    los_case = replace(los_data, force=None), los_truth, los_config(LOS)
     return {
-        "los": Case(*simulate_los(LOS, 3), los_config(LOS), ("gyro_t", "gyro"), write_los, read_los, los.problem),
+        "los": Case(*los_case, ("gyro_t", "gyro"), write_los, read_los, los.problem),
         "head": Case(*head_case, ("head_t", "head_gyro"), write_head, read_head, head.problem),
     }
 

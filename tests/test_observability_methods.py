@@ -12,6 +12,7 @@ from pipelines.methods.indexer.simulation import IndexerScenario, Position
 from pipelines.methods.los.simulation import LosScenario
 from pipelines.planning import Prediction, predict
 from pipelines.simulation.motion import EulerMotion, Swing
+from tests.builders import IDEAL
 
 _Scenario = LosScenario | HeadScenario | IndexerScenario | CubeScenario
 
@@ -83,7 +84,7 @@ def test_a_motion_that_leaves_a_direction_open_is_told_so(
 @pytest.mark.parametrize(
     "scenario",
     [
-        LosScenario(**_LOS),
+        LosScenario(**_LOS, sensors=IDEAL),
         IndexerScenario(**_INDEXER),
         HeadScenario(**_HEAD, head=_SWAY, platform=_MANOEUVRE),
         CubeScenario(**_CUBE, poses=24),

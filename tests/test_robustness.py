@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -85,8 +85,8 @@ def test_mounts_30_degrees_off_are_found(make: Callable[[], Made], solve: Callab
     assert judged.status == "calibrated" or (make is _far_indexer and solve is solve_incremental)
 
 
-def _apart(one: Estimate, other: Estimate) -> float:
-    free = other.sigmas > 0.0
+def _apart(one: Estimate, other: Estimate, but: Sequence[str] = ()) -> float:
+    free = (other.sigmas > 0.0) & ~np.isin(other.names, but)
     return float(np.abs((one.values - other.values)[free] / other.sigmas[free]).max())
 
 
@@ -105,7 +105,9 @@ def test_gross_los_errors_cost_no_more_than_knowing_them_would(share: float) -> 
     known = solve_batch(los.problem(replace(data, image_t=data.image_t[~wrong], error=data.error[~wrong]), config))
     clean = solve_batch(los.problem(data, config))
     # A wrong error may be as small as a right one.
-    assert _apart(estimate, known) < 0.1
+    assert _apart(estimate, known, but=("los_scale",)) < 0.1
+    # The scale goes by foreseen errors that are smoothed over all that were measured, the wrong ones among them.
+    assert _apart(estimate, known) < 0.15
     assert _apart(estimate, clean) < 1.5
     assert _worst(estimate, truth) < 3.5
 
