@@ -29,21 +29,47 @@ _MOST_ELLIPSES, _STRONG = 5, 0.5
 _SETTLED = 0.1
 
 
+# A template of plotly's own is copied and checked in every figure, at 25 ms and 7 kB each; this is what is used of one.
+_AXIS = {
+    "gridcolor": "#ebf0f8",
+    "linecolor": "#ebf0f8",
+    "zerolinecolor": "#ebf0f8",
+    "zerolinewidth": 2,
+    "ticks": "",
+    "automargin": True,
+    "title": {"standoff": 15},
+}
+_SPACE = {"backgroundcolor": "white", "gridcolor": "#dfe8f3", "linecolor": "#ebf0f8", "zerolinecolor": "#ebf0f8"}
+_STYLE = {
+    "layout": {
+        "autotypenumbers": "strict",
+        "font": {"color": "#2a3f5f"},
+        "hoverlabel": {"align": "left"},
+        "hovermode": "closest",
+        "paper_bgcolor": "white",
+        "plot_bgcolor": "white",
+        "scene": {"xaxis": _SPACE, "yaxis": _SPACE, "zaxis": _SPACE},
+        "xaxis": _AXIS,
+        "yaxis": _AXIS,
+    }
+}
+
+
 def figure(y_title: str, height: int = 320, x_title: str = "time, s") -> go.Figure:
     """An empty figure in the report's style."""
     import plotly.graph_objects as go
 
-    out = go.Figure()
-    out.update_layout(
-        template="plotly_white",
-        height=height,
-        margin={"l": 56, "r": 12, "t": 12, "b": 44},
-        legend={"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0.0},
-        font={"family": "system-ui, sans-serif", "size": 13},
-        xaxis={"title": {"text": x_title}},
-        yaxis={"title": {"text": y_title}},
+    return go.Figure(
+        layout={
+            "template": _STYLE,
+            "height": height,
+            "margin": {"l": 56, "r": 12, "t": 12, "b": 44},
+            "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0.0},
+            "font": {"family": "system-ui, sans-serif", "size": 13},
+            "xaxis": {"title": {"text": x_title}},
+            "yaxis": {"title": {"text": y_title}},
+        }
     )
-    return out
 
 
 def thin(count: int) -> slice:
