@@ -14,11 +14,13 @@ from pipelines.session import calibrate
 from tests.broad_trials import TRIALS, converted
 
 
-@pytest.fixture(scope="module")
-def scored(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Calibration, Score]]:
+@pytest.fixture(scope="module", params=[1, pytest.param(len(TRIALS), marks=pytest.mark.slow)], ids=["one", "all"])
+def scored(
+    request: pytest.FixtureRequest, shared_data: Path, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, tuple[Calibration, Score]]:
     """The batch calibration of each trial, through the files that it writes."""
     out = {}
-    for name in TRIALS:
+    for name in list(TRIALS)[: request.param]:
         trial_file = shared_data / "broad" / f"{name}.mat"
         folder = tmp_path_factory.mktemp(name)
         converted(trial_file, folder / "s.mcap")

@@ -214,6 +214,7 @@ def test_delay_of_20_ms_of_the_los_pictures() -> None:
     assert float(label.split()[4]) == pytest.approx(20.0, abs=2.0)
 
 
+@pytest.mark.slow
 def test_encoders_read_20_ms_late(los: Case) -> None:
     find, data, config = los
     label = first_cause((find, replace(data, gimbal_t=data.gimbal_t - 0.02), config))
@@ -221,7 +222,8 @@ def test_encoders_read_20_ms_late(los: Case) -> None:
     assert float(label.split()[4]) == pytest.approx(20.0, abs=0.3)
 
 
-@pytest.mark.parametrize("key", [pytest.param("los_error", marks=pytest.mark.slow), "gyro_density"])
+@pytest.mark.slow
+@pytest.mark.parametrize("key", ["los_error", "gyro_density"])
 def test_the_noise_that_is_too_small_is_told_from_the_others(los: Case, key: str) -> None:
     find, data, config = los
     assert first_cause((find, data, with_noise(config, **{key: 0.35}))).startswith(f"the noise {key} is stated ")
@@ -234,6 +236,7 @@ def test_sign_of_the_los_gyro(los: Case) -> None:
     assert first_cause((find, wrong, config)) == "the sign of the gyro's x is wrong"
 
 
+@pytest.mark.slow
 def test_swapped_axes(los: Case) -> None:
     find, data, config = los
     assert first_cause((find, replace(data, gyro=data.gyro[:, [1, 0, 2]]), config)) == "the gyro's x and y are swapped"

@@ -170,6 +170,7 @@ def test_wrong_heading_is_absorbed_and_reported() -> None:
     assert max(_sigmas_off(estimate, truth, "mag_k").values()) < 3.0
 
 
+@pytest.mark.slow
 def test_poses_near_iron_are_left_out() -> None:
     data, truth, config = _simulated(11, magnetometer=Magnetometer(disturbed=0.1))
     _, estimate, _ = _solved(data, config)
@@ -358,6 +359,7 @@ def _assert_as_good_from_pictures(folder: Path, scenario: str, corner_px: float)
     assert np.abs(error / pictured.sigmas[rows]).max() < 3.5
 
 
+@pytest.mark.slow
 def test_from_a_few_pictures_as_good_as_from_corners_of_a_tenth_of_a_pixel(tmp_path: Path) -> None:
     scenario = "poses: 6, static_s: 2.0, turn_rad_s: 4.0, camera: {rate_hz: 1.0, pictures: {rate_hz: 1.0}}"
     _assert_as_good_from_pictures(tmp_path, f"{scenario}, magnetometer: null", 0.1)

@@ -18,7 +18,7 @@ POSES = 6
 SCENARIO = f"{{poses: {POSES}, static_s: 2.0, turn_rad_s: 4.0, camera: {{rate_hz: 1.0, pictures: {{rate_hz: 1.0}}}}}}"
 
 
-@pytest.mark.parametrize("images", [False, True], ids=["detections", "pictures"])
+@pytest.mark.parametrize("images", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["detections", "pictures"])
 def test_static_intervals_and_tag_poses_are_found_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, images: bool
 ) -> None:

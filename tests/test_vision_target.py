@@ -80,7 +80,7 @@ def _wall() -> Quad:
     return Quad(_texture(), (24.0, 18.0), FACING, np.array([0.0, 0.0, DISTANCE]))
 
 
-@pytest.mark.parametrize("kind", ["tag", "texture"])
+@pytest.mark.parametrize("kind", ["tag", pytest.param("texture", marks=pytest.mark.slow)])
 def test_los_errors_are_exact_to_a_tenth_of_a_pixel(renderer: Renderer, kind: str) -> None:
     rng = np.random.default_rng(1)
     quad, middle = (
