@@ -71,8 +71,8 @@ def los() -> Case:
 
 @pytest.fixture(scope="module")
 def indexer() -> Case:
-    """The four positions, a turn each way."""
-    scenario = IndexerScenario(gyro_rate_hz=50, encoder_rate_hz=50)
+    """The four positions, a turn each way; with a data sheet of the encoders' delay it would be that which is named."""
+    scenario = IndexerScenario(gyro_rate_hz=50, encoder_rate_hz=50, sensors=IDEAL)
     data, _ = simulate_indexer(scenario, 1)
     return method("indexer"), data, load_config(indexer_config(scenario).encode())
 
@@ -266,7 +266,7 @@ def test_late_encoders(indexer: Case) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 4])
 def test_size_of_the_cubes_tags(seed: int) -> None:
-    scenario = CubeScenario(poses=8, static_s=2, imu_rate_hz=50, camera=CubeCamera(rate_hz=5))
+    scenario = CubeScenario(poses=8, static_s=2, imu_rate_hz=50, camera=CubeCamera(rate_hz=5), sensors=IDEAL)
     data, _ = simulate_cube(scenario, seed)
     config = load_config(cube_config(scenario).encode())
     tags = {i: tag.model_copy(update={"size": 1.03 * tag.size}) for i, tag in config.section(CubeConfig).tags.items()}
