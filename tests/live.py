@@ -87,9 +87,17 @@ class Bridge:
     def on_unsubscribe(self, _: object, __: object) -> None: ...
 
     def _serve(self, port: int) -> Any:
-        return foxglove.start_server(
-            name="bridge", host="127.0.0.1", port=port, context=self._context, server_listener=self
-        )
+        """On a port that may take a moment to be free again."""
+        end = time.monotonic() + 20.0
+        while True:
+            try:
+                return foxglove.start_server(
+                    name="bridge", host="127.0.0.1", port=port, context=self._context, server_listener=self
+                )
+            except RuntimeError:
+                if time.monotonic() > end:
+                    raise
+                time.sleep(0.1)
 
     def _play(self) -> None:
         drop = None if self._drop_at is None else int(self._drop_at * len(self._whole))

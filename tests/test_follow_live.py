@@ -208,8 +208,8 @@ def test_a_look_reads_the_end_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         return found
 
     monkeypatch.setattr(Growing, "look", noted)
-    spent = follow_grown(tmp_path, 66.0, 6.0)
-    assert spent[-1, 0] > 65.0
+    spent = follow_grown(tmp_path, 80.0, 6.0)
+    assert spent[-1, 0] > 79.0
     late = np.array(read[-2:])
     assert (late[:, 0] > 0).all(), "all was read"
     # 102 messages a second; at most 20 s since the past was marginalised out, two before, and a piece or two.
