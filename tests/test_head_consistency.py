@@ -122,7 +122,7 @@ def test_right_noise_is_consistent(solve: Solve) -> None:
     assert clean(solve).worst < 3.0
 
 
-@SOLVERS
+@pytest.mark.parametrize("solve", [solve_batch, pytest.param(solve_incremental, marks=pytest.mark.slow)])
 def test_vision_noise_set_too_small_is_inconsistent(solve: Solve) -> None:
     """Three times."""
     assessment = Run(scenario(), 1, solve, "vision_attitude").assessment
