@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -21,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines import methods
+from pipelines.graph.assumptions import kind
 from pipelines.session import Session
 
 NOTHING = "nothing"
@@ -29,8 +29,6 @@ SIZES = (0.3, 1.0, 3.0, 6.0, 10.0)
 WRONG, RIGHT = 4.0, 3.0
 # From so many times its prior on an assumption that the recording determines is to be named.
 NAMED_FROM = 6.0
-# Names of one assumption differ by their axes.
-_AXES = re.compile(r"(_[xyzen]{1,2})?(_sin|_cos)?$")
 
 
 @dataclass(frozen=True)
@@ -77,7 +75,7 @@ def effects(method: str, scenario: str | None) -> dict[str, dict[str, float]]:
     found: dict[str, dict[str, float]] = {NOTHING: {}}
     for q in session.problem().quantities:
         if q.group == "assumption" and q.prior_sigma:
-            found.setdefault(_AXES.sub("", q.name), {})[q.name] = q.prior_sigma
+            found.setdefault(kind(q.name), {})[q.name] = q.prior_sigma
     return found
 
 

@@ -7,6 +7,7 @@ trades with. A method lists its `Assumption`s and makes variables of them with `
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,6 +18,9 @@ from pipelines.settings import Config
 _FREE = 10.0
 # A sigma of more than this part of its prior's says nothing, one of less than that determines it.
 _UNTOLD, _DETERMINED = 0.98, 0.5
+
+# What the names of numbers of one kind differ by.
+_NUMBERS = re.compile(r"(_[xyzenu]{1,2})?(_sin|_cos)?$")
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,20 @@ def sensitivity_assumption(sensor: str, sheet: str, sigma: float) -> Assumption:
     """The nine numbers of a gyro's G, by rows: measured = w + G f."""
     names = tuple(f"{sensor}_g_{row}{column}" for row in "xyz" for column in "xyz")
     return Assumption(names, "rad/s/(m/s^2)", sheet, "g_sensitivity", sigma)
+
+
+def encoder_assumptions(joints: Sequence[str], once_per_turn: float, delay: float) -> tuple[Assumption, Assumption]:
+    """Sine and cosine of each encoder's error once a turn, rad, and the delay of their readings, s; one sigma."""
+    names = tuple(f"encoder_{joint}_{part}" for joint in joints for part in ("sin", "cos"))
+    return (
+        Assumption(names, "rad", "encoder", "once_per_turn", once_per_turn),
+        Assumption(("encoder_delay",), "s", "encoder", "delay", delay),
+    )
+
+
+def kind(name: str) -> str:
+    """What a parameter is about: its name without axes, and without sine and cosine."""
+    return _NUMBERS.sub("", name)
 
 
 def quantities(assumption: Assumption, config: Config) -> tuple[Quantity, ...]:

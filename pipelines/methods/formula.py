@@ -98,6 +98,31 @@ def gyro_rate(
     )
 
 
+def axis_angles(axes: Sequence[str], once_per_turn: Sequence[str], delay: str, known: Collection[str]) -> list[Formula]:
+    """The axes' angles from what their encoders read; none where no error of theirs is applied.
+
+    Args:
+        axes: names of the readings; the results have `_angle` added.
+        once_per_turn: sine and cosine of each axis' error, rad.
+        delay: name of the time that readings are later than their stamps.
+        known: parameters that are applied.
+    """
+    if not any(name in known for name in (*once_per_turn, delay)):
+        return []
+    late = f", {delay} s after the stamp of the reading" if delay in known else ""
+
+    def angle(axis: str, names: Sequence[str]) -> Formula:
+        def compute(v: Any) -> Array:
+            (sine, cosine), read = numbers_of(v, names), np.asarray(getattr(v, axis))
+            return np.asarray(read - sine * np.sin(read) - cosine * np.cos(read))
+
+        sine, cosine = (name if name in known else "0" for name in names)
+        expression = f"{axis} - {sine} * sin({axis}) - {cosine} * cos({axis})"
+        return Formula(f"angle of the {axis} axis, rad{late}", f"{axis}_angle", expression, (axis,), compute)
+
+    return [angle(axis, once_per_turn[2 * i : 2 * i + 2]) for i, axis in enumerate(axes)]
+
+
 def apply(formulas: Sequence[Formula], values: Mapping[str, float], measured: Mapping[str, Any]) -> dict[str, Array]:
     """Everything that follows from a calibration's values and what is measured.
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from pipelines.graph.assumptions import kind
 from pipelines.graph.problem import Quantity
 
 _PRIOR = "prior of "
-# What numbers of one kind differ by: axes, and sine and cosine.
-_AXES = re.compile(r"(_[xyzenu]{1,2})?(_sin|_cos)?$")
 # Smaller shares are told together, and so are those after so many.
 _LEAST, _MOST = 0.02, 4
 REST = "everything else"
@@ -62,9 +60,8 @@ def _told(name: str, source: str, assumed: set[str]) -> tuple[str, str]:
     if not source.startswith(_PRIOR):
         return f"{source} noise", "record longer, or measure it better"
     of = source.removeprefix(_PRIOR)
-    kind = _AXES.sub("", of)
     if of in assumed:
-        return f"assumed {kind}", "state its data sheet if yours is better, or move so that it shows"
+        return f"assumed {kind(of)}", "state its data sheet if yours is better, or move so that it shows"
     if of == name:
         return "its own prior", "the recording adds little to what was known"
-    return f"the prior of {kind}", "know it better, or move so that it shows"
+    return f"the prior of {kind(of)}", "know it better, or move so that it shows"

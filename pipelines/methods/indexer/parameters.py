@@ -9,7 +9,7 @@ from itertools import chain
 import gtsam
 import numpy as np
 
-from pipelines.graph.assumptions import Assumption, parameter, quantities, scale_assumptions
+from pipelines.graph.assumptions import encoder_assumptions, parameter, quantities, scale_assumptions
 from pipelines.graph.problem import Array, Parameter, Quantity
 from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
 from pipelines.methods.indexer.recording import JOINTS
@@ -22,14 +22,7 @@ EPSILON = ("axis_nonperpendicularity",)
 # What data sheets of navigation-grade sensors state, one sigma: fibre-optic or laser gyros after factory calibration,
 # axes that turn with encoders of some arc seconds.
 SCALE, SKEW = scale_assumptions("gyro", "gyro", 1e-4, 2e-5)
-ONCE_PER_TURN = Assumption(
-    tuple(f"encoder_{joint}_{part}" for joint in JOINTS for part in ("sin", "cos")),
-    "rad",
-    "encoder",
-    "once_per_turn",
-    5e-6,
-)
-DELAY = Assumption(("encoder_delay",), "s", "encoder", "delay", 1e-3)
+ONCE_PER_TURN, DELAY = encoder_assumptions(JOINTS, 5e-6, 1e-3)
 ASSUMPTIONS = (SCALE, SKEW, ONCE_PER_TURN, DELAY)
 ERRORS, ENCODER = (*SCALE.names, *SKEW.names), (*ONCE_PER_TURN.names, *DELAY.names)
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
 
 from factors import so3
-from pipelines.methods.formula import Formula, gyro_rate, numbers_of, passive
+from pipelines.methods.formula import Formula, axis_angles, gyro_rate, numbers_of, passive
 from pipelines.methods.los.parameters import (
     CLOCK_SKEW,
     DELAY,
@@ -31,6 +31,8 @@ def formulas(parameters: Collection[str]) -> list[Formula]:
         found.append(
             Formula("azimuth zero", "delta_z", "delta_pz - delta_gz", (), lambda v: np.array(v.delta_pz - v.delta_gz))
         )
+    angles = axis_angles(JOINTS, ONCE_PER_TURN.names, DELAY.names[0], parameters)
+    azimuth, elevation = [angle.name for angle in angles] or JOINTS
     true, measured, rate = gyro_rate(parameters, S, SENSITIVITY.names)
     found += [
         Formula(
@@ -41,8 +43,8 @@ def formulas(parameters: Collection[str]) -> list[Formula]:
             lambda v: so3.compose(passive(2, v.delta_z), passive(0, -v.delta_gx), passive(1, -v.delta_gy)),
         ),
         Formula("rate of the carrier, rad/s", "w_b", f"M * ({true})", measured, lambda v: so3.rotate(v.M, rate(v))),
-        *_axes(parameters),
-        _camera(parameters),
+        *angles,
+        _camera(parameters, azimuth, elevation),
         Formula(
             "a direction d_b of the carrier in the line-of-sight frame",
             "d_l",
@@ -64,27 +66,6 @@ def formulas(parameters: Collection[str]) -> list[Formula]:
     return [*found, *_clock(parameters)]
 
 
-def _axes(parameters: Collection[str]) -> list[Formula]:
-    """The axes' angles from what the encoders read."""
-    late = f", {DELAY.names[0]} s after the stamp of the reading" if DELAY.names[0] in parameters else ""
-
-    def angle(joint: str, names: Sequence[str]) -> Formula:
-        def compute(v: Any) -> so3.Array:
-            (sine, cosine), read = numbers_of(v, names), np.asarray(getattr(v, joint))
-            return np.asarray(read - sine * np.sin(read) - cosine * np.cos(read))
-
-        sine, cosine = (name if name in parameters else "0" for name in names)
-        expression = f"{joint} - {sine} * sin({joint}) - {cosine} * cos({joint})"
-        return Formula(f"angle of the {joint} axis, rad{late}", f"{joint}_angle", expression, (joint,), compute)
-
-    names = ONCE_PER_TURN.names
-    return [angle(JOINTS[0], names[:2]), angle(JOINTS[1], names[2:])] if _corrected(parameters) else []
-
-
-def _corrected(parameters: Collection[str]) -> bool:
-    return any(name in parameters for name in (*ONCE_PER_TURN.names, *DELAY.names))
-
-
 def _clock(parameters: Collection[str]) -> list[Formula]:
     """When a picture was taken."""
     offset, skew = OFFSET in parameters, CLOCK_SKEW.names[0] in parameters
@@ -102,10 +83,9 @@ def _clock(parameters: Collection[str]) -> list[Formula]:
     ]
 
 
-def _camera(parameters: Collection[str]) -> Formula:
+def _camera(parameters: Collection[str], azimuth: str, elevation: str) -> Formula:
     """The camera in the carrier, with those turns that are calibrated."""
     roll, collimation, tilt = (name in parameters for name in (*_LEFT, _MIDDLE))
-    azimuth, elevation = (f"{joint}_angle" if _corrected(parameters) else joint for joint in JOINTS)
     turns = [
         *(["Ry(camera_roll)"] if roll else []),
         *(["Rz(collimation)"] if collimation else []),

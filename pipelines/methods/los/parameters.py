@@ -10,6 +10,7 @@ import gtsam
 from pipelines.errors import InputError
 from pipelines.graph.assumptions import (
     Assumption,
+    encoder_assumptions,
     parameter,
     quantities,
     scale_assumptions,
@@ -36,14 +37,7 @@ TIME_OFFSET = Assumption((OFFSET,), "s", "clock", "offset", 1e-2)
 CLOCK_SKEW = Assumption(("clock_skew",), "", "clock", "skew", 1e-4)
 LOS_SCALE = Assumption(("los_scale",), "", "camera", "scale", 5e-3)
 TARGET_RATE = Assumption(("target_rate_x", "target_rate_z"), "rad/s", "target", "rate", 1e-5)
-ONCE_PER_TURN = Assumption(
-    tuple(f"encoder_{joint}_{part}" for joint in JOINTS for part in ("sin", "cos")),
-    "rad",
-    "encoder",
-    "once_per_turn",
-    2e-4,
-)
-DELAY = Assumption(("encoder_delay",), "s", "encoder", "delay", 1e-3)
+ONCE_PER_TURN, DELAY = encoder_assumptions(JOINTS, 2e-4, 1e-3)
 
 # Of the mounting, one by one; and those of factors.los.SIGHT_ERRORS, in its order.
 MOUNTED, SIGHT = (ROLL, COLLIMATION, AXES), (TIME_OFFSET, CLOCK_SKEW, LOS_SCALE, TARGET_RATE, ONCE_PER_TURN, DELAY)
