@@ -81,7 +81,8 @@ def test_hours_of_indexing_cost_the_same_per_turn() -> None:
 
     def clocked(chunk: int) -> object:
         for step in graph.steps(chunk):
-            moments.append(time.process_time())
+            if chunk == 1:  # others are read when a young run is solved again
+                moments.append(time.process_time())
             yield step
 
     timed = Problem(**{**graph.__dict__, "steps": clocked})
