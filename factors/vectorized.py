@@ -43,6 +43,14 @@ class _Evaluation:
             self.residuals[start:stop], lambda: tuple(jacobian[start:stop] for jacobian in self.jacobians())
         )
 
+    def weighed(self, weights: Array | None) -> _Evaluation:
+        """With rows multiplied by weights (n, m); None: as it is."""
+        if weights is None:
+            return self
+        return _Evaluation(
+            weights * self.residuals, lambda: tuple(weights[..., None] * jacobian for jacobian in self.jacobians())
+        )
+
 
 def _same(a: Any, b: Any) -> bool:
     """Whether two values of a variable are equal to the last bit."""
@@ -54,7 +62,7 @@ class VectorizedFactor:
     """A model tied to variables: what a gtsam graph takes (`.factor`) and what reports ask for (`.residuals`).
 
     Built by `Model.on`, which says what the fields are. A compressed factor has as many rows as unknowns and one more
-    that keeps its error exact.
+    that keeps its error exact. `weights` (n, m) multiply the whitened residuals, see `weighed`.
 
     Raises:
         ValueError: keys, noise or what the model declares do not fit.
@@ -65,6 +73,7 @@ class VectorizedFactor:
     loss: TruncatedLoss | None = None
     compress: bool = False
     noise: gtsam.noiseModel.Base | None = None
+    weights: Array | None = None
     columns: list[int | list[int]] = field(init=False)
     keys: list[int] = field(init=False)
 
@@ -140,11 +149,22 @@ class VectorizedFactor:
         other.loss = loss
         return other
 
+    def weighed(self, weights: Array) -> VectorizedFactor:
+        """The same factor with its whitened residuals multiplied by other weights (m,) or (n, m): noise of 1 / weights.
+
+        They take the place of those it has.
+        """
+        other = copy(self)
+        other.weights = np.broadcast_to(weights, (len(self.model.time), self.model.rows))
+        other._last = None
+        return other
+
     def only(self, kept: NDArray[np.bool_]) -> VectorizedFactor:
         """The factor on some of its n measurements. Only for a model that names what is `stacked`, uncompressed."""
         rows = np.flatnonzero(kept)
         tied = [column if isinstance(column, int) else [column[i] for i in rows] for column in self.columns]
-        return VectorizedFactor(_take(self.model, rows), tied, self.loss, noise=self.noise)
+        weights = None if self.weights is None else self.weights[rows]
+        return VectorizedFactor(_take(self.model, rows), tied, self.loss, noise=self.noise, weights=weights)
 
     @property
     def divisible(self) -> bool:
@@ -169,7 +189,7 @@ class VectorizedFactor:
             for variable in _read(values, [column] if isinstance(column, int) else column, block)
         ]
         if self._last is None or not all(map(_same, variables, self._last[0])):
-            self._last = variables, _Evaluation(*self.model(*self._arrays(variables)))
+            self._last = variables, _Evaluation(*self.model(*self._arrays(variables))).weighed(self.weights)
         return self._last[1]
 
     def _arrays(self, variables: list[Any]) -> Iterator[Array]:
@@ -315,7 +335,7 @@ class _Group:
 
     def give(self, loss: TruncatedLoss | None) -> None:
         for factor, part in zip(self._factors, self._parts, strict=True):
-            factor._given = part, None if factor.loss is None else loss
+            factor._given = part.weighed(factor.weights), None if factor.loss is None else loss
 
     def take(self) -> None:
         for factor in self._factors:

@@ -22,6 +22,7 @@ from pipelines.config import load_config, recorded_config
 from pipelines.discovery import nearest_suggestion, suggestions, with_suggested
 from pipelines.errors import InputError
 from pipelines.graph.problem import Estimate, Problem, Quantity, Step
+from pipelines.judgement import noise_levels
 from pipelines.judgement.assumptions import Strained, strained
 from pipelines.judgement.causes import find_causes
 from pipelines.judgement.halves import Halves, held_out, span, split_at, split_halves
@@ -240,15 +241,24 @@ class Session:
                 estimate.covariance if moved is None else moved.widened(estimate, quantities),
                 estimate.chi_square,
                 problem.advice,
+                decides=not noise_levels.asked(estimate.levels),
             )
-            misfit = assessment.status == "inconsistent" or too_many_rejected(estimate.residuals)
-            if ours and causes is None and (misfit or not estimate.converged):
+            wrong_noise = noise_levels.misfit(
+                estimate.levels,
+                assessment.consistency,
+                estimate.colours,
+                {family: len(r.time) for family, r in estimate.residuals.items()},
+            )
+            misfit = assessment.status == "inconsistent" or bool(wrong_noise) or too_many_rejected(estimate.residuals)
+            doubtful = misfit or noise_levels.suspicious(estimate.levels, estimate.colours)
+            if ours and causes is None and (doubtful or not estimate.converged):
                 with progress.doing("looking for causes"):
                     causes = find_causes(self.method, self.data, self.config, estimate)
             if ours and not estimate.converged:
                 assessment = assessment.unsolved(estimate.message).explained(causes or ())
-            elif ours and misfit:
-                assessment = assessment.misfit(rejection_sentence(estimate.residuals))
+            elif ours and (misfit or (doubtful and causes)):
+                reasons = filter(None, [wrong_noise, rejection_sentence(estimate.residuals)])
+                assessment = assessment.misfit(" ".join(reasons))
                 assumed = _not_as_assumed(strained(estimate, quantities))
                 assessment = assessment.explained(_first(causes or (), assumed))
             elif ours:
@@ -263,7 +273,7 @@ class Session:
                 checked = SelfCheck.of(estimate, self._solve("batch", None)[0])
                 assessment = assessment.remarked(checked.sentence if checked else "")
             if ours:
-                assessment = assessment.remarked(*problem.premises)
+                assessment = assessment.remarked(*noise_levels.remarks(estimate.levels), *problem.premises)
             found.append(
                 Calibration(
                     method=self.method,

@@ -52,7 +52,9 @@ class Section(BaseModel):
 class Noise(Section):
     """Noise of the sensors: densities per sqrt(Hz), walks per sqrt(s), the others per sample; None where not given.
 
-    gyro_scale (no unit) is what scale and alignment errors of the gyro add: a fraction of the angle turned.
+    gyro_scale (no unit) is what scale and alignment errors of the gyro add: a fraction of the angle turned. What the
+    mean over a rest repeats to beside white noise: gyro_, accel_, mag_repeatability, in the sensor's unit; the
+    angle turned from rest to rest: turn_repeatability, a fraction of it.
     """
 
     gyro_density: Sigma | None = None
@@ -66,6 +68,10 @@ class Noise(Section):
     encoder: SigmaOrZero | None = None
     vision_attitude: Sigma | None = None
     corner_px: Sigma | None = None
+    gyro_repeatability: SigmaOrZero | None = None
+    turn_repeatability: SigmaOrZero | None = None
+    accel_repeatability: SigmaOrZero | None = None
+    mag_repeatability: SigmaOrZero | None = None
 
 
 # Where neither the config nor a message says anything.
@@ -81,6 +87,10 @@ DEFAULT_NOISE = Noise(
     encoder=1.0e-5,
     vision_attitude=8.7e-3,
     corner_px=0.3,
+    gyro_repeatability=2.0e-5,
+    turn_repeatability=1.0e-3,
+    accel_repeatability=5.0e-4,
+    mag_repeatability=2.0e-8,
 )
 
 
@@ -226,6 +236,7 @@ class Config(Section):
     topics: dict[str, TopicSource] = {}
     columns: dict[str, TableTopic] = {}
     noise: Noise = Noise()
+    noise_known: SigmaOrZero = 0.1
     priors: dict[str, SigmaOrZero | None] = {}
     require: dict[str, Sigma] = {}
     sensors: SensorSheets = Sensors()

@@ -107,7 +107,7 @@ def test_wrong_noise_exits_with_4(alidade: Command, scenario: HeadScenario, tmp_
     short = scenario.model_copy(update={"duration_s": 6.0, "sensors": IDEAL})
     simulated, truth = simulate_head(short, 1)
     write_head(tmp_path / "s.mcap", simulated, truth, head_config(short))
-    (tmp_path / "noise.yaml").write_text("noise: {vision_attitude: 0.002}\n")
+    (tmp_path / "noise.yaml").write_text("noise: {vision_attitude: 0.001}\n")
     run = alidade("calibrate", tmp_path / "s.mcap", "--config", tmp_path / "noise.yaml", "--out", tmp_path / "out")
     assert run.code == 4
     assert "noise" in run.out

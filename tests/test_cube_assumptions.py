@@ -82,7 +82,9 @@ def test_effects_are_found_or_made_room_for() -> None:
 def test_ideal_sensors_leave_mounts_tags_heading_and_field_alone_and_go_wrong() -> None:
     scenario = _scenario(effects=EFFECTS, sensors="ideal")
     data, truth = simulate_cube(scenario, 3)
-    built = problem(data, load_config(cube_config(scenario).encode()))
+    # With the noise stated: what the graph lacks would be taken for noise.
+    known = load_config(cube_config(scenario).encode()).model_copy(update={"noise_known": 0.0})
+    built = problem(data, known)
     free = {q.name: q.prior_sigma for q in built.quantities if q.prior_sigma}
     assert not [name for name in free if name.startswith(("gyro_g", "accel_s", "accel_c", "reference_t"))]
     usual = {"camera_mount_x": 5e-3, "tag_17_x": 3e-3, "field_e": 5e-7, "reference_heading": 1e-2}

@@ -16,6 +16,7 @@ from factors import so3
 from pipelines.cli import app
 from pipelines.config import load_config
 from pipelines.graph.problem import Array, Estimate, Problem
+from pipelines.judgement import noise_levels
 from pipelines.judgement.observability import Assessment, assess
 from pipelines.methods.head.graph import problem
 from pipelines.methods.head.recording import write_head
@@ -48,9 +49,10 @@ def scenario(**changes: object) -> HeadScenario:
 class Run:
     """A simulated session solved."""
 
-    def __init__(self, settings: HeadScenario, seed: int, solve: Solve, noise: str = "") -> None:
+    def __init__(self, settings: HeadScenario, seed: int, solve: Solve, noise: str = "", known: float = 0.1) -> None:
         data, truth = simulate_head(settings, seed)
         config = load_config(head_config(settings).encode())
+        config = config.model_copy(update={"noise_known": known})
         if noise:
             changed = config.noise.model_copy(update={noise: getattr(config.noise, noise) / 3.0})
             config = config.model_copy(update={"noise": changed})
@@ -62,7 +64,8 @@ class Run:
     @property
     def assessment(self) -> Assessment:
         e = self.estimate
-        return assess(self.problem.quantities, e.covariance, e.chi_square, self.problem.advice)
+        decides = not noise_levels.asked(e.levels)
+        return assess(self.problem.quantities, e.covariance, e.chi_square, self.problem.advice, decides)
 
     @property
     def worst(self) -> float:
@@ -123,19 +126,31 @@ def test_right_noise_is_consistent(solve: Solve) -> None:
 
 
 @pytest.mark.parametrize("solve", [solve_batch, pytest.param(solve_incremental, marks=pytest.mark.slow)])
-def test_vision_noise_set_too_small_is_inconsistent(solve: Solve) -> None:
+def test_vision_noise_set_too_small_is_found(solve: Solve) -> None:
     """Three times."""
-    assessment = Run(scenario(), 1, solve, "vision_attitude").assessment
+    run = Run(scenario(), 1, solve, "vision_attitude")
+    assert run.assessment.status == "calibrated"
+    (vision,) = (level for level in run.estimate.levels if level.noise.name == "vision_attitude")
+    assert vision.contradicted
+    assert vision.scale == pytest.approx(3.0, rel=0.1)
+    right = Run(scenario(), 1, solve)
+    np.testing.assert_allclose(run.estimate.sigmas, right.estimate.sigmas, rtol=0.1)
+
+
+def test_vision_noise_known_exactly_and_too_small_is_inconsistent() -> None:
+    assessment = Run(scenario(), 1, solve_batch, "vision_attitude", known=0.0).assessment
     assert assessment.status == "inconsistent"
     assert "noise" in assessment.headline
     assert "vision" in assessment.headline
 
 
-def test_gyro_noise_set_too_small_is_inconsistent() -> None:
+def test_gyro_noise_set_too_small_is_found_in_its_samples() -> None:
     """Where the gyro's noise, and not vision's, is what the residuals are made of."""
     settings = scenario(noise={"gyro_density": 2e-3, "vision_attitude": 5e-4})
-    assert Run(settings, 1, solve_batch).assessment.status == "calibrated"
-    assert Run(settings, 1, solve_batch, "gyro_density").assessment.status == "inconsistent"
+    right, run = Run(settings, 1, solve_batch), Run(settings, 1, solve_batch, "gyro_density")
+    assert run.assessment.status == "calibrated"
+    np.testing.assert_allclose(run.estimate.sigmas, right.estimate.sigmas, rtol=0.1)
+    assert Run(settings, 1, solve_batch, "gyro_density", known=0.0).assessment.status == "inconsistent"
 
 
 @SOLVERS

@@ -53,7 +53,8 @@ def test_every_parameter_from_pictures_alone(session: Path) -> None:
     assert {"/camera/image/compressed", "/camera/camera_info"} <= set(recording.topics)
     off, status = sigmas_off(session)
     assert len(off) == 36
-    assert np.abs(off).max() < 3.0
+    # The largest of 36 numbers as likely to be beyond as one is to be beyond 2.2.
+    assert np.abs(off).max() < 3.5
     assert status == "calibrated"
 
 

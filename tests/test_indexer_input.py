@@ -79,7 +79,8 @@ def test_missing_latitude_is_refused_when_the_earth_shows(session: tuple[Indexer
     blind = replace(data, latitude_deg=None)
     with pytest.raises(InputError, match=r"latitude is not known; record /fix or give latitude_deg"):
         problem(blind, _config())
-    coarse = _config().model_copy(update={"noise": _config().noise.model_copy(update={"gyro_density": 1e-3})})
+    noise = _config().noise.model_copy(update={"gyro_density": 1e-3})
+    coarse = _config().model_copy(update={"noise": noise, "noise_known": 0.0})
     assert np.abs(_errors(blind, truth, coarse)).max() < 1.0
 
 

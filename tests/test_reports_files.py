@@ -51,7 +51,16 @@ def test_result_json_has_the_contracts_keys() -> None:
     assert content["schema"] == "alidade.result/1"
     assert (content["method"], content["solver"], content["status"]) == ("head", "incremental", "calibrated")
     for parameter in content["parameters"]:
-        assert list(parameter) == ["name", "value", "sigma", "unit", "prior_sigma", "require", "observability"]
+        assert list(parameter) == [
+            "name",
+            "value",
+            "sigma",
+            "unit",
+            "prior_sigma",
+            "require",
+            "observability",
+            "inflation",
+        ]
     by_name = {p["name"]: p for p in content["parameters"]}
     assert by_name["free"]["prior_sigma"] is None
     assert by_name["pinned"]["observability"] == "fixed"

@@ -12,8 +12,8 @@ import pytest
 
 from factors import so3
 from pipelines.graph.problem import Attitudes, Quantity, Residuals
+from pipelines.graph.robust import robust_sigma
 from pipelines.judgement.observability import assess
-from pipelines.judgement.robust import robust_sigma
 from pipelines.methods.head.figures import head_plots
 from pipelines.methods.head.recording import HeadData
 from pipelines.recording.sources import TopicSource

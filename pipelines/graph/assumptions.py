@@ -103,15 +103,22 @@ def fixed_without_force(assumption: Assumption, config: Config, topic: str) -> F
     return {"fixed_assumptions": [{"parameters": names, "value": 0.0, "why": f"{topic} has no acceleration"}]}
 
 
-def pull(quantity: Quantity, value: float, sigma: float) -> float | None:
+def pull(quantity: Quantity, value: float, sigma: float, inflation: float = 1.0) -> float | None:
     """How far the recording takes an assumption from its prior, in sigmas of what it could; None if it says nothing.
 
-    The estimate's change from the prior has the variance prior_sigma^2 - sigma^2.
+    With s = sigma / inflation, p the prior's sigma and V = sigma^2 - (s^2 / p)^2 what comes from elsewhere than from
+    the prior, the estimate's change from the prior has the variance (p - s^2 / p)^2 + V; for white noise p^2 - s^2.
+
+    Args:
+        quantity: the assumption.
+        value, sigma: its estimate.
+        inflation: by what sigma is larger because noise is coloured.
     """
-    prior = quantity.prior_sigma or 0.0
-    if sigma > _UNTOLD * prior or prior == 0.0:
+    prior, white = quantity.prior_sigma or 0.0, sigma / inflation
+    if white > _UNTOLD * prior or prior == 0.0:
         return None
-    return (value - quantity.prior_mean) / math.sqrt(prior**2 - sigma**2)
+    elsewhere = sigma**2 - (white**2 / prior) ** 2
+    return (value - quantity.prior_mean) / math.sqrt((prior - white**2 / prior) ** 2 + elsewhere)
 
 
 def determined(quantity: Quantity, sigma: float) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from factors import so3
 from factors.loss import TruncatedLoss
 from factors.vectorized import VectorizedFactor
+from pipelines.graph.noise import Level
 
 if TYPE_CHECKING:
     import gtsam
@@ -106,22 +107,25 @@ class Factor:
         factor: a gtsam factor.
         measurement: the vectorised factor behind it when it is a measurement that may be an outlier: the incremental
             solver gates its innovation, reports plot its residuals.
+        process: the vectorised factor behind it when it is none.
+        beside: (n,) what a unit of the noise beside its own adds to the whitened residuals, see Noise.beside.
     """
 
     family: str
     factor: gtsam.NonlinearFactor
     measurement: VectorizedFactor | None = None
     process: VectorizedFactor | None = None
+    beside: Array | None = None
 
     @classmethod
-    def of(cls, family: str, measurement: VectorizedFactor) -> Factor:
+    def of(cls, family: str, measurement: VectorizedFactor, beside: Array | None = None) -> Factor:
         """A measurement that may be an outlier."""
-        return cls(family, measurement.factor, measurement)
+        return cls(family, measurement.factor, measurement, beside=beside)
 
     @classmethod
-    def process_of(cls, family: str, process: VectorizedFactor) -> Factor:
+    def process_of(cls, family: str, process: VectorizedFactor, beside: Array | None = None) -> Factor:
         """What joins variables and is no outlier."""
-        return cls(family, process.factor, process=process)
+        return cls(family, process.factor, process=process, beside=beside)
 
     @property
     def vectorized(self) -> VectorizedFactor | None:
@@ -190,6 +194,7 @@ class Problem:
             this one on variables, and its steps stay as they are, but for the last one and those of the last
             `unsettled` s. None if there is no such keyframe. Not every graph can be built from the end alone.
         unsettled: see `onward`, s.
+        noises: that are in force, with what sensors' own samples say of them.
     """
 
     method: str
@@ -204,6 +209,7 @@ class Problem:
     steps_after: Callable[[float], Iterator[Step]] | None = None
     onward: Callable[[Any, float], Problem | None] | None = None
     unsettled: float = 1.0
+    noises: tuple[Level, ...] = ()
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
@@ -246,7 +252,8 @@ class History:
 
     Attributes:
         time, values, sigmas: as above.
-        covariance: (k, n, n) joint, where they are all linearised at the final estimate; None where they are not.
+        covariance: (k, n, n) joint for white noise, where they are all linearised at the final estimate; None where
+            they are not.
         steady: (n,) which quantities are the same number at all times; the others walk.
     """
 
@@ -255,6 +262,10 @@ class History:
     sigmas: Array
     covariance: Array | None = None
     steady: NDArray[np.bool_] | None = None
+
+    def inflated(self, by: Array) -> History:
+        """With sigmas larger by factors (n,); the covariances stay those of white noise."""
+        return replace(self, sigmas=self.sigmas * by)
 
 
 @dataclass(frozen=True)
@@ -276,6 +287,9 @@ class Estimate:
         attitudes: the trajectory, if the method has one.
         budget: quantity -> source -> its share of the quantity's variance, the largest first; None: not asked for.
         rejected: family -> number of measurements rejected as outliers.
+        levels: of the noises; none: all are as stated.
+        colours: family -> how many of its measurements in a row count as one, of those whose residuals are correlated.
+        inflation: (n,) by what the sigmas are larger because residuals are correlated in time; None: by nothing.
         seconds: phase -> wall time.
     """
 
@@ -292,9 +306,17 @@ class Estimate:
     attitudes: Attitudes | None = None
     budget: Mapping[str, Mapping[str, float]] | None = None
     rejected: Mapping[str, int] = field(default_factory=dict)
+    levels: tuple[Level, ...] = ()
+    colours: Mapping[str, float] = field(default_factory=dict)
+    inflation: Array | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def sigmas(self) -> Array:
         """(n,) standard deviations."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def inflations(self) -> Array:
+        """(n,) `inflation`, ones where it is None."""
+        return np.ones(len(self.values)) if self.inflation is None else self.inflation

@@ -44,10 +44,11 @@ def strained(estimate: Estimate, quantities: Sequence[Quantity]) -> tuple[Strain
         quantities: of the estimate, in its order.
     """
     sigmas = estimate.sigmas
+    numbers = zip(quantities, estimate.values.tolist(), sigmas.tolist(), estimate.inflations.tolist(), strict=True)
     pulls = {
         i: size
-        for i, q in enumerate(quantities)
-        if q.assumed and (size := pull(q, float(estimate.values[i]), float(sigmas[i]))) is not None
+        for i, (q, value, sigma, inflation) in enumerate(numbers)
+        if q.assumed and (size := pull(q, value, sigma, inflation)) is not None
     }
     assumed = [i for i, q in enumerate(quantities) if q.assumed and sigmas[i] > 0.0]
     left = sorted((i for i, p in pulls.items() if abs(p) > _FAR), key=lambda i: -abs(pulls[i]))

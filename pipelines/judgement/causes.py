@@ -3,26 +3,24 @@
     causes = find_causes(method, data, config)      # after a calibration that ended inconsistent
     causes[0].label, causes[0].evidence             # the likeliest
 
-A cause counts when the recording fits with it, or fits far better. Signs of axes and the time offset go before the
-noise: noise large enough fits anything.
+A cause counts when the recording fits with it, or fits far better. Noise is offered where it is said to be known
+exactly and nothing else explains: noise large enough fits anything.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipelines.graph.problem import Estimate, Residuals
 from pipelines.judgement.halves import cut
-from pipelines.judgement.hypotheses import Hypotheses
 from pipelines.judgement.observability import Cause
 from pipelines.judgement.outcome import Outcome, outcome, quick_score
 from pipelines.judgement.rejection import too_many_rejected
 from pipelines.judgement.trials import Trial, faults, trials
-from pipelines.settings import DEFAULT_NOISE, Config
+from pipelines.settings import Config
 
 if TYPE_CHECKING:
     from pipelines.methods import Method
@@ -33,11 +31,11 @@ _STRETCH, _SHORT = 30.0, 8.0
 _SIGNIFICANT = 5.0
 # A change that leaves more than this share of the noise factor explains little.
 _BETTER = 0.8
-_NOISE_STEPS = 5
-_NOISE_ACCURACY = 0.02
 # Noise so many times larger explains anything, and is never offered.
 _MOST_NOISE = 4.0
 _MOST_NAMED = 3
+# How well noise is known, in the logarithm, when the recording is asked for it.
+_ROUGHLY = 1.0
 # How far the typical residual has to fall for a change to be looked at closely.
 _PROMISING = 0.97
 # A change whose typical residual is so many times the least one's explains nothing that the other does not.
@@ -55,23 +53,23 @@ def find_causes(method: Method, data: Any, config: Config, estimate: Estimate | 
         config: of the recording.
         estimate: its calibration, which tells where to look; by default the whole is tried.
     """
-    problem, hypotheses = method.problem(data, config), method.hypotheses()
-    if estimate is not None and estimate.solver == "batch" and not hypotheses.cut:
-        before = Outcome.of(problem, estimate)
-    else:
-        if estimate is not None and hypotheses.cut:
-            data = cut(hypotheses, data, *_worst_stretch(estimate.residuals, _STRETCH))
-        before = outcome(method, data, config)
+    hypotheses = method.hypotheses()
+    known = config.noise_known == 0.0
+    # With the noise stated: levels made to fit hide what is looked for.
+    config = config.model_copy(update={"noise_known": 0.0})
+    if estimate is not None and hypotheses.cut:
+        data = cut(hypotheses, data, *_worst_stretch(estimate.residuals, _STRETCH))
+    before = outcome(method, data, config)
     if before is None or (before.fits and not too_many_rejected(before.estimate.residuals)):
         return ()
     found = _explaining(method, _screened(method, data, config, before), before)
     if any(after.fits for after, _ in found):
         found = [each for each in found if each[0].fits]
-    elif not found:
-        found = _noise(method, hypotheses, data, config, before)
     if not found:
         last = _explaining(method, faults(hypotheses, data, config, last=True), before)
         found = [each for each in last if each[0].fits]
+    if not found and known:
+        return _noise(method, data, config)
     return tuple(Cause(label, _evidence(before, after)) for after, label in found[:_MOST_NAMED])
 
 
@@ -128,48 +126,15 @@ def _evidence(before: Outcome, after: Outcome) -> str:
     )
 
 
-def _noise(
-    method: Method, hypotheses: Hypotheses, data: Any, config: Config, before: Outcome
-) -> list[tuple[Outcome, str]]:
-    """The one noise that, stated larger, balances all families best; nothing when none brings chi-square to fit."""
-    found = []
-    for key in hypotheses.noise:
-        scaled = _scaled_to_fit(method, hypotheses, data, config, key, before)
-        if scaled is not None and _NOTABLE < scaled[1] <= _MOST_NOISE:
-            found.append((scaled[0], f"the noise {key} is stated {scaled[1]:.2g} times too small"))
-    return sorted(found, key=lambda each: each[0].imbalance)[:1]
-
-
-def _scaled_to_fit(
-    method: Method, hypotheses: Hypotheses, data: Any, config: Config, key: str, before: Outcome
-) -> tuple[Outcome, float] | None:
-    """The solution with a noise multiplied so that its families' chi-square is the expected one, and the factor.
-
-    Variance component estimation, as Foerstner has it (1979).
-    """
-    families = hypotheses.noise[key][1]
-    factor, after = 1.0, before
-    for _ in range(_NOISE_STEPS):
-        step = after.spread(families)
-        if abs(step - 1.0) < _NOISE_ACCURACY:
-            break
-        factor *= step
-        found = outcome(method, *_with_noise(hypotheses, data, config, key, factor))
-        if found is None:
-            return None
-        after = found
-    return (after, factor) if after.fits else None
-
-
-def _with_noise(hypotheses: Hypotheses, data: Any, config: Config, key: str, factor: float) -> tuple[Any, Config]:
-    """Data and config with a noise multiplied, wherever it is stated."""
-    source = hypotheses.noise[key][0]
-    own = None if source is None else getattr(data, source)
-    if source is not None and own is not None:
-        data = replace(data, **{source: own * factor ** (1 if isinstance(own, float) else 2)})
-    given = getattr(config.noise, key)
-    if given is None and own is None:
-        given = getattr(DEFAULT_NOISE, key)
-    if given is not None:
-        config = config.model_copy(update={"noise": config.noise.model_copy(update={key: given * factor})})
-    return data, config
+def _noise(method: Method, data: Any, config: Config) -> tuple[Cause, ...]:
+    """The noises that are stated too small, as the recording has them; none so large as to explain anything."""
+    found = outcome(method, data, config.model_copy(update={"noise_known": _ROUGHLY}))
+    levels = [level for level in found.estimate.levels if level.contradicted] if found is not None else []
+    return tuple(
+        Cause(
+            f"the noise {level.noise.name} is stated {level.scale:.2g} times too small",
+            f"the recording says {level.used:.3g} {level.noise.unit}, stated are {level.noise.stated:.3g}",
+        )
+        for level in sorted(levels, key=lambda level: -level.scale)
+        if _NOTABLE < level.scale <= _MOST_NOISE
+    )

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.graph.problem import Array, Problem
+from pipelines.graph.robust import robust_sigma
 from pipelines.judgement.outcome import outcome
-from pipelines.judgement.robust import robust_sigma
 from pipelines.settings import Config
 
 if TYPE_CHECKING:

@@ -47,7 +47,6 @@ class Hypotheses:
     Attributes:
         streams: stamps -> what carries them.
         signs: readings (n,) or (n, k) -> how people call them, and their columns.
-        noise: key of the config's noise -> the field that holds the messages' own, if any, and the families it is of.
         offset: whether the method has a parameter `time_offset`.
         delays: other parameters that are delays -> the fault in words, with the parameter's name in braces.
         clock: stamps that may be late, and how people call their source.
@@ -58,7 +57,6 @@ class Hypotheses:
 
     streams: Mapping[str, Sequence[str]]
     signs: Mapping[str, tuple[str, Sequence[str]]]
-    noise: Mapping[str, tuple[str | None, Sequence[str]]]
     offset: bool = False
     delays: Mapping[str, str] = field(default_factory=dict)
     clock: tuple[str, str] | None = None

@@ -299,7 +299,11 @@ class Assessment:
 
 
 def assess(
-    quantities: Sequence[Quantity], covariance: Array, chi_square: ChiSquare | None, advice: Advice | None
+    quantities: Sequence[Quantity],
+    covariance: Array,
+    chi_square: ChiSquare | None,
+    advice: Advice | None,
+    decides: bool = True,
 ) -> Assessment:
     """The verdict on an estimate with this joint covariance (n, n) of the quantities; never fails on a singular one.
 
@@ -314,13 +318,16 @@ def assess(
         covariance: of the reported numbers, rows and columns as the quantities.
         chi_square: of the residuals, if the solver has one.
         advice: the method's sentence for a direction, given its weights by parameter name.
+        decides: whether chi-square beyond its bound makes it inconsistent; not where noise levels are estimated.
     """
     covariance = _finite(quantities, covariance)
     sigmas = np.sqrt(np.diag(covariance))
     verdicts = {q.name: _verdict(q, float(s)) for q, s in zip(quantities, sigmas, strict=True) if q.judged}
     directions = _directions(quantities, covariance, advice)
     consistency = _consistency(chi_square)
-    status = _status([*verdicts.values(), *(d.verdict for d in directions)], consistency)
+    unusable = consistency is not None and not np.isfinite(consistency.total.value)
+    deciding = consistency if decides or unusable else None
+    status = _status([*verdicts.values(), *(d.verdict for d in directions)], deciding)
     headline = _headline(status, verdicts, directions, consistency)
     if status == "weak":
         headline = " ".join(filter(None, [headline, costs(quantities, covariance)]))

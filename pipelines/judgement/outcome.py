@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +9,6 @@ import numpy as np
 
 from pipelines.graph.problem import ChiSquare, Estimate, Problem
 from pipelines.judgement.observability import Fit
-from pipelines.judgement.robust import robust_sigma
 from pipelines.settings import Config
 
 if TYPE_CHECKING:
@@ -68,20 +66,6 @@ class Outcome:
         """Whether chi-square lies within its interval without more than a few outliers rejected."""
         few = self.chi_square.dof > (1.0 - _OUTLIERS) * self.rows
         return few and self.chi_square.value <= Fit.of(0.0, self.chi_square.dof).high
-
-    def spread(self, families: Sequence[str]) -> float:
-        """Size of the families' residuals in units of what is expected, those rejected not forgotten."""
-        of = [f for f in families if f in self.chi_square.families]
-        value, dof = (sum(self.chi_square.families[f][i] for f in of) for i in range(2))
-        rejected = [r for f, r in self.estimate.residuals.items() if f in of and not r.used.all()]
-        typical = max((robust_sigma(r.whitened) for r in rejected), default=0.0)
-        return max(float(np.sqrt(value / max(dof, 1.0))), typical)
-
-    @property
-    def imbalance(self) -> float:
-        """How far the family that fits worst is from its expectation, in standard deviations."""
-        fits = (Fit.of(value, dof) for value, dof in self.chi_square.families.values())
-        return max((abs(fit.excess) for fit in fits if fit.dof >= 1.0), default=0.0)
 
 
 def outcome(method: Method, data: Any, config: Config) -> Outcome | None:

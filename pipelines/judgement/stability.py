@@ -110,7 +110,7 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
     if len(history.time) < _FEWEST_MOMENTS or not len(kept):
         return None
     values, covariance = _with_priors_as_found(estimate, quantities, history.values, history.covariance)
-    P = covariance[:, kept[:, None], kept]
+    P = (covariance * np.outer(estimate.inflations, estimate.inflations))[:, kept[:, None], kept]
     difference = values[:-1, kept] - values[-1, kept]
     whitening = [_whitening(P[i], P[-1]) for i in range(len(P) - 1)]
     ranks = np.array([len(rows) for rows in whitening])
@@ -132,7 +132,8 @@ def _with_priors_as_found(
     """
     for i, q in enumerate(quantities):
         prior = q.prior_sigma or 0.0
-        size = pull(q, float(estimate.values[i]), float(estimate.sigmas[i]))
+        inflation = float(estimate.inflations[i])
+        size = pull(q, float(estimate.values[i]), float(estimate.sigmas[i]), inflation)
         if size is None or abs(size) < _BEYOND:
             continue
         added = 1.0 / (size * prior) ** 2 - 1.0 / prior**2

@@ -54,6 +54,7 @@ def report_html(calibration: Calibration) -> str:
             start=datetime.datetime.fromtimestamp(facts.epoch_ns // 1_000_000_000, datetime.UTC),
             rows=[row for row in rows if not row.assumed],
             assumptions=[row for row in rows if row.assumed],
+            noises=calibration.noises,
             limits=found,
             advised=_short_of(calibration, found),
             formulas=[formula.text for formula in calibration.formulas],

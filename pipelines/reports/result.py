@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from pipelines.graph.assumptions import determined, pull
+from pipelines.graph.noise import Source
 from pipelines.graph.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
 from pipelines.judgement.observability import Assessment, Fit, Innovations, Learning, Status, Verdict, learning
 from pipelines.judgement.rejection import rejection_sentence
@@ -106,7 +107,11 @@ class Calibration:
     def parameters(self) -> dict[str, ParameterResult]:
         """Name -> parameter, as result.json lists them."""
         rows = zip(
-            quantities_of(self.problem, self.estimate), self.estimate.values, self.assessment.sigmas, strict=True
+            quantities_of(self.problem, self.estimate),
+            self.estimate.values,
+            self.assessment.sigmas,
+            self.estimate.inflations,
+            strict=True,
         )
         return {
             q.name: ParameterResult(
@@ -118,10 +123,29 @@ class Calibration:
                 require=q.require if q.judged else None,
                 observability=self.assessment.verdicts.get(q.name),
                 group=q.group,
-                pull=None if q.group is None else pull(q, float(value), float(sigma)),
+                pull=None if q.group is None else pull(q, float(value), float(sigma), float(inflation)),
+                inflation=float(inflation),
             )
-            for q, value, sigma in rows
+            for q, value, sigma, inflation in rows
         }
+
+    @property
+    def noises(self) -> list[NoiseResult]:
+        """Every noise that was in force: as stated, as found, as used."""
+        colours = self.estimate.colours
+        return [
+            NoiseResult(
+                name=level.noise.name,
+                unit=level.noise.unit,
+                source=level.noise.source,
+                stated=level.noise.stated,
+                estimated=None if level.found is None else level.found * level.noise.stated,
+                sigma=None if level.sigma is None else level.sigma * level.noise.stated,
+                used=level.used,
+                inflation=max((colours.get(family, 1.0) ** 0.5 for family in level.noise.families), default=1.0),
+            )
+            for level in self.estimate.levels or self.problem.noises
+        ]
 
     @property
     def budget(self) -> dict[str, Mapping[str, float]] | None:
@@ -308,12 +332,29 @@ class ParameterResult(_Record):
     observability: Verdict | None
     group: Literal["assumption"] | None = None
     pull: float | None = None
+    inflation: float = 1.0
 
     @model_serializer(mode="wrap")
     def _without_group(self, handler: SerializerFunctionWrapHandler) -> dict[str, object]:
         """What is calibrated belongs to no group and has no pull."""
         content: dict[str, object] = handler(self)
         return content if self.group else {k: v for k, v in content.items() if k not in ("group", "pull")}
+
+
+class NoiseResult(_Record):
+    """A noise in its unit: stated by whom, estimated from the recording with sigma (null: not asked), and used.
+
+    `inflation` is by what the sigma of a mean of its measurements is larger than if they were independent.
+    """
+
+    name: str
+    unit: str
+    source: Source
+    stated: float
+    estimated: float | None
+    sigma: float | None
+    used: float
+    inflation: float
 
 
 class CovarianceResult(_Record):
@@ -417,6 +458,7 @@ class Result(_Record):
     covariance: CovarianceResult
     null_directions: list[DirectionResult]
     chi_square: ChiSquareResult
+    noise: list[NoiseResult]
     session: SessionResult
     software: dict[str, str]
     timing_s: dict[str, float]
@@ -445,6 +487,7 @@ def result(calibration: Calibration) -> Result:
             DirectionResult(sigma_ratio=d.sigma_ratio, weights=dict(d.weights), advice=d.advice) for d in a.directions
         ],
         chi_square=_chi_square(a),
+        noise=c.noises,
         session=SessionResult(sha256=c.sha256, duration_s=c.facts.duration_s, counts=c.counts, dropped=c.dropped),
         software=dict(c.software),
         timing_s=c.timing,

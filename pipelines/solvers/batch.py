@@ -17,11 +17,22 @@ import numpy as np
 
 from factors.loss import TruncatedLoss
 from factors.vectorized import Ensemble
+from pipelines.graph.noise import Level
 from pipelines.graph.problem import Array, Estimate, Factor, Problem, Residuals
 from pipelines.solvers.assembly import Assembly
+from pipelines.solvers.coloured import added_variance, coloured, inflations
 from pipelines.solvers.history import sequential_history
 from pipelines.solvers.influence import influence, uncertainty_budget
-from pipelines.solvers.marginals import chi_square, eliminated, joint_covariance, ordering_of, reported, smoothed
+from pipelines.solvers.marginals import (
+    chi_square,
+    eliminated,
+    expected_squares,
+    joint_covariance,
+    ordering_of,
+    reported,
+    smoothed,
+)
+from pipelines.solvers.noise_levels import far, refined, weigh
 
 # Frames in one vectorised factor: past this the Jacobians' zeros cost more than the Python calls they save.
 CHUNK = 20
@@ -49,6 +60,8 @@ _TIED, _MOST_PLAIN = 1e-9, 10
 # Outliers are a minority. If the gate would leave less than this share, it is the noise or the model that is wrong:
 # nothing is rejected then, and chi-square says so.
 _FEWEST_USED = 0.5
+# Solutions with other noise levels.
+_MOST_LEVELS = 8
 
 
 @dataclass(frozen=True)
@@ -75,8 +88,11 @@ class System:
     def of(cls, factors: Sequence[Factor], shared: Sequence[int], loss: TruncatedLoss | None) -> System:
         """The system of some factors; the shared variables are eliminated last."""
         graph = graph_of(factors)
-        ensemble = Ensemble([v for f in factors if (v := f.vectorized) is not None])
-        return cls(factors, graph, elimination_ordering(graph, shared), shared, ensemble, loss)
+        return cls(factors, graph, elimination_ordering(graph, shared), shared, _ensemble(factors), loss)
+
+    def made_of(self, factors: Sequence[Factor]) -> System:
+        """The same system with other noise: of factors on the same variables, one for one."""
+        return replace(self, factors=factors, graph=graph_of(factors), ensemble=_ensemble(factors))
 
     def under(self, loss: TruncatedLoss | None) -> System:
         """The same system with another loss."""
@@ -106,6 +122,10 @@ class System:
             return residuals_of(self.factors, values)
 
 
+def _ensemble(factors: Sequence[Factor]) -> Ensemble:
+    return Ensemble([v for f in factors if (v := f.vectorized) is not None])
+
+
 @dataclass(frozen=True)
 class Solution:
     """Values at a minimum of a system, and how it was reached."""
@@ -115,6 +135,30 @@ class Solution:
     converged: bool
     message: str
     iterations: int
+
+
+@dataclass(frozen=True)
+class Linearized:
+    """A system about a solution.
+
+    Attributes:
+        graph: linearised.
+        bayes_net: its triangular factor.
+        expected: squares of the residuals, see marginals.expected_squares.
+    """
+
+    graph: gtsam.GaussianFactorGraph
+    bayes_net: gtsam.GaussianBayesNet
+    expected: dict[tuple[str, int], float]
+
+    @classmethod
+    def of(cls, solution: Solution) -> Linearized:
+        """Raises IndeterminateError, naming a variable that is not determined."""
+        system, values = solution.system, solution.values
+        graph = system.linearize(values)
+        bayes_net = eliminated(graph, system.ordering)
+        with system.at(values):
+            return cls(graph, bayes_net, expected_squares(system.factors, graph, bayes_net, values))
 
 
 def solve_batch(problem: Problem, most: int = _MOST_ITERATIONS, budget: bool = False) -> Estimate:
@@ -135,20 +179,24 @@ def solve_batch(problem: Problem, most: int = _MOST_ITERATIONS, budget: bool = F
     whole = Assembly.of(problem.steps(CHUNK))
     built = time.perf_counter()
     shared = whole.shared(problem)
-    solution = optimize(whole.factors, whole.initial, shared, problem.loss, most, held=problem.assumed)
+    weighed = weigh(whole.factors, problem.noises)
+    solution = optimize(weighed, whole.initial, shared, problem.loss, most, held=problem.assumed)
+    solution, levels, about = with_levels(problem, whole.factors, solution, problem.noises, most)
     solved = time.perf_counter()
     values, system, ordering = solution.values, solution.system, solution.system.ordering
-    linear = system.linearize(values)
+    linear, factors = about.graph, system.factors
     past = sequential_history(problem, linear, ordering, values, whole.boundaries)
     marginal = past[1] if past else joint_covariance(problem, linear, ordering, values, whole.current_keys)
     residuals = system.residuals(values)
-    bayes_net = eliminated(linear, ordering)
     with system.at(values):
-        summary = chi_square(problem, whole.factors, linear, bayes_net, values, marginal)
-    sources = None
-    if budget:
-        found = influence(problem, whole.factors, linear, bayes_net, values, whole.current_keys)
-        sources = uncertainty_budget(problem, found)
+        summary = chi_square(problem, factors, values, marginal, about.expected)
+        colours = coloured(factors, values) if levels else {}
+    sources, inflation = None, np.ones(len(marginal))
+    if budget or colours:
+        found = influence(problem, factors, linear, about.bayes_net, values, whole.current_keys)
+        added = added_variance(found, colours)
+        inflation = inflations(problem, marginal, found.names, added)
+        sources = uncertainty_budget(problem, found, added) if budget else None
     # Times from which on other variables held the parameters than before; after the last one they are those reported.
     ends = whole.boundaries
     changes = [
@@ -160,16 +208,19 @@ def solve_batch(problem: Problem, most: int = _MOST_ITERATIONS, budget: bool = F
         solver="batch",
         names=tuple(q.name for q in problem.quantities),
         values=reported(problem, values, whole.current_keys),
-        covariance=marginal,
+        covariance=marginal * np.outer(inflation, inflation),
+        inflation=inflation,
+        colours={family: 1.0 + 2.0 * float(lags.sum()) for family, lags in colours.items()},
         converged=solution.converged,
         message=solution.message,
         residuals=residuals,
         chi_square=summary,
-        history=past[0] if past else None,
+        history=past[0].inflated(inflation) if past else None,
         smoothed=smooth,
         attitudes=problem.attitudes(whole.keyframes, values) if problem.attitudes else None,
         budget=sources,
         rejected={family: int((~r.used).sum()) for family, r in residuals.items()},
+        levels=levels,
         seconds={"build": built - start, "solve": solved - built, "marginals": done - solved},
     )
 
@@ -232,12 +283,62 @@ def optimize(
             relaxed = _minimize(unweighed.under(replace(loss, mu=mu)), values, most=2)
             values, iterations = relaxed.values, iterations + relaxed.iterations
             mu *= 4.0
+    final = _truncated(unweighed, loss, values, plain.values, most)
+    return replace(final, iterations=iterations + final.iterations)
+
+
+def with_levels(
+    problem: Problem,
+    factors: Sequence[Factor],
+    solution: Solution,
+    levels: tuple[Level, ...],
+    most: int = _MOST_ITERATIONS,
+) -> tuple[Solution, tuple[Level, ...], Linearized]:
+    """The solution with the noise levels that the recording tells, these, and the system about it.
+
+    Args:
+        problem: the graph's.
+        factors: with the noise stated.
+        solution: of the same with the levels given.
+        levels: to begin with.
+        most: iterations of each minimisation.
+
+    Raises:
+        IndeterminateError: a variable is not determined.
+    """
+    first, linear = levels, Linearized.of(solution)
+    for _ in range(_MOST_LEVELS if any(level.noise.estimated for level in levels) else 0):
+        if not solution.converged:
+            break
+        system, values, before = solution.system, solution.values, levels
+        with system.at(values):
+            levels, steady = refined(levels, system.factors, values, linear.expected, levels is first)
+        if steady:
+            break
+        weighed = system.made_of(weigh(factors, levels)).under(None)
+        again = _again(problem, weighed, values, far(levels, before), most)
+        solution = replace(again, iterations=solution.iterations + again.iterations)
+        linear = Linearized.of(solution)
+    return solution, levels, linear
+
+
+def _again(problem: Problem, system: System, values: gtsam.Values, far: bool, most: int) -> Solution:
+    """The solution of a system, not yet under a loss, near values; outliers looked for anew where noise is far off."""
+    if problem.loss is None:
+        return _minimize(system, values, most=most)
+    if far:
+        return optimize(system.factors, values, system.shared, problem.loss, most, held=problem.assumed)
+    return _truncated(system, problem.loss, values, values, most)
+
+
+def _truncated(
+    unweighed: System, loss: TruncatedLoss, values: gtsam.Values, plain: gtsam.Values, most: int
+) -> Solution:
+    """Least squares on what lies inside the gate, from some values; on all, from plain ones, where few do."""
     truncated = unweighed.under(loss)
     final = _minimize(truncated, values, most=most)
     used = np.concatenate([r.used for r in truncated.residuals(final.values).values()])
-    if used.mean() < _FEWEST_USED:
-        final = _minimize(unweighed, plain.values, most=most)
-    return replace(final, iterations=iterations + final.iterations)
+    return _minimize(unweighed, plain, most=most) if used.mean() < _FEWEST_USED else final
 
 
 def _tie(key: int, at: Array) -> Factor:

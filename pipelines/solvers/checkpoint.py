@@ -24,7 +24,7 @@ from pipelines.solvers.innovations import Innovations
 from pipelines.solvers.rows import Rows
 from pipelines.solvers.state import State
 
-_SCHEMA = "alidade.checkpoint/2"
+_SCHEMA = "alidade.checkpoint/3"
 _INNOVATIONS = "innovations/"
 
 
@@ -50,6 +50,7 @@ def save_checkpoint(path: Path, run: Run, identity: Mapping[str, str]) -> None:
         "stamps": list(state.stamps.items()),
         "current_keys": list(run.current_keys.items()),
         "keyframes": run.keyframes,
+        "levels": {level.noise.name: level.scale for level in run.levels},
         "unusable": run.innovations.unusable,
         "rejected_in_a_row": run.innovations.rejected_in_a_row,
         "values": state.values.serialize(),
@@ -97,7 +98,7 @@ def load_checkpoint(path: Path, problem: Problem, identity: Mapping[str, str]) -
         values.deserialize(head["values"])
         linear.deserialize(head["linear"])
         stamps = {int(key): float(stamp) for key, stamp in head["stamps"]}
-        run = Run.resumed(problem, head["window"], State(head["time"], values, linear, stamps))
+        run = Run.resumed(problem, head["window"], State(head["time"], values, linear, stamps), head["levels"])
         run.current_keys = {int(key): int(held) for key, held in head["current_keys"]}
         run.keyframes = head["keyframes"]
         run.history, run.attitudes = Rows(arrays.pop("history")), Rows(arrays.pop("attitudes"))

@@ -12,17 +12,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
 from pipelines.graph.problem import Array, Attitudes, ChiSquare, Estimate, Factor, History, Problem, Step
 from pipelines.solvers.assembly import Assembly
-from pipelines.solvers.batch import CHUNK, Solution, optimize
+from pipelines.solvers.batch import CHUNK, Solution, optimize, with_levels
 from pipelines.solvers.innovations import Innovations, Prediction
 from pipelines.solvers.linearity import is_linear
 from pipelines.solvers.marginals import IndeterminateError, reported, reported_covariance
+from pipelines.solvers.noise_levels import weigh
 from pipelines.solvers.rows import Rows
 from pipelines.solvers.smoother import Smoother, linearized, unweighed, used_part
 from pipelines.solvers.state import State, explained, require_known, require_sound
@@ -97,6 +98,7 @@ class Run:
         current_keys: parameter key -> variable that holds its value now.
         keyframes: how many were added.
         innovations: of all measurements.
+        levels: of the noises, as the last batch solution has them.
         history: rows of time, values and sigmas.
         attitudes: rows of time and quaternion.
     """
@@ -109,6 +111,7 @@ class Run:
         self.current_keys: dict[int, int] = {}
         self.keyframes = 0
         self.innovations = Innovations()
+        self.levels = problem.noises
         self.history = Rows()
         self.attitudes = Rows()
         self._smoother: Smoother | None = None  # None before the first batch solution
@@ -119,10 +122,11 @@ class Run:
         self._trouble = ""
 
     @classmethod
-    def resumed(cls, problem: Problem, window: float, base: State) -> Run:
-        """A run that goes on from what another one knew."""
+    def resumed(cls, problem: Problem, window: float, base: State, scales: Mapping[str, float]) -> Run:
+        """A run that goes on from what another one knew, with its noise levels by name."""
         run = cls(problem, window)
         run._young = False
+        run.levels = tuple(replace(level, scale=scales[level.noise.name]) for level in run.levels)
         run._continue_from(base)
         return run
 
@@ -210,6 +214,7 @@ class Run:
             history=History(history[:, 0], history[:, 1 : 1 + n], history[:, 1 + n :]),
             attitudes=None if self.problem.attitudes is None else Attitudes(attitudes[:, 0], attitudes[:, 1:]),
             rejected=self.innovations.rejected(),
+            levels=self.levels,
             seconds={"solve": seconds},
         )
 
@@ -247,11 +252,12 @@ class Run:
         self, smoother: Smoother, step: Step, values: gtsam.Values, new: gtsam.Values, point: gtsam.Values
     ) -> list[Factor]:
         """The step's processes and those of its measurements that are to be used, linear about a point."""
-        processes = [f for f in step.factors if f.measurement is None]
+        factors = weigh(step.factors, self.levels)
+        processes = [f for f in factors if f.measurement is None]
         require_sound(processes, values, step.time)
         prediction = Prediction(smoother, processes, values, new)
         measurements = []
-        for f in step.factors:
+        for f in factors:
             if f.measurement is not None:
                 require_known([f], values, step.time)
                 used = self.innovations.accept(f, prediction, gated=self.problem.loss is not None)
@@ -278,14 +284,17 @@ class Run:
             whole.factors.append(self.base.factor)
             whole.initial.insert(self.base.estimate)
             whole.timestamps = {**self.base.stamps, **whole.timestamps}
-        solution = optimize(whole.factors, whole.initial, self.keys, self.problem.loss, held=self.problem.assumed)
+        weighed = weigh(whole.factors, self.levels)
+        solution = optimize(weighed, whole.initial, self.keys, self.problem.loss, held=self.problem.assumed)
+        if solution.converged:
+            solution, self.levels, _ = with_levels(self.problem, whole.factors, solution, self.levels)
         if not solution.converged:
             require_sound(whole.factors, whole.initial, self.time)
         self._trouble = "" if solution.converged else f"the first {self.time:.1f} s: {solution.message}"
         values = solution.values
         if from_start:
             with solution.system.at(values):
-                self.innovations.revise(whole.factors, values)
+                self.innovations.revise(solution.system.factors, values)
         last = self.past[-1].keyframes if self.past else range(0)
         since = 0.0 if self.base is not None or not self.past else self.time - self.past[0].time
         if self._young and since >= max(_YOUNG, self._looked) and len(self.past) >= _FEW_STEPS:
@@ -338,7 +347,8 @@ class Run:
         values, loss = solution.values, solution.system.loss
         alive = self._alive(values, stamps)
         if alive is None:
-            factors = [used_part(f, values, loss) for step in self.past for f in step.factors]
+            past = (f for step in self.past for f in weigh(step.factors, self.levels))
+            factors = [used_part(f, values, loss) for f in past]
             self._start([unweighed(f) for f in factors if f is not None], values, stamps)
             return
         state = State.of(self.time, solution.system.linearize(values), values, alive, stamps)

@@ -42,6 +42,11 @@ class Influence:
     solutions: Mapping[int, Array]
     covariance: Array
 
+    def part(self, of: slice) -> Influence:
+        """The same of some of the numbers."""
+        solutions = {key: columns[:, of] for key, columns in self.solutions.items()}
+        return Influence(self.names[of], self.factors, self.linear, solutions, self.covariance[of, of])
+
     def rows(self) -> Iterator[tuple[int, Array]]:
         """Index of a factor and the derivative (n, m) of the numbers by its m whitened residuals, factor by factor."""
         for i in range(self.linear.size()):
@@ -91,11 +96,16 @@ def influence(
     return Influence(tuple(names), factors, linear, solutions, 0.5 * (covariance + covariance.T))
 
 
-def uncertainty_budget(problem: Problem, found: Influence) -> dict[str, dict[str, float]]:
+def uncertainty_budget(problem: Problem, found: Influence, added: Mapping[str, Array]) -> dict[str, dict[str, float]]:
     """Number -> source -> its share of the number's variance, the largest first; shares sum to one.
 
     Sources are the families of the noise, every prior of the problem by itself ("prior of NAME"), and what the graph
     does not model ("not modelled").
+
+    Args:
+        problem: the graph's.
+        found: the influence of its residuals.
+        added: family -> variance (n,) that the colour of its noise adds.
     """
     by_key = {p.key: p for p in problem.parameters}
     variances: dict[str, Array] = {}
@@ -110,6 +120,8 @@ def uncertainty_budget(problem: Problem, found: Influence) -> dict[str, dict[str
             parts = [(factor.family, squares.sum(axis=1))]
         for source, part in parts:
             variances[source] = variances.get(source, np.zeros(len(found.names))) + part
+    for family, more in added.items():
+        variances[family] = variances[family] + more
     extra = {q.name: q.extra_sigma**2 for q in problem.quantities}
     variances["not modelled"] = np.array([extra[name] for name in found.names])
     total = np.sum(list(variances.values()), axis=0)

@@ -7,13 +7,15 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.graph.problem import Array, ChiSquare, Factor, History, Parameter, Problem
 
 # A direction the data and priors say nothing about gets this many times its prior scale as sigma, so that it can be
 # named with the others instead of making the system unsolvable.
 _UNKNOWN = 1e4
-_SAMPLES = 6
+# Random right sides that tell traces: many where that costs little, few where every one tells enough.
+_SAMPLES, _MOST_SAMPLES, _SAMPLED_ROWS = 6, 60, 30_000
 # Families whose residuals say nothing about the noise of the recording.
 _NO_MEASUREMENTS = ("prior", "definition")
 
@@ -149,34 +151,47 @@ def eliminated(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> g
 def chi_square(
     problem: Problem,
     factors: Sequence[Factor],
-    linear: gtsam.GaussianFactorGraph,
-    bayes_net: gtsam.GaussianBayesNet,
     values: gtsam.Values,
     covariance: Array,
+    expected: Mapping[tuple[str, int], float],
 ) -> ChiSquare:
     """Sum of squares of measurements and processes (not of priors) and its degrees of freedom, whole and by family.
 
     The whole: rows used, less unknowns, plus what the priors contribute to the unknowns. The families' shares are
     sampled, the largest family's taken as what is left of the whole.
+
+    Args:
+        problem: the graph's.
+        factors: of the graph.
+        values: the estimate.
+        covariance: of the reported numbers.
+        expected: see `expected_squares`.
     """
     value: dict[str, float] = {}
-    rows: list[int] = []
+    rows = rows_used(factors, values)
     for f in factors:
-        if f.measurement is None:
-            rows.append(f.factor.dim())
-        else:
-            rows.append(f.measurement.model.rows * int(f.measurement.used(values).sum()))
         if f.family not in _NO_MEASUREMENTS:
-            value[f.family] = value.get(f.family, 0.0) + _square(f, values)
+            value[f.family] = value.get(f.family, 0.0) + sum_of_squares(f, values)
     counted = sum(count for f, count in zip(factors, rows, strict=True) if f.family != "prior")
     dof = counted - values.dim() + _from_priors(problem, covariance)
-    families = _family_dof(factors, rows, linear, bayes_net)
+    families = dict.fromkeys(value, 0.0)
+    for (family, _), square in expected.items():
+        if family in families:
+            families[family] += square
     largest = max(value, key=lambda family: families[family])
     families[largest] = dof - sum(families[family] for family in value if family != largest)
     return ChiSquare(sum(value.values()), dof, {family: (value[family], families[family]) for family in value})
 
 
-def _square(factor: Factor, values: gtsam.Values) -> float:
+def rows_used(factors: Sequence[Factor], values: gtsam.Values) -> list[int]:
+    """How many rows each factor stands for, rejected measurements left out."""
+    return [
+        f.factor.dim() if f.measurement is None else f.measurement.model.rows * int(f.measurement.used(values).sum())
+        for f in factors
+    ]
+
+
+def sum_of_squares(factor: Factor, values: gtsam.Values) -> float:
     """Sum of squares of a factor's whitened residuals, rejected ones left out."""
     if factor.measurement is None:
         return 2.0 * float(factor.factor.error(values))
@@ -194,21 +209,22 @@ def _from_priors(problem: Problem, covariance: Array) -> float:
     return share
 
 
-def _family_dof(
+def expected_squares(
     factors: Sequence[Factor],
-    rows: Sequence[int],
     linear: gtsam.GaussianFactorGraph,
     bayes_net: gtsam.GaussianBayesNet,
-) -> dict[str, float]:
-    """Expected sum of squares of each family: that of random signs after solving for the same unknowns.
+    values: gtsam.Values,
+) -> dict[tuple[str, int], float]:
+    """(family, row of its measurements) -> expected sum of squares, of random signs after solving for the unknowns.
 
-    Noise of variance one would do too; signs tell the traces of projections with less scatter (Hutchinson 1989).
+    Noise of variance one would do too; signs tell the traces of projections with less scatter (Hutchinson 1989). The
+    rows of what is no measurement, or compressed, count as one.
 
     Args:
         factors: of the graph.
-        rows: how many each stands for, rejected measurements left out.
-        linear: the factors linearised; a compressed one has fewer rows than it stands for.
+        linear: the same, linearised; a compressed one has fewer rows than it stands for.
         bayes_net: the system's triangular factor.
+        values: the estimate.
     """
     origin = bayes_net.optimize()
     keys = sorted(linear.keyVector())
@@ -217,28 +233,37 @@ def _family_dof(
     elements = linear.sparseJacobian_()
     elements = elements[:, elements[1] <= ends[-1]]
     row, column, element = elements[0].astype(int) - 1, elements[1].astype(int) - 1, elements[2]
-    names = sorted({f.family for f in factors})
-    index = np.array([names.index(f.family) for f in factors])
     sizes = [len(linear.at(i).jacobian()[1]) for i in range(linear.size())]
-    family = np.repeat(index, sizes)
+    labels: dict[tuple[str, int], int] = {}
+    group = np.concatenate([_labelled(f, size, labels) for f, size in zip(factors, sizes, strict=True)])
     # Rejected measurements and free priors have empty rows, which are no measurements.
-    counted = np.bincount(row, minlength=len(family)) > 0
+    counted = np.bincount(row, minlength=len(group)) > 0
     held = np.bincount(np.repeat(np.arange(len(sizes)), sizes), counted, len(sizes))
     measured = np.array([f.measurement is not None for f in factors])
     # What compression took out of the system holds no unknowns: each such row is expected to be one.
-    absent = np.bincount(index, np.where(measured, np.array(rows) - held, 0.0), len(names))
-    square = np.zeros(len(names))
+    first = group[np.append(0, np.cumsum(sizes))[:-1]]
+    stands = np.array(rows_used(factors, values), dtype=float)
+    square: Array = np.bincount(first, np.where(measured, stands - held, 0.0), len(labels)).astype(float)
     generator = np.random.default_rng(0)
-    for _ in range(_SAMPLES):
-        noise = np.where(counted, generator.choice([-1.0, 1.0], len(family)), 0.0)
+    samples = int(np.clip(_SAMPLED_ROWS // len(group), _SAMPLES, _MOST_SAMPLES))
+    for _ in range(samples):
+        noise = np.where(counted, generator.choice([-1.0, 1.0], len(group)), 0.0)
         pulls = np.bincount(column, element * noise[row], ends[-1])
         projection = gtsam.VectorValues()
         for key, start, stop in zip(keys, [0, *ends[:-1]], ends, strict=True):
             projection.insert(key, pulls[start:stop])
         x = bayes_net.backSubstitute(bayes_net.backSubstituteTranspose(projection)).vector(keys)
-        left = np.bincount(row, element * x[column], len(family)) - noise
-        square += np.bincount(family, left**2, len(names))
-    return dict(zip(names, (absent + square / _SAMPLES).tolist(), strict=True))
+        left = np.bincount(row, element * x[column], len(group)) - noise
+        square = square + np.bincount(group, left**2, len(labels)) / samples
+    return dict(zip(labels, square.tolist(), strict=True))
+
+
+def _labelled(factor: Factor, size: int, labels: dict[tuple[str, int], int]) -> NDArray[np.intp]:
+    """(size,) number of the label of each row of a linearised factor; new labels are added."""
+    measurement = factor.measurement
+    rows = 1 if measurement is None or measurement.compress else measurement.model.rows
+    own = [labels.setdefault((factor.family, row), len(labels)) for row in range(rows)]
+    return np.resize(np.array(own, dtype=np.intp), size)
 
 
 def explain(message: str) -> str:

@@ -13,13 +13,18 @@ from numpy.typing import NDArray
 
 from factors.earth import magnetic_field
 from pipelines.errors import InputError
+from pipelines.graph.noise import Noise
 from pipelines.methods.cube.topics import CubeConfig, RawConversion, field_date
-from pipelines.settings import DEFAULT_NOISE, Config, first_given
+from pipelines.methods.noise import stated
+from pipelines.settings import Config
 
 if TYPE_CHECKING:
     from pipelines.vision.camera import Camera
 
 Array = NDArray[np.float64]
+
+# Of gyro, accelerometer and magnetometer, in this order.
+DENSITIES = ("gyro_density", "accel_density", "mag_density")
 
 _Result = TypeVar("_Result")
 
@@ -119,15 +124,15 @@ def local_field(data: CubeData, config: Config) -> Array:
         raise InputError(f"{error}; give the date of the recording in the config as `date`") from error
 
 
-def noise_densities(data: CubeData, config: Config) -> tuple[float, float, float]:
-    """Of gyro, accelerometer and magnetometer, nominal SI per sqrt(Hz): config, else messages, else default."""
-    raw, noise, default = config.section(CubeConfig).raw, config.noise, DEFAULT_NOISE
+def stated_density(name: str, data: CubeData, config: Config, *families: str) -> Noise:
+    """One of DENSITIES as the config, the messages or nobody states it, in nominal SI, of some families."""
+    sensor = name.removesuffix("_density")
+    density: float | None = getattr(data, name)
+    conversion: RawConversion | None = getattr(config.section(CubeConfig).raw, sensor)
+    message = density if density is None or conversion is None else density * conversion.scale
+    return stated(name, config, message, families)
 
-    def message(density: float | None, conversion: RawConversion | None) -> float | None:
-        return density if density is None or conversion is None else density * conversion.scale
 
-    return (
-        first_given(noise.gyro_density, message(data.gyro_density, raw.gyro), default.gyro_density),
-        first_given(noise.accel_density, message(data.accel_density, raw.accel), default.accel_density),
-        first_given(noise.mag_density, message(data.mag_density, raw.mag), default.mag_density),
-    )
+def noise_densities(data: CubeData, config: Config) -> tuple[float, ...]:
+    """Of gyro, accelerometer and magnetometer as stated, nominal SI per sqrt(Hz)."""
+    return tuple(stated_density(name, data, config).stated for name in DENSITIES)

@@ -32,6 +32,7 @@ from pipelines.methods.cube.measurements import (
     turn_factor,
 )
 from pipelines.methods.cube.model import Model, prepare
+from pipelines.methods.cube.noises import noises
 from pipelines.methods.cube.parameters import SENSITIVITY_KEY, TRIAD_KEYS, first_priors
 from pipelines.methods.cube.wandering import deviation_key
 from pipelines.settings import Config
@@ -58,6 +59,7 @@ def problem(data: CubeData, config: Config) -> Problem:
         attitude_name="nRb",
         advice=advice,
         dropped=model.dropped,
+        noises=tuple(noises(data, config).values()),
     )
 
 

@@ -22,12 +22,6 @@ def _tag_sizes(data: Any, config: Config, factor: float) -> tuple[Any, Config] |
 HYPOTHESES = Hypotheses(
     streams={"imu_t": ("gyro", "accel"), "mag_t": ("mag",), "reference_t": ("reference_wxyz", "reference_cov")},
     signs={"gyro": ("gyro", AXES)},
-    noise={
-        "corner_px": (None, ("tags",)),
-        "accel_density": ("accel_density", ("accelerometer",)),
-        "gyro_density": ("gyro_density", ("gyro at rest", "gyro turns")),
-        "mag_density": ("mag_density", ("magnetometer",)),
-    },
     scalings=(Scaling("the tags are {factor:.3g} times as large as the config says", _tag_sizes),),
     cut=False,
 )

@@ -52,13 +52,13 @@ def sensor_factors(model: Model, k: int) -> list[Factor]:
     gyro = GyroStaticFactor(time, poses.gyro[row], gyro_sigma, model.earth_rate, model.gravity if feels else None)
     terms, G = [CURVATURE_KEY] if curved else [], [SENSITIVITY_KEY] if feels else []
     factors = [
-        Factor.of("accelerometer", accel.on(pose_key(k), TRIAD_KEYS["accel"], *terms)),
-        Factor.of("gyro at rest", gyro.on(pose_key(k), TRIAD_KEYS["gyro"], deviation_key(k), *G)),
+        Factor.of("accelerometer", accel.on(pose_key(k), TRIAD_KEYS["accel"], *terms), 1.0 / accel.sigma),
+        Factor.of("gyro at rest", gyro.on(pose_key(k), TRIAD_KEYS["gyro"], deviation_key(k), *G), 1.0 / gyro.sigma),
     ]
     if model.field is not None and poses.mag is not None and poses.mag_duration[k] > 0.0:
         mag = MagFactor(time, poses.mag[row], mag_density / np.sqrt(poses.mag_duration[row]))
         seen = mag.on(pose_key(k), TRIAD_KEYS["mag"], FIELD_KEY, loss=model.loss)
-        factors.append(Factor.of("magnetometer", seen))
+        factors.append(Factor.of("magnetometer", seen, 1.0 / mag.sigma))
     return factors
 
 
@@ -109,4 +109,5 @@ def turn_factor(model: Model, k: int) -> Factor:
     of_force = [SENSITIVITY_KEY, TRIAD_KEYS["accel"]] if feels else []
     gyro = TRIAD_KEYS["gyro"]
     measured = rotation.on(pose_key(k - 1), pose_key(k), gyro, deviation_key(k - 1), deviation_key(k), *of_force)
-    return Factor("gyro turns", measured.factor)
+    angle = float(np.sum(np.linalg.norm(samples.gyro[1:], axis=1) * np.diff(t)))
+    return Factor.process_of("gyro turns", measured, angle / sigma)

@@ -14,14 +14,15 @@ from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
 from pipelines.errors import InputError
 from pipelines.graph.problem import Array
-from pipelines.methods.cube.data import CubeData, local_field, noise_densities, nominal
+from pipelines.methods.cube.data import DENSITIES, CubeData, local_field, nominal
+from pipelines.methods.cube.noises import noises
 from pipelines.methods.cube.parameters import Parameters, cube_parameters
 from pipelines.methods.cube.poses import StaticPoses, static_poses, turn
 from pipelines.methods.cube.reference import Reference, cube_reference, from_vectors
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.methods.cube.wandering import GaussMarkovDeviation
 from pipelines.recording.checks import count
-from pipelines.settings import DEFAULT_NOISE, Config, first_given
+from pipelines.settings import Config
 
 # A pause of the gyro's record in a turn longer than this, s, breaks the chain of turns.
 _LONGEST_GAP = 0.1
@@ -54,7 +55,7 @@ class Model:
     earth_rate: Array  # (3,) rad/s in n, as far as the heading is known
     unknown_rate: float  # rad/s per axis, what of the earth rate that leaves out
     field: Array | None  # (3,) T in n, by the model
-    density: tuple[float, float, float]  # of gyro, accelerometer and magnetometer
+    density: tuple[float, ...]  # of gyro, accelerometer and magnetometer
     deviation: GaussMarkovDeviation
     gyro_bias: Array  # (3,) first guess, in nominal units
     initial: Array  # (P, 4) nRb
@@ -76,7 +77,7 @@ def prepare(data: CubeData, config: Config) -> Model:
             "the place on the earth is unknown, and with it gravity and the earth's rate: record /reference/fix, or "
             "give latitude_deg in the config"
         )
-    poses = static_poses(data, config)
+    poses, known = static_poses(data, config), noises(data, config)
     field, dropped = None, {**data.dropped, **poses.dropped}
     if poses.mag is not None and data.longitude is None:
         count(dropped, "magnetometer: no position for the field model, not calibrated", 1)
@@ -102,10 +103,8 @@ def prepare(data: CubeData, config: Config) -> Model:
         earth_rate=earth * np.array([1.0, 1.0, 1.0] if heading_known else [0.0, 0.0, 1.0]),
         unknown_rate=0.0 if heading_known else float(np.hypot(*earth[:2]) * np.sqrt(0.5)),
         field=field,
-        density=noise_densities(data, config),
-        deviation=GaussMarkovDeviation.over(
-            poses, first_given(config.noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk)
-        ),
+        density=tuple(known[name].used if name in known else 0.0 for name in DENSITIES),
+        deviation=GaussMarkovDeviation.over(poses, known["gyro_bias_walk"].used),
         gyro_bias=bias,
         initial=_attitudes(data, config, poses, reference, field, bias),
         loss=TruncatedLoss(gate(8)),

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from factors import so3
 from pipelines.graph.problem import Array, Attitudes
-from pipelines.judgement.robust import robust_sigma
+from pipelines.graph.robust import robust_sigma
 from pipelines.methods.head.recording import HeadData
 from pipelines.reports.plots import COLORS, add_line, add_points, figure
 from pipelines.reports.result import Calibration, Plot

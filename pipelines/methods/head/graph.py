@@ -23,10 +23,12 @@ from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
 from pipelines.errors import InputError
 from pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk
+from pipelines.graph.noise import Level
 from pipelines.graph.priors import rotation_prior, vector_prior
 from pipelines.graph.problem import Array, Attitudes, Factor, Problem, Step
 from pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, HeadParameters
 from pipelines.methods.head.recording import HeadData
+from pipelines.methods.noise import sampled, stated, typical
 from pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 # Pictures share a keyframe within this time, s, and keyframes are never farther apart than this, s: increments are
@@ -37,6 +39,7 @@ _NEGLIGIBLE = 0.1
 # Rates for the first guess are taken over this time, s: long against vision noise, short against turns.
 _GUESS_SPAN = 0.3
 _FEWEST_FRAMES = 10
+_FAMILY = "vision"
 
 # Said where it is taken for granted.
 _AT_REST = "No platform IMU: the platform counts as at rest."
@@ -57,6 +60,7 @@ class _Model:
     loss: TruncatedLoss
     parameters: HeadParameters
     helmet_guess: Array  # vRh
+    noises: dict[str, Level]  # by name
 
 
 def problem(data: HeadData, config: Config) -> Problem:
@@ -82,7 +86,21 @@ def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
         premises=() if data.platform_t is not None else (_AT_REST,),
         onward=partial(_onward, config, model),
         unsettled=0.0,
+        noises=tuple(model.noises.values()),
     )
+
+
+def _noises(data: HeadData, config: Config) -> dict[str, Level]:
+    """What is in force, by name."""
+    found = [
+        Level(stated("vision_attitude", config, typical(data.vision_cov, 0, 1, 2), (_FAMILY,))),
+        sampled(stated("gyro_density", config, data.gyro_density, ("gyro",)), data.head_t, data.head_gyro),
+        Level(stated("gyro_bias_walk", config)),
+    ]
+    if data.platform_t is not None and data.platform_gyro is not None:
+        platform = stated("platform_gyro_density", config, data.platform_gyro_density)
+        found.append(sampled(platform, data.platform_t, data.platform_gyro))
+    return {level.noise.name: level for level in found}
 
 
 def _onward(config: Config, model: _Model, data: HeadData, time: float) -> Problem | None:
@@ -107,14 +125,13 @@ def _prepare(
             f"at least {_FEWEST_FRAMES} are needed: check the topics and their clocks"
         )
     vision_t, measured = data.vision_t[inside], data.vision_wxyz[inside]
-    density = first_given(config.noise.gyro_density, data.gyro_density, DEFAULT_NOISE.gyro_density)
+    noises = _noises(data, config) if before is None else before.noises
+    density = noises["gyro_density"].used
     platform_density = 0.0
     platform = None
     if data.platform_t is not None and data.platform_gyro is not None:
         platform = GyroPath(data.platform_t, data.platform_gyro)
-        platform_density = first_given(
-            config.noise.platform_gyro_density, data.platform_gyro_density, DEFAULT_NOISE.platform_gyro_density
-        )
+        platform_density = noises["platform_gyro_density"].used
     parameters = HeadParameters.of(config, platform is not None, data.head_force is not None, data.stamp_sigma)
     sqrt_information = _sqrt_information(data.vision_cov, inside, config)
 
@@ -139,7 +156,7 @@ def _prepare(
         GyroPath(data.head_t, data.head_gyro, bias_hat, data.head_force if sensitive else None),
         density=density,
         other_density=platform_density,
-        walk=first_given(config.noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk),
+        walk=noises["gyro_bias_walk"].used,
         errors=parameters.gyro,
         platform=platform,
         platform_errors=parameters.platform,
@@ -157,6 +174,7 @@ def _prepare(
         loss=TruncatedLoss(gate(3)),
         parameters=parameters,
         helmet_guess=vRh,
+        noises=noises,
     )
 
 
@@ -280,7 +298,7 @@ def _vision_factor(model: _Model, keyframes: range) -> list[Factor]:
     )
     states = [chain.state(k) for k in of]
     keys = p.camera.key, p.helmet.key, p.picture.key, *chain.error_keys
-    return [Factor.of("vision", seen.on(states, chain.bias_keys(of), *keys, loss=model.loss))]
+    return [Factor.of(_FAMILY, seen.on(states, chain.bias_keys(of), *keys, loss=model.loss))]
 
 
 def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) -> Attitudes:

@@ -57,11 +57,6 @@ HYPOTHESES = Hypotheses(
         "truth_t": ("truth_wxyz",),
     },
     signs={"head_gyro": ("helmet gyro", AXES), "platform_gyro": ("platform gyro", AXES)},
-    noise={
-        "vision_attitude": ("vision_cov", ("vision",)),
-        "gyro_density": ("gyro_density", ("gyro",)),
-        "platform_gyro_density": ("platform_gyro_density", ("gyro",)),
-    },
     offset=True,
     faults=(
         Fault("the attitudes of vision are inverted: they map the camera's frame to the markers', not back", _inverted),

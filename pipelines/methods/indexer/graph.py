@@ -22,12 +22,13 @@ from numpy.typing import NDArray
 from factors.earth import EARTH_RATE
 from factors.indexer import ENCODER_ERRORS, IndexerAverageFactor, Option
 from pipelines.errors import InputError
+from pipelines.graph.noise import Level, Noise
 from pipelines.graph.priors import prior_sigmas, vector_prior
 from pipelines.graph.problem import Array, Attitudes, Factor, Parameter, Problem, Step
 from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
 from pipelines.graph.walking_bias import WalkingBias
 from pipelines.methods.indexer.attitude import carrier, frames
-from pipelines.methods.indexer.groups import Group, groups_of
+from pipelines.methods.indexer.groups import KINDS, Group, groups_of
 from pipelines.methods.indexer.guess import agreeing, guess
 from pipelines.methods.indexer.parameters import (
     EPSILON,
@@ -41,7 +42,8 @@ from pipelines.methods.indexer.parameters import (
 from pipelines.methods.indexer.recording import IndexerData
 from pipelines.methods.indexer.runs import AxisMotion, axis_motion, cut_turns, encoder_scatter
 from pipelines.methods.indexer.topics import FIX
-from pipelines.settings import DEFAULT_NOISE, Config, first_given
+from pipelines.methods.noise import sampled, stated
+from pipelines.settings import Config
 
 # So many groups stay in a smoother whatever its window, s: a schedule of four positions, to be linearised anew when its
 # later positions move the angles that its earlier ones left open.
@@ -60,6 +62,7 @@ class _Model:
     motion: AxisMotion
     groups: tuple[Group, ...]
     bias: WalkingBias
+    noises: tuple[Level, ...]
     density: float
     encoder: float  # white noise of a sample, rad
     slow: float  # sigma of the errors that come again with every turn, rad; 0: none
@@ -93,14 +96,32 @@ def problem(data: IndexerData, config: Config) -> Problem:
         attitude_name="nRb",
         advice=_advice,
         dropped=dropped,
+        noises=model.noises,
     )
+
+
+def _mean_rates(groups: Sequence[Group], gyro: Level, encoders: Level) -> tuple[Level, ...]:
+    """What mean rates repeat to, by kind of window: noise of gyro and encoders, and what else there is."""
+    found = []
+    known = max(gyro.noise.known, encoders.noise.known)
+    source = gyro.noise.source if encoders.noise.known < known else encoders.noise.source
+    for kind in KINDS:
+        windows = [np.diff(g.rates.edges) for g in groups if g.kind == kind]
+        if windows:
+            window = float(np.median(np.concatenate(windows)))
+            sigma = float(np.hypot(gyro.used / window**0.5, 2.0**0.5 * encoders.used / window))
+            found.append(Level(Noise(f"{kind}_rate", sigma, source, known, (kind,), least=1.0)))
+    return tuple(found)
 
 
 def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]:
     parameters = indexer_parameters(config)
     motion = axis_motion(data)
-    density = first_given(config.noise.gyro_density, data.gyro_density, DEFAULT_NOISE.gyro_density)
-    encoder = first_given(config.noise.encoder, DEFAULT_NOISE.encoder)
+    gyro, encoders = (
+        sampled(stated("gyro_density", config, data.gyro_density), data.gyro_t, data.gyro),
+        Level(stated("encoder", config)),
+    )
+    density, encoder = gyro.used, encoders.used
     scatter = encoder_scatter(motion)
     slow = float(np.sqrt(encoder**2 - scatter**2)) if encoder > max(_SLOW * scatter, _NO_ERROR) else 0.0
     groups = groups_of(data, config, motion, split=slow == 0.0)
@@ -116,7 +137,8 @@ def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]
     groups, disagreeing = agreeing(groups, parameters, density, encoder)
     theta_guess, bias_guess = guess(groups)
     starts = np.array([g.rates.edges[0] for g in groups])
-    walk = first_given(config.noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk)
+    walks = Level(stated("gyro_bias_walk", config))
+    walk = walks.used
     rows = frames(data, motion)
     reasons = {
         "turn cut by a gap in the stamps (what lies before and after is used)": cut_turns(motion),
@@ -128,6 +150,7 @@ def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]
         motion=motion,
         groups=groups,
         bias=WalkingBias(np.append(starts, groups[-1].rates.edges[-1]), walk, density, groups[-1].rates.edges[-1]),
+        noises=(gyro, walks, encoders, *_mean_rates(groups, gyro, encoders)),
         density=density,
         encoder=scatter if slow > 0.0 else encoder,
         slow=slow,

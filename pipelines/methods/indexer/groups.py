@@ -27,6 +27,9 @@ _FEWEST_SAMPLES = 4
 # The other axis stands at the same angle when it differs by less than half of this, deg.
 _SAME_ANGLE_DEG = 5.0
 
+# Whole turns, less than these, and rests.
+KINDS = ("turn", "move", "dwell")
+
 
 @dataclass(frozen=True)
 class Group:

@@ -7,10 +7,6 @@ from pipelines.judgement.hypotheses import AXES, Hypotheses
 HYPOTHESES = Hypotheses(
     streams={"gyro_t": ("gyro", "attitude"), "encoder_t": ("outer", "inner")},
     signs={"gyro": ("gyro", AXES), "outer": ("encoder", ("outer",)), "inner": ("encoder", ("inner",))},
-    noise={
-        "gyro_density": ("gyro_density", ("turn", "move", "dwell")),
-        "encoder": (None, ("turn", "move", "dwell")),
-    },
     clock=("encoder_t", "encoders"),
     cut=False,
 )

@@ -12,7 +12,7 @@ import numpy as np
 from factors.gimbal import SMOOTHING
 from factors.preintegration import GyroPath
 from pipelines.graph.problem import Array
-from pipelines.judgement.robust import robust_sigma
+from pipelines.graph.robust import robust_sigma
 from pipelines.methods.los.corrected import angles, rates, taken
 from pipelines.methods.los.guess import camera, carried_errors
 from pipelines.methods.los.parameters import ANGLES, OFFSET

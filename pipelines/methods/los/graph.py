@@ -23,17 +23,21 @@ from factors.los import LosDirectionFactor, Surroundings
 from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
 from pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk
+from pipelines.graph.noise import Level
 from pipelines.graph.priors import vector_prior
 from pipelines.graph.problem import Array, Factor, Problem, Step
 from pipelines.methods.los.guess import camera, foreseen, guess, initial_attitudes, seen
 from pipelines.methods.los.parameters import BIAS, OFFSET, SPLIT, LosParameters
 from pipelines.methods.los.pictures import select_pictures
 from pipelines.methods.los.recording import LosData
+from pipelines.methods.noise import sampled, stated, typical
 from pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 # Sigmas, rad, of a chain's first attitude about t's axes: wide where pictures tell. Its turn about the line of sight is
 # free when no picture tells the camera's roll (it only turns t), and held for the sake of the arithmetic.
 _WIDE, _HELD = 0.3, 1e-3
+# Families of pictures whose roll is not measured, and is.
+_FAMILIES = ("los", "los with roll")
 # Gimbal angles at a picture are settled this long after it, s.
 _SETTLED = 0.05
 
@@ -50,6 +54,7 @@ class _Model:
     around: Surroundings | None  # of the keyframes, when errors of the sensors are variables
     loss: TruncatedLoss
     parameters: LosParameters
+    noises: dict[str, Level]  # by name
 
 
 def problem(data: LosData, config: Config) -> Problem:
@@ -74,7 +79,19 @@ def _problem(config: Config, data: LosData, model: _Model, dropped: Mapping[str,
         # Errors from pictures are against the first picture of a target, which the end of a recording does not show.
         onward=partial(_onward, config, model) if data.error_cov is None else None,
         unsettled=_SETTLED if model.around is None else SMOOTHING,
+        noises=tuple(model.noises.values()),
     )
+
+
+def _noises(data: LosData, config: Config) -> dict[str, Level]:
+    """What is in force, by name; that of the encoders is part of what the tracker's rows have."""
+    los, roll = typical(data.error_cov, 0, 1), typical(data.error_cov, 2)
+    found = [Level(stated("los_error", config, los, _FAMILIES, (0, 1)))]
+    if np.isfinite(data.error[:, 2]).any():
+        found.append(Level(stated("los_roll", config, roll, _FAMILIES[1:], (2,))))
+    found.append(sampled(stated("gyro_density", config, data.gyro_density, ("gyro",)), data.gyro_t, data.gyro))
+    found.extend(Level(stated(name, config)) for name in ("gyro_bias_walk", "encoder"))
+    return {level.noise.name: level for level in found}
 
 
 def _onward(config: Config, model: _Model, data: LosData, time: float) -> Problem | None:
@@ -91,8 +108,7 @@ def _prepare(
 ) -> tuple[_Model, dict[str, int]]:
     """The model of a recording, or of one that grows from a keyframe of its model until now on."""
     parameters = LosParameters.of(config, data.force is not None)
-    noise = config.noise
-    density = first_given(noise.gyro_density, data.gyro_density, DEFAULT_NOISE.gyro_density)
+    noises = _noises(data, config) if before is None else before.noises
     gimbal, gyro = GimbalPath(data.gimbal_t, data.gimbal), GyroPath(data.gyro_t, data.gyro)
     covariance = _covariance(data, gimbal, config)
     margin = SMOOTHING if parameters.sight else 0.0
@@ -116,8 +132,8 @@ def _prepare(
         starts,
         initial_attitudes(chains, time, cRm, measured, gyro),
         GyroPath(data.gyro_t, data.gyro, bias_hat, data.force if sensitive else None),
-        density=density,
-        walk=first_given(noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk),
+        density=noises["gyro_density"].used,
+        walk=noises["gyro_bias_walk"].used,
         errors=parameters.gyro,
         trunk=trunk,
     )
@@ -143,6 +159,7 @@ def _prepare(
         around=around,
         loss=TruncatedLoss(gate(3 if np.isfinite(measured[:, 2]).any() else 2)),
         parameters=parameters,
+        noises=noises,
     )
     return model, {**data.dropped, **dropped}
 
@@ -225,7 +242,7 @@ def _picture_factors(model: _Model, keyframes: range) -> list[Factor]:
     rolls = np.isfinite(model.measured[k, 2])
     return [
         _picture_factor(model, k[mine], rows, family)
-        for rows, family, mine in ((2, "los", ~rolls), (3, "los with roll", rolls))
+        for rows, family, mine in ((2, _FAMILIES[0], ~rolls), (3, _FAMILIES[1], rolls))
         if mine.any()
     ]
 

@@ -7,10 +7,6 @@ from pipelines.judgement.hypotheses import AXES, Hypotheses
 HYPOTHESES = Hypotheses(
     streams={"gyro_t": ("gyro", "force"), "gimbal_t": ("gimbal",), "image_t": ("error", "error_cov")},
     signs={"gyro": ("gyro", AXES), "gimbal": ("gimbal", ("azimuth", "elevation"))},
-    noise={
-        "los_error": ("error_cov", ("los", "los with roll")),
-        "gyro_density": ("gyro_density", ("gyro",)),
-    },
     offset=True,
     delays={"encoder_delay": "the encoders were read {encoder_delay} later than they are stamped"},
 )

@@ -19,8 +19,10 @@ from gyro_pair.factor import GyroPairFactor
 from gyro_pair.published import FARTHEST, align
 from gyro_pair.recording import GyroPairData, densities
 from pipelines.errors import InputError
+from pipelines.graph.noise import Level
 from pipelines.graph.priors import rotation_prior, vector_prior
 from pipelines.graph.problem import Array, Factor, Parameter, Problem, Quantity, Step, rotation_vector_coordinates
+from pipelines.methods.noise import stated
 from pipelines.settings import DEFAULT_NOISE, Config, check_names, first_given
 
 _ROTATION, _OFFSET, _DIFFERENCE = "rotation", "time_offset", "bias_difference"
@@ -60,6 +62,7 @@ def problem(data: GyroPairData, config: Config) -> Problem:
         steps_after=partial(_steps, measured, parameters, initial, 1),
         advice=_advice,
         dropped=data.dropped,
+        noises=(Level(stated("gyro_density", config, data.a_density, ("increment",))),),
     )
 
 

@@ -7,6 +7,5 @@ from pipelines.judgement.hypotheses import AXES, Hypotheses
 HYPOTHESES = Hypotheses(
     streams={"a_t": ("a_gyro",), "b_t": ("b_gyro",)},
     signs={"a_gyro": ("gyro a", AXES), "b_gyro": ("gyro b", AXES)},
-    noise={"gyro_density": ("a_density", ("increment",))},
     offset=True,
 )

@@ -1,0 +1,109 @@
+"""The noises of a problem: what was stated of each, by whom, what the recording says, and what is used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+Source = Literal["config", "message", "default"]
+
+UNITS = {
+    "gyro_density": "rad/s/√Hz",
+    "gyro_bias_walk": "rad/s/√s",
+    "platform_gyro_density": "rad/s/√Hz",
+    "accel_density": "m/s²/√Hz",
+    "mag_density": "T/√Hz",
+    "los_error": "rad",
+    "los_roll": "rad",
+    "encoder": "rad",
+    "gyro_repeatability": "rad/s",
+    "turn_repeatability": "",
+    "accel_repeatability": "m/s²",
+    "mag_repeatability": "T",
+    "turn_rate": "rad/s",
+    "move_rate": "rad/s",
+    "dwell_rate": "rad/s",
+    "vision_attitude": "rad",
+    "corner_px": "px",
+}
+
+# How well a noise is known, one sigma in its logarithm, that a message states or nobody. What the config states counts
+# as known no better once the recording contradicts it by so many sigmas.
+ROUGHLY, _APART = 1.0, 3.0
+
+
+@dataclass(frozen=True)
+class Noise:
+    """One noise of a problem as it was stated.
+
+    Attributes:
+        name: as in the config's section `noise`, where it is there.
+        stated: its sigma or density before the recording is asked; typical where measurements differ.
+        source: who says so.
+        known: one sigma of its logarithm; 0: exactly.
+        families: of measurements whose residuals tell of it; none: residuals are not asked.
+        rows: of each measurement that it is of; None: all.
+        least: its level is never less than this over what is stated: what else than white noise is in a mean of many
+            samples shows in few of them alike.
+        beside: whether it is there beside the noise that its factors are whitened by, which say as `beside` how much
+            of it they have: what means of many samples repeat to is more than white noise over their duration.
+    """
+
+    name: str
+    stated: float
+    source: Source
+    known: float
+    families: tuple[str, ...] = ()
+    rows: tuple[int, ...] | None = None
+    least: float = 0.0
+    beside: bool = False
+
+    @property
+    def unit(self) -> str:
+        """SI, or pixels."""
+        return UNITS[self.name]
+
+    @property
+    def estimated(self) -> bool:
+        """Whether residuals are asked."""
+        return self.known > 0.0 and bool(self.families) and self.stated > 0.0
+
+
+@dataclass(frozen=True)
+class Level:
+    """How large a noise is, over what was stated.
+
+    Attributes:
+        noise: as it was stated.
+        scale: what is used.
+        found: what the recording alone says; None where it is not asked, or says nothing.
+        sigma: one standard deviation of that.
+        least: of a process that its sensor's own samples say is smaller than stated: how small, at most. Residuals
+            tell where in between it is, and never that it is larger than stated: coloured noise of other sensors would
+            raise it without bound. None: of no such process.
+    """
+
+    noise: Noise
+    scale: float = 1.0
+    found: float | None = None
+    sigma: float | None = None
+    least: float | None = None
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the recording says something else than was stated."""
+        if self.found is None or self.sigma is None:
+            return False
+        return abs(float(np.log(self.found))) > _APART * float(np.hypot(self.noise.known, self.sigma / self.found))
+
+    @property
+    def known(self) -> float:
+        """One sigma of the logarithm of what was stated: wide when the recording contradicts it."""
+        return max(self.noise.known, ROUGHLY) if self.contradicted else self.noise.known
+
+    @property
+    def used(self) -> float:
+        """In the noise's unit."""
+        return self.scale * self.noise.stated

@@ -1,0 +1,188 @@
+"""What noises a method's graph reckons with: the config's, the messages', what sensors' own samples say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import comb
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.graph.noise import ROUGHLY, Level, Noise, Source
+from pipelines.graph.robust import robust_sigma
+from pipelines.settings import DEFAULT_NOISE, Config
+
+Array = NDArray[np.float64]
+
+_CONFIG: Source = "config"
+_MESSAGE: Source = "message"
+_DEFAULT: Source = "default"
+
+# Of this order are the differences that tell a sensor's white noise while it moves: motion is smooth, noise is not.
+_ORDER = 6
+# Means of so many samples are looked at, one after the other, until two of them agree to this part: below a sensor's
+# own filter its noise is white.
+_MEANS, _ALIKE = (1, 2, 4, 8), 0.1
+# Fewer differences tell nothing; the best of them are not trusted to less than this, in the logarithm.
+_FEWEST, _TRUSTED = 200, 0.05
+# A walk is looked for in steps of this, in the logarithm, where the bias was seen so many times.
+# ... and what was stated is contradicted by so many sigmas.
+_STEP, _FEWEST_MEANS, _SURE = 0.25, 12, 4.0
+# How well repeatability is known, in the logarithm, where nobody states it.
+_HARDLY = 2.0
+# A process is not made smaller than this without its residuals being asked.
+_MUCH_SMALLER = 0.8
+
+
+def stated(
+    name: str,
+    config: Config,
+    message: float | None = None,
+    families: Sequence[str] = (),
+    rows: Sequence[int] | None = None,
+) -> Noise:
+    """A noise of the config's section `noise`: its figure, else what messages state, else the default.
+
+    Args:
+        name: its key.
+        config: in force.
+        message: typical figure of the messages; None: they state none.
+        families, rows: as Noise has them.
+    """
+    given = getattr(config.noise, name)
+    figure, source = getattr(DEFAULT_NOISE, name), _DEFAULT
+    if given is not None:
+        figure, source = given, _CONFIG
+    elif message is not None:
+        figure, source = message, _MESSAGE
+    # Who takes the config's figures for exact wants no level estimated.
+    known = config.noise_known if given is not None or config.noise_known == 0.0 else ROUGHLY
+    return Noise(name, float(figure), source, known, tuple(families), None if rows is None else tuple(rows))
+
+
+def repeatability(sensor: str, config: Config, family: str) -> Level:
+    """What a mean over a rest, or a turn, repeats to beside white noise: as stated, until the residuals tell.
+
+    Where nobody states it, it counts as hardly known, and as none where noise is said to be known exactly.
+    """
+    noise = replace(stated(f"{sensor}_repeatability", config, None, (family,)), beside=True)
+    if noise.source == _CONFIG:
+        return Level(noise)
+    return Level(replace(noise, known=_HARDLY)) if noise.known else Level(noise, scale=0.0)
+
+
+def sampled(noise: Noise, time: Array, samples: Array) -> Level:
+    """The level of a sensor's white noise, from what was stated and from its own samples while it moves.
+
+    What is stated larger than the samples have it may stand for more than white noise, so that residuals decide.
+
+    Args:
+        noise: its density; its families are the processes, if any, that it drives.
+        time: (n,) s.
+        samples: (n, k) of a rate.
+    """
+    found = white_density(time, samples) if noise.known > 0.0 and noise.stated > 0.0 else None
+    held = replace(noise, families=())
+    if found is None:
+        return Level(held)
+    ratio, spread = found[0] / noise.stated, max(found[1], _TRUSTED)
+    level = _weighed(Level(held, 1.0, ratio, ratio * spread))
+    if noise.families and level.scale < _MUCH_SMALLER:
+        return replace(level, noise=noise, scale=1.0, least=level.scale)
+    return level
+
+
+def walked(noise: Noise, time: Array, means: Array, force: Array) -> Level:
+    """The level of a bias's random walk from what was stated and from the bias itself, seen at some times.
+
+    By restricted maximum likelihood: the walk beside an error that is new every time, the mean and what follows the
+    specific force (g-sensitivity, the vertical part of the earth's rate) free.
+
+    Args:
+        noise: the walk.
+        time: (n,) s.
+        means: (n, k) the bias as measured then.
+        force: (n, 3) specific force then, in any unit.
+    """
+    if noise.known == 0.0 or noise.stated == 0.0 or len(time) < _FEWEST_MEANS:
+        return Level(noise)
+    follows = np.column_stack([np.ones(len(time)), force / np.abs(force).max()])
+    left = means - follows @ np.linalg.lstsq(follows, means)[0]
+    size = float(np.std(left, axis=0).max())
+    tried = size / float(np.ptp(time)) ** 0.5 * np.exp(np.arange(-5.0, 3.0, _STEP))
+    error = size * np.exp(np.arange(-4.0, 0.5, _STEP))
+    earlier = np.minimum.outer(time - time[0], time - time[0])
+
+    def likeliest(walk: float) -> float:
+        return max(_likelihood(left, follows, walk**2 * earlier + e**2 * np.eye(len(time))) for e in error)
+
+    fit = np.array([likeliest(walk) for walk in tried])
+    best = int(np.argmax(fit))
+    contradicts = fit[best] - likeliest(noise.stated) > 0.5 * _SURE**2
+    if best in (0, len(tried) - 1) or not contradicts:
+        return Level(noise)
+    bend = float(2.0 * fit[best] - fit[best - 1] - fit[best + 1]) / _STEP**2
+    ratio, spread = float(tried[best]) / noise.stated, max(bend, 1e-6) ** -0.5
+    return _weighed(Level(noise, 1.0, ratio, ratio * spread))
+
+
+def _likelihood(means: Array, follows: Array, covariance: Array) -> float:
+    """Logarithm of the likelihood of columns (n, k) that follow others (n, d), restricted to what says nothing of how.
+
+    Patterson, Thompson, "Recovery of inter-block information when block sizes are unequal", Biometrika 1971.
+    """
+    root = np.linalg.cholesky(covariance)
+    own, columns = np.linalg.solve(root, follows), np.linalg.solve(root, means)
+    orthogonal, triangle = np.linalg.qr(own)
+    square = float((columns**2).sum() - ((orthogonal.T @ columns) ** 2).sum())
+    diagonals = np.concatenate([np.diag(root), np.diag(triangle)])
+    return -0.5 * square - means.shape[1] * float(np.log(np.abs(diagonals)).sum())
+
+
+def _weighed(level: Level) -> Level:
+    """With the scale that statement and finding have together."""
+    assert level.found is not None
+    assert level.sigma is not None
+    spread = level.sigma / level.found
+    return replace(level, scale=float(np.exp(np.log(level.found) / (1.0 + (spread / level.known) ** 2))))
+
+
+def white_density(time: Array, samples: Array) -> tuple[float, float] | None:
+    """Density, per sqrt(Hz), of the white part of samples (n, k) while they move, and its relative sigma.
+
+    From high differences of means of 1, 2, 4, ... samples, each of which sees a lower band: the first two that agree.
+    None where none do, as behind a filter, under vibration, or where steps of the readings hide the noise.
+    """
+    interval = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+    if not interval > 0.0:
+        return None
+    even = np.append(np.abs(np.diff(time) / interval - 1.0) < 0.5, False)
+    before: float | None = None
+    for count in _MEANS:
+        pieces = np.split(samples, np.flatnonzero(~even) + 1)
+        differences = np.concatenate([_differences(piece, count) for piece in pieces])
+        if differences.size < _FEWEST or np.mean(differences == 0.0) > 0.05:
+            return None
+        density = robust_sigma(differences) / comb(2 * _ORDER, _ORDER) ** 0.5 * (count * interval) ** 0.5
+        if before is not None and abs(np.log(density / before)) < _ALIKE:
+            # Neighbouring differences go together, and the median tells less than the mean square would.
+            return before, float(2.0 * differences.size**-0.5)
+        before = density
+    return None
+
+
+def _differences(samples: Array, count: int) -> Array:
+    """Of high order, of means of `count` samples (n, k)."""
+    whole = len(samples) // count * count
+    means = samples[:whole].reshape(-1, count, samples.shape[1]).mean(axis=1)
+    return np.diff(means, _ORDER, axis=0).ravel() if len(means) > _ORDER else np.empty(0)
+
+
+def typical(covariance: Array | None, *components: int) -> float | None:
+    """Median sigma of some components of measurements' covariances (n, m, m); None where none is told."""
+    if covariance is None:
+        return None
+    variance = np.concatenate([covariance[:, i, i] for i in components])
+    known = variance[np.isfinite(variance)]
+    return float(np.sqrt(np.median(known))) if len(known) else None
