@@ -81,7 +81,7 @@ def test_rows_are_those_of_the_dense_system(case: Solved) -> None:
 
 
 def test_budget_sums_to_one_and_names_its_sources(case: Solved) -> None:
-    budget = uncertainty_budget(case.problem, case.found)
+    budget = uncertainty_budget(case.problem, case.found, {})
     families = {f.family for f in case.system.factors}
     for name, shares in budget.items():
         assert sum(shares.values()) == pytest.approx(1.0, abs=1e-9)
@@ -142,7 +142,7 @@ def test_a_measurement_moves_the_parameters_as_foretold() -> None:
 def test_budget_is_what_each_source_alone_does() -> None:
     """Each source switched on alone: the variance of the estimate over many draws of it."""
     problem, linear, found = _of_line()
-    budget = uncertainty_budget(problem, found)
+    budget = uncertainty_budget(problem, found, {})
     dense, _ = linear.jacobian(ordering_of([A, B, S]))
     rng = np.random.default_rng(0)
     total = found.covariance[0, 0] + 0.05**2
