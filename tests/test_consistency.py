@@ -96,14 +96,19 @@ def test_what_fits_has_no_cause(head: Case) -> None:
     assert find_causes(*head) == ()
 
 
-@pytest.mark.slow
-def test_noise_stated_three_times_too_small_is_named_with_its_factor(head: Case) -> None:
+def test_noise_stated_three_times_too_small_is_no_cause_and_told(head: Case) -> None:
     find, data, config = head
-    wrong = replace(data, vision_cov=data.vision_cov / 9.0)
-    label = first_cause((find, wrong, with_noise(config, vision_attitude=1.0 / 3.0)))
-    name, said = label.split(" is stated ")
-    assert name == "the noise vision_attitude"
-    assert float(said.split()[0]) == pytest.approx(3.0, rel=0.1)
+    told = headline((find, data, with_noise(config, vision_attitude=1.0 / 3.0)))
+    assert told.startswith("All 3 parameters are as accurate as required. vision_attitude: ")
+    assert told.endswith(" rad is used, 3 times what the config states.")
+
+
+def test_noise_known_exactly_and_three_times_too_small_does_not_fit(head: Case) -> None:
+    find, data, config = head
+    known = with_noise(config, vision_attitude=1.0 / 3.0).model_copy(update={"noise_known": 0.0})
+    calibration = Session(find, data, known, Arrays(find, data)).calibrate()
+    assert calibration.status == "inconsistent"
+    assert "vision" in calibration.headline
 
 
 @pytest.mark.slow
@@ -183,9 +188,7 @@ def test_without_a_platform_topic_what_else_is_wrong_is_still_named() -> None:
     assert find_causes(find, data, config) == ()
     flipped = replace(data, head_gyro=data.head_gyro * [1.0, -1.0, 1.0])
     assert first_cause((find, flipped, config)) == "the sign of the helmet gyro's y is wrong"
-    assert first_cause((find, data, with_noise(config, vision_attitude=1.0 / 3.0))).startswith(
-        "the noise vision_attitude"
-    )
+    assert "vision_attitude" in headline((find, data, with_noise(config, vision_attitude=1.0 / 3.0)))
     late = replace(data, vision_t=data.vision_t - 0.03)
     assert first_cause((find, late, config)).startswith("a time offset of ")
 
@@ -226,7 +229,9 @@ def test_encoders_read_20_ms_late(los: Case) -> None:
 @pytest.mark.parametrize("key", ["los_error", "gyro_density"])
 def test_the_noise_that_is_too_small_is_told_from_the_others(los: Case, key: str) -> None:
     find, data, config = los
-    assert first_cause((find, data, with_noise(config, **{key: 0.35}))).startswith(f"the noise {key} is stated ")
+    told = headline((find, data, with_noise(config, **{key: 0.35})))
+    assert told.startswith(f"All 7 parameters are as accurate as required. {key}: ")
+    assert told.count("is used") == 1
 
 
 @pytest.mark.slow
