@@ -161,8 +161,8 @@ def _squares(family: str, residuals: Residuals) -> Plot:
     out.add_hline(y=rows.shape[1], line={"color": "#888888", "width": 1, "dash": "dot"})
     return Plot(
         f"Innovations squared of {family}",
-        f"The mean should stay at {rows.shape[1]} (dotted): above it the noise stated is too small or the model lacks "
-        "something at that time, below it the noise stated is too large.",
+        f"The mean should stay at {rows.shape[1]} (dotted): above it noise is larger than reckoned with or the model "
+        "lacks something at that time, below it noise is smaller.",
         out,
     )
 
