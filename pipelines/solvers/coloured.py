@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 import gtsam
 import numpy as np
 
-from pipelines.graph.problem import Array, Factor, Problem
+from pipelines.graph.problem import Array, Factor, Problem, Residuals
 from pipelines.solvers.influence import Influence
 
 # Families of fewer measurements are too short to tell their colour.
@@ -61,6 +61,30 @@ def coloured(factors: Sequence[Factor], values: gtsam.Values) -> dict[str, Array
 def _residuals(factor: Factor, values: gtsam.Values) -> Array:
     assert factor.measurement is not None
     return np.where(factor.measurement.used(values)[:, None], factor.measurement.residuals(values), 0.0)
+
+
+def inflations_by_innovations(
+    problem: Problem, covariance: Array, innovations: Mapping[str, Residuals]
+) -> tuple[Array, dict[str, float]]:
+    """(n,) by what a filter's sigmas grow as its innovations are correlated, and how many of a family count as one.
+
+    A filter does not tell what each measurement did: the family that is correlated most counts for all that does not
+    come from a number's own prior.
+
+    Args:
+        problem: the graph's.
+        covariance: (n, n) of the reported numbers for white noise.
+        innovations: whitened, by family.
+    """
+    lengths = {}
+    for family, found in innovations.items():
+        lags = correlations(np.where(found.used[:, None], found.whitened, 0.0))
+        if len(lags):
+            lengths[family] = 1.0 + 2.0 * float(lags.sum())
+    variance = np.diag(covariance)
+    prior = np.array([np.inf if q.prior_sigma is None else q.prior_sigma or np.inf for q in problem.quantities])
+    told = np.clip(1.0 - variance / prior**2, 0.0, 1.0)
+    return np.sqrt(1.0 + (max(lengths.values(), default=1.0) - 1.0) * told), lengths
 
 
 def added_variance(found: Influence, colours: Mapping[str, Array]) -> dict[str, Array]:

@@ -20,6 +20,7 @@ import numpy as np
 from pipelines.graph.problem import Array, Attitudes, ChiSquare, Estimate, Factor, History, Problem, Step
 from pipelines.solvers.assembly import Assembly
 from pipelines.solvers.batch import CHUNK, Solution, optimize, with_levels
+from pipelines.solvers.coloured import inflations_by_innovations
 from pipelines.solvers.innovations import Innovations, Prediction
 from pipelines.solvers.linearity import is_linear
 from pipelines.solvers.marginals import IndeterminateError, reported, reported_covariance
@@ -201,17 +202,21 @@ class Run:
         if not (np.isfinite(values).all() and np.isfinite(covariance).all()):
             raise IndeterminateError(f"the estimate at {self.time:.3f} s is not a finite number")
         history, n = self.history.array.copy(), len(values)
+        innovations = self.innovations.residuals()
+        inflation, colours = inflations_by_innovations(self.problem, covariance, innovations)
         attitudes = self.attitudes.array.copy()
         return Estimate(
             solver="incremental",
             names=tuple(q.name for q in self.problem.quantities),
             values=values,
-            covariance=covariance,
+            covariance=covariance * np.outer(inflation, inflation),
+            inflation=inflation,
+            colours=colours,
             converged=not self._trouble,
             message=self._trouble or "all steps taken",
-            residuals=self.innovations.residuals(),
+            residuals=innovations,
             chi_square=self.chi_square(),
-            history=History(history[:, 0], history[:, 1 : 1 + n], history[:, 1 + n :]),
+            history=History(history[:, 0], history[:, 1 : 1 + n], history[:, 1 + n :]).inflated(inflation),
             attitudes=None if self.problem.attitudes is None else Attitudes(attitudes[:, 0], attitudes[:, 1:]),
             rejected=self.innovations.rejected(),
             levels=self.levels,

@@ -1,0 +1,192 @@
+"""Noise levels come from the recording: figures stated wrong, or not at all, change neither values nor sigmas."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from alidade import simulate
+from factors import so3
+from pipelines import methods
+from pipelines.config import load_config
+from pipelines.graph.problem import Array, Estimate, Problem
+from pipelines.methods.noise import white_density
+from pipelines.settings import DEFAULT_NOISE, Config
+from pipelines.settings import Noise as NoiseSettings
+from pipelines.solvers.batch import solve_batch
+from pipelines.solvers.incremental import solve_incremental
+
+# Method -> scenario, and the noises that its recording is made of.
+CASES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
+    "los": ({"duration_s": 20.0, "sensors": {}}, ("los_error", "gyro_density", "encoder")),
+    "head": ({"duration_s": 30.0, "sensors": {}}, ("vision_attitude", "gyro_density")),
+    "indexer": ({"sensors": {}}, ("gyro_density", "encoder")),
+    "cube": ({"sensors": {}}, ("gyro_density", "accel_density", "mag_density", "corner_px")),
+}
+
+
+@cache
+def made(method: str, seed: int) -> tuple[Any, Config, dict[str, float]]:
+    """Data, config with the noise as it is, truth."""
+    simulated = simulate(method, CASES[method][0], seed=seed)
+    return simulated.data, load_config(simulated.config.encode()), simulated.truth
+
+
+def stated(config: Config, factors: dict[str, float]) -> Config:
+    """The config with noises stated as multiples of what they are."""
+    given = {
+        name: factor * (getattr(config.noise, name) or getattr(DEFAULT_NOISE, name)) for name, factor in factors.items()
+    }
+    return config.model_copy(update={"noise": config.noise.model_copy(update=given)})
+
+
+@cache
+def right(method: str, seed: int, solve: Callable[[Problem], Estimate]) -> Estimate:
+    return solved(method, seed, {}, solve)
+
+
+def solved(method: str, seed: int, factors: dict[str, float], solve: Callable[[Problem], Estimate]) -> Estimate:
+    data, config, _ = made(method, seed)
+    return solve(methods.method(method).problem(data, stated(config, factors)))
+
+
+def assert_as_right(method: str, seed: int, factors: dict[str, float], solve: Callable[[Problem], Estimate]) -> None:
+    """Values and sigmas are those with the noise as it is."""
+    as_it_is, wrong = right(method, seed, solve), solved(method, seed, factors, solve)
+    free = as_it_is.sigmas > 0.0
+    assert np.abs((wrong.values - as_it_is.values)[free] / as_it_is.sigmas[free]).max() < 0.5
+    np.testing.assert_allclose(wrong.sigmas[free], as_it_is.sigmas[free], rtol=0.15)
+
+
+@pytest.mark.parametrize("factor", [3.0, 1.0 / 3.0])
+@pytest.mark.parametrize("method", CASES)
+def test_all_noise_stated_wrong(method: str, factor: float) -> None:
+    factors = dict.fromkeys(CASES[method][1], factor)
+    assert_as_right(method, 1, factors, solve_batch)
+    for level in solved(method, 1, factors, solve_batch).levels:
+        if level.noise.name in factors and level.found is not None and level.sigma is not None:
+            assert abs(level.found - 1.0 / factor) < 4.0 * level.sigma
+
+
+def test_the_incremental_solver_finds_them_too() -> None:
+    assert_as_right("head", 1, {"vision_attitude": 3.0, "gyro_density": 1.0 / 3.0}, solve_incremental)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", CASES)
+def test_every_noise_stated_wrong(method: str) -> None:
+    for seed in range(10):
+        factor = (1.0 / 3.0, 0.5, 2.0, 3.0)[seed % 4]
+        for name in CASES[method][1]:
+            assert_as_right(method, seed, {name: factor}, solve_batch)
+
+
+def test_noise_known_exactly_is_what_is_used() -> None:
+    data, config, _ = made("head", 1)
+    known = stated(config, {"vision_attitude": 3.0}).model_copy(update={"noise_known": 0.0})
+    estimate = solve_batch(methods.method("head").problem(data, known))
+    assert all(level.scale == 1.0 and level.found is None for level in estimate.levels)
+    assert estimate.chi_square is not None
+    assert estimate.chi_square.value < 0.2 * estimate.chi_square.dof
+
+
+def coloured(seed: int, tau: float) -> tuple[Problem, Array]:
+    """A head recording whose vision errs by a Gauss-Markov process, its sigma stated; and the truth."""
+    rate, sigma = 30.0, 8.7e-3
+    scenario = {"duration_s": 60.0, "vision_rate_hz": rate, "sensors": "ideal", "noise": {"vision_attitude": 1e-9}}
+    simulated = simulate("head", scenario, seed=seed)
+    config = load_config(simulated.config.encode())
+    config = config.model_copy(update={"noise": config.noise.model_copy(update={"vision_attitude": sigma})})
+    data, truth = simulated.data, simulated.truth
+    keep = np.exp(-1.0 / (rate * tau)) if tau > 0.0 else 0.0
+    white = np.random.default_rng(seed).standard_normal((len(data.vision_t) + 200, 3))
+    error = sigma * np.sqrt(1.0 - keep**2) * lfilter([1.0], [1.0, -keep], white, axis=0)[200:]
+    data = replace(data, vision_wxyz=so3.multiply(data.vision_wxyz, so3.exp(error)))
+    problem = methods.method("head").problem(data, config)
+    return problem, np.array([truth[q.name] for q in problem.quantities])
+
+
+def in_sigmas(problem: Problem, truth: Array, solve: Callable[[Problem], Estimate]) -> tuple[Array, Array]:
+    """Errors and inflations of what is estimated."""
+    estimate = solve(problem)
+    free = estimate.sigmas > 0.0
+    return ((estimate.values - truth)[free] / estimate.sigmas[free]), estimate.inflations[free]
+
+
+def test_white_noise_inflates_nothing() -> None:
+    for seed in range(3):
+        _, inflation = in_sigmas(*coloured(seed, 0.0), solve_batch)
+        assert (inflation < 1.05).all()
+
+
+@pytest.mark.parametrize("solve", [solve_batch, solve_incremental])
+def test_colour_inflates_what_vision_tells(solve: Callable[[Problem], Estimate]) -> None:
+    problem, truth = coloured(0, 0.2)
+    errors, inflation = in_sigmas(problem, truth, solve)
+    assert np.abs(errors).max() < 3.5
+    assert inflation[3:].min() > 2.0
+    assert inflation.max() < 6.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tau", [0.03, 0.1, 0.2, 0.5])
+def test_sigmas_survive_coloured_noise(tau: float) -> None:
+    errors = np.concatenate([in_sigmas(*coloured(seed, tau), solve_batch)[0] for seed in range(20)])
+    assert 0.85 < np.sqrt((errors**2).mean()) < 1.15
+
+
+# Noise of sensors that nobody states: navigation, tactical and consumer grade.
+GRADES: dict[str, dict[str, Any]] = {
+    "navigation": {"gyro_density": 2e-6, "gyro_bias_walk": 1e-8, "vision_attitude": 1e-3},
+    "tactical": {"gyro_density": 3e-5, "gyro_bias_walk": 1e-6, "vision_attitude": 5e-3},
+    "consumer": {"gyro_density": 3e-4, "gyro_bias_walk": 1e-6, "vision_attitude": 3e-2},
+}
+
+
+def unstated(grade: str, seeds: Sequence[int]) -> float:
+    """NEES per number of head recordings without a word about noise."""
+    nees = []
+    for seed in seeds:
+        scenario = {"duration_s": 30.0, "sensors": {}, "noise": GRADES[grade]}
+        simulated = simulate("head", scenario, seed=seed)
+        silent = replace(simulated.data, vision_cov=None, gyro_density=None, platform_gyro_density=None)
+        config = load_config(simulated.config.encode()).model_copy(update={"noise": NoiseSettings()})
+        problem = methods.method("head").problem(silent, config)
+        estimate = solve_batch(problem)
+        error = estimate.values - np.array([simulated.truth[q.name] for q in problem.quantities])
+        free = estimate.sigmas > 0.0
+        nees.append(error[free] @ np.linalg.solve(estimate.covariance[np.ix_(free, free)], error[free]) / free.sum())
+    return float(np.mean(nees))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("grade", GRADES)
+def test_nothing_stated_and_honest(grade: str) -> None:
+    assert 0.8 < unstated(grade, range(50)) < 1.25
+
+
+@pytest.mark.parametrize("grade", GRADES)
+def test_nothing_stated_and_honest_on_a_few(grade: str) -> None:
+    assert 0.6 < unstated(grade, range(4)) < 1.6
+
+
+def test_white_noise_of_a_sensor_in_motion() -> None:
+    rng, rate, density = np.random.default_rng(2), 200.0, 1e-4
+    time = np.arange(6000) / rate
+    motion = np.column_stack([np.sin(2.0 * np.pi * f * time) for f in (0.3, 1.0, 2.0)])
+    samples = motion + density * np.sqrt(rate) * rng.standard_normal((6000, 3))
+    found = white_density(time, samples)
+    assert found is not None
+    assert found[0] == pytest.approx(density, rel=0.05)
+    # Behind a filter the highest frequencies say less, and lower ones are asked.
+    filtered = motion + density * np.sqrt(rate) * lfilter([0.25] * 4, [1.0], rng.standard_normal((6000, 3)), axis=0)
+    found = white_density(time, filtered)
+    assert found is None or found[0] == pytest.approx(density, rel=0.2)
+    # Steps of the readings hide it.
+    assert white_density(time, np.round(samples / 0.1) * 0.1) is None
