@@ -141,7 +141,8 @@ def predict(method_name: str, scenario: Scenario, config_file: Path | None, requ
 
     method = methods.method(method_name)
     session = Session.of(method, method.simulate(method.scenario.model_validate(scenario), _SEED), config_file)
-    config = session.config.model_copy(update={"require": {**session.config.require, **require}})
+    # The noise asked about is that of the config; the recording is only simulated.
+    config = session.config.model_copy(update={"require": {**session.config.require, **require}, "noise_known": 0.0})
     problem = method.problem(session.data, config)
     try:
         estimate = solve_batch(problem, budget=True)

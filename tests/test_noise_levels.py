@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -32,7 +32,7 @@ CASES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
 
 
 @cache
-def made(method: str, seed: int) -> tuple[Any, Config, dict[str, float]]:
+def made(method: str, seed: int) -> tuple[Any, Config, Mapping[str, float]]:
     """Data, config with the noise as it is, truth."""
     simulated = simulate(method, CASES[method][0], seed=seed)
     return simulated.data, load_config(simulated.config.encode()), simulated.truth

@@ -62,8 +62,8 @@ class Noise:
 
     @property
     def unit(self) -> str:
-        """SI, or pixels."""
-        return UNITS[self.name]
+        """SI, or pixels; of a noise that other distributions name, none."""
+        return UNITS.get(self.name, "")
 
     @property
     def estimated(self) -> bool:

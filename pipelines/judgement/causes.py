@@ -34,8 +34,9 @@ _BETTER = 0.8
 # Noise so many times larger explains anything, and is never offered.
 _MOST_NOISE = 4.0
 _MOST_NAMED = 3
-# How well noise is known, in the logarithm, when the recording is asked for it.
-_ROUGHLY = 1.0
+# How well noise counts as known, in the logarithm, when the recording is asked for it: what it contradicts counts for
+# little, and what would be known worse than this could hardly be contradicted.
+_KNOWN = 0.1
 # How far the typical residual has to fall for a change to be looked at closely.
 _PROMISING = 0.97
 # A change whose typical residual is so many times the least one's explains nothing that the other does not.
@@ -128,7 +129,7 @@ def _evidence(before: Outcome, after: Outcome) -> str:
 
 def _noise(method: Method, data: Any, config: Config) -> tuple[Cause, ...]:
     """The noises that are stated too small, as the recording has them; none so large as to explain anything."""
-    found = outcome(method, data, config.model_copy(update={"noise_known": _ROUGHLY}))
+    found = outcome(method, data, config.model_copy(update={"noise_known": _KNOWN}))
     levels = [level for level in found.estimate.levels if level.contradicted] if found is not None else []
     return tuple(
         Cause(

@@ -12,6 +12,8 @@ from pipelines.judgement.observability import Consistency
 _NO_NOISE, _SURE = 4.0, 3.0
 # Processes are judged that have so many degrees of freedom of their own: of fewer, measurements' errors are most.
 _ENOUGH = 100.0
+# A level so many times larger or smaller than a data sheet says is told.
+_WORTH_A_WORD = 2.0
 # Residuals that go together for this part of the recording are no noise either.
 _SLOW = 0.1
 # A noise so many times larger than stated is worth looking for another cause.
@@ -73,7 +75,9 @@ def remarks(levels: Sequence[Level]) -> tuple[str, ...]:
         f"{level.noise.name}: {level.used:.3g} {level.noise.unit} is used, {level.scale:.2g} times what the "
         f"{level.noise.source} states."
         for level in levels
-        if level.contradicted and level.noise.source != "default"
+        if level.noise.source != "default"
+        and level.scale != 1.0
+        and (level.contradicted or not 1.0 / _WORTH_A_WORD < level.scale < _WORTH_A_WORD)
     )
 
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from pipelines.graph.assumptions import determined, pull
-from pipelines.graph.noise import Source
+from pipelines.graph.noise import Level, Source
 from pipelines.graph.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
 from pipelines.judgement.observability import Assessment, Fit, Innovations, Learning, Status, Verdict, learning
 from pipelines.judgement.rejection import rejection_sentence
@@ -144,7 +144,7 @@ class Calibration:
                 used=level.used,
                 inflation=max((colours.get(family, 1.0) ** 0.5 for family in level.noise.families), default=1.0),
             )
-            for level in self.estimate.levels or self.problem.noises
+            for level in self.estimate.levels or [Level(level.noise) for level in self.problem.noises]
         ]
 
     @property

@@ -49,9 +49,15 @@ def correlations(whitened: Array) -> Array:
 
 
 def coloured(factors: Sequence[Factor], values: gtsam.Values) -> dict[str, Array]:
-    """Family -> autocorrelation of its residuals, of those that are not white; rejected measurements count as zero."""
+    """Family -> autocorrelation of its residuals, of those that are not white; rejected measurements count as zero.
+
+    Compressed factors do not tell what each measurement did to the estimate: their families are left out.
+    """
     found = {}
+    compressed = {f.family for f in factors if f.measurement is not None and f.measurement.compress}
     for family in dict.fromkeys(f.family for f in factors if f.measurement is not None):
+        if family in compressed:
+            continue
         rows = [_residuals(f, values) for f in factors if f.family == family]
         if len({row.shape[1] for row in rows}) == 1 and len(lags := correlations(np.concatenate(rows))):
             found[family] = lags

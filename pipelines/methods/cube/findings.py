@@ -10,11 +10,12 @@ from factors import so3
 from pipelines.graph.problem import Array, Estimate, Findings
 from pipelines.methods.cube.compensation import calibrated
 from pipelines.methods.cube.data import CubeData, noise_densities, nominal
+from pipelines.methods.cube.noises import noises
 from pipelines.methods.cube.parameters import TRIADS, triad_names
 from pipelines.methods.cube.poses import StaticPoses, static_poses
 from pipelines.methods.cube.topics import MAG, CubeConfig
 from pipelines.recording.topics import IMU
-from pipelines.settings import DEFAULT_NOISE, Config, first_given
+from pipelines.settings import Config
 
 # White noise is told from means over this much time, s: shorter ones are what the device's own filter leaves.
 _BLOCK = 0.25
@@ -101,7 +102,7 @@ def _noise(
         "density": density.tolist(),
         "stated": stated,
     }
-    taken = first_given(config.noise.gyro_bias_walk, DEFAULT_NOISE.gyro_bias_walk) if name == "gyro" else 0.0
+    taken = noises(data, config)["gyro_bias_walk"].used if name == "gyro" else 0.0
     # One that adds up to more over the recording than the mean of one rest is good to would have shown.
     length = float(poses.span[-1, 1] - poses.span[0, 0])
     bound = float(np.mean(density) / np.sqrt(np.median(poses.duration) * length))
