@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -172,9 +173,11 @@ class AxisPath:
             ],
             axis=3,
         )
-        swept = np.einsum("kpia,kae->kpie", crossing, 0.5 * (change[:-1] + change[1:]))
+        mean = 0.5 * (change[:-1] + change[1:])
+        windows = [slice(*ends) for ends in pairwise(at_edge)]
+        swept = [np.tensordot(crossing[rows], mean[rows], axes=((0, 3), (0, 1))) for rows in windows]
         turned = np.einsum("kpia,kae->kpie", axes[at_edge], change[at_edge])
-        total = np.diff(turned, axis=0) + np.add.reduceat(swept, at_edge[:-1], axis=0)
+        total = np.diff(turned, axis=0) + np.array(swept)
         return np.asarray(total / np.diff(edges)[:, None, None, None])
 
     def _interpolation(self, at: Array, i: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
@@ -210,7 +213,9 @@ class AxisPath:
 
     def _base_rate_turned(self, outer: Array) -> Array:
         """The base's rate behind the outer axis, (n, 3)."""
-        return so3.rotate(so3.exp(-outer[:, None] * _EX), self._base_rate)
+        x, y, z = self._base_rate
+        c, s = np.cos(outer), np.sin(outer)
+        return np.stack([np.full_like(c, x), c * y + s * z, c * z - s * y], axis=1)
 
 
 def _in_platform(vectors: Array, inner: Array) -> Array:
