@@ -314,7 +314,19 @@ class Session:
         from pipelines.solvers.batch import solve_batch
 
         with progress.doing("solving"):
-            return solve_batch(problem, budget=True), problem
+            return solve_batch(problem, budget=True, changed=self._changed()), problem
+
+    def _changed(self) -> Iterator[tuple[str, Problem]]:
+        """Each input that the graph takes for exact, and the graph with that input off by its step."""
+        for exact in self.method.hypotheses().exact:
+            changed = exact.changed(self.data, self.config, exact.step)
+            if changed is None:
+                continue
+            try:
+                problem = self.method.problem(*changed)
+            except InputError:  # on the edge of what can be used, a step farther than the recording itself
+                continue
+            yield exact.name, problem
 
     def _published(self) -> Estimate | None:
         """The published solver's estimate, where it can serve the recording: it needs more than the graphs."""

@@ -269,6 +269,24 @@ class History:
 
 
 @dataclass(frozen=True)
+class Pull:
+    """What a measurement does to the parameter that it moves most.
+
+    Attributes:
+        family: of the measurement.
+        time: s, its own, or that of the last reading in it.
+        parameter: its name.
+        sigmas: how far the measurement takes it, in the parameter's sigmas; left out, it would be back by that, and by
+            more where few others tell of it.
+    """
+
+    family: str
+    time: float
+    parameter: str
+    sigmas: float
+
+
+@dataclass(frozen=True)
 class Estimate:
     """A calibration by one solver; `names`, `values` (n,) and `covariance` (n, n) belong together.
 
@@ -286,6 +304,8 @@ class Estimate:
             are as they are at the end.
         attitudes: the trajectory, if the method has one.
         budget: quantity -> source -> its share of the quantity's variance, the largest first; None: not asked for.
+        moved: input of the graph -> quantity -> by how much it moves when that input is changed; None: not asked for.
+        strongest: the measurements that move parameters most, the strongest first; None: not asked for.
         rejected: family -> number of measurements rejected as outliers.
         levels: of the noises; none: all are as stated.
         colours: family -> how many of its measurements in a row count as one, of those whose residuals are correlated.
@@ -305,6 +325,8 @@ class Estimate:
     smoothed: History | None = None
     attitudes: Attitudes | None = None
     budget: Mapping[str, Mapping[str, float]] | None = None
+    moved: Mapping[str, Mapping[str, float]] | None = None
+    strongest: tuple[Pull, ...] | None = None
     rejected: Mapping[str, int] = field(default_factory=dict)
     levels: tuple[Level, ...] = ()
     colours: Mapping[str, float] = field(default_factory=dict)

@@ -26,6 +26,23 @@ class Scaling:
 
 
 @dataclass(frozen=True)
+class ExactInput:
+    """A number of data or config that the graph takes for exact.
+
+    Attributes:
+        name: as in result.json.
+        unit: of its changes; "1": a share of itself.
+        step: what it is usually off by, one sigma.
+        changed: data, config and change -> both with the number larger by that; None where it does not occur.
+    """
+
+    name: str
+    unit: str
+    step: float
+    changed: Callable[[Any, Config, float], tuple[Any, Config] | None]
+
+
+@dataclass(frozen=True)
 class Fault:
     """A fault of its own kind.
 
@@ -52,6 +69,7 @@ class Hypotheses:
         clock: stamps that may be late, and how people call their source.
         scalings: numbers of the config that may be off by a factor.
         faults: of other kinds.
+        exact: numbers that are not tried, but told what they would do.
         cut: whether a stretch of the recording is a recording.
     """
 
@@ -62,4 +80,5 @@ class Hypotheses:
     clock: tuple[str, str] | None = None
     scalings: Sequence[Scaling] = ()
     faults: Sequence[Fault] = ()
+    exact: Sequence[ExactInput] = ()
     cut: bool = True

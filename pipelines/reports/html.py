@@ -9,6 +9,7 @@ from __future__ import annotations
 import datetime
 from dataclasses import dataclass
 
+from pipelines.graph.problem import Quantity
 from pipelines.judgement.observability import by_advice
 from pipelines.reports.budget import Limit, limits
 from pipelines.reports.plots import common_plots
@@ -18,6 +19,10 @@ from pipelines.reports.units import human_unit, to_digits_of
 
 # Beyond so many sigmas of its prior a number says nothing.
 _MEANINGLESS = 10.0
+# What an input moves by less than this, in sigmas, is not worth a word.
+_LEAST_MOVE = 0.1
+# So many parameters are named of those that it moves.
+_MOST_MOVED = 6
 
 
 @dataclass(frozen=True)
@@ -34,6 +39,15 @@ class _Row:
     assumed: bool
     pull: str
     error: str
+
+
+@dataclass(frozen=True)
+class _Exact:
+    """An input taken for exact and what it does to parameters if it is off by what it usually is."""
+
+    name: str
+    off_by: str
+    moves: str
 
 
 def report_html(calibration: Calibration) -> str:
@@ -57,6 +71,7 @@ def report_html(calibration: Calibration) -> str:
             noises=calibration.noises,
             limits=found,
             advised=_short_of(calibration, found),
+            exact=_exact(calibration),
             formulas=[formula.text for formula in calibration.formulas],
             tables=[each for each in own if isinstance(each, Table)],
             plots=[(plot.title, plot.caption, _div(plot, i)) for i, plot in enumerate(plots)],
@@ -72,6 +87,29 @@ def _short_of(calibration: Calibration, found: list[Limit]) -> list[str]:
     short = [limit for limit in known if of[limit.name] > 1.0]
     told = short or sorted(known, key=lambda limit: -of[limit.name])[:1]
     return [limit.sentence for limit in told]
+
+
+def _exact(calibration: Calibration) -> list[_Exact]:
+    """The inputs that are taken for exact, each with the parameters that it moves by more than a trifle."""
+    quantities = {q.name: q for q in calibration.problem.quantities if not q.assumed}
+    found = []
+    for name, sensitivity in (calibration.sensitivity or {}).items():
+        step, unit = sensitivity.step, sensitivity.unit
+        sigmas = {p: calibration.parameters[p].sigma for p in quantities if p in sensitivity.parameters}
+        moves = {p: step * sensitivity.parameters[p] for p in sigmas}
+        worth = [p for p in moves if abs(moves[p]) > _LEAST_MOVE * sigmas[p]]
+        worth.sort(key=lambda p: -abs(moves[p]) / sigmas[p])
+        told = [_moved(quantities[p], moves[p], sigmas[p]) for p in worth[:_MOST_MOVED]]
+        rest = [f"{len(worth) - len(told)} more by less"] if len(worth) > len(told) else []
+        off_by = f"{100.0 * step:g} %" if unit == "1" else f"{step:g} {unit}"
+        found.append(_Exact(name, off_by, ", ".join([*told, *rest]) or "nothing worth a word"))
+    return found
+
+
+def _moved(quantity: Quantity, move: float, sigma: float) -> str:
+    unit, factor = human_unit(quantity)
+    size = f"{to_digits_of(factor * move, factor * sigma)} {unit.removeprefix('1')}".strip()
+    return f"{quantity.name} {move / sigma:+.1f} σ ({size})"
 
 
 def notebook_html(calibration: Calibration) -> str:

@@ -152,8 +152,36 @@ class Calibration:
         """Parameter -> source -> its share of the variance, without assumptions; None if the solver does not tell."""
         if self.estimate.budget is None:
             return None
-        calibrated = [q.name for q in quantities_of(self.problem, self.estimate) if q.group is None]
-        return {name: self.estimate.budget[name] for name in calibrated if name in self.estimate.budget}
+        return {name: self.estimate.budget[name] for name in self._calibrated if name in self.estimate.budget}
+
+    @property
+    def sensitivity(self) -> dict[str, SensitivityResult] | None:
+        """Input taken for exact -> what it does to the parameters if off; None if the solver does not tell."""
+        moved = self.estimate.moved
+        if moved is None:
+            return None
+        found = {}
+        for exact in self.method.hypotheses().exact:
+            if exact.name in moved:
+                moves = moved[exact.name]
+                by_unit = {name: moves[name] / exact.step for name in self._calibrated if name in moves}
+                found[exact.name] = SensitivityResult(unit=exact.unit, step=exact.step, parameters=by_unit)
+        return found
+
+    @property
+    def measurements(self) -> list[MeasurementResult] | None:
+        """The measurements that move parameters most; None if the solver does not tell."""
+        if self.estimate.strongest is None:
+            return None
+        return [
+            MeasurementResult(family=p.family, time_s=p.time, parameter=p.parameter, pull=p.sigmas)
+            for p in self.estimate.strongest
+        ]
+
+    @property
+    def _calibrated(self) -> list[str]:
+        """The parameters without assumptions."""
+        return [q.name for q in quantities_of(self.problem, self.estimate) if q.group is None]
 
     @property
     def status(self) -> str:
@@ -439,6 +467,26 @@ class TruthResult(_Record):
     error_sigmas: float | None
 
 
+class SensitivityResult(_Record):
+    """What an input that is taken for exact does: parameter -> change, SI, per unit of the input.
+
+    `step` is what the input is usually off by, one sigma; unit "1" is a share of the input itself.
+    """
+
+    unit: str
+    step: float
+    parameters: dict[str, float]
+
+
+class MeasurementResult(_Record):
+    """A measurement and the parameter that it moves most: by `pull` of its sigmas."""
+
+    family: str
+    time_s: float
+    parameter: str
+    pull: float
+
+
 class SelfCheckResult(_Record):
     """An incremental estimate beside batch's, in sigmas."""
 
@@ -470,6 +518,8 @@ class Result(_Record):
     stability: StabilityResult | None
     self_check: SelfCheckResult | None
     budget: dict[str, dict[str, float]] | None
+    sensitivity: dict[str, SensitivityResult] | None
+    measurements: list[MeasurementResult] | None
     findings: dict[str, list[dict[str, object]]]
     truth: dict[str, TruthResult] | None = None
 
@@ -499,6 +549,8 @@ def result(calibration: Calibration) -> Result:
         stability=_stability(c.stability),
         self_check=None if c.self_check is None else SelfCheckResult(**asdict(c.self_check)),
         budget=None if c.budget is None else {name: dict(shares) for name, shares in c.budget.items()},
+        sensitivity=c.sensitivity,
+        measurements=c.measurements,
         findings={name: [dict(row) for row in rows] for name, rows in c.findings.items()},
         truth=truth_errors(c) if c.truth is not None else None,
     )

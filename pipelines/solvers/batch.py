@@ -8,7 +8,7 @@ is by QR: tight processes beside loose priors cost Cholesky its digits, and QR c
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
@@ -22,7 +22,7 @@ from pipelines.graph.problem import Array, Estimate, Factor, Problem, Residuals
 from pipelines.solvers.assembly import Assembly
 from pipelines.solvers.coloured import added_variance, coloured, inflations
 from pipelines.solvers.history import sequential_history
-from pipelines.solvers.influence import influence, uncertainty_budget
+from pipelines.solvers.influence import Influence, influence, strongest, uncertainty_budget
 from pipelines.solvers.marginals import (
     chi_square,
     eliminated,
@@ -62,6 +62,8 @@ _TIED, _MOST_PLAIN = 1e-9, 10
 _FEWEST_USED = 0.5
 # Solutions with other noise levels.
 _MOST_LEVELS = 8
+# The measurements that matter most are so many.
+_STRONGEST = 20
 
 
 @dataclass(frozen=True)
@@ -161,7 +163,12 @@ class Linearized:
             return cls(graph, bayes_net, expected_squares(system.factors, graph, bayes_net, values))
 
 
-def solve_batch(problem: Problem, most: int = _MOST_ITERATIONS, budget: bool = False) -> Estimate:
+def solve_batch(
+    problem: Problem,
+    most: int = _MOST_ITERATIONS,
+    budget: bool = False,
+    changed: Iterable[tuple[str, Problem]] = (),
+) -> Estimate:
     """The maximum a-posteriori estimate with the joint marginal covariance of its parameters.
 
     Outliers are found by graduated non-convexity on the problem's truncated loss: the final solution is plain least
@@ -170,7 +177,9 @@ def solve_batch(problem: Problem, most: int = _MOST_ITERATIONS, budget: bool = F
     Args:
         problem: to be solved.
         most: iterations of each minimisation, after which it counts as not converged.
-        budget: also where the variance of each number comes from.
+        budget: also where the variance of each number comes from, which measurements move it most, and by how much it
+            is elsewhere in the `changed` graphs.
+        changed: names and graphs of the same recording in which something is a little different.
 
     Raises:
         IndeterminateError: states other than the parameters are not determined; names the variable.
@@ -191,12 +200,16 @@ def solve_batch(problem: Problem, most: int = _MOST_ITERATIONS, budget: bool = F
     with system.at(values):
         summary = chi_square(problem, factors, values, marginal, about.expected)
         colours = coloured(factors, values) if levels else {}
-    sources, inflation = None, np.ones(len(marginal))
+    sources, moved, pulls, inflation = None, None, None, np.ones(len(marginal))
     if budget or colours:
         found = influence(problem, factors, linear, about.bayes_net, values, whole.current_keys)
         added = added_variance(found, colours)
         inflation = inflations(problem, marginal, found.names, added)
-        sources = uncertainty_budget(problem, found, added) if budget else None
+        if budget:
+            sources = uncertainty_budget(problem, found, added)
+            sigmas = zip(problem.quantities, inflation * np.sqrt(np.diag(marginal)), strict=True)
+            pulls = strongest(found, {q.name: sigma for q, sigma in sigmas if not q.assumed}, _STRONGEST)
+            moved = {name: moves for name, other in changed if (moves := _moves(other, solution, levels, found))}
     # Times from which on other variables held the parameters than before; after the last one they are those reported.
     ends = whole.boundaries
     changes = [
@@ -219,10 +232,41 @@ def solve_batch(problem: Problem, most: int = _MOST_ITERATIONS, budget: bool = F
         smoothed=smooth,
         attitudes=problem.attitudes(whole.keyframes, values) if problem.attitudes else None,
         budget=sources,
+        moved=moved,
+        strongest=pulls,
         rejected={family: int((~r.used).sum()) for family, r in residuals.items()},
         levels=levels,
         seconds={"build": built - start, "solve": solved - built, "marginals": done - solved},
     )
+
+
+def _moves(changed: Problem, solution: Solution, levels: tuple[Level, ...], found: Influence) -> dict[str, float]:
+    """By how much the numbers are elsewhere in a graph that is a little different, empty where its variables differ.
+
+    Noise levels, and which measurements are rejected, are those of the solution.
+    """
+    system, values = solution.system, solution.values
+    factors = weigh(Assembly.of(changed.steps(CHUNK)).factors, levels)
+    if [_shape(f) for f in factors] != [_shape(f) for f in system.factors]:
+        return {}
+    with system.at(values):
+        kept = [_without_rejected(f, own, values) for f, own in zip(factors, system.factors, strict=True)]
+    moves = found.moves(system.made_of(kept).under(None).linearize(values))
+    return dict(zip(found.names, moves.tolist(), strict=True))
+
+
+def _shape(factor: Factor) -> tuple[str, list[int], int]:
+    """What the factors of two graphs of one recording have in common: family, variables, how many measurements."""
+    vectorized = factor.vectorized
+    return factor.family, factor.factor.keys(), 0 if vectorized is None else len(vectorized.model.time)
+
+
+def _without_rejected(factor: Factor, like: Factor, values: gtsam.Values) -> Factor:
+    """A factor with no weight on the measurements that another one, of the same, rejects at the values."""
+    if factor.measurement is None or like.measurement is None or (used := like.measurement.used(values)).all():
+        return factor
+    weights = np.ones(1) if factor.measurement.weights is None else factor.measurement.weights
+    return Factor.of(factor.family, factor.measurement.weighed(weights * used[:, None]))
 
 
 def graph_of(factors: Sequence[Factor]) -> gtsam.NonlinearFactorGraph:

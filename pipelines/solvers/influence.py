@@ -1,4 +1,7 @@
-"""The influence of every measurement on every parameter, and from it the uncertainty budget by source.
+"""The influence of every measurement on every parameter, and what follows from it.
+
+That is the uncertainty budget by source, the measurements that move parameters most, and by how much the parameters
+move when the graph is a little different.
 
 At the minimum a small change r of the whitened residuals moves the reported numbers by L r, with
 
@@ -18,7 +21,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from pipelines.graph.problem import Array, Factor, Problem
+from pipelines.graph.problem import Array, Factor, Problem, Pull
 
 # Family of the priors, which are told one by one.
 _PRIOR = "prior"
@@ -53,6 +56,21 @@ class Influence:
             factor = self.linear.at(i)
             A, _ = factor.jacobian()
             yield i, (A @ np.concatenate([self.solutions[key] for key in factor.keys()])).T
+
+    def moves(self, changed: gtsam.GaussianFactorGraph) -> Array:
+        """(n,) by how much the numbers are elsewhere at the minimum of a graph that is a little different.
+
+        To first order that is J N^-1 times the difference of the gradients A^T r, and the rows of the two graphs need
+        not be the same, as compressed ones are not.
+
+        Args:
+            changed: that graph, linearised where this one is.
+        """
+        before, after = self.linear.gradientAtZero(), changed.gradientAtZero()
+        moved = np.zeros(len(self.names))
+        for key, columns in self.solutions.items():
+            moved -= columns.T @ (after.at(key) - before.at(key))
+        return moved
 
 
 def influence(
@@ -134,3 +152,34 @@ def uncertainty_budget(problem: Problem, found: Influence, added: Mapping[str, A
         )
         for j, name in enumerate(found.names)
     }
+
+
+def strongest(found: Influence, sigmas: Mapping[str, float], most: int) -> tuple[Pull, ...]:
+    """The measurements that move a number most, in its sigmas, each with that number.
+
+    A measurement with whitened residuals r takes the numbers elsewhere by its columns of L times r; at the minimum all
+    of these and the priors' are in balance. Measurements of a compressed factor count as one; rejected ones have no
+    influence.
+
+    Args:
+        found: the influence of the residuals.
+        sigmas: of the numbers that are looked at.
+        most: so many at most.
+    """
+    names = [name for name in found.names if name in sigmas]
+    columns = [found.names.index(name) for name in names]
+    scale = np.array([1.0 / sigmas[name] for name in names])
+    pulls: list[Pull] = []
+    for i, rows in found.rows():
+        vectorized = found.factors[i].vectorized
+        if vectorized is None or not names:
+            continue
+        time = vectorized.model.time[-1:] if vectorized.compress else vectorized.model.time
+        _, r = found.linear.at(i).jacobian()
+        moves = (rows[columns] * scale[:, None] * r).reshape(len(names), len(time), -1).sum(axis=2)
+        largest = np.abs(moves).argmax(axis=0)
+        pulls += [
+            Pull(found.factors[i].family, float(t), names[j], float(moves[j, k]))
+            for k, (t, j) in enumerate(zip(time, largest, strict=True))
+        ]
+    return tuple(sorted(pulls, key=lambda pull: -abs(pull.sigmas))[:most])

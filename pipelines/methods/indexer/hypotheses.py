@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
-from pipelines.judgement.hypotheses import AXES, Hypotheses
+from dataclasses import replace
+
+from pipelines.judgement.hypotheses import AXES, ExactInput, Hypotheses
+from pipelines.methods.indexer.recording import IndexerData
+from pipelines.settings import Config
+
+
+def _latitude(data: IndexerData, config: Config, change: float) -> tuple[IndexerData, Config] | None:
+    if data.latitude_deg is None:
+        return None
+    return replace(data, latitude_deg=data.latitude_deg + change), config
+
 
 HYPOTHESES = Hypotheses(
     streams={"gyro_t": ("gyro", "attitude"), "encoder_t": ("outer", "inner")},
     signs={"gyro": ("gyro", AXES), "outer": ("encoder", ("outer",)), "inner": ("encoder", ("inner",))},
     clock=("encoder_t", "encoders"),
+    exact=(ExactInput("latitude_deg", "deg", 0.1, _latitude),),
     cut=False,
 )
