@@ -128,7 +128,8 @@ def test_effects_that_a_recording_determines_are_found() -> None:
 
 def test_ideal_sensors_leave_what_is_calibrated_alone_and_go_wrong() -> None:
     _, truth = _recording()
-    estimate = _estimate("\nsensors: ideal\n")
+    # With the noise stated: what the graph lacks would be taken for noise.
+    estimate = _estimate("\nsensors: ideal\nnoise_known: 0\n")
     assert len(estimate.names) == 10
     error = (estimate.values - [truth[name] for name in estimate.names]) / estimate.sigmas
     assert np.abs(error).max() > 10.0
