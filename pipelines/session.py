@@ -243,14 +243,10 @@ class Session:
                 problem.advice,
                 decides=not noise_levels.asked(estimate.levels),
             )
-            wrong_noise = noise_levels.misfit(
-                estimate.levels,
-                assessment.consistency,
-                estimate.colours,
-                {family: len(r.time) for family, r in estimate.residuals.items()},
-            )
+            counts = {family: len(r.time) for family, r in estimate.residuals.items()}
+            wrong_noise = noise_levels.misfit(estimate.levels, assessment.consistency, estimate.colours, counts)
             misfit = assessment.status == "inconsistent" or bool(wrong_noise) or too_many_rejected(estimate.residuals)
-            doubtful = misfit or noise_levels.suspicious(estimate.levels, estimate.colours)
+            doubtful = misfit or noise_levels.suspicious(estimate.levels, estimate.colours, counts)
             if ours and causes is None and (doubtful or not estimate.converged):
                 with progress.doing("looking for causes"):
                     causes = find_causes(self.method, self.data, self.config, estimate)

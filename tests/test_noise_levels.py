@@ -16,6 +16,7 @@ from factors import so3
 from pipelines import methods
 from pipelines.config import load_config
 from pipelines.graph.problem import Array, Estimate, Problem
+from pipelines.methods.cube.static_intervals import static_intervals
 from pipelines.methods.noise import white_density
 from pipelines.settings import DEFAULT_NOISE, Config
 from pipelines.settings import Noise as NoiseSettings
@@ -94,6 +95,32 @@ def test_noise_known_exactly_is_what_is_used() -> None:
     assert all(level.scale == 1.0 and level.found is None for level in estimate.levels)
     assert estimate.chi_square is not None
     assert estimate.chi_square.value < 0.2 * estimate.chi_square.dof
+
+
+def repeating(seed: int, size: float) -> tuple[Any, Config, Mapping[str, float]]:
+    """A cube whose accelerometer reads something else by `size` m/s^2 at every rest; nobody states so."""
+    data, config, truth = made("cube", seed)
+    spans = static_intervals(data, config)
+    error = size * np.random.default_rng(seed).standard_normal((len(spans) + 1, 3))
+    middle = 0.5 * (spans[1:, 0] + spans[:-1, 1])
+    data = replace(data, accel=data.accel + error[np.searchsorted(middle, data.imu_t)])
+    noise = config.noise.model_copy(update={"accel_repeatability": None})
+    return data, config.model_copy(update={"noise": noise}), truth
+
+
+def test_poses_that_repeat_worse_than_white_noise_says() -> None:
+    size = 8e-3
+    data, config, truth = repeating(1, size)
+    problem = methods.method("cube").problem(data, config)
+    estimate = solve_batch(problem)
+    used = {level.noise.name: level.used for level in estimate.levels}
+    assert used["accel_repeatability"] == pytest.approx(size, rel=0.35)
+    of = [i for i, name in enumerate(estimate.names) if name.startswith("accel_")]
+    error = np.array([(estimate.values[i] - truth[estimate.names[i]]) / estimate.sigmas[i] for i in of])
+    assert np.abs(error).max() < 3.5
+    white = solve_batch(methods.method("cube").problem(data, config.model_copy(update={"noise_known": 0.0})))
+    error = np.array([(white.values[i] - truth[white.names[i]]) / white.sigmas[i] for i in of])
+    assert np.abs(error).max() > 5.0
 
 
 def coloured(seed: int, tau: float) -> tuple[Problem, Array]:

@@ -25,13 +25,16 @@ def asked(levels: Sequence[Level]) -> bool:
     return any(level.noise.estimated for level in levels)
 
 
-def suspicious(levels: Sequence[Level], colours: Mapping[str, float]) -> bool:
-    """Whether residuals are so much larger than stated that another cause is to be looked for: white ones are noise."""
+def suspicious(levels: Sequence[Level], colours: Mapping[str, float], counts: Mapping[str, int]) -> bool:
+    """Whether measurements err by so much more than stated that another cause is to be looked for.
+
+    White residuals are noise. Arguments as `misfit` has them.
+    """
+    told = [(level, counts.keys() & set(level.noise.families)) for level in levels]
     return any(
-        level.contradicted
-        and (level.found or 0.0) > (_SUSPICIOUS if colours.keys() & set(level.noise.families) else _NO_NOISE)
-        for level in levels
-        if level.noise.families
+        level.found > (_SUSPICIOUS if colours.keys() & families else _NO_NOISE)
+        for level, families in told
+        if families and level.contradicted and level.found is not None
     )
 
 

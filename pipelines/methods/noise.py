@@ -85,7 +85,8 @@ def sampled(noise: Noise, time: Array, samples: Array) -> Level:
     found = white_density(time, samples) if noise.known > 0.0 and noise.stated > 0.0 else None
     held = replace(noise, families=())
     if found is None:
-        return Level(held)
+        # What neither anybody states nor samples tell is asked of the residuals after all.
+        return Level(noise if noise.source == _DEFAULT else held)
     ratio, spread = found[0] / noise.stated, max(found[1], _TRUSTED)
     level = _weighed(Level(held, 1.0, ratio, ratio * spread))
     if noise.families and level.scale < _MUCH_SMALLER:

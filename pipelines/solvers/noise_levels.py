@@ -36,13 +36,15 @@ _FEWEST = 50
 _NEWTON = 20
 # A noise beside others is looked for within this of what was stated, in the logarithm.
 _WIDEST = 7.0
+# Of it a residual counts as no more than this, in sigmas; what the square of a normal number is then expected to be.
+_CLIPPED, _EXPECTED = 2.0, 0.9205
 # A sum of squares is too small by so many of its sigmas.
 _APART = 3.0
 
 
 def weigh(factors: Sequence[Factor], levels: Sequence[Level]) -> list[Factor]:
     """The factors with their measurements' noise at these levels."""
-    scaled = [level for level in levels if level.scale != 1.0 or (level.noise.beside and level.used > 0.0)]
+    scaled = [level for level in levels if (level.used > 0.0 if level.noise.beside else level.scale != 1.0)]
     if not scaled:
         return list(factors)
     families = {family for level in scaled for family in level.noise.families}
@@ -154,7 +156,8 @@ def _found_beside(
     """A noise beside others as the residuals have it, and whether that changes little.
 
     With v the variance of a row, f the part of it that is this noise's, and e the residual, all rows alike redundant,
-    the root of: sum f (e^2 / v - r / n) - ln(level) / tau^2.
+    the root of: sum f (e^2 / v - r / n) - ln(level) / tau^2. What is beyond two sigmas counts
+    as that, so that a pose near iron does not pass for repeatability.
     """
     own = [(f, v) for f in factors if f.family in level.noise.families and (v := f.vectorized) is not None]
     unit = np.concatenate(
@@ -167,7 +170,8 @@ def _found_beside(
     while high - low > 1e-3:
         middle = 0.5 * (low + high)
         part = unit * np.exp(2.0 * middle)
-        score = (part / (rest + part) * (square / (rest + part) - share)).sum() - middle / level.known**2
+        whitened = np.minimum(square / (share * (rest + part)), _CLIPPED**2) / _EXPECTED
+        score = share * (part / (rest + part) * (whitened - 1.0)).sum() - middle / level.known**2
         low, high = (middle, high) if score > 0.0 else (low, middle)
     scale = float(np.exp(low))
     part = unit * scale**2
@@ -211,8 +215,10 @@ def _rows(noise: Noise, rows: int) -> list[int]:
 def _size(noise: Noise, factors: Sequence[Factor], values: gtsam.Values) -> tuple[float, float]:
     """Sum of squares of a noise's whitened residuals that are used, and what it would be if all were of typical size.
 
-    Of few residuals the latter is 0.
+    Of few residuals, and of processes, the latter is 0.
     """
+    if any(f.measurement is None for f in factors if f.family in noise.families):
+        return sum(sum_of_squares(f, values) for f in factors if f.family in noise.families), 0.0
     parts, used = [], []
     for f in factors:
         if f.measurement is not None and f.family in noise.families:

@@ -139,7 +139,9 @@ def cube_config(scenario: CubeScenario, images: bool = False) -> str:
     """The recording's config (YAML): the cube as built to the drawing, the noise simulated, the scenario's priors."""
     from ruamel.yaml import YAML
 
-    noise = scenario.noise.model_dump()
+    # Simulated sensors repeat as well as white noise lets them.
+    repeats = {f"{name}_repeatability": 0.0 for name in ("gyro", "turn", "accel", "mag")}
+    noise = {**scenario.noise.model_dump(), **repeats}
     if images:
         del noise["corner_px"]  # the tracker's own
     config: dict[str, Any] = {"method": "cube", "noise": noise, "priors": scenario.priors, "date": "2026-11-20"}
