@@ -94,10 +94,10 @@ def solved(data: bytes, path: Path) -> str:
 def test_many_damaged_recordings_are_calibrated_rightly_or_not_at_all(session: bytes, tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     for name, copies in {
-        "cut at a record": cuts(session),
-        "cut anywhere": [session[:at] for at in rng.integers(8, len(session), 200)],
-        "one byte": flips(session, 500, 3),
-        "stretches and several bytes": spoilt(session, 200, 4),
+        "cut at a record": cuts(session)[::3],
+        "cut anywhere": [session[:at] for at in rng.integers(8, len(session), 70)],
+        "one byte": flips(session, 170, 3),
+        "stretches and several bytes": spoilt(session, 70, 4),
     }.items():
         print(name, dict(Counter(solved(data, tmp_path / "x.mcap") for data in copies)), flush=True)
 

@@ -132,14 +132,14 @@ def test_the_consistency_page_lists_every_solver(scheduler: str, scenario: Path,
 
 
 # Shorter than the nominal recordings: `python -m pipelines.fleet.consistency` has the whole study.
-SHORT = {"los": "{duration_s: 30.0, sensors: {}}", "head": "{duration_s: 30.0, vision_rate_hz: 15.0, sensors: {}}"}
+BRIEF = {"los": "{duration_s: 30.0, sensors: {}}", "head": "{duration_s: 30.0, vision_rate_hz: 15.0, sensors: {}}"}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", names())
 def test_batch_and_incremental_are_consistent(method: str, tmp_path: Path) -> None:
     scenario = tmp_path / "scenario.yaml"
-    scenario.write_text(SHORT.get(method, "{sensors: {}}"))
+    scenario.write_text(BRIEF.get(method, "{sensors: {}}"))
     study = run_study(method, str(scenario), range(8), ("batch", "incremental"), tmp_path, jobs=2)
     for solver in study.solvers:
         assert not study.failures(solver)
