@@ -156,8 +156,8 @@ def _found_beside(
     """A noise beside others as the residuals have it, and whether that changes little.
 
     With v the variance of a row, f the part of it that is this noise's, and e the residual, all rows alike redundant,
-    the root of: sum f (e^2 / v - r / n) - ln(level) / tau^2. What is beyond two sigmas counts
-    as that, so that a pose near iron does not pass for repeatability.
+    the root of: sum f (e^2 / v - r / n) - ln(level) / tau^2. Where outliers are
+    rejected, what is beyond two sigmas counts as that: a pose near iron is not to pass for repeatability.
     """
     own = [(f, v) for f in factors if f.family in level.noise.families and (v := f.vectorized) is not None]
     unit = np.concatenate(
@@ -166,11 +166,13 @@ def _found_beside(
     variance = np.concatenate([_weights(v) for _, v in own]) ** -2.0
     square = np.concatenate([v.residuals(values) for _, v in own]) ** 2 * variance
     rest, share = variance - unit * level.scale**2, redundancy / variance.size
+    rejecting = any(v.loss is not None for _, v in own)
+    most, expected = (_CLIPPED**2, _EXPECTED) if rejecting else (np.inf, 1.0)
     low, high = -_WIDEST, _WIDEST
     while high - low > 1e-3:
         middle = 0.5 * (low + high)
         part = unit * np.exp(2.0 * middle)
-        whitened = np.minimum(square / (share * (rest + part)), _CLIPPED**2) / _EXPECTED
+        whitened = np.minimum(square / (share * (rest + part)), most) / expected
         score = share * (part / (rest + part) * (whitened - 1.0)).sum() - middle / level.known**2
         low, high = (middle, high) if score > 0.0 else (low, middle)
     scale = float(np.exp(low))

@@ -14,8 +14,9 @@ from pipelines.settings import Config
 _SPAN = 0.5
 # Shorter intervals, s, are turning points of a motion.
 _SHORTEST = 0.5
-# Quiet: the scatter over the span is below this many times the noise.
-_QUIET = 2.0
+# The scatter over the span is below the first many times the noise somewhere in an interval, and below the second all
+# through it: a hand's tremor does not end a rest.
+_QUIET, _STILL = 2.0, 6.0
 # A motion starts slower than the test can see: this much, s, is cut off at both ends.
 _MARGIN = 0.25
 # The noise is what the quietest twentieth of the recording shows, between these multiples of the stated one.
@@ -59,12 +60,14 @@ def find_static_intervals(t: Array, gyro: Array, accel: Array, gyro_sigma: float
     stated = np.array([gyro_sigma, accel_sigma])
     low, high = _FLOOR_LIMITS
     floor = np.clip(np.quantile(scatter, _FLOOR_SHARE, axis=1), low * stated, high * stated)
-    quiet = np.all(scatter < _QUIET * floor[:, None], axis=0)
+    quiet, still = (np.all(scatter < limit * floor[:, None], axis=0) for limit in (_QUIET, _STILL))
     dense = np.diff(t) < _GAP_SAMPLES * interval
-    quiet &= np.append(dense, True) & np.append(True, dense)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], quiet, [False]]).astype(int)))
+    still &= np.append(dense, True) & np.append(True, dense)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int))).reshape(-1, 2)
+    counted = np.append(0, np.cumsum(quiet & still))
+    edges = edges[counted[edges[:, 1]] > counted[edges[:, 0]]]
     margin = round(_MARGIN / interval)
-    runs = edges.reshape(-1, 2) + np.array([margin, -1 - margin])
+    runs = edges + np.array([margin, -1 - margin])
     runs = runs[runs[:, 1] > runs[:, 0]]
     runs = runs[t[runs[:, 1]] - t[runs[:, 0]] >= _SHORTEST]
     runs = runs[_turns_not(gyro, runs, floor[0])]
