@@ -97,7 +97,7 @@ def test_errors_fit_their_covariance_in_a_few_short_runs(scenario: LosScenario, 
 @pytest.mark.parametrize("solve", [solve_batch, solve_incremental])
 @pytest.mark.parametrize("sensors", [Sensors(), IDEAL], ids=["real", "ideal"])
 def test_errors_fit_their_covariance_over_many_runs(sensors: Sensors, solve: Solve) -> None:
-    runs = 20
+    runs = 20 if solve is solve_batch else 12
     scenario = LosScenario(sensors=sensors, image_rate_hz=25.0, gyro_rate_hz=200.0)
     mean, size = _mean_nees(scenario, solve, runs)
     assert quantile(5e-3, runs * size) < runs * mean < quantile(1 - 5e-3, runs * size)
@@ -256,7 +256,10 @@ def test_independent_recording(shared_data: Path) -> None:
 def test_independent_pictures(shared_data: Path) -> None:
     _, assessment, z = _contract(shared_data / "contract" / "los_images_tag.mcap")
     assert np.abs(z).max() < 3.0
-    assert assessment.status == "calibrated"
+    assert assessment.status == "weak"
+    _, ideal, z = _contract(shared_data / "contract" / "los_images_tag.mcap", IDEAL)
+    assert np.abs(z).max() < 3.0
+    assert ideal.status == "calibrated"
 
 
 @pytest.mark.parametrize("solve", [solve_batch, pytest.param(solve_incremental, marks=pytest.mark.slow)])
