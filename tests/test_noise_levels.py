@@ -65,7 +65,7 @@ def assert_as_right(method: str, seed: int, factors: dict[str, float], solve: Ca
     np.testing.assert_allclose(wrong.sigmas[free], as_it_is.sigmas[free], rtol=0.15)
 
 
-@pytest.mark.parametrize("factor", [3.0, 1.0 / 3.0])
+@pytest.mark.parametrize("factor", [3.0, pytest.param(1.0 / 3.0, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("method", CASES)
 def test_all_noise_stated_wrong(method: str, factor: float) -> None:
     factors = dict.fromkeys(CASES[method][1], factor)
@@ -152,7 +152,7 @@ def test_white_noise_inflates_nothing() -> None:
         assert (inflation < 1.05).all()
 
 
-@pytest.mark.parametrize("solve", [solve_batch, solve_incremental])
+@pytest.mark.parametrize("solve", [solve_batch, pytest.param(solve_incremental, marks=pytest.mark.slow)])
 def test_colour_inflates_what_vision_tells(solve: Callable[[Problem], Estimate]) -> None:
     problem, truth = coloured(0, 0.2)
     errors, inflation = in_sigmas(problem, truth, solve)
@@ -198,9 +198,8 @@ def test_nothing_stated_and_honest(grade: str) -> None:
     assert 0.8 < unstated(grade, range(50)) < 1.25
 
 
-@pytest.mark.parametrize("grade", GRADES)
-def test_nothing_stated_and_honest_on_a_few(grade: str) -> None:
-    assert 0.6 < unstated(grade, range(4)) < 1.6
+def test_nothing_stated_and_honest_on_a_few() -> None:
+    assert 0.6 < unstated("consumer", range(4)) < 1.6
 
 
 def test_white_noise_of_a_sensor_in_motion() -> None:
