@@ -266,7 +266,7 @@ class Session:
                 assessment = assessment.remarked(sentence) if small else assessment.misfit(sentence)
             checked = None
             if check and estimate.solver == "incremental":
-                checked = SelfCheck.of(estimate, self._solve("batch", None)[0])
+                checked = SelfCheck.of(estimate, self._batch_beside())
                 assessment = assessment.remarked(checked.sentence if checked else "")
             if ours:
                 assessment = assessment.remarked(*noise_levels.remarks(estimate.levels), *problem.premises)
@@ -323,6 +323,13 @@ class Session:
             except InputError:  # on the edge of what can be used, a step farther than the recording itself
                 continue
             yield exact.name, problem
+
+    def _batch_beside(self) -> Estimate:
+        """Batch's estimate to compare with: without what its own report would tell of it."""
+        from pipelines.solvers.batch import solve_batch
+
+        with progress.doing("solving"):
+            return solve_batch(self.problem())
 
     def _published(self) -> Estimate | None:
         """The published solver's estimate, where it can serve the recording: it needs more than the graphs."""

@@ -156,13 +156,11 @@ def _found_beside(
     """A noise beside others as the residuals have it, and whether that changes little.
 
     With v the variance of a row, f the part of it that is this noise's, and e the residual, all rows alike redundant,
-    the root of: sum f (e^2 / v - r / n) - ln(level) / tau^2. Where outliers are
-    rejected, what is beyond two sigmas counts as that: a pose near iron is not to pass for repeatability.
+    the root of: sum f (e^2 / v - r / n) - ln(level) / tau^2. Where outliers are rejected, what is beyond two sigmas
+    counts as that: a pose near iron is not to pass for repeatability.
     """
     own = [(f, v) for f in factors if f.family in level.noise.families and (v := f.vectorized) is not None]
-    unit = np.concatenate(
-        [np.broadcast_to(_beside(f, level.noise.stated), (len(v.model.time), v.model.rows)) for f, v in own]
-    )
+    unit = np.concatenate([_beside(f, level.noise.stated) for f, _ in own])
     variance = np.concatenate([_weights(v) for _, v in own]) ** -2.0
     square = np.concatenate([v.residuals(values) for _, v in own]) ** 2 * variance
     rest, share = variance - unit * level.scale**2, redundancy / variance.size
@@ -189,7 +187,7 @@ def _within(level: Level, factors: Sequence[Factor], values: gtsam.Values, redun
     these fit, else it is taken down to its samples and up from there as far as its residuals ask for.
     """
     assert level.least is not None
-    ratio = sum(sum_of_squares(f, values) for f in factors if f.family in level.noise.families) / redundancy
+    ratio = _square(level.noise, factors, values) / redundancy
     if level.scale == 1.0:
         fits = ratio > 1.0 - _APART * (2.0 / redundancy) ** 0.5
         if fits:
@@ -214,13 +212,18 @@ def _rows(noise: Noise, rows: int) -> list[int]:
     return list(range(rows)) if noise.rows is None else [row for row in noise.rows if row < rows]
 
 
+def _square(noise: Noise, factors: Sequence[Factor], values: gtsam.Values) -> float:
+    """Sum of squares of all whitened residuals of a noise's families that are used."""
+    return sum(sum_of_squares(f, values) for f in factors if f.family in noise.families)
+
+
 def _size(noise: Noise, factors: Sequence[Factor], values: gtsam.Values) -> tuple[float, float]:
     """Sum of squares of a noise's whitened residuals that are used, and what it would be if all were of typical size.
 
     Of few residuals, and of processes, the latter is 0.
     """
     if any(f.measurement is None for f in factors if f.family in noise.families):
-        return sum(sum_of_squares(f, values) for f in factors if f.family in noise.families), 0.0
+        return _square(noise, factors, values), 0.0
     parts, used = [], []
     for f in factors:
         if f.measurement is not None and f.family in noise.families:
