@@ -37,7 +37,13 @@ Source = str | Path | Simulated | Mapping[str, Any] | Any
 Settings = _BaseConfig | str | Path | None
 
 
-def open(source: Source, method: str | None = None, config: Settings = None, strict: bool = False) -> Session:
+def open(
+    source: Source,
+    method: str | None = None,
+    config: Settings = None,
+    strict: bool = False,
+    prior: str | Path | None = None,
+) -> Session:
     """A recording, or arrays, ready to be calibrated.
 
         alidade.open("session.mcap")
@@ -50,10 +56,16 @@ def open(source: Source, method: str | None = None, config: Settings = None, str
         method: its name; by default that of the config, or the only one the recording can serve.
         config: overrides, key by key, the config that comes with the source.
         strict: refuse a recording of which anything is lost.
+        prior: an earlier calibration of the device to begin from: its result.json or calibration.yaml.
 
     Raises:
-        InputError: source or config cannot be used.
+        InputError: source, config or prior cannot be used.
     """
+    session = _open(source, method, config, strict)
+    return session if prior is None else session.beginning_from(Path(prior))
+
+
+def _open(source: Source, method: str | None, config: Settings, strict: bool) -> Session:
     override = Path(config) if isinstance(config, str) else config
     if isinstance(source, str | Path):
         return Session.read(open_recording(Path(source), strict), method, override)
@@ -78,6 +90,7 @@ def calibrate(
     method: str | None = None,
     config: Settings = None,
     window: float | None = 1.0,
+    prior: str | Path | None = None,
 ) -> Calibration:
     """Open and calibrate in one go (arguments as `open` and `Session.calibrate` have them).
 
@@ -85,7 +98,7 @@ def calibrate(
         InputError: source or config cannot be used, or there is no such solver.
         IndeterminateError: states other than the parameters are not determined.
     """
-    return open(source, method, config).calibrate(solver, window)
+    return open(source, method, config, prior=prior).calibrate(solver, window)
 
 
 def simulate(

@@ -73,6 +73,9 @@ _Strict = Annotated[bool, typer.Option("--strict", help="Refuse a recording of w
 _AutoTopics = Annotated[bool, typer.Option("--auto-topics", help="Take the topics that `info` suggests.")]
 _Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")]
 _NoCheck = Annotated[bool, typer.Option("--no-check", help="Do not hold an incremental result against batch.")]
+_Prior = Annotated[
+    Path | None, typer.Option(help="An earlier calibration of the device to begin from: result.json, calibration.yaml.")
+]
 _Window = Annotated[str, typer.Option(help="Of the incremental solver: seconds kept, or 'all'.")]
 
 
@@ -101,6 +104,7 @@ def calibrate(
     strict: _Strict = False,
     auto_topics: _AutoTopics = False,
     jobs: _PictureJobs = None,
+    prior: _Prior = None,
     no_check: _NoCheck = False,
     as_json: _Json = False,
     quiet: Quiet = False,
@@ -114,7 +118,7 @@ def calibrate(
     folder = out or _beside(session, solver.value)
     with progress.shown(quiet or as_json), parallel.processes(jobs):
         (calibration,) = run(
-            session, [solver.value], method, config, _seconds(window), strict, auto_topics, not no_check
+            session, [solver.value], method, config, _seconds(window), strict, auto_topics, not no_check, prior
         )
         with progress.doing("writing"):
             written = write_results(folder, calibration)

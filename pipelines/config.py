@@ -51,7 +51,7 @@ def load_config(attachment: bytes | None, override: Path | Config | None = None)
     except ValidationError as error:
         # An unknown key explains more than what follows from it.
         first = min(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
-        path = tuple(part for part in first["loc"] if part != "[key]")
+        path = tuple(part for part in first["loc"] if not str(part).startswith("["))
         said = path[:-1] if first["type"] == "missing" else path
         where = str(override) if _has(more, said) else f"attachment {ATTACHMENT}"
         raise InputError(f"{where}: {_explain(path, first)}") from error

@@ -143,7 +143,7 @@ def predict(method_name: str, scenario: Scenario, config_file: Path | None, requ
     session = Session.of(method, method.simulate(method.scenario.model_validate(scenario), _SEED), config_file)
     # The noise asked about is that of the config; the recording is only simulated.
     config = session.config.model_copy(update={"require": {**session.config.require, **require}, "noise_known": 0.0})
-    problem = method.problem(session.data, config)
+    problem = method.graph(session.data, config)
     try:
         estimate = solve_batch(problem, budget=True)
     except IndeterminateError as error:

@@ -34,9 +34,11 @@ from pipelines.methods import Method
 from pipelines.recording.info import SessionFacts, facts_of, lacking
 from pipelines.recording.message_reader import ENCODING
 from pipelines.recording.reading import Recording, open_recording
+from pipelines.reports.known import load_known
 from pipelines.reports.result import Calibration
 from pipelines.reports.units import human_unit, to_digits_of
 from pipelines.settings import TRUTH, Config
+from pipelines.sharing import device_belief
 from pipelines.simulation.simulated import Simulated
 
 SOLVERS = ("batch", "incremental", "published")
@@ -154,6 +156,7 @@ class Session:
         method_name: str | None,
         config_file: Path | Config | None,
         auto_topics: bool = False,
+        prior: Path | None = None,
     ) -> Session:
         """Read and check a recording (arguments and exceptions as `calibrate` has them)."""
         config = recorded_config(recording, config_file)
@@ -167,7 +170,18 @@ class Session:
                 raise
             nearest = nearest_suggestion(suggestions(recording, config, [chosen.name]))
             raise InputError(f"{error}{f'; nearest is {nearest}' if nearest else ''}") from error
-        return cls(chosen, data, config, Recorded(recording))
+        session = cls(chosen, data, config, Recorded(recording))
+        return session if prior is None else session.beginning_from(prior)
+
+    def beginning_from(self, prior: Path) -> Session:
+        """The same with what an earlier calibration says of the device as prior; a result.json or calibration.yaml.
+
+        Raises:
+            InputError: it cannot be used, is another method's, or was made of this recording.
+        """
+        known, origin = load_known(prior), self.origin
+        belief = device_belief(known, self.method, self.config, origin.sha256(), origin.epoch_ns)
+        return replace(self, config=self.config.believing(belief))
 
     def again(self, recording: Recording) -> Session:
         """The same method and config with another recording, or another part of it. Raises InputError."""
@@ -183,7 +197,7 @@ class Session:
     def problem(self) -> Problem:
         """The graph. Raises InputError when the data are too few, or the config says what the method has no use for."""
         _check_sheets(self.method, self.config)
-        return self.method.problem(self.data, self.config)
+        return self.method.graph(self.data, self.config)
 
     @cached_property
     def facts(self) -> SessionFacts:
@@ -319,7 +333,7 @@ class Session:
             if changed is None:
                 continue
             try:
-                problem = self.method.problem(*changed)
+                problem = self.method.graph(*changed)
             except InputError:  # on the edge of what can be used, a step farther than the recording itself
                 continue
             yield exact.name, problem
@@ -348,6 +362,7 @@ def calibrate(
     strict: bool = False,
     auto_topics: bool = False,
     check: bool = False,
+    prior: Path | None = None,
 ) -> list[Calibration]:
     """One calibration a solver, from one reading of the recording.
 
@@ -360,6 +375,7 @@ def calibrate(
         strict: refuse a recording of which anything is lost.
         auto_topics: take the topics that `alidade info` suggests where those of the method are not there.
         check: hold an incremental calibration against batch.
+        prior: an earlier calibration of the device to begin from, result.json or calibration.yaml.
 
     Raises:
         InputError: recording or config cannot be used, or there is no such solver.
@@ -367,7 +383,7 @@ def calibrate(
     """
     start = time.perf_counter()
     with progress.doing("reading"):
-        session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics)
+        session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics, prior)
     return session.calibrations(solvers, window, {"read": time.perf_counter() - start}, check)
 
 

@@ -11,8 +11,20 @@ import datetime
 from collections.abc import Collection, Iterable
 from typing import Annotated, ClassVar, TypeVar
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_serializer
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    PlainValidator,
+    PrivateAttr,
+    model_serializer,
+)
+from pydantic import Tag as Case
 
+from pipelines.belief import Belief, independent
 from pipelines.errors import InputError, nearest
 from pipelines.recording.sources import TopicSource
 from pipelines.recording.table_topics import TableTopic
@@ -220,6 +232,31 @@ class Board(Section):
     tags: dict[int, Tag] = {}
 
 
+class KnownPrior(Section):
+    """A prior with a mean; sigma 0 fixes the parameter there."""
+
+    mean: float
+    sigma: SigmaOrZero
+
+
+# A sigma, null, or mean and sigma; the names of cases are left out of messages.
+PriorEntry = Annotated[
+    Annotated[SigmaOrZero | None, Case("[sigma]")] | Annotated[KnownPrior, Case("[known]")],
+    Discriminator(lambda given: "[known]" if isinstance(given, (dict, KnownPrior)) else "[sigma]"),
+]
+
+
+def _share(value: object) -> str | float:
+    if value in ("device", "recording"):
+        return str(value)
+    if isinstance(value, int | float) and not isinstance(value, bool) and 0.0 <= value < float("inf"):
+        return float(value)
+    raise ValueError("must be device, recording, or how far it walks in the root of a day")
+
+
+Share = Annotated[str | float, PlainValidator(_share)]
+
+
 class MethodSection(Section):
     """What a config says for one method alone, under that method's key."""
 
@@ -237,11 +274,33 @@ class Config(Section):
     columns: dict[str, TableTopic] = {}
     noise: Noise = Noise()
     noise_known: SigmaOrZero = 0.1
-    priors: dict[str, SigmaOrZero | None] = {}
+    priors: dict[str, PriorEntry] = {}
+    share: dict[str, Share] = {}
     require: dict[str, Sigma] = {}
     sensors: SensorSheets = Sensors()
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None
     date: Date | None = None
+    _belief: Belief | None = PrivateAttr(None)
+
+    def prior(self, name: str, default: float | None) -> float | None:
+        """Sigma of a parameter's prior where the config gives one, else the default."""
+        given = self.priors.get(name, default)
+        return given.sigma if isinstance(given, KnownPrior) else given
+
+    def believing(self, belief: Belief) -> Config:
+        """The same config with what is known from elsewhere; what it says of priors itself goes before that."""
+        out = self.model_copy()
+        out._belief = belief
+        return out
+
+    @property
+    def beliefs(self) -> list[Belief]:
+        """Priors with means: those given by hand, and what is known from elsewhere of the other parameters."""
+        given = {name: prior for name, prior in self.priors.items() if isinstance(prior, KnownPrior)}
+        by_hand = independent(list(given), [p.mean for p in given.values()], [p.sigma for p in given.values()])
+        if self._belief is None:
+            return [by_hand] if given else []
+        return [by_hand, self._belief.of([name for name in self._belief.names if name not in self.priors])]
 
     def topic(self, topic: Topic) -> str:
         """Name of a topic, renamed or default."""

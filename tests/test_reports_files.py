@@ -73,6 +73,7 @@ def test_result_json_has_the_contracts_keys() -> None:
     assert content["chi_square"]["low"] < 588.0 < content["chi_square"]["high"]
     assert content["session"] == {
         "sha256": "ab" * 32,
+        "start": "2026-11-20T12:00:00+00:00",
         "duration_s": 9.5,
         "counts": {"/head/imu": 3800, "vision": 196},
         "dropped": {"/vision/attitude: not finite": 3, "vision: outliers": 4},

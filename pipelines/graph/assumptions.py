@@ -79,7 +79,7 @@ def quantities(assumption: Assumption, config: Config) -> tuple[Quantity, ...]:
     usual = sheet or assumption.sigma
 
     def quantity(name: str) -> Quantity:
-        prior = config.priors.get(name, sheet)
+        prior = config.prior(name, sheet)
         if prior is None:
             prior = _FREE * usual
         figure = f"{assumption.sheet}.{assumption.figure}"

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from factors import so3
-from pipelines.graph.problem import Array, Factor, Parameter
+from pipelines.graph.problem import Array, Factor, Parameter, Quantity
 
 # A fixed quantity is held by a prior this much tighter than the accuracy wanted of it.
 _PINNED = 1e-6
@@ -18,11 +18,13 @@ _FREE = 10.0
 def prior_sigmas(parameter: Parameter) -> Array:
     """(n,) sigmas of the prior factor."""
     return np.array(
-        [
-            _FREE * q.prior_scale if q.prior_sigma is None else q.prior_sigma or _PINNED * min(q.require, q.prior_scale)
-            for q in parameter.quantities
-        ]
+        [_FREE * q.prior_scale if q.prior_sigma is None else q.prior_sigma or pinned(q) for q in parameter.quantities]
     )
+
+
+def pinned(quantity: Quantity) -> float:
+    """The sigma that holds a fixed quantity."""
+    return _PINNED * min(quantity.require, quantity.prior_scale)
 
 
 def vector_prior(parameter: Parameter, mean: Array) -> Factor:

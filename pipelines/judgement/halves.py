@@ -70,7 +70,7 @@ def split_at(method: Method, data: Any, config: Config, middle: float) -> dict[s
         return {}
     a, b = first.estimate, second.estimate
     found = {}
-    for i, q in enumerate(method.problem(data, config).quantities):
+    for i, q in enumerate(method.graph(data, config).quantities):
         sigmas = float(a.sigmas[i]), float(b.sigmas[i])
         if 0.0 < max(sigmas) < _DETERMINED * q.scale:
             found[q.name] = Halves(float(a.values[i]), sigmas[0], float(b.values[i]), sigmas[1])

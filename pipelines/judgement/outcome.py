@@ -76,7 +76,7 @@ def outcome(method: Method, data: Any, config: Config) -> Outcome | None:
     from pipelines.solvers.batch import solve_batch
 
     try:
-        problem = method.problem(data, config)
+        problem = method.graph(data, config)
         return Outcome.of(problem, solve_batch(problem, _ENOUGH))
     except Exception:
         return None
@@ -88,7 +88,7 @@ def quick_score(method: Method, data: Any, config: Config) -> float:
     Infinite when there is no solution, whatever a trial raises.
     """
     try:
-        return _score(method.problem(data, config))
+        return _score(method.graph(data, config))
     except Exception:
         return np.inf
 

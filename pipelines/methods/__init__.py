@@ -53,6 +53,7 @@ class Method(ABC):
         needs: what it cannot do without.
         section: the model of its own section of the config, if it has one.
         sheets: the data sheets it uses, as under `sensors` in the config.
+        of_recording: patterns of the parameters that belong to a recording; the others are the device's.
         rotations: parameters that are rotation vectors, without their _x, _y, _z -> the rotation each is.
         scenarios: folder with scenarios that come with the method, if it brings its own.
     """
@@ -63,6 +64,7 @@ class Method(ABC):
     needs: ClassVar[tuple[Need, ...]]
     section: ClassVar[type[MethodSection] | None] = None
     sheets: ClassVar[tuple[str, ...]] = ()
+    of_recording: ClassVar[tuple[str, ...]] = ()
     rotations: ClassVar[Mapping[str, str]] = {}
     scenarios: ClassVar[Path | None] = None
 
@@ -80,6 +82,12 @@ class Method(ABC):
     @abstractmethod
     def problem(self, data: Any, config: Config) -> Problem:
         """The graph. Raises InputError when the data are too few, or the config names no such parameter."""
+
+    def graph(self, data: Any, config: Config) -> Problem:
+        """The graph with what the config knows of parameters in place of their priors. Raises as `problem` does."""
+        from pipelines.graph.believing import believing
+
+        return believing(self.problem(data, config), config.beliefs)
 
     @abstractmethod
     def published(self, data: Any, config: Config, problem: Problem) -> Estimate:

@@ -6,7 +6,6 @@ saved.value("gyro_bias_x"), saved.rotations["helmet_mount"]
 
 from __future__ import annotations
 
-import datetime
 from collections.abc import Mapping
 from io import StringIO
 from pathlib import Path
@@ -113,12 +112,11 @@ def saved(calibration: Calibration) -> SavedCalibration:
         p.name: SavedParameter(value=_rounded(p.value), sigma=_rounded(p.sigma), unit=p.unit, verdict=p.observability)
         for p in calibration.parameters.values()
     }
-    start = datetime.datetime.fromtimestamp(calibration.facts.epoch_ns // 1_000_000_000, datetime.UTC)
     return SavedCalibration(
         method=method,
         solver=calibration.estimate.solver,
         status=calibration.assessment.status,
-        recording=SavedRecording(file=calibration.recording, sha256=calibration.sha256, start=start.isoformat()),
+        recording=SavedRecording(file=calibration.recording, sha256=calibration.sha256, start=calibration.start),
         parameters=parameters,
         rotations=_rotations(calibration),
         findings={name: [_plain(row) for row in rows] for name, rows in calibration.findings.items()},

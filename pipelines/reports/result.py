@@ -6,6 +6,7 @@ result_json(calibration)            # the contract's text of result.json
 
 from __future__ import annotations
 
+import datetime
 import math
 import platform
 from collections.abc import Callable, Mapping, Sequence
@@ -120,6 +121,7 @@ class Calibration:
                 sigma=float(sigma),
                 unit=q.unit,
                 prior_sigma=q.prior_sigma,
+                prior_mean=q.prior_mean,
                 require=q.require if q.judged else None,
                 observability=self.assessment.verdicts.get(q.name),
                 group=q.group,
@@ -182,6 +184,11 @@ class Calibration:
     def _calibrated(self) -> list[str]:
         """The parameters without assumptions."""
         return [q.name for q in quantities_of(self.problem, self.estimate) if q.group is None]
+
+    @property
+    def start(self) -> str:
+        """Of the recording, ISO 8601."""
+        return datetime.datetime.fromtimestamp(self.facts.epoch_ns // 1_000_000_000, datetime.UTC).isoformat()
 
     @property
     def status(self) -> str:
@@ -356,6 +363,7 @@ class ParameterResult(_Record):
     sigma: float
     unit: str
     prior_sigma: float | None
+    prior_mean: float = 0.0
     require: float | None
     observability: Verdict | None
     group: Literal["assumption"] | None = None
@@ -364,9 +372,10 @@ class ParameterResult(_Record):
 
     @model_serializer(mode="wrap")
     def _without_group(self, handler: SerializerFunctionWrapHandler) -> dict[str, object]:
-        """What is calibrated belongs to no group and has no pull."""
+        """What is calibrated belongs to no group and has no pull; a prior about 0 has no mean."""
         content: dict[str, object] = handler(self)
-        return content if self.group else {k: v for k, v in content.items() if k not in ("group", "pull")}
+        left_out = {*(() if self.group else ("group", "pull")), *(() if self.prior_mean else ("prior_mean",))}
+        return {k: v for k, v in content.items() if k not in left_out}
 
 
 class NoiseResult(_Record):
@@ -451,9 +460,10 @@ class StabilityResult(_Record):
 
 
 class SessionResult(_Record):
-    """What went in."""
+    """What went in; it starts at `start`, ISO 8601."""
 
     sha256: str
+    start: str
     duration_s: float
     counts: dict[str, int]
     dropped: dict[str, int]
@@ -538,7 +548,9 @@ def result(calibration: Calibration) -> Result:
         ],
         chi_square=_chi_square(a),
         noise=c.noises,
-        session=SessionResult(sha256=c.sha256, duration_s=c.facts.duration_s, counts=c.counts, dropped=c.dropped),
+        session=SessionResult(
+            sha256=c.sha256, start=c.start, duration_s=c.facts.duration_s, counts=c.counts, dropped=c.dropped
+        ),
         software=dict(c.software),
         timing_s=c.timing,
         headline=a.headline,

@@ -154,7 +154,7 @@ def cube_parameters(config: Config, camera: bool, reference: bool, field: Array 
     _check_names(config, tags)
 
     def quantity(name: str, unit: str, prior: float, require: float, fixed: bool = False) -> Quantity:
-        sigma = config.priors.get(name, 0.0 if fixed else prior)
+        sigma = config.prior(name, 0.0 if fixed else prior)
         return Quantity(name, unit, sigma, prior, config.require.get(name, require))
 
     def nuisance(name: str, unit: str, prior: float, require: float, fixed: bool = False) -> Quantity:

@@ -32,6 +32,7 @@ class Head(Method):
     needs = NEEDS
     section = HeadConfig
     sheets = ("gyro", "platform_gyro", "camera", "clock")
+    of_recording = ("gyro_bias_*", "time_offset", "clock_skew", "platform_bias_*")
     rotations: ClassVar[Mapping[str, str]] = {"helmet_mount": "vRh", "camera_mount": "cRb"}
 
     @property

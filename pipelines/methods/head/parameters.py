@@ -69,7 +69,7 @@ class HeadParameters:
             )
 
         def quantity(name: str, unit: str, scale: float, require: float, fixed: bool, extra: float) -> Quantity:
-            prior = config.priors.get(name, 0.0 if fixed else scale)
+            prior = config.prior(name, 0.0 if fixed else scale)
             return Quantity(name, unit, prior, scale, config.require.get(name, require), extra)
 
         def triple(

@@ -32,6 +32,7 @@ class Indexer(Method):
     needs = NEEDS
     section = IndexerConfig
     sheets = ("gyro", "encoder")
+    of_recording = ("gyro_bias_*",)
 
     @property
     def data(self) -> type[IndexerData]:

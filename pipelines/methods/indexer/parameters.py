@@ -47,14 +47,11 @@ def indexer_parameters(config: Config) -> tuple[Parameter, ...]:
 
     def calibrated(names: Sequence[str], unit: str, scale: float, require: float) -> tuple[Quantity, ...]:
         return tuple(
-            Quantity(name, unit, config.priors.get(name, scale), scale, config.require.get(name, require))
-            for name in names
+            Quantity(name, unit, config.prior(name, scale), scale, config.require.get(name, require)) for name in names
         )
 
     axes = tuple(
-        Quantity(
-            name, "rad", config.priors.get(name, 0.0), 1e-2, config.require.get(name, math.inf), group="assumption"
-        )
+        Quantity(name, "rad", config.prior(name, 0.0), 1e-2, config.require.get(name, math.inf), group="assumption")
         for name in EPSILON
     )
     found = (

@@ -31,6 +31,7 @@ class Los(Method):
     topics = TOPICS
     needs = NEEDS
     sheets = ("gyro", "camera", "encoder", "clock", "gimbal", "target")
+    of_recording = ("gyro_bias_*", "time_offset", "clock_skew", "target_rate_*")
 
     @property
     def data(self) -> type[LosData]:

@@ -88,7 +88,7 @@ class LosParameters:
 
         def calibrated(names: Sequence[str], unit: str, scale: float) -> tuple[Quantity, ...]:
             return tuple(
-                Quantity(name, unit, config.priors.get(name, scale), scale, config.require.get(name, _REQUIRE))
+                Quantity(name, unit, config.prior(name, scale), scale, config.require.get(name, _REQUIRE))
                 for name in names
             )
 

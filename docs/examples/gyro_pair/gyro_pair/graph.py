@@ -88,7 +88,7 @@ def _parameters(config: Config) -> tuple[Parameter, ...]:
     """The three variables with their priors."""
 
     def quantity(name: str, unit: str, scale: float, require: float) -> Quantity:
-        return Quantity(name, unit, config.priors.get(name, scale), scale, config.require.get(name, require))
+        return Quantity(name, unit, config.prior(name, scale), scale, config.require.get(name, require))
 
     def triple(name: str, unit: str, scale: float, require: float) -> tuple[Quantity, ...]:
         return tuple(quantity(f"{name}_{axis}", unit, scale, require) for axis in "xyz")

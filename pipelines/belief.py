@@ -1,0 +1,45 @@
+"""What is known of parameters before a recording is looked at, from elsewhere than from data sheets."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """A Gaussian over reported numbers, in place of the priors that these have otherwise.
+
+    Attributes:
+        names: of the numbers.
+        mean: (n,) SI.
+        covariance: (n, n); a number whose row is zero is exactly its mean.
+        source: where it is from, for people; empty: the config.
+    """
+
+    names: tuple[str, ...]
+    mean: Array
+    covariance: Array
+    source: str = ""
+
+    def of(self, names: Collection[str]) -> Belief:
+        """What it says of those of these numbers that it knows."""
+        kept = [i for i, name in enumerate(self.names) if name in names]
+        rows = np.array(kept, dtype=np.intp)
+        known = tuple(self.names[i] for i in kept)
+        return Belief(known, self.mean[rows], self.covariance[np.ix_(rows, rows)], self.source)
+
+    @property
+    def sigmas(self) -> Array:
+        """(n,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+
+def independent(names: Sequence[str], mean: Sequence[float], sigmas: Sequence[float], source: str = "") -> Belief:
+    """Numbers of which each is known by itself."""
+    return Belief(tuple(names), np.array(mean, dtype=float), np.diag(np.square(np.array(sigmas, dtype=float))), source)

@@ -1,0 +1,117 @@
+"""A calibration that was made before, as something to begin from: result.json with its joint covariance, or
+calibration.yaml, whose numbers count as independent.
+"""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from pipelines.belief import Belief, independent
+from pipelines.errors import InputError
+from pipelines.judgement.observability import Status
+from pipelines.reports.calibration import load_calibration
+
+# A covariance is symmetric, and none of its eigenvalues negative, to this share.
+_ROUNDING = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What a calibration says of all its parameters.
+
+    Attributes:
+        method, solver, status: of the calibration.
+        sha256: of its recording.
+        start_ns: of its recording, Unix ns.
+        belief: about its parameters.
+    """
+
+    method: str
+    solver: str
+    status: Status
+    sha256: str
+    start_ns: int
+    belief: Belief
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False, populate_by_name=True)
+
+
+class _Parameter(_Record):
+    name: str
+    value: float
+
+
+class _Covariance(_Record):
+    order: list[str]
+    matrix: list[list[float]]
+
+
+class _Session(_Record):
+    sha256: str
+    start: datetime.datetime
+
+
+class _Result(_Record):
+    schema_name: Annotated[Literal["alidade.result/1"], Field(alias="schema")]
+    method: str
+    solver: str
+    status: Status
+    parameters: list[_Parameter]
+    covariance: _Covariance
+    session: _Session
+
+
+def load_known(path: Path) -> Known:
+    """Read result.json or calibration.yaml. Raises InputError when the file cannot be used."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be opened ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: neither a result.json nor a calibration.yaml: it is no text") from error
+    return _of_result(path, text) if text.lstrip().startswith("{") else _of_calibration(path)
+
+
+def _of_result(path: Path, text: str) -> Known:
+    try:
+        result = _Result.model_validate_json(text)
+    except ValidationError as error:
+        first: Any = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "the whole"
+        raise InputError(f"{path}: not a result.json: {where}: {first['msg']}") from error
+    names = tuple(p.name for p in result.parameters)
+    covariance = np.array(result.covariance.matrix, dtype=float) if names else np.empty((0, 0))
+    if tuple(result.covariance.order) != names or covariance.shape != (len(names), len(names)):
+        raise InputError(f"{path}: not a result.json: its covariance is not that of its parameters")
+    sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    scaled = covariance / np.outer(np.where(sigmas > 0.0, sigmas, 1.0), np.where(sigmas > 0.0, sigmas, 1.0))
+    asymmetry, negative = np.abs(scaled - scaled.T).max(initial=0.0), -np.linalg.eigvalsh(scaled).min(initial=0.0)
+    if np.diag(covariance).min(initial=0.0) < 0.0 or max(asymmetry, negative) > _ROUNDING:
+        raise InputError(f"{path}: not a result.json: its covariance is none")
+    belief = Belief(names, np.array([p.value for p in result.parameters]), covariance, str(path))
+    session = result.session
+    return Known(result.method, result.solver, result.status, session.sha256, _nanoseconds(session.start), belief)
+
+
+def _of_calibration(path: Path) -> Known:
+    saved = load_calibration(path)
+    given = saved.parameters
+    belief = independent(list(given), [p.value for p in given.values()], [p.sigma for p in given.values()], str(path))
+    try:
+        start = datetime.datetime.fromisoformat(saved.recording.start)
+    except ValueError as error:
+        raise InputError(f"{path}: not a calibration.yaml: recording.start: {saved.recording.start!r}") from error
+    return Known(saved.method, saved.solver, saved.status, saved.recording.sha256, _nanoseconds(start), belief)
+
+
+def _nanoseconds(start: datetime.datetime) -> int:
+    known = start if start.tzinfo else start.replace(tzinfo=datetime.UTC)
+    return round(known.timestamp()) * 1_000_000_000

@@ -1,0 +1,73 @@
+"""What several recordings of one device have in common: which parameters are the same in all of them, which walk.
+
+The method says which parameters belong to a recording, as a gyro's turn-on bias does; the config's `share` goes before
+that, by names or patterns ("camera_mount_*").
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from dataclasses import replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import numpy as np
+
+from pipelines.belief import Belief
+from pipelines.errors import InputError, nearest
+from pipelines.methods import Method
+from pipelines.reports.known import Known
+from pipelines.settings import Config
+
+DAY_S = 86_400.0
+
+
+def walks(method: Method, config: Config, names: Sequence[str]) -> dict[str, float]:
+    """Parameter of the device -> how far it walks in the root of a day, SI; 0: not at all. Those of recordings are not
+    among them.
+
+    Raises:
+        InputError: the config's `share` names no parameter.
+    """
+    rates = {name: 0.0 for name in names if not any(fnmatchcase(name, each) for each in method.of_recording)}
+    for pattern, share in config.share.items():
+        meant = [name for name in names if fnmatchcase(name, pattern)]
+        if not meant:
+            raise InputError(f"unknown key share.{pattern}{nearest(pattern, names)}")
+        for name in meant:
+            rates.pop(name, None)
+            if share != "recording":
+                rates[name] = 0.0 if isinstance(share, str) else share
+    return {name: rates[name] for name in names if name in rates}
+
+
+def device_belief(known: Known, method: Method, config: Config, sha256: str, start_ns: int) -> Belief:
+    """What an earlier calibration says of the device at the time of another recording.
+
+    Args:
+        known: the earlier calibration.
+        method: of the recording.
+        config: of the recording; its `share` says what walks.
+        sha256: of the recording.
+        start_ns: of the recording, Unix ns.
+
+    Raises:
+        InputError: the calibration is another method's, has no sigmas worth the name, or is of this very recording.
+    """
+    source = known.belief.source
+    if known.method != method.name:
+        raise InputError(f"{source}: is a calibration of {known.method}, not of {method.name}")
+    if known.solver == "published":
+        raise InputError(f"{source}: is of the published solver, whose sigmas make no prior; use batch's")
+    if known.sha256 == sha256:
+        raise InputError(f"{source}: was made of this very recording, which would count twice; name another one's")
+    rates = walks(method, config, known.belief.names)
+    told = [name for name, sigma in zip(known.belief.names, known.belief.sigmas, strict=True) if sigma > 0.0]
+    belief = known.belief.of([name for name in told if name in rates])
+    days = abs(start_ns - known.start_ns) * 1e-9 / DAY_S
+    walked = np.diag([rates[name] ** 2 * days for name in belief.names])
+    date = datetime.datetime.fromtimestamp(known.start_ns // 1_000_000_000, datetime.UTC).date()
+    verdict = "" if known.status == "calibrated" else f", whose own verdict is {known.status}"
+    said = f"that of {Path(source).name}, of {date}{verdict}"
+    return replace(belief, covariance=belief.covariance + walked.reshape(belief.covariance.shape), source=said)
