@@ -105,6 +105,30 @@ def unused(recording: Recording, config: Config) -> tuple[str, ...]:
     )
 
 
+def idle(recording: Recording, config: Config, method: str) -> tuple[str, ...]:
+    """Sentences about topics that a method could read as another of its sensors, and does not."""
+    chosen = methods.method(method)
+    read = {part for topic in chosen.topics for part in _recorded_as(config, topic)}
+    sentences = []
+    for topic in chosen.topics:
+        if _is_attitude(topic) or config.topic(topic) in recording.topics:
+            continue
+        there = recording.topics.items()
+        free = [n for n, t in there if t.type == topic.types[0] and t.count and t.is_readable and n not in read]
+        if free:
+            sentences.append(
+                f"{' and '.join(free)} ({topic.types[0].rpartition('/')[2]}): not used; is it the {topic.key}? "
+                f"`topics: {{{topic.key}: {free[0]}}}`"
+            )
+    return tuple(sentences)
+
+
+def _recorded_as(config: Config, topic: Topic) -> tuple[str, ...]:
+    """The recorded topics that a topic of a method is taken from."""
+    source = config.topics.get(topic.key)
+    return (topic.name,) if source is None else source.parts
+
+
 def _suggestion(
     method: str, recording: Recording, config: Config, pairings: dict[tuple[str, str], Pairing | None]
 ) -> Suggestion:

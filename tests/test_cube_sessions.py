@@ -12,6 +12,7 @@ import pytest
 from factors import so3
 from pipelines.config import load_config
 from pipelines.errors import InputError
+from pipelines.methods import method
 from pipelines.methods.cube.data import CubeData, Sightings, local_field
 from pipelines.methods.cube.poses import static_poses
 from pipelines.methods.cube.recording import read_cube
@@ -76,6 +77,18 @@ def test_what_is_missing_is_none(tmp_path: Path, session: CubeData, absent: dict
         assert getattr(back, name) == value
 
 
+def test_the_config_may_say_where_it_was(tmp_path: Path, session: CubeData) -> None:
+    """Without a longitude the magnetometer is left out, loudly."""
+    nowhere = replace(session, latitude=None, longitude=None)
+    for text, premises in (("latitude_deg: 47.0", 1), ("latitude_deg: 47.0\nlongitude_deg: 8.5", 0)):
+        config = _config(f"\n{text}\n")
+        back = _read_back(tmp_path / "s.mcap", nowhere, config)
+        told = method("cube").problem(back, config)
+        assert len(told.premises) == premises
+        assert ("mag_k11" in [q.name for q in told.quantities]) == (premises == 0)
+        assert all("give latitude_deg and longitude_deg" in sentence for sentence in told.premises)
+
+
 def test_rests_lie_within_the_true_ones(session: CubeData) -> None:
     found = static_intervals(session, _config())
     assert len(found) == SCENARIO.poses
@@ -101,7 +114,7 @@ def test_a_steady_turn_is_no_rest() -> None:
         (lambda d: {"mag": d.mag * 1e4}, r"is it in gauss\?"),
         (lambda d: {"mag": d.mag * 1e9}, r"is it in nT\?"),
         (lambda d: {"accel": d.accel / 9.8}, r"/imu: acceleration .* implausible in m/s\^2; is it in g\?"),
-        (lambda d: {"gyro": np.rad2deg(d.gyro)}, "is the gyro in deg/s"),
+        (lambda d: {"gyro": np.rad2deg(d.gyro)}, "is the gyro in deg/s.*, or its conversion under cube.raw"),
         (lambda d: {"reference_wxyz": d.reference_wxyz * 1.1}, "unit quaternion"),
         (lambda d: {"reference_t": d.reference_t + 1e4}, "no stretch of time"),
         (lambda _: {"latitude": float(np.deg2rad(95.0))}, "NavSatFix is in degrees"),

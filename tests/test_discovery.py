@@ -18,6 +18,7 @@ from pipelines.recording.pairing import pair
 from pipelines.recording.reading import Recording, open_recording
 from pipelines.recording.sources import inverted
 from pipelines.recording.writing import write_session
+from pipelines.session import Session
 from tests.command import Command
 
 NONE = load_config(None)
@@ -94,6 +95,20 @@ def test_what_is_suggested_reads_as_the_recording_did_under_its_own_names(simula
     np.testing.assert_array_equal(data.head_gyro, expected.head_gyro)
     np.testing.assert_allclose(data.vision_wxyz, expected.vision_wxyz, atol=1e-15)
     assert unused(recording, config) == ()
+
+
+def test_a_sensor_that_is_there_but_not_used_is_told(simulated: Path, tmp_path: Path) -> None:
+    """A second gyro beside the head's, which the platform's could be."""
+    whole = open_recording(simulated)
+    topics = {"/head/imu": whole.imu("/head/imu"), "/vision/attitude": whole.poses("/vision/attitude")}
+    write_session(tmp_path / "s.mcap", {**topics, "/vehicle/imu": whole.imu("/platform/imu")})
+    session = Session.read(open_recording(tmp_path / "s.mcap"), "head", None)
+    told = "/vehicle/imu (Imu): not used; is it the platform_imu? `topics: {platform_imu: /vehicle/imu}`"
+    assert session.facts.notes == (told,)
+    config = load_config(b"topics: {platform_imu: /vehicle/imu}")
+    assert Session.read(open_recording(tmp_path / "s.mcap"), "head", config).facts.notes == ()
+    write_session(tmp_path / "t.mcap", topics)
+    assert Session.read(open_recording(tmp_path / "t.mcap"), "head", None).facts.notes == ()
 
 
 def test_a_recording_that_is_served_is_left_alone(simulated: Path) -> None:

@@ -15,6 +15,7 @@ from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.graph.problem import Array, Estimate, Problem
 from pipelines.judgement.observability import assess
+from pipelines.methods import method
 from pipelines.methods.head import graph as head
 from pipelines.methods.head.recording import read_head, write_head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
@@ -26,6 +27,7 @@ from pipelines.recording.reading import Recording, open_recording
 from pipelines.settings import Config
 from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.solvers.batch import solve_batch
+from tests.builders import make_calibration
 
 SWAY = EulerMotion(
     yaw=[Swing(amplitude_deg=20, frequency_hz=0.15)],
@@ -149,6 +151,35 @@ def test_a_faulty_gyro_moves_no_parameter(name: str, fault: Fault, tmp_path: Pat
     error = np.abs(estimate.values - [case.truth.get(name, 0.0) for name in estimate.names]) / estimate.sigmas
     assert error.max() < 4.0
     assert (estimate.sigmas > 0.99 * case.clean.sigmas).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "rates", "brief"),
+    [
+        ("los", "gyro", {"duration_s": 20.0, "gyro_rate_hz": 100.0, "gimbal_rate_hz": 50.0, "image_rate_hz": 5.0}),
+        ("head", "head_gyro", {"duration_s": 20.0, "gyro_rate_hz": 100.0}),
+        ("indexer", "gyro", {}),
+        ("cube", "gyro", {"poses": 3, "static_s": 2.0, "camera": None}),
+        ("cube", "accel", {"poses": 3, "static_s": 2.0, "camera": None}),
+    ],
+)
+def test_saturated_samples_are_left_out_and_reported_by_every_method(
+    name: str, rates: str, brief: dict[str, Any], tmp_path: Path
+) -> None:
+    chosen = method(name)
+    simulated = chosen.simulate(chosen.settings().model_copy(update=brief), 3)
+    whole = getattr(simulated.data, rates)
+    most = np.sort(np.abs(whole), axis=0)[-len(whole) // 40]
+    clipped = replace(simulated.data, **{rates: np.clip(whole, -most, most)})
+    chosen.write(tmp_path / "s.mcap", replace(simulated, data=clipped))
+    recording = open_recording(tmp_path / "s.mcap")
+    found = chosen.read(recording, load_config(recording.attachment("alidade.yaml")))
+    ((what, count),) = ((what, n) for what, n in found.dropped.items() if what.endswith("end of the sensor's range"))
+    # Fewer than three in a row may be what there was.
+    assert count > 0.1 * np.count_nonzero((np.abs(getattr(clipped, rates)) == most).any(axis=1))
+    told = make_calibration()
+    told = replace(told, problem=replace(told.problem, dropped=found.dropped))
+    assert f"{what}: {count} samples left out" in told.notes
 
 
 def test_what_is_dropped_is_what_was_spoilt(cases: dict[str, Case]) -> None:

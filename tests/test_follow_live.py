@@ -42,11 +42,15 @@ def record(path: Path, seconds: float, images_hz: float, rate_hz: float) -> tupl
     return path / "whole.mcap", path / "c.yaml"
 
 
-def played(kind: str, whole: list[Message], folder: Path, stack: ExitStack) -> tuple[Source, Callable[[], bool]]:
-    """A source that plays the messages as fast as they were recorded, and whether it is over."""
+def played(
+    kind: str, whole: list[Message], folder: Path, stack: ExitStack
+) -> tuple[Source, Callable[[], bool], Callable[[], float]]:
+    """A source that plays the messages as fast as they were recorded, whether it is over, and when it began."""
+    began = time.monotonic()
     if kind == "bridge":
         bridge = stack.enter_context(Bridge(whole, 1.0))
-        return source_of(bridge.url, None, lambda _: None), lambda: bridge.is_over
+        first = whole[0][2]
+        return source_of(bridge.url, None, lambda _: None), lambda: bridge.is_over, lambda: bridge.came[first]
     if kind == "standard input":
         out, into = os.pipe()
         thread = threading.Thread(target=lambda: write(paced(whole, 1.0), _Pipe(into, "w"), 2_000), daemon=True)
@@ -56,7 +60,7 @@ def played(kind: str, whole: list[Message], folder: Path, stack: ExitStack) -> t
         thread = threading.Thread(target=_record, args=(whole, path), daemon=True)
         source = Source(path)
     thread.start()
-    return source, lambda: not thread.is_alive()
+    return source, lambda: not thread.is_alive(), lambda: began
 
 
 class _Pipe(io.FileIO):
@@ -90,7 +94,7 @@ def _record(whole: list[Message], path: Path) -> None:
 
 def follow_live(kind: str, whole: Path, config: Path, folder: Path) -> tuple[Calibration, np.ndarray, np.ndarray]:
     """What came out; how old, s, what was told was when it was told, and up to when, s of recording."""
-    sent, started = messages(whole), time.monotonic()
+    sent = messages(whole)
     told: list[tuple[float, float]] = []
 
     def show(view: View) -> None:
@@ -98,14 +102,12 @@ def follow_live(kind: str, whole: Path, config: Path, folder: Path) -> tuple[Cal
             told.append((time.monotonic(), view.time))
 
     with ExitStack() as stack:
-        source, is_over = played(kind, sent, folder, stack)
+        source, is_over, began = played(kind, sent, folder, stack)
         stack.enter_context(source)
         settings = Settings(config=config, patience=10.0)
         calibration = Follower(source, settings, show, lambda _: None, is_over).follow()
     now, upto = np.array(told).T
-    # A bridge begins when it is asked to: what was told soonest was told without delay.
-    late = now - started - upto
-    return calibration, (late - late.min() if kind == "bridge" else late), upto
+    return calibration, now - began() - upto, upto
 
 
 @pytest.mark.parametrize("kind", ["file", "standard input"])

@@ -109,6 +109,13 @@ def test_a_folder_in_which_splits_appear(whole: Path, batch: Calibration, tmp_pa
     assert len({round(view.time) for view in views}) > 2
 
 
+def test_a_folder_of_several_recordings_is_one_line(tmp_path: Path) -> None:
+    for name in ("one.mcap", "other.mcap"):
+        (tmp_path / name).write_bytes(bytes(100))
+    with pytest.raises(InputError, match=r"a folder of several recordings \(one.mcap, other.mcap\)"):
+        follow(Source(tmp_path), Settings())
+
+
 def test_standard_input(whole: Path, batch: Calibration, tmp_path: Path) -> None:
     source = StandardInput(None, io.BytesIO(whole.read_bytes()))
     calibration, _, _ = follow(source, Settings())

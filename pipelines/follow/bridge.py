@@ -33,8 +33,8 @@ _SCHEMAS = {
 _BYTES = ("protobuf", "flatbuffer")
 # Between two calls of a bridge that does not answer, and for one that does, s.
 _PAUSE, _PATIENCE = 0.5, 5.0
-# A waiting client looks so often whether it is still wanted, s.
-_GLANCE = 0.1
+# A waiting client looks so often whether it is still wanted, and what has come is shown to readers so often, s.
+_GLANCE, _FLUSH = 0.1, 0.01
 # No message of a sensor is larger.
 _LARGEST = 1 << 26
 
@@ -121,7 +121,7 @@ class _Record:
             schema = self._writer.register_schema(channel["schemaName"], channel["schemaEncoding"], _schema(channel))
             self._channels[key] = self._writer.register_channel(channel["topic"], channel["encoding"], schema)
         self._writer.add_message(self._channels[key], log_ns, data, log_ns)
-        if time.monotonic() - self._flushed > 0.5 * _GLANCE:
+        if time.monotonic() - self._flushed > _FLUSH:
             self.flush()
 
     def flush(self) -> None:

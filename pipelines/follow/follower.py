@@ -31,9 +31,9 @@ from pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
 from pipelines.solvers.incremental import Run
 
 # At least so long from one look to the next, s, and so many times what a look cost.
-_PAUSE, _REST = 0.1, 2.0
+_PAUSE, _REST = 0.05, 2.0
 # The files' size is looked at so often, s.
-_POLL = 0.05
+_POLL = 0.01
 # The end of a recording is read from so long before the first step taken of it, s: what is logged late, and samples and
 # pictures by which those beside them are judged. Where that is too little, more.
 _MARGINS = (2.0, 20.0)
@@ -42,6 +42,10 @@ _LONG_AGO = 1.5
 # While a long recording is caught up with, the view is renewed this often, s.
 _VIEW = 1.0
 _FINGERPRINT = 4096
+# Times are differences of stamps, which are whole ns: they are told apart beyond this, s.
+_ROUNDING = 1e-9
+# A picture serves once gyro and gimbal have been read after it: so long a picture is waited for beyond its time, s.
+_SAMPLE = 0.01
 
 
 @dataclass(frozen=True)
@@ -96,6 +100,7 @@ class Follower:
         self._session: Session | None = None  # as last read whole
         self._delay_ns, self._attachments = 0, 0
         self._guessed = 0.0  # from a recording of so many s
+        self._held: Step | None = None  # the first step that is not settled
         if settings.checkpoint is not None and settings.window is None:
             raise InputError("--window all has no checkpoints: it forgets nothing; give seconds")
 
@@ -117,7 +122,7 @@ class Follower:
             over = finished or self._stopped() or now - grown > patience
             if over:
                 return self._end(finished, size)
-            if new and now >= due and size > 0:
+            if new and now >= due and size > 0 and self._may_settle():
                 started, new = time.monotonic(), False
                 self._look()
                 cost = time.monotonic() - started
@@ -133,7 +138,25 @@ class Follower:
         except InputError as error:
             self._wait(str(error))
             return
-        self._take(problem, _settled(steps, problem.unsettled))
+        self._take(problem, self._settled(steps, problem.unsettled))
+
+    def _may_settle(self) -> bool:
+        """Whether what has come may settle a step: to look takes long, and another look has to wait for this one."""
+        run, held = self._run, self._held
+        last_ns = self._growing.last_log_ns(self.source.parts)
+        if run is None or held is None or last_ns is None:
+            return True
+        settled_s = held.time + run.problem.unsettled + _SAMPLE
+        return last_ns >= self._epoch_ns + self._delay_ns + int(settled_s * 1e9)
+
+    def _settled(self, steps: Iterable[Step], unsettled: float) -> Iterator[Step]:
+        """The steps that are so much older, s, than the last, which may still grow; the first that is not is held."""
+        held: deque[Step] = deque()
+        for step in steps:
+            held.append(step)
+            while len(held) > 1 and held[0].time <= step.time - unsettled + _ROUNDING:
+                yield held.popleft()
+        self._held = held[0] if held else None
 
     def _whole(self) -> tuple[Problem, Iterator[Step]]:
         """The graph of all there is, and its steps that were not taken yet."""
@@ -287,15 +310,6 @@ def _first(steps: Iterable[Step]) -> Iterator[Step]:
     for step in steps:
         yield step
         return
-
-
-def _settled(steps: Iterable[Step], unsettled: float) -> Iterator[Step]:
-    """The steps that are so much older, s, than the last, which may still grow."""
-    held: deque[Step] = deque()
-    for step in steps:
-        held.append(step)
-        while len(held) > 1 and held[0].time <= step.time - unsettled:
-            yield held.popleft()
 
 
 def _that_grows(problem: Problem, session: Session) -> Problem:

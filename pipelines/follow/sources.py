@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 from pipelines.errors import InputError
 from pipelines.recording.mcap_records import MAGIC
-from pipelines.recording.opening import PARTS, Where
+from pipelines.recording.opening import Where, parts_in
 
 _PIECE = 1 << 16
 # Names of the files in which a stream is written down.
@@ -36,10 +36,10 @@ class Source(AbstractContextManager["Source"]):
 
     @property
     def parts(self) -> list[Path]:
-        """The files by now, but those that nothing is in, in their order."""
+        """The files by now, but those that nothing is in, in their order. Raises InputError for several recordings."""
         if not self.path.is_dir():
             return [self.path] if _size(self.path) else []
-        return sorted(p for p in self.path.iterdir() if p.suffix in PARTS and _size(p))
+        return [p for p in parts_in(self.path) if _size(p)]
 
     @property
     def where(self) -> Where:

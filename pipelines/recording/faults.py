@@ -24,6 +24,8 @@ _JUMP, _SPIKE = 10.0, 10.0
 _CLIPPED, _QUANTA = 3, 20.0
 # More repeats than this are the nature of the stream.
 _MOST_REPEATED = 0.5
+# What is dropped, as it is counted.
+CLIPPED = "at the end of the sensor's range"
 # A recording that loses more than this is not worth solving.
 _MOST_LOST = 0.2
 
@@ -38,7 +40,7 @@ def drop_faults(topic: str, t: Array, values: Array, dropped: dict[str, int], un
     spikes = np.stack([_spikes(column) for column in values.T], axis=1)
     rest = np.where(spikes, np.nan, values)
     clipped, frozen = (np.stack([find(t, column) for column in rest.T], axis=1) for find in (_clipped, _frozen))
-    reasons = {"spike": spikes, "at the end of the sensor's range": clipped, "frozen, the same value for long": frozen}
+    reasons = {"spike": spikes, CLIPPED: clipped, "frozen, the same value for long": frozen}
     for reason, mask in reasons.items():
         lost = mask.any(axis=1)
         if lost.mean() > _MOST_LOST:

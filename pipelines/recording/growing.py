@@ -59,6 +59,12 @@ class GrowingMcap(McapFile):
         self.profile = self._index.profile
         self.counts = {number: n for number, n in self._counted().items() if self._defined(number)}
 
+    def last_log_ns(self) -> int | None:
+        """Log time of the last messages there are by now, in view or not, as their block states it; None: of none."""
+        with self._open() as stream:
+            self._index.grow(stream)
+        return next((block.span[1] for block in reversed(self._index.blocks) if block.span is not None), None)
+
     @property
     def first_log_ns(self) -> int:
         """As the first block in view states it."""
@@ -96,6 +102,11 @@ class Growing:
     def attachments(self) -> list[str]:
         """Names of all attachments met."""
         return [name for file in self._files.values() for name in file.attachments]
+
+    def last_log_ns(self, where: Sequence[Path]) -> int | None:
+        """Log time of the last messages there are by now, without reading them; None where that cannot be told."""
+        last = self._files.get(where[-1]) if where else None
+        return None if last is None else last.last_log_ns()
 
     def look(self, where: Sequence[Path], since_ns: int | None) -> Container:
         """What the files hold by now: all, or what was logged since a time, Unix ns. Raises InputError."""

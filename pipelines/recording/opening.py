@@ -148,13 +148,19 @@ def _folder(path: Path, strict: bool) -> Container:
     root = find_euroc(path)
     if root is not None:
         return read_euroc(path, root)
+    there = parts_in(path)
+    if not there:
+        raise InputError(f"{path}: a folder without a recording")
+    return _together(there, strict, path)
+
+
+def parts_in(path: Path) -> list[Path]:
+    """The files of the recording in a folder, in the order of their names. Raises InputError when there are several."""
     there = sorted(file for file in path.iterdir() if file.suffix in PARTS and file.is_file())
     if len({_PART_NAME.sub("", file.name) for file in there}) > 1:
         names = ", ".join(file.name for file in there)
         raise InputError(f"{path}: a folder of several recordings ({names}); name one, or the parts by a pattern")
-    if not there:
-        raise InputError(f"{path}: a folder without a recording")
-    return _together(there, strict, path)
+    return there
 
 
 def _metadata(path: Path) -> dict[str, Any]:

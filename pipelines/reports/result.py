@@ -24,6 +24,7 @@ from pipelines.judgement.observability import Assessment, Fit, Innovations, Lear
 from pipelines.judgement.rejection import rejection_sentence
 from pipelines.judgement.self_check import SelfCheck
 from pipelines.judgement.stability import Stability
+from pipelines.recording.faults import CLIPPED
 from pipelines.recording.info import SessionFacts
 from pipelines.settings import Config
 
@@ -328,7 +329,8 @@ class Calibration:
         far = _beyond_priors(self)
         told = rejection_sentence(self.residuals).removesuffix(".")
         rejected = (told,) if told and told not in self.headline else ()
-        return (*trouble, *self.facts.notes, *self.assessment.warnings, *far, *rejected)
+        clipped = tuple(f"{what}: {n} samples left out" for what, n in self.dropped.items() if what.endswith(CLIPPED))
+        return (*trouble, *self.facts.notes, *self.assessment.warnings, *far, *rejected, *clipped)
 
 
 def _beyond_priors(calibration: Calibration) -> tuple[str, ...]:

@@ -37,6 +37,10 @@ from pipelines.methods.cube.parameters import SENSITIVITY_KEY, TRIAD_KEYS, first
 from pipelines.methods.cube.wandering import deviation_key
 from pipelines.settings import Config
 
+_NO_FIELD = (
+    "The magnetometer is not calibrated, for the field is not known where nobody says where it was: give latitude_deg "
+    "and longitude_deg in the config, or record /reference/fix."
+)
 # Sigmas of priors as good as none, m on the cube's place in the camera and rad on an attitude that no gyro leads to:
 # these only make the new variables of a step determined without its measurements.
 _POSITION_PRIOR_SIGMA, _ATTITUDE_PRIOR_SIGMA = 10.0, np.pi
@@ -59,6 +63,7 @@ def problem(data: CubeData, config: Config) -> Problem:
         attitude_name="nRb",
         advice=advice,
         dropped=model.dropped,
+        premises=(_NO_FIELD,) if model.poses.mag is not None and model.field is None else (),
         noises=tuple(noises(data, config).values()),
     )
 

@@ -21,7 +21,6 @@ from pipelines.methods.cube.poses import StaticPoses, static_poses, turn
 from pipelines.methods.cube.reference import Reference, cube_reference, from_vectors
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.methods.cube.wandering import GaussMarkovDeviation
-from pipelines.recording.checks import count
 from pipelines.settings import Config
 
 # A pause of the gyro's record in a turn longer than this, s, breaks the chain of turns.
@@ -79,9 +78,7 @@ def prepare(data: CubeData, config: Config) -> Model:
         )
     poses, known = static_poses(data, config), noises(data, config)
     field, dropped = None, {**data.dropped, **poses.dropped}
-    if poses.mag is not None and data.longitude is None:
-        count(dropped, "magnetometer: no position for the field model, not calibrated", 1)
-    elif poses.mag is not None:
+    if poses.mag is not None and data.longitude is not None:
         field = local_field(data, config)
     # Else only the horizontal earth rate would show the heading, which no MEMS gyro feels: it is left out as noise.
     heading_known = field is not None or data.reference_t is not None

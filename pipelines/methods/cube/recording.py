@@ -23,6 +23,7 @@ from pipelines.recording.checks import (
     density,
     unit_quaternions,
 )
+from pipelines.recording.faults import drop_faults
 from pipelines.recording.reading import Recording
 from pipelines.recording.topics import IMAGE, IMU, wanted
 from pipelines.settings import Config, first_given
@@ -48,8 +49,13 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
     imu = recording.imu(name)
     count(dropped, f"{name}: stamped by log time (kept)", imu.stamped_by_log)
     imu_t, keep = clean(name, imu.t_ns, epoch, np.hstack([imu.gyro, imu.accel]), dropped, least=3)
+    sound = np.intersect1d(
+        drop_faults(name, imu_t, imu.gyro[keep], dropped, "rad/s"),
+        drop_faults(name, imu_t, imu.accel[keep], dropped, "m/s^2"),
+    )
+    imu_t, keep = imu_t[sound], keep[sound]
     gyro, accel = imu.gyro[keep], imu.accel[keep]
-    check_gyro(name, imu_t, nominal(gyro, config.section(CubeConfig).raw.gyro))
+    check_gyro(name, imu_t, nominal(gyro, config.section(CubeConfig).raw.gyro), ", or its conversion under cube.raw")
     check_accel(name, nominal(accel, config.section(CubeConfig).raw.accel))
     gyro_density = density(name, imu_t, imu.gyro_cov[keep], LEAST_GYRO, dropped)
     accel_density = density(name, imu_t, imu.accel_cov[keep], LEAST_ACCEL, dropped)
@@ -60,6 +66,8 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
     if wanted(recording, config, MAG):
         field_ = recording.magnetic(name)
         mag_t, keep = clean(name, field_.t_ns, epoch, field_.field, dropped)
+        sound = drop_faults(name, mag_t, field_.field[keep], dropped, "T")
+        mag_t, keep = mag_t[sound], keep[sound]
         mag, mag_density = field_.field[keep], density(name, mag_t, field_.field_cov[keep], LEAST_MAG, dropped)
         check_mag(name, nominal(mag, config.section(CubeConfig).raw.mag))
         spans[name] = mag_t
@@ -120,11 +128,11 @@ def _reference(
 
 
 def _position(recording: Recording, config: Config) -> tuple[float | None, float | None, float]:
-    """Latitude and longitude, rad, height, m: the median of the fixes; the config's latitude wins."""
-    given = None if config.latitude_deg is None else float(np.deg2rad(config.latitude_deg))
+    """Latitude and longitude, rad, height, m: the median of the fixes; what the config says wins."""
+    given = [None if x is None else float(np.deg2rad(x)) for x in (config.latitude_deg, config.longitude_deg)]
     topic = config.topic(REFERENCE_FIX)
     if not wanted(recording, config, REFERENCE_FIX):
-        return given, None, 0.0
+        return given[0], given[1], 0.0
     fixes = recording.fixes(topic)
     good = (fixes.status >= 0) & np.isfinite(fixes.latitude_deg + fixes.longitude_deg + fixes.height)
     if not good.any():
@@ -134,4 +142,5 @@ def _position(recording: Recording, config: Config) -> tuple[float | None, float
     )
     if abs(latitude) > 90.0 or abs(longitude) > 360.0:
         raise InputError(f"topic {topic}: latitude {latitude:g}, longitude {longitude:g}; NavSatFix is in degrees")
-    return first_given(given, float(np.deg2rad(latitude))), float(np.deg2rad(longitude)), height
+    found = [float(np.deg2rad(x)) for x in (latitude, longitude)]
+    return first_given(given[0], found[0]), first_given(given[1], found[1]), height

@@ -14,6 +14,8 @@ _LOST = 0.5
 # A gap in gyro or gimbal longer than so many sample intervals is no sampling jitter.
 _GAP = 5.0
 _FEWEST_PICTURES = 10
+# Times are differences of stamps, which are whole ns: they are told apart beyond this, s.
+_ROUNDING = 1e-9
 # Pictures that a target's first one has to agree with.
 _FOLLOWERS = 5
 
@@ -35,7 +37,7 @@ def select_pictures(
     for i, chain in enumerate(chains):
         after = t[chain] - t[chain[0]] if i > 0 else np.inf
         before = t[chain[-1]] - t[chain] if i < len(chains) - 1 else np.inf
-        close[chain] = np.minimum(after, before) < margin
+        close[chain] = np.minimum(after, before) < margin - _ROUNDING
         left = chain[~close[chain]]
         wrong = _wrong_before_followers(data.error[left, :2], sigma[left])
         early[left[:wrong]] = True
