@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -36,6 +37,7 @@ def stores() -> tuple[Any, Any]:
 
 
 ROS2, ROS1 = stores()
+IDL_NAMES = {"float64": "double", "float32": "float", "bool": "boolean", "byte": "octet"}
 
 
 def raw_messages(path: Path) -> Iterator[Message]:
@@ -131,6 +133,43 @@ def mcap_ros1(source: Path, path: Path) -> Path:
     return mcap(raw_messages(source), path, _to_ros1, "ros1", "ros1msg", schema)
 
 
+def mcap_idl(source: Path, path: Path) -> Path:
+    """MCAP with ROS 2 messages defined in IDL."""
+    return mcap(raw_messages(source), path, lambda _, data: data, "cdr", "ros2idl", _idl)
+
+
+def _idl(kind: str) -> tuple[str, bytes]:
+    """A type, and those it holds, as rosidl writes them: arrays are types of their own."""
+    parts: dict[str, str] = {}
+
+    def name_of(what: str) -> str:
+        return what.replace("/", "::")
+
+    def describe(kind: str) -> None:
+        if kind in parts:
+            return
+        parts[kind] = ""
+        package, _, name = kind.split("/")
+        arrays, members = [], []
+        for field, (node, what) in ROS2.fielddefs[kind][1]:
+            repeated = int(node) > 2
+            (inner, element), count = what if repeated else ((node, what), 0)
+            if int(inner) == 2:
+                describe(element)
+            base = name_of(element) if int(inner) == 2 else IDL_NAMES.get(element[0], element[0])
+            if int(node) == 3:
+                arrays.append(f"    typedef {base} {field}__{count}[{count}];")
+                base = f"{field}__{count}"
+            elif int(node) == 4:
+                base = f"sequence<{base}>"
+            members.append(f'      @verbatim (language="comment", text="of what") {base} {field};')
+        inside = [*arrays, f"    struct {name} {{", *members, "    };"]
+        parts[kind] = "\n".join([f"module {package} {{", "  module msg {", *inside, "  };", "};", ""])
+
+    describe(kind)
+    return kind, "".join(f"{'=' * 80}\nIDL: {name}\n{text}" for name, text in parts.items()).encode()
+
+
 def mcap_json(source: Path, path: Path) -> Path:
     """MCAP with the messages as JSON."""
 
@@ -198,6 +237,46 @@ def ulog(path: Path, topics: dict[str, dict[str, np.ndarray[Any, Any]]]) -> Path
         ]
     path.write_bytes(b"".join([*out, *(data for _, data in sorted(rows, key=lambda row: row[0]))]))
     return path
+
+
+def h264(pictures: Any) -> list[bytes]:
+    """Grey pictures (n, height, width), in multiples of 16, as H.264: a key picture a message, of raw macroblocks.
+
+    Each message has its sequence and picture parameter sets (ITU-T H.264, 7.3.2), with the full range of brightness.
+    """
+    _, height, width = pictures.shape
+
+    def ue(value: int) -> str:
+        digits = f"{value + 1:b}"
+        return "0" * (len(digits) - 1) + digits
+
+    def unit(head: int, bits: str, blocks: bytes = b"") -> bytes:
+        bits += "" if blocks else "1"
+        bits += "0" * (-len(bits) % 8)
+        body = int(bits, 2).to_bytes(len(bits) // 8, "big") + blocks
+        return b"\0\0\0\1" + bytes([head]) + re.sub(rb"\0\0(?=[\0-\3])", b"\0\0\3", body)
+
+    vui = "0" + "0" + "1" + "101" + "1" + "0" + "0" + "0" + "0" + "0" + "0" + "0"
+    size = ue(width // 16 - 1) + ue(height // 16 - 1)
+    sequence = unit(
+        0x67, f"{66:08b}{0:08b}{40:08b}" + ue(0) + ue(0) + ue(2) + ue(0) + "0" + size + "1" + "0" + "0" + "1" + vui
+    )
+    picture = unit(
+        0x68, ue(0) + ue(0) + "0" + "0" + ue(0) + ue(0) + ue(0) + "0" + "00" + ue(0) + ue(0) + ue(0) + "1" + "0" + "0"
+    )
+    out = []
+    for i, grey in enumerate(pictures):
+        bits, slice_ = ue(0) + ue(7) + ue(0) + f"{0:04b}" + ue(i % 2) + "0" + "0" + ue(0) + ue(1), b""
+        for row in range(0, height, 16):
+            for column in range(0, width, 16):
+                bits += ue(25)
+                bits += "0" * (-len(bits) % 8)
+                slice_ += int(bits, 2).to_bytes(len(bits) // 8, "big")
+                slice_ += grey[row : row + 16, column : column + 16].tobytes() + bytes([128]) * 128
+                bits = ""
+        whole = slice_ + b"\x80"
+        out.append(sequence + picture + b"\0\0\0\1\x65" + re.sub(rb"\0\0(?=[\0-\3])", b"\0\0\3", whole))
+    return out
 
 
 def ros2_schema(kind: str) -> tuple[str, bytes]:

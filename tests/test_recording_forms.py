@@ -72,6 +72,7 @@ FORMS: dict[str, Callable[[Path, Path], Path]] = {
     "ros 1 lz4": lambda s, f: forms.rosbag1(s, f / "s.bag", Ros1Writer.CompressionFormat.LZ4),
     "ros 1 bz2": lambda s, f: forms.rosbag1(s, f / "s.bag", Ros1Writer.CompressionFormat.BZ2),
     "mcap ros 1": lambda s, f: forms.mcap_ros1(s, f / "r.mcap"),
+    "mcap IDL": lambda s, f: forms.mcap_idl(s, f / "i.mcap"),
     "mcap json": lambda s, f: forms.mcap_json(s, f / "j.mcap"),
     "mcap protobuf": lambda s, f: forms.mcap_protobuf(s, f / "p.mcap"),
 }
@@ -676,6 +677,50 @@ def test_another_encoding_of_pictures_is_one_line(tmp_path: Path) -> None:
     recording = open_recording(ros2_recording(tmp_path / "i.mcap", {"/image": [(T0, picture)]}))
     with pytest.raises(InputError, match="the encoding '32FC1' is not one of mono, rgb"):
         list(recording.images("/image"))
+
+
+def video(
+    path: Path, pictures: Any, change: Callable[[list[bytes]], list[bytes]] = list, form: str = "h264"
+) -> Recording:
+    """A recording of Foxglove's CompressedVideo, 10 pictures a second."""
+    import foxglove
+    from foxglove import channels
+    from foxglove import messages as fox
+
+    context = foxglove.Context()
+    with foxglove.open_mcap(path, context=context, allow_overwrite=True):
+        channel = channels.CompressedVideoChannel("/video", context=context)
+        for i, data in enumerate(change(forms.h264(pictures))):
+            stamp = fox.Timestamp(1_700_000_000, 100_000_000 * i)
+            channel.log(fox.CompressedVideo(timestamp=stamp, frame_id="camera", data=data, format=form), log_time=i)
+    return open_recording(path)
+
+
+def test_pictures_of_a_video(tmp_path: Path) -> None:
+    import cv2
+
+    pictures = np.random.default_rng(1).integers(0, 256, (6, 32, 48), dtype=np.uint8)
+    found = list(video(tmp_path / "v.mcap", pictures).images("/video"))
+    assert [t_ns for t_ns, _ in found] == [1_700_000_000_000_000_000 + 100_000_000 * i for i in range(6)]
+    for (_, file), picture in zip(found, pictures, strict=True):
+        grey = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_GRAYSCALE)
+        np.testing.assert_array_equal(grey, picture)
+
+
+@pytest.mark.parametrize(
+    ("change", "form", "message"),
+    [
+        (list, "h265", "a video in h265; H.264 is read"),
+        (lambda whole: [b"#EXTM3U\n" + whole[0], *whole[1:]], "h264", r"is no H.264 \(Annex B\)"),
+        (lambda whole: [whole[0][:9], *whole[1:]], "h264", r"only 2 of 3 pictures of the video can be decoded"),
+        (lambda whole: [whole[0] + whole[1], *whole[1:]], "h264", "more pictures than its 3 messages"),
+        (lambda _: [b"\0\0\0\1\x67junk"] * 3, "h264", "only 0 of 3 pictures"),
+    ],
+)
+def test_a_video_that_is_not_as_it_should_be_is_one_line(change: Any, form: str, message: str, tmp_path: Path) -> None:
+    recording = video(tmp_path / "v.mcap", np.full((3, 16, 16), 90, np.uint8), change, form)
+    with pytest.raises(InputError, match=f"topic /video: .*{message}"):
+        list(recording.images("/video"))
 
 
 def test_messages_without_a_stamp_are_told_with_the_jitter_of_what_stands_in(tmp_path: Path) -> None:

@@ -220,7 +220,7 @@ def test_a_wrong_schema_of_the_right_name_is_one_line(kind: str, text: str, tmp_
         ("protobuf", "protobuf", "own.Gyro", r"/imu \(own.Gyro, protobuf/protobuf\)"),
         ("flatbuffer", "flatbuffer", "foxglove.Log", r"/imu \(foxglove.Log, flatbuffer/flatbuffer\)"),
         ("ros1", "", "sensor_msgs/Imu", r"\(a ROS 1 recording\): /imu \(Imu, ros1/\)"),
-        ("cdr", "ros2idl", messages.IMU, r"/imu \(Imu, cdr/ros2idl\)"),
+        ("cdr", "omgidl", messages.IMU, r"/imu \(Imu, cdr/omgidl\)"),
         ("cdr", "", messages.IMU, r"/imu \(Imu, cdr/\)"),
     ],
 )
@@ -241,5 +241,6 @@ def test_another_encoding_is_named_with_what_is_needed(
     assert not facts.methods
     with pytest.raises(InputError, match=rf"no usable topics.*{shown}.*needed are ROS 2 messages \(cdr/ros2msg\)"):
         resolve_method(None, recording, Config())
-    with pytest.raises(InputError, match=r"topic /imu (holds|has the encoding) .*needed is .*cdr/ros2msg"):
+    with pytest.raises(InputError, match=r"topic /imu (holds|has the encoding) .*needed is .*cdr/ros2msg") as found:
         recording.imu("/imu")
+    assert ("flatc --json" in str(found.value)) == (message == "flatbuffer")

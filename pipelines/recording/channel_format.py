@@ -10,13 +10,27 @@ from numpy.typing import NDArray
 from pipelines.recording import messages
 from pipelines.recording.container import Channel, Rows, Schema, rows_of
 from pipelines.recording.decoding import header_stamps, logged_at
-from pipelines.recording.messages import Definition, MessageError, Wire
+from pipelines.recording.messages import Definition, Language, MessageError, Wire
 from pipelines.recording.translation import Translation, ros_type
 
-# Encoding of the messages and of what defines them -> layout.
-_ROS: dict[str, Wire] = {"cdr/ros2msg": "cdr", "ros1/ros1msg": "ros1"}
+# Encoding of the messages and of what defines them -> layout, and what the definition is written in.
+_ROS: dict[str, tuple[Wire, Language]] = {
+    "cdr/ros2msg": ("cdr", "msg"),
+    "cdr/ros2idl": ("cdr", "idl"),
+    "ros1/ros1msg": ("ros1", "msg"),
+}
 _TRANSLATED = ("protobuf/protobuf", "json/jsonschema")
 READABLE = (*_ROS, *_TRANSLATED)
+# Encoding that is not read -> how to get one that is.
+_CONVERTED = {
+    "flatbuffer/flatbuffer": "record with Foxglove's protobuf schemas, whose fields are the same, or write "
+    "the messages as JSON, which `flatc --json --raw-binary` makes of each with its .fbs, into another MCAP file",
+}
+
+
+def converted(encoding: str) -> str:
+    """How to get an encoding that is read in place of one that is not, as the end of a sentence; may be empty."""
+    return f": {_CONVERTED[encoding]}" if encoding in _CONVERTED else ""
 
 
 class ChannelFormat:
@@ -32,7 +46,9 @@ class ChannelFormat:
         self._schema = schema
         self.encoding = f"{channel.message_encoding}/{schema.encoding if schema else ''}"
         self.type = schema.name if schema else ""
-        self._wire = _ROS.get(self.encoding)
+        self._wire: Wire | None
+        self._language: Language
+        self._wire, self._language = _ROS.get(self.encoding, (None, "msg"))
         self.is_readable = self._wire is not None
         if self._wire == "ros1":
             self.type = _ros2_name(self.type)
@@ -47,7 +63,8 @@ class ChannelFormat:
         if self._wire is None:
             return messages.known(self.type)
         text = self._schema.data.decode(errors="replace") or messages.definition_text(self.type)
-        found = messages.definition(self.type, text, self._wire)
+        language = self._language if self._schema.data else "msg"
+        found = messages.definition(self.type, text, self._wire, language)
         found.check()
         return found
 
@@ -64,12 +81,12 @@ class ChannelFormat:
     def stamps(self, rows: Rows) -> NDArray[np.int64]:
         """Header stamps of messages as the container has them, ns; log times where there are none to be read."""
         stamps = rows.log_ns
-        if self._wire is not None and self._schema is not None:
+        if self._wire is not None and self._schema is not None and self._language == "msg":
             has_header = messages.has_header(self._schema.data.decode(errors="replace"))
             stamps = header_stamps(has_header, rows, self._wire)
         elif self.is_readable:
             try:
-                stamps = header_stamps(self.definition.has_header, self.rows(rows), "cdr")
+                stamps = header_stamps(self.definition.has_header, self.rows(rows), self.definition.wire)
             except MessageError:
                 return rows.log_ns
         return np.where(stamps == 0, rows.log_ns, stamps)

@@ -16,7 +16,7 @@ import numpy as np
 
 from pipelines.errors import InputError
 from pipelines.recording import messages
-from pipelines.recording.channel_format import READABLE, ChannelFormat
+from pipelines.recording.channel_format import READABLE, ChannelFormat, converted
 from pipelines.recording.clocks import check_clock
 from pipelines.recording.container import Container, Rows
 from pipelines.recording.decoding import Decoder, Times, header_stamps, logged_at
@@ -115,11 +115,12 @@ class MessageReader:
             )
         if types and found.type not in types:
             kind = found.type if found.encoding == ENCODING else f"{found.type} ({found.encoding})"
-            raise InputError(f"{self._name}: topic {topic} holds {kind}, needed is {' or '.join(types)} ({ENCODING})")
+            needed = f"needed is {' or '.join(types)} ({ENCODING}){converted(found.encoding)}"
+            raise InputError(f"{self._name}: topic {topic} holds {kind}, {needed}")
         if not found.is_readable:
             raise InputError(
                 f"{self._name}: topic {topic} has the encoding {found.encoding}, needed is {ENCODING} (ROS 2, as "
-                f"`ros2 bag record -s mcap` writes it), or one of {', '.join(READABLE[1:])}"
+                f"`ros2 bag record -s mcap` writes it), or one of {', '.join(READABLE[1:])}{converted(found.encoding)}"
             )
         if not found.count:
             raise InputError(f"{self._name}: topic {topic} has no messages")

@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
-from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 
 Array = NDArray[np.float64]
 
 # How ROS 2 and ROS 1 lay a message out: ROS 1 without encapsulation and without alignment.
 Wire = Literal["cdr", "ros1"]
+# What a definition is written in: ROS' own lines, or OMG's IDL.
+Language = Literal["msg", "idl"]
 
 IMU = "sensor_msgs/msg/Imu"
 MAGNETIC_FIELD = "sensor_msgs/msg/MagneticField"
@@ -63,6 +65,7 @@ _APRILTAG_MSGS = {
     TAG_DETECTIONS: "std_msgs/Header header\napriltag_msgs/AprilTagDetection[] detections\n",
 }
 
+_HEADER = "std_msgs/msg/Header"
 _CODES = {"bool": "u1", "byte": "u1", "char": "u1"}
 
 # The primitive types `time` and `duration` of ROS 1.
@@ -138,12 +141,12 @@ class Definition:
     The text is another's, and rosbags makes code of it, so that its size is looked at before.
     """
 
-    def __init__(self, name: str, text: str, wire: Wire = "cdr") -> None:
+    def __init__(self, name: str, text: str, wire: Wire = "cdr", language: Language = "msg") -> None:
         self.name, self.wire = name, wire
         if len(text) > _LONGEST_TEXT:
             raise MessageError(f"the definition of message type {name} has {len(text)} letters")
         try:
-            self._types = get_types_from_msg(text, name)
+            self._types = get_types_from_msg(text, name) if language == "msg" else _types_of_idl(text)
         except Exception as error:  # a parser on a text that may be anything
             raise self._unreadable(error) from error
         if wire == "ros1":  # where CameraInfo has K, ROS 2 has k
@@ -151,7 +154,7 @@ class Definition:
                 kind: (constants, [(field.lower(), what) for field, what in fields])
                 for kind, (constants, fields) in (_ROS1_TIMES | self._types).items()
             }
-        self.has_header = has_header(text)
+        self.has_header = has_header(text) if language == "msg" else self._first_field == (Nodetype.NAME, _HEADER)
 
     def check(self) -> None:
         """Raise MessageError if no messages can be read with the definition."""
@@ -206,6 +209,12 @@ class Definition:
             return None
         return Layout(data, tuple(walk.leaves), (*([(0, 2)] if self.wire == "cdr" else []), *walk.fixed))
 
+    @property
+    def _first_field(self) -> Any:
+        """What it is, in rosbags' terms; None if there is none."""
+        _, fields = self._types.get(self.name, ((), ()))
+        return next((what for _, what in fields), None)
+
     @cached_property
     def _store(self) -> Any:
         store = get_typestore(Stores.EMPTY)
@@ -237,9 +246,19 @@ class Definition:
 
 
 @lru_cache(maxsize=64)
-def definition(name: str, text: str, wire: Wire = "cdr") -> Definition:
+def definition(name: str, text: str, wire: Wire = "cdr", language: Language = "msg") -> Definition:
     """The definition of a type in the text of a recording. Raises MessageError."""
-    return Definition(name, text, wire)
+    return Definition(name, text, wire, language)
+
+
+def _types_of_idl(text: str) -> Any:
+    """The types in the IDL of one type, or of several under a line with the name of each."""
+    types: dict[str, Any] = {}
+    for part in text.split(f"{'=' * 80}\n"):
+        types |= (
+            get_types_from_idl(part.partition("\n")[2] if part.startswith("IDL: ") else part) if part.strip() else {}
+        )
+    return types
 
 
 def has_header(text: str) -> bool:

@@ -56,6 +56,11 @@ def netpbm(image: Any) -> bytes:
     return _file(_colours(pixels, _RED[bayer["pattern"]]))
 
 
+def colour_file(rgb: Pixels) -> bytes:
+    """A picture (height, width, 3) of 8 bits as a file."""
+    return _file(np.ascontiguousarray(rgb))
+
+
 def _rows(data: NDArray[np.uint8], height: int, used: int, step: int) -> NDArray[np.uint8]:
     """The bytes that are used of each row."""
     if not 0 < used <= step or height <= 0 or height * step != len(data) or len(data) > _LARGEST:

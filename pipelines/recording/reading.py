@@ -11,6 +11,7 @@ damaged is left out, see `Recording.notes`.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from pipelines import progress
 from pipelines.errors import InputError
-from pipelines.recording import messages, series
+from pipelines.recording import messages, series, video
 from pipelines.recording.clocks import check_clock
 from pipelines.recording.container import Container
 from pipelines.recording.data_loss import DataLoss
@@ -242,14 +243,35 @@ class Recording:
         raise AssertionError("an empty topic has been refused")
 
     def images(self, topic: str) -> Iterator[tuple[int, bytes]]:
-        """(stamp in ns, file) of the pictures on a CompressedImage or Image topic, one by one; raw ones as Netpbm."""
+        """(stamp in ns, file) of the pictures on a CompressedImage or Image topic, one by one.
+
+        Raw ones, and those of a H.264 video, are files in the Netpbm form.
+        """
         self._reader.require(topic, *messages.PICTURES)
+        files = progress.track(self._files(topic), "pictures", self.topics[topic].count)
+        for t_ns, form, data in files:
+            if form in video.OTHERS:
+                raise InputError(f"{self.path}: topic {topic}: a video in {form}; H.264 is read, or single pictures")
+            if form in video.H264:
+                packets = itertools.chain([(t_ns, data)], ((t_ns, data) for t_ns, _, data in files))
+                yield from self._video(topic, packets)
+                return
+            yield t_ns, data
+
+    def _files(self, topic: str) -> Iterator[tuple[int, str, bytes]]:
+        """(stamp in ns, form, file or message of a video) of the messages of a topic of pictures."""
         is_raw = self.topics[topic].type == messages.IMAGE
-        decoded = self._reader.decoded(topic, *messages.PICTURES)
-        for t_ns, _, message, _ in progress.track(decoded, "pictures", self.topics[topic].count):
+        for t_ns, _, message, _ in self._reader.decoded(topic, *messages.PICTURES):
             with self._reader.fields(topic):
-                picture = netpbm(message) if is_raw else message.data.tobytes()
-            yield t_ns, picture
+                file = ("netpbm", netpbm(message)) if is_raw else (message.format.lower(), message.data.tobytes())
+            yield t_ns, *file
+
+    def _video(self, topic: str, packets: Iterable[tuple[int, bytes]]) -> Iterator[tuple[int, bytes]]:
+        """The pictures of a video."""
+        try:
+            yield from video.decoded(packets)
+        except ValueError as error:
+            raise InputError(f"{self.path}: topic {topic}: {error}") from error
 
     def detections(self, topic: str) -> series.DetectionSeries:
         """An apriltag_msgs/msg/AprilTagDetectionArray topic, with corners as points or as plain numbers."""

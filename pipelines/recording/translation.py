@@ -24,6 +24,7 @@ _HEADER, _TIME = "std_msgs/msg/Header", "builtin_interfaces/msg/Time"
 _ROS = {name.rpartition("/")[2]: name for name in messages.SENSORS}
 _FOXGLOVE = {
     "CompressedImage": messages.COMPRESSED_IMAGE,
+    "CompressedVideo": messages.COMPRESSED_IMAGE,
     "PoseInFrame": messages.PLAIN_POSE,
     "FrameTransform": messages.TRANSFORM,
     "FrameTransforms": messages.TF,
