@@ -280,6 +280,7 @@ class Config(Section):
     sensors: SensorSheets = Sensors()
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None
     longitude_deg: Annotated[float, Field(ge=-180.0, le=360.0)] | None = None
+    height: float | None = None
     date: Date | None = None
     _belief: Belief | None = PrivateAttr(None)
 

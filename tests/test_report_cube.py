@@ -13,12 +13,13 @@ from pipelines.config import load_config
 from pipelines.graph.problem import Estimate, Findings
 from pipelines.methods.cube.data import CubeData
 from pipelines.methods.cube.figures import cube_plots
-from pipelines.methods.cube.findings import findings, parts_of, white_noise
+from pipelines.methods.cube.findings import findings, white_noise
 from pipelines.methods.cube.graph import problem
 from pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
 from pipelines.methods.cube.simulation import simulate_cube
-from pipelines.methods.cube.tables import described
+from pipelines.methods.triads import parts_of
 from pipelines.reports.result import Calibration, Plot, Table
+from pipelines.reports.sphere_map import described
 from pipelines.settings import Config
 from pipelines.solvers.batch import solve_batch
 

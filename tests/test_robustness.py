@@ -16,7 +16,6 @@ from pipelines.config import load_config
 from pipelines.graph.problem import Estimate, Problem
 from pipelines.judgement.observability import assess
 from pipelines.methods.cube import graph as cube
-from pipelines.methods.cube.parameters import triad_names
 from pipelines.methods.cube.scenario import CubeScenario, cube_config
 from pipelines.methods.cube.simulation import simulate_cube
 from pipelines.methods.indexer import graph as indexer
@@ -24,6 +23,7 @@ from pipelines.methods.indexer.simulation import IndexerScenario, indexer_config
 from pipelines.methods.los import graph as los
 from pipelines.methods.los.recording import write_los
 from pipelines.methods.los.simulation import LosAngles, LosScenario, los_config, simulate_los
+from pipelines.methods.triads import triad_names
 from pipelines.session import calibrate
 from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.solvers import batch

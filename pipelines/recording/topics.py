@@ -35,6 +35,8 @@ Need = Sequence[Sequence[Topic | Setting]]
 
 # Topics that several methods read.
 IMU = Topic("imu", "/imu", (messages.IMU,))
+MAG = Topic("mag", "/mag", (messages.MAGNETIC_FIELD,))
+FIX = Topic("fix", "/fix", (messages.NAV_SAT_FIX,))
 IMAGE = Topic("image", "/camera/image/compressed", messages.PICTURES)
 CAMERA_INFO = Topic("camera_info", "/camera/camera_info", (messages.CAMERA_INFO,))
 

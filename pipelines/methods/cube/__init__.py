@@ -110,7 +110,7 @@ class Cube(Method):
 
     @property
     def exporters(self) -> Mapping[str, Callable[[SavedCalibration], str]]:
-        from pipelines.methods.cube.export import FORMATS
+        from pipelines.methods.triad_export import FORMATS
 
         return FORMATS
 

@@ -8,8 +8,9 @@ import numpy as np
 
 from pipelines.graph.problem import Array
 from pipelines.methods.cube.data import CubeData, nominal, recorded
-from pipelines.methods.cube.parameters import CUBE, SENSITIVITY, SQUARE, triad_names
+from pipelines.methods.cube.parameters import CUBE, SENSITIVITY, SQUARE
 from pipelines.methods.cube.topics import CubeConfig
+from pipelines.methods.triads import triad_of
 from pipelines.settings import Config
 
 
@@ -31,9 +32,9 @@ def calibrated(
         )
     if name == "gyro" and force is not None:
         vectors = vectors - force @ np.array([values.get(n, 0.0) for n in SENSITIVITY.names]).reshape(3, 3).T
-    numbers = np.array([values[entry] for entry in triad_names(name)])
     raw = recorded(vectors, getattr(config.section(CubeConfig).raw, name))
-    return np.asarray(raw @ numbers[:9].reshape(3, 3).T + numbers[9:])
+    K, b = triad_of(name, values)
+    return np.asarray(raw @ K.T + b)
 
 
 def calibrated_rates(data: CubeData, config: Config, values: Mapping[str, float]) -> Array:

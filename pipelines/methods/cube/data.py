@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, wraps
@@ -11,11 +10,10 @@ from typing import TYPE_CHECKING, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.earth import magnetic_field
-from pipelines.errors import InputError
 from pipelines.graph.noise import Noise
 from pipelines.methods.cube.topics import CubeConfig, RawConversion, field_date
 from pipelines.methods.noise import stated
+from pipelines.methods.place import field_at
 from pipelines.settings import Config
 
 if TYPE_CHECKING:
@@ -115,13 +113,7 @@ def local_field(data: CubeData, config: Config) -> Array:
     """
     assert data.latitude is not None
     assert data.longitude is not None
-    date = field_date(config) or datetime.datetime.fromtimestamp(data.epoch_ns * 1e-9, datetime.UTC).date()
-    first, last = datetime.date(date.year, 1, 1), datetime.date(date.year + 1, 1, 1)
-    year = date.year + (date - first) / (last - first)
-    try:
-        return magnetic_field(data.latitude, data.longitude, data.height, year)
-    except ValueError as error:
-        raise InputError(f"{error}; give the date of the recording in the config as `date`") from error
+    return field_at(data.latitude, data.longitude, data.height, data.epoch_ns, field_date(config))
 
 
 def stated_density(name: str, data: CubeData, config: Config, *families: str) -> Noise:

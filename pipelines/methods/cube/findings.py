@@ -6,22 +6,19 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from factors import so3
 from pipelines.graph.problem import Array, Estimate, Findings
 from pipelines.methods.cube.compensation import calibrated
 from pipelines.methods.cube.data import CubeData, noise_densities, nominal
 from pipelines.methods.cube.noises import noises
-from pipelines.methods.cube.parameters import TRIADS, triad_names
 from pipelines.methods.cube.poses import StaticPoses, static_poses
-from pipelines.methods.cube.topics import MAG, CubeConfig
-from pipelines.recording.topics import IMU
+from pipelines.methods.cube.topics import CubeConfig
+from pipelines.methods.triads import TRIADS, parts_row, parts_with_sigmas, triad_names
+from pipelines.recording.topics import IMU, MAG
 from pipelines.settings import Config
 
 # White noise is told from means over this much time, s: shorter ones are what the device's own filter leaves.
 _BLOCK = 0.25
 _UNITS = {"accel": "m/s^2/sqrt(Hz)", "gyro": "rad/s/sqrt(Hz)", "mag": "T/sqrt(Hz)"}
-# Of K's entries, for the derivatives of its parts.
-_STEP = 1e-6
 
 
 def findings(data: CubeData, config: Config, estimate: Estimate) -> Findings:
@@ -44,40 +41,13 @@ def findings(data: CubeData, config: Config, estimate: Estimate) -> Findings:
     }
 
 
-def parts_of(K: Array) -> Array:
-    """Scales (3), nonorthogonalities (3) and mounting (3) of a triad whose nominal = K raw + b; shape (9,).
-
-    The rows of K^-1 are the sensitive axes in the body, as long as their scales; the mounting is the rotation nearest
-    to the unit axes. Raises ValueError when K is singular or its axes are left-handed.
-    """
-    if not np.linalg.det(K) > 0.0:
-        raise ValueError("K is singular or left-handed")
-    axes = np.linalg.inv(K)
-    scale = np.linalg.norm(axes, axis=1)
-    axes /= scale[:, None]
-    across = (axes @ axes.T)[[0, 0, 1], [1, 2, 2]]
-    mounting = so3.log(so3.align(axes, np.eye(3)))
-    return np.concatenate([scale, np.arcsin(np.clip(across, -1.0, 1.0)), mounting])
-
-
 def _triad(name: str, config: Config, estimate: Estimate) -> dict[str, object] | None:
     rows = [estimate.names.index(entry) for entry in triad_names(name)[:9]]
     conversion = getattr(config.section(CubeConfig).raw, name)
     unit = 1.0 if conversion is None else conversion.scale
-    K = estimate.values[rows] / unit
-    try:
-        found = parts_of(K.reshape(3, 3))
-        steps = _STEP * np.eye(9)
-        columns = [parts_of((K + s).reshape(3, 3)) - parts_of((K - s).reshape(3, 3)) for s in steps]
-    except ValueError:
-        return None
-    J = np.array(columns).T / (2.0 * _STEP)
-    sigma = np.sqrt(np.diag(J @ estimate.covariance[np.ix_(rows, rows)] @ J.T)) / unit
-    kinds = ("scale", "nonorthogonality", "mounting")
-    row: dict[str, object] = {"sensor": name}
-    for kind, part in zip(kinds, (slice(0, 3), slice(3, 6), slice(6, 9)), strict=True):
-        row |= {kind: found[part].tolist(), f"{kind}_sigma": sigma[part].tolist()}
-    return row
+    K, covariance = estimate.values[rows].reshape(3, 3) / unit, estimate.covariance[np.ix_(rows, rows)] / unit**2
+    parts = parts_with_sigmas(K, covariance)
+    return None if parts is None else parts_row(name, *parts)
 
 
 def _noise(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -13,13 +13,8 @@ from pipelines.methods.cube.data import nominal, recorded
 from pipelines.methods.cube.parameters import CUBE, SENSITIVITY, SQUARE, TILT
 from pipelines.methods.cube.topics import CubeConfig, RawConversion
 from pipelines.methods.formula import Formula, matrix_text, numbers_of, vector_text
+from pipelines.methods.triads import triad_formula
 from pipelines.settings import Config
-
-_TRIADS = {
-    "accel": ("specific force along the cube's axes, m/s^2", "f_b"),
-    "gyro": ("rate along the cube's axes, rad/s", "w_b"),
-    "mag": ("field along the cube's axes, T", "m_b"),
-}
 
 
 def formulas(parameters: Collection[str], config: Config) -> list[Formula]:
@@ -34,7 +29,7 @@ def formulas(parameters: Collection[str], config: Config) -> list[Formula]:
     if "gyro_k11" in parameters:
         found.append(_gyro(parameters, raw.gyro))
     if "mag_k11" in parameters:
-        found.append(_triad("mag", "mag", ("mag",), lambda v: v.mag))
+        found.append(triad_formula("mag", parameters, "mag", ("mag",), lambda v: v.mag))
     if "camera_mount_x" in parameters:
         found.append(
             Formula(
@@ -74,7 +69,7 @@ def formulas(parameters: Collection[str], config: Config) -> list[Formula]:
 def _accelerometer(parameters: Collection[str], conversion: RawConversion | None) -> list[Formula]:
     """With its curvature taken off, in nominal units, if any of it is known."""
     if not any(name in parameters for each in (SQUARE, CUBE) for name in each.names):
-        return [_triad("accel", "accel", ("accel",), lambda v: v.accel)]
+        return [triad_formula("accel", parameters, "accel", ("accel",), lambda v: v.accel)]
     square, cube = (vector_text(each.names, parameters) for each in (SQUARE, CUBE))
     said = "accel" if conversion is None else f"(accel - {conversion.offset!r}) * {conversion.scale!r}"
     back = "accel_u" if conversion is None else f"(accel_u / {conversion.scale!r} + {conversion.offset!r})"
@@ -94,37 +89,24 @@ def _accelerometer(parameters: Collection[str], conversion: RawConversion | None
     return [
         Formula(f"{meaning}, nearly", "accel_near", bent(first), ("accel",), once),
         Formula(meaning, "accel_u", bent("accel_near"), ("accel",), straight),
-        _triad("accel", back, ("accel",), lambda v: recorded(v.accel_u, conversion)),
+        triad_formula("accel", parameters, back, ("accel",), lambda v: recorded(v.accel_u, conversion)),
     ]
 
 
 def _gyro(parameters: Collection[str], conversion: RawConversion | None) -> Formula:
     """With what it says for the specific force taken off, if that is known."""
     if not any(name in parameters for name in SENSITIVITY.names):
-        return _triad("gyro", "gyro", ("gyro",), lambda v: v.gyro)
+        return triad_formula("gyro", parameters, "gyro", ("gyro",), lambda v: v.gyro)
     felt = f"{matrix_text([SENSITIVITY.names[i : i + 3] for i in (0, 3, 6)], parameters)} * f_b"
     text = f"(gyro - {felt})" if conversion is None else f"(gyro - {felt} / {conversion.scale!r})"
     scale = 1.0 if conversion is None else conversion.scale
-    return _triad(
+    return triad_formula(
         "gyro",
+        parameters,
         text,
         ("gyro", "accel"),
         lambda v: v.gyro - v.f_b @ numbers_of(v, SENSITIVITY.names).reshape(3, 3).T / scale,
     )
-
-
-def _triad(name: str, said: str, measured: tuple[str, ...], read: Callable[[Any], so3.Array]) -> Formula:
-    """K and b applied to what a sensor said, as text and as code."""
-    meaning, result = _TRIADS[name]
-    rows = ", ".join(f"[{', '.join(f'{name}_k{i}{j}' for j in '123')}]" for i in "123")
-
-    def compute(v: Any) -> so3.Array:
-        K = np.array([[getattr(v, f"{name}_k{i}{j}") for j in "123"] for i in "123"])
-        b = np.array([getattr(v, f"{name}_b{i}") for i in "123"])
-        return np.asarray(read(v) @ K.T + b)
-
-    bias = f"[{', '.join(f'{name}_b{i}' for i in '123')}]"
-    return Formula(meaning, result, f"[{rows}] * {said} + {bias}", measured, compute)
 
 
 def _tag(tag: int) -> Formula:

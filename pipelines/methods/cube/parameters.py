@@ -18,9 +18,10 @@ from pipelines.graph.linear import linear_factor
 from pipelines.graph.priors import prior_sigmas, rotation_prior, vector_prior
 from pipelines.graph.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
 from pipelines.methods.cube.topics import CubeConfig, RawConversion
+from pipelines.methods.place import FIELD, STRENGTH_SIGMA
+from pipelines.methods.triads import TRIADS, triad_names
 from pipelines.settings import Config, check_names
 
-TRIADS = ("accel", "gyro", "mag")
 TRIAD_KEYS: dict[str, int] = {name: int(gtsam.symbol(c, 0)) for name, c in zip(TRIADS, "AGM", strict=True)}
 MOUNT_KEY, SAID_KEY, FIELD_KEY, SENSITIVITY_KEY, CURVATURE_KEY = (int(gtsam.symbol(c, 0)) for c in "CHFSQ")
 
@@ -30,11 +31,6 @@ SQUARE = Assumption(tuple(f"accel_square_{i}" for i in "123"), "s^2/m", "accel",
 CUBE = Assumption(tuple(f"accel_cube_{i}" for i in "123"), "s^4/m^2", "accel", "cube", 1e-6)
 TILT = Assumption(("reference_tilt_e", "reference_tilt_n"), "rad", "reference", "tilt", 1e-3)
 ASSUMPTIONS = (SENSITIVITY, SQUARE, CUBE, TILT)
-# The earth's field, each component about its model: outdoors; a building may add ten times that.
-FIELD = Assumption(("field_e", "field_n", "field_u"), "T", "field", "model_error", 5e-7)
-
-# Of the total intensity by WMM 2025, T: global error model of its technical report (NOAA/NCEI and BGS, 2024).
-_STRENGTH_SIGMA = 1.38e-7
 
 # Triad -> unit of its nominal value, default prior sigma and accuracy wanted of its bias.
 _BIAS: Mapping[str, tuple[str, float, float]] = {
@@ -50,11 +46,6 @@ _FRAME = ("accel_k21", "accel_k31", "accel_k32")
 def tag_key(tag: int) -> int:
     """Variable of the correction of a tag's attitude on the cube, a Rot3."""
     return int(gtsam.symbol("T", tag))
-
-
-def triad_names(name: str) -> tuple[str, ...]:
-    """Names of a triad's 12 numbers: rows of K, then b."""
-    return tuple(f"{name}_k{i}{j}" for i in "123" for j in "123") + tuple(f"{name}_b{i}" for i in "123")
 
 
 @dataclass(frozen=True)
@@ -130,7 +121,7 @@ def _strength(key: int, model: Array) -> Factor:
     Not for a field that is farther off: what a building does to it, it does to its strength too.
     """
     along = (model / np.linalg.norm(model))[None]
-    return Factor("prior", linear_factor({key: along}, {key: model}, _STRENGTH_SIGMA))
+    return Factor("prior", linear_factor({key: along}, {key: model}, STRENGTH_SIGMA))
 
 
 def cube_parameters(config: Config, camera: bool, reference: bool, field: Array | None) -> Parameters:

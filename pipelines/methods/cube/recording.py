@@ -9,8 +9,9 @@ import numpy as np
 from pipelines.errors import InputError
 from pipelines.methods.cube.data import Array, CubeData, nominal
 from pipelines.methods.cube.sightings import read_camera, read_sightings
-from pipelines.methods.cube.topics import MAG, REFERENCE_FIX, REFERENCE_IMU, TAG_DETECTIONS, CubeConfig
+from pipelines.methods.cube.topics import REFERENCE_FIX, REFERENCE_IMU, TAG_DETECTIONS, CubeConfig
 from pipelines.methods.cube.units import check_accel, check_mag
+from pipelines.methods.place import read_place
 from pipelines.recording.checks import (
     LEAST_ACCEL,
     LEAST_GYRO,
@@ -25,8 +26,8 @@ from pipelines.recording.checks import (
 )
 from pipelines.recording.faults import drop_faults
 from pipelines.recording.reading import Recording
-from pipelines.recording.topics import IMAGE, IMU, wanted
-from pipelines.settings import Config, first_given
+from pipelines.recording.topics import IMAGE, IMU, MAG, wanted
+from pipelines.settings import Config
 
 # rad^2; no reference is as good.
 _LEAST_VARIANCE = 1e-11
@@ -78,7 +79,7 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
         spans[config.topic(REFERENCE_IMU)] = reference_t
     check_overlap(spans)
 
-    latitude, longitude, height = _position(recording, config)
+    latitude, longitude, height = read_place(recording, config, REFERENCE_FIX)
     data = CubeData(
         epoch_ns=epoch,
         imu_t=imu_t,
@@ -125,22 +126,3 @@ def _reference(
     cov = believed(topic, cov, _LEAST_VARIANCE, dropped)
     known = (np.linalg.eigvalsh(0.5 * (cov + cov.swapaxes(1, 2)))[:, 0] > 0.0).all()
     return t, wxyz, cov if known else None
-
-
-def _position(recording: Recording, config: Config) -> tuple[float | None, float | None, float]:
-    """Latitude and longitude, rad, height, m: the median of the fixes; what the config says wins."""
-    given = [None if x is None else float(np.deg2rad(x)) for x in (config.latitude_deg, config.longitude_deg)]
-    topic = config.topic(REFERENCE_FIX)
-    if not wanted(recording, config, REFERENCE_FIX):
-        return given[0], given[1], 0.0
-    fixes = recording.fixes(topic)
-    good = (fixes.status >= 0) & np.isfinite(fixes.latitude_deg + fixes.longitude_deg + fixes.height)
-    if not good.any():
-        raise InputError(f"topic {topic}: none of {len(fixes)} messages has a position fix")
-    latitude, longitude, height = (
-        float(np.median(values[good])) for values in (fixes.latitude_deg, fixes.longitude_deg, fixes.height)
-    )
-    if abs(latitude) > 90.0 or abs(longitude) > 360.0:
-        raise InputError(f"topic {topic}: latitude {latitude:g}, longitude {longitude:g}; NavSatFix is in degrees")
-    found = [float(np.deg2rad(x)) for x in (latitude, longitude)]
-    return first_given(given[0], found[0]), first_given(given[1], found[1]), height

@@ -21,7 +21,7 @@ from pipelines.graph.assumptions import stated
 from pipelines.methods.cube.data import CubeData, Sightings
 from pipelines.methods.cube.faces import FACES
 from pipelines.methods.cube.motion import drawn_motion
-from pipelines.methods.cube.parameters import ASSUMPTIONS, CUBE, FIELD, SENSITIVITY, SQUARE, TILT
+from pipelines.methods.cube.parameters import ASSUMPTIONS, CUBE, SENSITIVITY, SQUARE, TILT
 from pipelines.methods.cube.scenario import (
     EPOCH_NS,
     FORWARD,
@@ -33,6 +33,7 @@ from pipelines.methods.cube.scenario import (
     ReferenceAttitude,
     cube_config,
 )
+from pipelines.methods.place import FIELD
 from pipelines.settings import Config
 from pipelines.simulation.motion import sample_times
 from pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.reports.result import Calibration, Table
+from pipelines.reports.sphere_map import described
 from pipelines.reports.units import to_digits_of
 
 NAMES = {"accel": "accelerometer", "gyro": "gyro", "mag": "magnetometer"}
@@ -84,16 +85,3 @@ def _static_poses(calibration: Calibration) -> Table:
         ("pose", "from, s", "to, s", "up", "used"),
         tuple(rows),
     )
-
-
-def described(up: object) -> str:
-    """The side of the body that is up, and where it leans, in words; `up` (3,) is the direction of up in the body."""
-    direction = np.asarray(up, dtype=float) / np.linalg.norm(np.asarray(up, dtype=float))
-    first, second = np.argsort(-np.abs(direction))[:2]
-    lean = np.rad2deg(np.arccos(np.clip(abs(direction[first]), 0.0, 1.0)))
-    words = _side(first, direction[first])
-    return words if lean < 5.0 else f"{words}, {lean:.0f} deg towards {_side(second, direction[second])}"
-
-
-def _side(axis: int, value: float) -> str:
-    return f"{'+' if value > 0.0 else '-'}{'xyz'[axis]}"

@@ -6,10 +6,9 @@ import datetime
 from typing import ClassVar
 
 from pipelines.recording import messages
-from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, Need, Setting, Topic
+from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, MAG, Need, Setting, Topic
 from pipelines.settings import Board, Config, Date, MethodSection, Quaternion, Section, Sigma
 
-MAG = Topic("mag", "/mag", (messages.MAGNETIC_FIELD,))
 REFERENCE_FIX = Topic("reference_fix", "/reference/fix", (messages.NAV_SAT_FIX,))
 REFERENCE_IMU = Topic("reference_imu", "/reference/imu", (messages.IMU,))
 TAG_DETECTIONS = Topic("tag_detections", "/tag_detections", (messages.TAG_DETECTIONS,))

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.methods.cube.data import Array, CubeData, Sightings
-from pipelines.methods.cube.topics import MAG, REFERENCE_FIX, REFERENCE_IMU, TAG_DETECTIONS
+from pipelines.methods.cube.topics import REFERENCE_FIX, REFERENCE_IMU, TAG_DETECTIONS
 from pipelines.recording import series
 from pipelines.recording.checks import nanoseconds
-from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU
+from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, MAG
 from pipelines.recording.writing import attached, write_session
 
 if TYPE_CHECKING:

@@ -41,8 +41,8 @@ from pipelines.methods.indexer.parameters import (
 )
 from pipelines.methods.indexer.recording import IndexerData
 from pipelines.methods.indexer.runs import AxisMotion, axis_motion, cut_turns, encoder_scatter
-from pipelines.methods.indexer.topics import FIX
 from pipelines.methods.noise import sampled, stated
+from pipelines.recording.topics import FIX
 from pipelines.settings import Config
 
 # So many groups stay in a smoother whatever its window, s: a schedule of four positions, to be linearised anew when its

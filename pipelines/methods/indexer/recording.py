@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import InputError
-from pipelines.methods.indexer.topics import FIX, INDEXER
+from pipelines.methods.indexer.topics import INDEXER
 from pipelines.recording import series
 from pipelines.recording.checks import (
     LEAST_GYRO,
@@ -24,7 +24,7 @@ from pipelines.recording.checks import (
 )
 from pipelines.recording.gyro import usable
 from pipelines.recording.reading import Recording
-from pipelines.recording.topics import IMU
+from pipelines.recording.topics import FIX, IMU
 from pipelines.recording.writing import attached, write_session
 from pipelines.settings import Config
 

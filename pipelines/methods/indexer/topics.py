@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import ClassVar
 
 from pipelines.recording import messages
-from pipelines.recording.topics import IMU, Need, Setting, Topic
+from pipelines.recording.topics import FIX, IMU, Need, Setting, Topic
 from pipelines.settings import MethodSection, Quaternion
 
 INDEXER = Topic("indexer", "/indexer/joint_states", (messages.JOINT_STATE,))
-FIX = Topic("fix", "/fix", (messages.NAV_SAT_FIX,))
 
 TOPICS = (IMU, INDEXER, FIX)
 _LATITUDE = Setting("latitude_deg in the config", lambda config: config.latitude_deg is not None)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import InputError
+from pipelines.methods.triads import TRIADS, triad_of
 from pipelines.reports.calibration import SavedCalibration
 
 Array = NDArray[np.float64]
@@ -24,7 +25,7 @@ _AXES = "XYZ"
 
 def _triads(saved: SavedCalibration) -> dict[str, tuple[Array, Array]]:
     """K and b of the sensors there are."""
-    names = [name for name in ("accel", "gyro", "mag") if f"{name}_k11" in saved.parameters]
+    names = [name for name in TRIADS if f"{name}_k11" in saved.parameters]
     return {name: _triad(saved, name) for name in names}
 
 
@@ -40,8 +41,7 @@ def _in_si(saved: SavedCalibration) -> dict[str, tuple[Array, Array]]:
 
 def _triad(saved: SavedCalibration, name: str) -> tuple[Array, Array]:
     """K (3, 3) and b (3,) with nominal = K raw + b."""
-    K = np.array([[saved.value(f"{name}_k{i}{j}") for j in "123"] for i in "123"])
-    return K, np.array([saved.value(f"{name}_b{i}") for i in "123"])
+    return triad_of(name, {key: parameter.value for key, parameter in saved.parameters.items()})
 
 
 def zero_offset(K: Array, b: Array) -> Array:

@@ -1,0 +1,73 @@
+"""Where on the earth a recording was made, and the magnetic field there."""
+
+from __future__ import annotations
+
+import datetime
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.earth import magnetic_field
+from pipelines.errors import InputError
+from pipelines.graph.assumptions import Assumption
+from pipelines.recording.reading import Recording
+from pipelines.recording.topics import Topic, wanted
+from pipelines.settings import Config, first_given
+
+Array = NDArray[np.float64]
+
+# The earth's field, each component about its model: outdoors; a building may add ten times that.
+FIELD = Assumption(("field_e", "field_n", "field_u"), "T", "field", "model_error", 5e-7)
+# Of the total intensity by WMM 2025, T: global error model of its technical report (NOAA/NCEI and BGS, 2024).
+STRENGTH_SIGMA = 1.38e-7
+
+
+def read_place(recording: Recording, config: Config, fix: Topic) -> tuple[float | None, float | None, float]:
+    """Latitude and longitude, rad, None if unknown, and height, m: the median of the fixes; the config's figures win.
+
+    Raises InputError when there are fixes and none of them can be used.
+    """
+    given = [config.latitude_deg, config.longitude_deg, config.height]
+    if wanted(recording, config, fix) and None in given:
+        found: list[float | None] = [*_median(recording, config.topic(fix))]
+    else:
+        found = [None, None, 0.0]
+    latitude, longitude, height = (b if a is None else a for a, b in zip(given, found, strict=True))
+    angles = [None if angle is None else float(np.deg2rad(angle)) for angle in (latitude, longitude)]
+    return angles[0], angles[1], first_given(height, 0.0)
+
+
+def _median(recording: Recording, topic: str) -> tuple[float, float, float]:
+    fixes = recording.fixes(topic)
+    good = (fixes.status >= 0) & np.isfinite(fixes.latitude_deg + fixes.longitude_deg + fixes.height)
+    if not good.any():
+        raise InputError(f"topic {topic}: none of {len(fixes)} messages has a position fix")
+    latitude, longitude, height = (
+        float(np.median(values[good])) for values in (fixes.latitude_deg, fixes.longitude_deg, fixes.height)
+    )
+    if abs(latitude) > 90.0 or abs(longitude) > 360.0:
+        raise InputError(f"topic {topic}: latitude {latitude:g}, longitude {longitude:g}; NavSatFix is in degrees")
+    return latitude, longitude, height
+
+
+def field_at(
+    latitude: float, longitude: float, height: float, epoch_ns: int, date: datetime.date | None = None
+) -> Array:
+    """The World Magnetic Model, (3,) T in East-North-Up, on a date or else that of a stamp.
+
+    Args:
+        latitude, longitude: rad.
+        height: m.
+        epoch_ns: Unix ns.
+        date: as the config gives it.
+
+    Raises:
+        InputError: the model does not hold then.
+    """
+    day = date or datetime.datetime.fromtimestamp(epoch_ns * 1e-9, datetime.UTC).date()
+    first, last = datetime.date(day.year, 1, 1), datetime.date(day.year + 1, 1, 1)
+    year = day.year + (day - first) / (last - first)
+    try:
+        return magnetic_field(latitude, longitude, height, year)
+    except ValueError as error:
+        raise InputError(f"{error}; give the date of the recording in the config as `date`") from error

@@ -1,0 +1,112 @@
+"""Static intervals, when a device stood still: a variance test on its gyro and accelerometer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.errors import InputError
+
+Array = NDArray[np.float64]
+
+# The test looks at this much time about each sample, s; half of it keeps a pose's ends clear of the motion.
+_SPAN = 0.5
+# Shorter intervals, s, are turning points of a motion.
+_SHORTEST = 0.5
+# The scatter over the span is below the first many times the noise somewhere in an interval, and below the second all
+# through it: a hand's tremor does not end a rest.
+_QUIET, _STILL = 2.0, 6.0
+# A motion starts slower than the test can see: this much, s, is cut off at both ends.
+_MARGIN = 0.25
+# The noise is what the quietest twentieth of the recording shows, between these multiples of the stated one.
+_FLOOR_SHARE, _FLOOR_LIMITS = 0.05, (0.2, 10.0)
+# A steady turn is as quiet; its mean rate departs from that of the static intervals by more than this, rad/s.
+_STEADY = 0.01
+# A pause between samples is a gap when longer than this many intervals.
+_GAP_SAMPLES = 5.0
+
+
+def find_static_intervals(t: Array, gyro: Array, accel: Array, gyro_sigma: float, accel_sigma: float) -> Array:
+    """Beginnings and ends, (P, 2) s, of the static intervals, each at a sample's stamp.
+
+    After Tedaldi, Pretto, Menegatti, "A robust and easy to implement method for IMU calibration without external
+    equipments", ICRA 2014, which tests the accelerometer; a turn about the vertical shows in the gyro alone.
+
+    Args:
+        t: (N,) s.
+        gyro: (N, 3) rad/s.
+        accel: (N, 3) m/s^2.
+        gyro_sigma, accel_sigma: stated noise of one sample, per axis.
+
+    Raises:
+        InputError: there is none.
+    """
+    runs, scatter, floor = _quiet_runs(t, [(gyro, gyro_sigma), (accel, accel_sigma)])
+    runs = runs[_turns_not(gyro, runs, floor[0])]
+    if not len(runs):
+        least = scatter.min(axis=1)
+        raise InputError(
+            f"no static pose: in the quietest {_SPAN:g} s the gyro scatters by {least[0]:.2g} rad/s and the "
+            f"accelerometer by {least[1]:.2g} m/s^2, noise stated is {gyro_sigma:.2g} and {accel_sigma:.2g}; let the "
+            "cube stand still for a few seconds in each pose, or state the device's noise in the config"
+        )
+    return t[runs]
+
+
+def quiet_intervals(t: Array, streams: Sequence[tuple[Array, float]]) -> Array:
+    """Beginnings and ends, (P, 2) s, of intervals in which vectors (N, 3) are quiet, each with its noise; maybe none.
+
+    For a device without a gyro: a steady turn about what a sensor feels does not show in it.
+    """
+    return np.asarray(t[_quiet_runs(t, streams)[0]])
+
+
+def _quiet_runs(t: Array, streams: Sequence[tuple[Array, float]]) -> tuple[NDArray[np.intp], Array, Array]:
+    """First and last sample of each quiet run (P, 2), and for each stream its scatter (N,) and the floor of that.
+
+    Raises InputError when the record is shorter than what is looked at.
+    """
+    interval = float(np.median(np.diff(t)))
+    half = max(2, round(0.5 * _SPAN / interval))
+    if len(t) < 2 * half + 1:
+        raise InputError(f"the device's record is {t[-1] - t[0]:.3g} s long, shorter than one static pose")
+    scatter = np.stack([_scatter(values, half) for values, _ in streams])
+    stated = np.array([sigma for _, sigma in streams])
+    low, high = _FLOOR_LIMITS
+    floor = np.clip(np.quantile(scatter, _FLOOR_SHARE, axis=1), low * stated, high * stated)
+    quiet, still = (np.all(scatter < limit * floor[:, None], axis=0) for limit in (_QUIET, _STILL))
+    dense = np.diff(t) < _GAP_SAMPLES * interval
+    still &= np.append(dense, True) & np.append(True, dense)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int))).reshape(-1, 2)
+    counted = np.append(0, np.cumsum(quiet & still))
+    edges = edges[counted[edges[:, 1]] > counted[edges[:, 0]]]
+    margin = round(_MARGIN / interval)
+    runs = edges + np.array([margin, -1 - margin])
+    runs = runs[runs[:, 1] > runs[:, 0]]
+    return runs[t[runs[:, 1]] - t[runs[:, 0]] >= _SHORTEST], scatter, floor
+
+
+def _scatter(values: Array, half: int) -> Array:
+    """Standard deviation (N,) over 2 half + 1 samples about each, root mean square over the axes; inf at the ends."""
+    n = 2 * half + 1
+    centred = values - values.mean(axis=0)
+    sums = [np.cumsum(np.pad(power, ((1, 0), (0, 0))), axis=0) for power in (centred, centred**2)]
+    mean, square = ((s[n:] - s[:-n]) / n for s in sums)
+    out = np.full(len(values), np.inf)
+    out[half:-half] = np.sqrt(np.maximum(square - mean**2, 0.0).mean(axis=1))
+    # The recording's ends are as quiet as the first and last whole span.
+    out[:half], out[-half:] = out[half], out[-half - 1]
+    return out
+
+
+def _turns_not(gyro: Array, runs: NDArray[np.intp], sigma: float) -> NDArray[np.bool_]:
+    """Which runs have the mean rate that most of the quiet time has."""
+    means = np.array([gyro[a : b + 1].mean(axis=0) for a, b in runs]).reshape(-1, 3)
+    lengths = runs[:, 1] - runs[:, 0] + 1
+    if not len(runs):
+        return np.zeros(0, dtype=bool)
+    middle = np.quantile(means, 0.5, axis=0, weights=lengths, method="inverted_cdf")
+    allowed = _STEADY + 5.0 * sigma / np.sqrt(lengths)
+    return np.asarray(np.abs(means - middle).max(axis=1) < allowed)

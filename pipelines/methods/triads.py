@@ -1,0 +1,113 @@
+"""Triads, sensors of three axes with nominal = K raw + b, as several methods report them.
+
+Rows of K are named NAME_k11 to NAME_k33 and b is NAME_b1 to NAME_b3. Of a K that is symmetric by
+definition of the body's axes there are only the six on and above the diagonal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from typing import Any
+
+import numpy as np
+
+from factors import so3
+from pipelines.graph.problem import Array
+from pipelines.methods.formula import Formula
+
+TRIADS = ("accel", "gyro", "mag")
+# Sensor -> what comes out, and what formulas call it.
+_RESULTS = {
+    "accel": ("specific force along the {body} axes, {unit}", "f_b", "m/s^2"),
+    "gyro": ("rate along the {body} axes, {unit}", "w_b", "rad/s"),
+    "mag": ("field along the {body} axes, {unit}", "m_b", "T"),
+}
+# Of K's entries, for the derivatives of its parts.
+_STEP = 1e-6
+
+
+def triad_names(name: str, symmetric: bool = False) -> tuple[str, ...]:
+    """Names of a triad's numbers: rows of K, of a symmetric one its upper half, then b."""
+    gains = tuple(f"{name}_k{i}{j}" for i in "123" for j in "123" if i <= j or not symmetric)
+    return (*gains, *(f"{name}_b{i}" for i in "123"))
+
+
+def gain_names(name: str, known: Collection[str]) -> list[list[str]]:
+    """Name of the parameter in each place of K."""
+    return [[own if (own := f"{name}_k{i}{j}") in known or i <= j else f"{name}_k{j}{i}" for j in "123"] for i in "123"]
+
+
+def triad_of(name: str, values: Mapping[str, float]) -> tuple[Array, Array]:
+    """K (3, 3) and b (3,) of a triad from parameters by name."""
+    K = np.array([[values[entry] for entry in row] for row in gain_names(name, values)])
+    return K, np.array([values[f"{name}_b{i}"] for i in "123"])
+
+
+def triad_formula(
+    name: str,
+    parameters: Collection[str],
+    said: str,
+    measured: tuple[str, ...],
+    read: Callable[[Any], Array],
+    body: str = "cube's",
+    unit: str | None = None,
+) -> Formula:
+    """K and b applied to what a sensor said, as text and as code.
+
+    Args:
+        name: of the sensor.
+        parameters: that there are.
+        said: the sensor's reading as the formula writes it, and `read` as code.
+        measured: what that needs.
+        read: from the names' values.
+        body: whose axes the result is along.
+        unit: of the result, where it is not the SI one.
+    """
+    meaning, result, si = _RESULTS[name]
+    names = gain_names(name, parameters)
+    rows = ", ".join(f"[{', '.join(row)}]" for row in names)
+
+    def compute(v: Any) -> Array:
+        K = np.array([[getattr(v, entry) for entry in row] for row in names])
+        b = np.array([getattr(v, f"{name}_b{i}") for i in "123"])
+        return np.asarray(read(v) @ K.T + b)
+
+    bias = f"[{', '.join(f'{name}_b{i}' for i in '123')}]"
+    return Formula(meaning.format(body=body, unit=unit or si), result, f"[{rows}] * {said} + {bias}", measured, compute)
+
+
+def parts_of(K: Array) -> Array:
+    """Scales (3), nonorthogonalities (3) and mounting (3) of a triad whose nominal = K raw + b; shape (9,).
+
+    The rows of K^-1 are the sensitive axes in the body, as long as their scales; the mounting is the rotation nearest
+    to the unit axes. Raises ValueError when K is singular or its axes are left-handed.
+    """
+    if not np.linalg.det(K) > 0.0:
+        raise ValueError("K is singular or left-handed")
+    axes = np.linalg.inv(K)
+    scale = np.linalg.norm(axes, axis=1)
+    axes /= scale[:, None]
+    across = (axes @ axes.T)[[0, 0, 1], [1, 2, 2]]
+    mounting = so3.log(so3.align(axes, np.eye(3)))
+    return np.concatenate([scale, np.arcsin(np.clip(across, -1.0, 1.0)), mounting])
+
+
+def parts_with_sigmas(K: Array, covariance: Array) -> tuple[Array, Array] | None:
+    """`parts_of` K, and their sigmas by the covariance (9, 9) of its rows; None for a K that is no sensor's."""
+    try:
+        found = parts_of(K)
+        steps = (_STEP * np.eye(9)).reshape(9, 3, 3)
+        columns = [parts_of(K + s) - parts_of(K - s) for s in steps]
+    except ValueError:
+        return None
+    J = np.array(columns).T / (2.0 * _STEP)
+    return found, np.sqrt(np.maximum(np.diag(J @ covariance @ J.T), 0.0))
+
+
+def parts_row(name: str, parts: Array, sigmas: Array) -> dict[str, object]:
+    """A sensor's parts as a row of findings."""
+    row: dict[str, object] = {"sensor": name}
+    for i, kind in enumerate(("scale", "nonorthogonality", "mounting")):
+        part = slice(3 * i, 3 * i + 3)
+        row |= {kind: parts[part].tolist(), f"{kind}_sigma": sigmas[part].tolist()}
+    return row
