@@ -32,6 +32,9 @@ _STEP = 3.0
 _BEYOND = 3.0
 # Two moments make no path.
 _FEWEST_MOMENTS = 5
+# Coloured residuals are as many measurements as they are independent stretches. With fewer of these for each number
+# than this, inflated covariances, which hold for long recordings, say too little of how far an estimate may be off.
+_STRETCHES = 3.0
 
 
 @dataclass(frozen=True)
@@ -107,9 +110,11 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
     if history is None or history.covariance is None or history.steady is None:
         return None
     kept = np.flatnonzero(history.steady & np.array([q.prior_sigma != 0.0 for q in quantities], dtype=bool))
-    if len(history.time) < _FEWEST_MOMENTS or not len(kept):
+    late = history.time >= _long_enough(estimate, len(kept))
+    if late.sum() < _FEWEST_MOMENTS or not len(kept):
         return None
-    values, covariance = _with_priors_as_found(estimate, quantities, history.values, history.covariance)
+    time = history.time[late]
+    values, covariance = _with_priors_as_found(estimate, quantities, history.values[late], history.covariance[late])
     P = (covariance * np.outer(estimate.inflations, estimate.inflations))[:, kept[:, None], kept]
     difference = values[:-1, kept] - values[-1, kept]
     whitening = [_whitening(P[i], P[-1]) for i in range(len(P) - 1)]
@@ -120,7 +125,18 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
     sigmas = np.sqrt(np.maximum(np.diag(P[worst] - P[-1]), 1e-12 * np.diag(P[worst])))
     by_size = np.argsort(-np.abs(difference[worst] / sigmas))
     departures = {quantities[kept[j]].name: float(difference[worst, j] / sigmas[j]) for j in by_size}
-    return Stability(float(sizes[worst]), beyond, float(history.time[worst]), departures)
+    return Stability(float(sizes[worst]), beyond, float(time[worst]), departures)
+
+
+def _long_enough(estimate: Estimate, numbers: int) -> float:
+    """From when on, s, all families of coloured residuals had stretches enough; infinite where they never do."""
+    latest = -np.inf
+    for family, together in estimate.colours.items():
+        times = np.sort(estimate.residuals[family].time)
+        needed = int(np.ceil(_STRETCHES * numbers * together))
+        if together > 1.0:
+            latest = max(latest, float(times[needed - 1]) if needed <= len(times) else np.inf)
+    return latest
 
 
 def _with_priors_as_found(
