@@ -64,7 +64,7 @@ class Solver(StrEnum):
     published = "published"
 
 
-_METHODS = "los, indexer, head, cube or one installed"
+_METHODS = "los, indexer, head, cube, tumble or one installed"
 _MethodName = Annotated[str | None, typer.Option("--method", help=f"{_METHODS}; by default what fits.")]
 _Scheduler = Annotated[str | None, typer.Option(help="Of a dask cluster, tcp://host:8786; default: this machine.")]
 _Jobs = Annotated[int | None, typer.Option(help="Local worker processes; default: one a core.")]

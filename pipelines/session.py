@@ -416,7 +416,7 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
         return methods.method(option).name
     if config.method:
         return config.method
-    able = [name for name in methods.names() if not missing_for(name, recording, config)]
+    able = methods.without_yielding([name for name in methods.names() if not missing_for(name, recording, config)])
     if len(able) == 1:
         return able[0]
     if able:

@@ -196,7 +196,7 @@ def test_bad_options_are_refused(alidade: Command, session: Path, tmp_path: Path
     _refused(
         alidade("simulate", "head", "--scenario", "hed", "--out", tmp_path / "x"), tmp_path / "x", ("head_nominal",)
     )
-    _refused(alidade("simulate", "spoon", "--out", tmp_path / "x"), tmp_path / "x", ("head",))
+    _refused(alidade("simulate", "hedd", "--out", tmp_path / "x"), tmp_path / "x", ("head",))
 
 
 @pytest.mark.parametrize("where", ["reading", "importing", "writing"])

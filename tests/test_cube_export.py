@@ -157,7 +157,7 @@ def test_wrong_format_and_method() -> None:
     saved, _, _ = _fits(_diagonal())
     with pytest.raises(InputError, match="unknown format yaml; there are px4, ardupilot, ros2, kalibr"):
         exported(saved, "yaml")
-    with pytest.raises(InputError, match="only calibrations of the cube method"):
+    with pytest.raises(InputError, match="only calibrations of the cube and tumble method"):
         exported(_calibration({"accel": np.eye(3)}, {"accel": np.zeros(3)}, "head"), "px4")
 
 

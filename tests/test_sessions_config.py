@@ -95,7 +95,7 @@ def test_the_file_overrides_key_by_key(tmp_path: Path) -> None:
         ("noise: 3", "noise: must be"),
         ("priors: {x: -0.1}", r"priors\.x: must be greater than or equal to 0, not -0.1"),
         ("require: {x: 0}", r"require\.x: must be greater than 0, not 0"),
-        ("method: loss", "method: must be 'los', 'indexer', 'head' or 'cube', not 'loss'"),
+        ("method: loss", "method: must be 'los', 'indexer', 'head', 'cube' or 'tumble', not 'loss'"),
         ("latitude_deg: 91", "latitude_deg: must be less than or equal to 90"),
         ("cube: {tags: {16: {rotation: [1, 0, 0, 0]}}}", r"cube\.tags\.16\.size: is missing"),
         ("cube: {tags: {a: {size: 1}}}", r"cube\.tags\.a: must be a valid integer"),

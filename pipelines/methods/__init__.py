@@ -1,9 +1,9 @@
 """Methods: what the rest of the toolkit may ask of one, and which there are.
 
     method("head").simulate("head_nominal", seed=1).data      # arrays
-    names()                                                   # ("los", "indexer", "head", "cube", ...)
+    names()                                                   # ("los", "indexer", "head", "cube", "tumble", ...)
 
-A method is an object of a class derived from `Method`. The four of the toolkit stand in folders beside this file; other
+A method is an object of a class derived from `Method`. Those of the toolkit stand in folders beside this file; other
 distributions bring theirs as entry points of the group `alidade.methods`, name = the method's, value = the class.
 """
 
@@ -56,6 +56,8 @@ class Method(ABC):
         of_recording: patterns of the parameters that belong to a recording; the others are the device's.
         rotations: parameters that are rotation vectors, without their _x, _y, _z -> the rotation each is.
         scenarios: folder with scenarios that come with the method, if it brings its own.
+        yields: whether it is chosen by itself only where no other method is served: it makes do with what others read
+            too.
     """
 
     name: ClassVar[str]
@@ -67,6 +69,7 @@ class Method(ABC):
     of_recording: ClassVar[tuple[str, ...]] = ()
     rotations: ClassVar[Mapping[str, str]] = {}
     scenarios: ClassVar[Path | None] = None
+    yields: ClassVar[bool] = False
 
     # -- from a recording to estimates
 
@@ -172,7 +175,7 @@ class Method(ABC):
         return {}
 
 
-_BUILT_IN = ("los", "indexer", "head", "cube")
+_BUILT_IN = ("los", "indexer", "head", "cube", "tumble")
 
 
 def names() -> tuple[str, ...]:
@@ -197,6 +200,11 @@ def method(name: str) -> Method:
     if not isinstance(made, Method) or made.name != name:
         raise InputError(f"method {name}, brought by {_origin(entry)}: {entry.value} is no Method of that name")
     return made
+
+
+def without_yielding(able: Sequence[str]) -> list[str]:
+    """Of the methods that a recording serves those that do not yield; all of them where there are no others."""
+    return [name for name in able if not method(name).yields] or list(able)
 
 
 def simulate(name: str, scenario: str | None, seed: int, out: Path, images: bool = False) -> None:

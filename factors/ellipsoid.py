@@ -1,0 +1,163 @@
+"""Triads turned every way in a constant field: lengths that stay, and the angle between two fields that stays.
+
+Frames: b the body. A triad has nominal = K raw + b. Of a vector that is the same in level coordinates at all times a
+sensor in any attitude sees the length: raw lies on an ellipsoid. The attitude is eliminated: what is left of a noisy
+raw is its distance from there.
+
+Variables are (K by rows, b), 12 numbers, or of a K that is symmetric 9: k11 k12 k13 k22 k23 k33, b. To first order
+residuals are as white as the samples; of second order is that noise along a bent surface leads away from it, `excess`
+(of fitted curves: Kanatani, "Statistical optimization for geometric computation", 1996).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from factors.model import Array, Block, Model, Residuals
+
+# Of a symmetric K: which of the nine entries by rows each of the six numbers is.
+_UPPER = np.zeros((9, 6))
+_UPPER[[0, 1, 3, 2, 6, 4, 5, 7, 8], [0, 1, 1, 2, 2, 3, 4, 4, 5]] = 1.0
+_SYMMETRIC = np.block([[_UPPER, np.zeros((9, 3))], [np.zeros((3, 6)), np.eye(3)]])
+
+
+# No length or strength is less, so that logarithms have a value.
+_LEAST = 1e-12
+
+
+def entries(symmetric: bool) -> Array:
+    """(12, 9) or (12, 12): rows of K and b, of the variable."""
+    return _SYMMETRIC if symmetric else np.eye(12)
+
+
+def nominal_of(raw: Array, numbers: Array) -> Array:
+    """K raw + b, (n, 3), of raw (n, 3) by rows of K and b (12,) or (n, 12)."""
+    K, b = numbers[..., :9].reshape(*numbers.shape[:-1], 3, 3), numbers[..., 9:]
+    return np.asarray(np.einsum("...ij,...j->...i", K, raw) + b)
+
+
+def excess(raw: Array, sigma: Array, numbers: Array) -> Array:
+    """(n,) mean of the distances of raw (n, 3) from the ellipsoid of rows of K and b (12,) for noise of sigma (n,).
+
+    With f = |K raw + b| of gradient g and second derivatives H it is sigma^2 (tr H / (2 |g|) - g'Hg / |g|^3).
+    """
+    K, vectors = numbers[:9].reshape(3, 3), nominal_of(raw, numbers)
+    length = np.linalg.norm(vectors, axis=1)
+    g = vectors / length[:, None] @ K
+    slope = np.linalg.norm(g, axis=1)
+    trace = ((K**2).sum() - slope**2) / length
+    bent = (((g @ K.T) ** 2).sum(axis=1) - slope**4) / length
+    return np.asarray(sigma**2 * (0.5 * trace / slope - bent / slope**3))
+
+
+@dataclass(frozen=True)
+class StrengthFactor(Model):
+    """The length of a vector measured in any attitude: |K raw + b| = s. Blocks: triad (9 or 12), s (1).
+
+    The residual is how far raw is from the ellipsoid (Sampson's distance, |v| - s over its slope |K' v / |v||), and not
+    how far |v| is from s: that would be less for a K that is too small, down to K = 0 and |b| = s.
+
+    Attributes:
+        time: (n,) s.
+        raw: (n, 3).
+        sigma: (n,) of raw, per axis.
+        excess: (n,) by what the distance is more than 0 on average, see `excess`.
+        symmetric: whether K is.
+    """
+
+    time: Array
+    raw: Array
+    sigma: Array
+    excess: Array
+    symmetric: bool
+    rows: int = 1
+    stacked: ClassVar = ("time", "raw", "sigma", "excess")
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """Triad and strength."""
+        return (9 if self.symmetric else 12, 1)
+
+    def __call__(self, triads: Array, strength: Array) -> Residuals:
+        """Residual ((|v| - s) / |K' v / |v|| - excess) / sigma, (n, 1), v = K raw + b."""
+        length, direction, by_triad = _polar(self.raw, triads, self.symmetric)
+        K = (triads @ entries(self.symmetric).T)[:, :9].reshape(-1, 3, 3)
+        gradient = np.einsum("nij,ni->nj", K, direction)
+        slope = np.maximum(np.linalg.norm(gradient, axis=1), _LEAST)
+        distance = (length - strength[:, 0]) / slope
+        weight = 1.0 / self.sigma
+
+        def jacobians() -> tuple[Array, ...]:
+            # The slope changes with K, and as the direction does.
+            unit = gradient / slope[:, None]
+            ahead = np.einsum("nij,nj->ni", K, unit)
+            across = (ahead - (ahead * direction).sum(axis=1)[:, None] * direction) / length[:, None]
+            by_K = np.einsum("ni,nj->nij", direction, unit).reshape(-1, 9)
+            of_slope = np.concatenate([by_K, np.zeros((len(by_K), 3))], axis=1) @ entries(self.symmetric)
+            of_slope += np.einsum("ni,nid->nd", across, by_triad)
+            of_length = np.einsum("ni,nid->nd", direction, by_triad)
+            scale = (weight / slope)[:, None]
+            return ((of_length - distance[:, None] * of_slope) * scale)[:, None], -scale[..., None]
+
+        return ((distance - self.excess) * weight)[:, None], jacobians
+
+
+@dataclass(frozen=True)
+class DipFactor(Model):
+    """The angle between two constant vectors, up and the field, measured together in any attitude: u . f = -sin dip.
+
+    u and f have the directions of K raw + b of the accelerometer and of the magnetometer. Blocks: both triads (9 or 12
+    each), dip (1; rad, the field's inclination, positive down).
+
+    Attributes:
+        time: (n,) s.
+        accel, mag: (n, 3) raw.
+        sigma: (n,) of the product.
+        symmetric: whether the K of accelerometer and magnetometer are.
+    """
+
+    time: Array
+    accel: Array
+    mag: Array
+    sigma: Array
+    symmetric: tuple[bool, bool]
+    rows: int = 1
+    stacked: ClassVar = ("time", "accel", "mag", "sigma")
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """Accelerometer, magnetometer, dip."""
+        return (*(9 if symmetric else 12 for symmetric in self.symmetric), 1)
+
+    def __call__(self, accel: Array, mag: Array, dip: Array) -> Residuals:
+        """Residual (u . f + sin dip) / sigma, (n, 1)."""
+        up_length, up, by_accel = _polar(self.accel, accel, self.symmetric[0])
+        field_length, field, by_mag = _polar(self.mag, mag, self.symmetric[1])
+        cosine = (up * field).sum(axis=1)
+        weight = 1.0 / self.sigma[:, None]
+
+        def jacobians() -> tuple[Array, ...]:
+            across_up = (field - cosine[:, None] * up) / up_length[:, None] * weight
+            across_field = (up - cosine[:, None] * field) / field_length[:, None] * weight
+            return (
+                np.einsum("ni,nid->nd", across_up, by_accel)[:, None],
+                np.einsum("ni,nid->nd", across_field, by_mag)[:, None],
+                (np.cos(dip) * weight)[..., None],
+            )
+
+        return (cosine[:, None] + np.sin(dip)) * weight, jacobians
+
+
+def _polar(raw: Array, triads: Array, symmetric: bool) -> tuple[Array, Array, Array]:
+    """Length (n,) and direction (n, 3) of K raw + b, and the Jacobian (n, 3, d) of K raw + b by the variable."""
+    spread = entries(symmetric)
+    vectors = nominal_of(raw, triads @ spread.T)
+    length = np.maximum(np.linalg.norm(vectors, axis=1), _LEAST)
+    by_all = np.zeros((len(raw), 3, 12))
+    for i in range(3):
+        by_all[:, i, 3 * i : 3 * i + 3] = raw
+        by_all[:, i, 9 + i] = 1.0
+    return length, vectors / length[:, None], by_all @ spread

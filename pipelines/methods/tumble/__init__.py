@@ -1,0 +1,105 @@
+"""The tumble method: magnetometer and accelerometer of a device that is turned by hand, with nothing beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pipelines.methods import Method
+from pipelines.methods.tumble.topics import NEEDS, TOPICS
+
+if TYPE_CHECKING:
+    from pipelines.graph.problem import Estimate, Findings, Problem
+    from pipelines.judgement.hypotheses import Hypotheses
+    from pipelines.judgement.validation import Validation
+    from pipelines.methods.formula import Formula
+    from pipelines.methods.tumble.recording import TumbleData
+    from pipelines.methods.tumble.scenario import TumbleScenario
+    from pipelines.recording.reading import Recording
+    from pipelines.reports.calibration import SavedCalibration
+    from pipelines.reports.result import Calibration, Plot, Table
+    from pipelines.settings import Config
+    from pipelines.simulation.simulated import Simulated
+
+
+class Tumble(Method):
+    """The door of the tumble method."""
+
+    name = "tumble"
+    title = "Tumbled magnetometer and accelerometer"
+    topics = TOPICS
+    needs = NEEDS
+    sheets = ("field",)
+    yields = True
+
+    @property
+    def data(self) -> type[TumbleData]:
+        from pipelines.methods.tumble.recording import TumbleData
+
+        return TumbleData
+
+    def read(self, recording: Recording, config: Config) -> TumbleData:
+        from pipelines.methods.tumble.recording import read_tumble
+
+        return read_tumble(recording, config)
+
+    def problem(self, data: TumbleData, config: Config) -> Problem:
+        from pipelines.methods.tumble.graph import problem
+
+        return problem(data, config)
+
+    def published(self, data: TumbleData, config: Config, problem: Problem) -> Estimate:
+        from pipelines.methods.tumble.published import published_estimate
+
+        return published_estimate(data, config, problem)
+
+    @property
+    def scenario(self) -> type[TumbleScenario]:
+        from pipelines.methods.tumble.scenario import TumbleScenario
+
+        return TumbleScenario
+
+    def simulate(self, scenario: TumbleScenario, seed: int, images: bool = False) -> Simulated:
+        from pipelines.methods.tumble.simulation import simulated
+
+        return simulated(scenario, seed, images)
+
+    def write(self, path: Path, simulated: Simulated) -> None:
+        from pipelines.methods.tumble.recording import write_tumble
+
+        write_tumble(path, simulated)
+
+    def hypotheses(self) -> Hypotheses:
+        from pipelines.methods.tumble.hypotheses import HYPOTHESES
+
+        return HYPOTHESES
+
+    def validate(self, data: TumbleData, config: Config, values: Mapping[str, float]) -> Sequence[Validation]:
+        from pipelines.methods.tumble.validation import validate
+
+        return validate(data, config, values)
+
+    def formulas(self, parameters: Collection[str], config: Config) -> Sequence[Formula]:  # noqa: ARG002
+        from pipelines.methods.tumble.formulas import formulas
+
+        return formulas(parameters)
+
+    def findings(self, data: TumbleData, config: Config, estimate: Estimate) -> Findings:
+        from pipelines.methods.tumble.findings import findings
+
+        return findings(data, config, estimate)
+
+    def figures(self, data: TumbleData, calibration: Calibration) -> Sequence[Plot | Table]:
+        from pipelines.methods.tumble.figures import figures
+
+        return figures(data, calibration)
+
+    @property
+    def exporters(self) -> Mapping[str, Callable[[SavedCalibration], str]]:
+        from pipelines.methods.triad_export import FORMATS
+
+        return FORMATS
+
+
+METHOD = Tumble()

@@ -1,0 +1,96 @@
+"""Figures of the tumble method: what was found in words, lengths before and after, directions covered."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from pipelines.graph.problem import Array
+from pipelines.methods.triads import triad_of
+from pipelines.methods.tumble.findings import NAMES, directions
+from pipelines.methods.tumble.model import Sensor, prepare
+from pipelines.methods.tumble.recording import TumbleData
+from pipelines.reports.plots import COLORS, add_points, figure, thin
+from pipelines.reports.result import Calibration, Plot, Table
+from pipelines.reports.sphere_map import described, sphere_map
+
+_BEFORE = "#8a949e"
+
+
+def figures(data: TumbleData, calibration: Calibration) -> list[Plot | Table]:
+    """With the estimate applied."""
+    estimate = calibration.estimate
+    values = dict(zip(estimate.names, estimate.values.tolist(), strict=True))
+    found: list[Plot | Table] = [_words(calibration)]
+    for sensor in prepare(data, calibration.config).sensors:
+        if f"{sensor.name}_k11" in values:
+            found += [_lengths(sensor, values), _sphere(sensor, values), _covered(sensor, values)]
+    return found
+
+
+def _words(calibration: Calibration) -> Table:
+    kinds = ("offsets", "stretches", "coverage")
+    rows = [(NAMES[str(row["sensor"])], str(row["says"])) for kind in kinds for row in calibration.findings[kind]]
+    return Table(
+        "In plain words", "Directions are those of the device's axes.", ("sensor", "what was found"), tuple(rows)
+    )
+
+
+def _lengths(sensor: Sensor, values: Mapping[str, float]) -> Plot:
+    K, b = triad_of(sensor.name, values)
+    raw = np.linalg.norm(sensor.raw, axis=1)
+    lengths = [raw / raw.mean(), np.linalg.norm(sensor.raw @ K.T + b, axis=1) / sensor.strength]
+    misses = [100.0 * (length - 1.0) for length in lengths]
+    out = figure("length, % off")
+    some = thin(2 * len(raw))
+    for words, miss, color in zip(("uncalibrated", "calibrated"), misses, (_BEFORE, COLORS[0]), strict=True):
+        add_points(out, sensor.time[some], miss[some], words, color, 4)
+    rms = [float(np.sqrt((miss**2).mean())) for miss in misses]
+    return Plot(
+        f"Length of what the {NAMES[sensor.name]} reads",
+        f"It should be the same in every attitude: {rms[0]:.2g} % RMS off its mean as recorded, {rms[1]:.2g} % off "
+        "calibrated.",
+        out,
+    )
+
+
+def _sphere(sensor: Sensor, values: Mapping[str, float]) -> Plot:
+    """Readings in two views, as recorded about their own centre, and calibrated."""
+    K, b = triad_of(sensor.name, values)
+    clouds = (sensor.raw / sensor.radius, (sensor.raw @ K.T + b) / sensor.strength)
+    some = thin(3 * len(sensor.raw))
+    out = figure("", height=420, x_title="")
+    out.set_subplots(1, 2)
+    for column, (i, j) in enumerate(((0, 1), (0, 2)), start=1):
+        for name, cloud, color in zip(("as recorded", "calibrated"), clouds, (_BEFORE, COLORS[0]), strict=True):
+            out.add_scatter(
+                x=cloud[some, i],
+                y=cloud[some, j],
+                mode="markers",
+                name=name,
+                marker={"color": color, "size": 3},
+                showlegend=column == 1,
+                row=1,
+                col=column,
+            )
+        out.update_xaxes(title_text="xyz"[i], constrain="domain", row=1, col=column)
+        out.update_yaxes(title_text="xyz"[j], scaleanchor=f"x{column}", row=1, col=column)
+    return Plot(
+        f"Readings of the {NAMES[sensor.name]}",
+        "Seen along z and along y, in units of what is measured: an ellipsoid about the offset as recorded, the unit "
+        "sphere about zero calibrated.",
+        out,
+    )
+
+
+def _covered(sensor: Sensor, values: Mapping[str, float]) -> Plot:
+    reached: Array = directions(sensor, values)
+    reached = reached[thin(3 * len(reached))]
+    names = [described(direction) for direction in reached]
+    what = "the field" if sensor.name == "mag" else "up"
+    return Plot(
+        f"Directions covered by the {NAMES[sensor.name]}",
+        f"Where {what} was, in the device's axes, on an equal-area map of all directions.",
+        sphere_map(reached, names, "reading"),
+    )

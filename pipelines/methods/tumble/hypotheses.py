@@ -1,0 +1,8 @@
+"""What can be wrong with the data of the tumble method."""
+
+from __future__ import annotations
+
+from pipelines.judgement.hypotheses import Hypotheses
+
+# Signs, order and scale of axes are what is calibrated.
+HYPOTHESES = Hypotheses(streams={"mag_t": ("mag",), "accel_t": ("accel",)}, signs={})

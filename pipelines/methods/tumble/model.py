@@ -1,0 +1,392 @@
+"""A tumbled recording prepared for its graph: units, first guesses, the samples to be used and their noise.
+
+Graph variables have no unit: raw numbers are divided by the radius of the ellipsoid that they lie on and nominal ones
+by the strength of what they measure, so that K is about a rotation whatever was recorded.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.earth import gravity
+from factors.ellipsoid import StrengthFactor, entries, excess, nominal_of
+from pipelines.errors import InputError
+from pipelines.graph.assumptions import stated as sheet
+from pipelines.graph.noise import ROUGHLY, Noise
+from pipelines.graph.problem import Array
+from pipelines.graph.robust import robust_sigma
+from pipelines.methods.noise import stated
+from pipelines.methods.place import FIELD, STRENGTH_SIGMA, field_at
+from pipelines.methods.static_intervals import quiet_intervals
+from pipelines.methods.triads import triad_names
+from pipelines.methods.tumble.published import FEWEST, ellipsoid
+from pipelines.methods.tumble.recording import TumbleData
+from pipelines.settings import Config
+
+# Typical norms, SI, by which counts are told; of a sensor with its offset.
+_PLAUSIBLE = {"accel": (3.0, 30.0), "mag": (1e-6, 1e-3)}
+# Standard gravity, and what it is off by where the latitude is unknown, m/s^2.
+_GRAVITY, _GRAVITY_SIGMA = 9.80665, 0.02
+# Fewer rests than this and every sample of an accelerometer counts as one at rest.
+_FEWEST_RESTS = 9
+# Samples this many sigmas from the ellipsoid are left out of the first guess.
+_FAR, _ROUNDS = 5.0, 5
+# A rotation is told by pairs of vectors if the second-best answer fits this many times worse.
+_CLEAR = 2.0
+# What the sine of the dip may be off before a sign is called wrong, and the least sine that tells.
+_SINE = 0.35
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor:
+    """One triad.
+
+    Attributes:
+        name: accel or mag.
+        time, raw: (n,) s and (n, 3), as recorded, of the samples or means that are used.
+        sigma, excess: (n,) of these over the radius; see StrengthFactor.
+        symmetric: whether K is so by definition: the sensor defines the body's axes.
+        is_si: whether it is recorded in SI; else in counts.
+        radius: of the ellipsoid, in the unit recorded.
+        strength, spread: of what it measures, and how well that is known, one sigma.
+        unit: of the strength; "1" where it is unknown and called 1.
+        start: (9,) or (12,) first guess, without unit.
+        turned: (3, 3) the part of that which turns: the body's axes against those of a symmetric K.
+        noise: of a sample, with its family.
+    """
+
+    name: str
+    time: Array
+    raw: Array
+    sigma: Array
+    excess: Array
+    symmetric: bool
+    is_si: bool
+    radius: float
+    strength: float
+    spread: float
+    unit: str
+    start: Array
+    turned: Array
+    noise: Noise
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of its numbers."""
+        return triad_names(self.name, self.symmetric)
+
+    @property
+    def scaled(self) -> Array:
+        """(n, 3) raw without unit."""
+        return self.raw / self.radius
+
+    @property
+    def scales(self) -> Array:
+        """What the variable's numbers are multiplied by when they are reported."""
+        gains = len(self.start) - 3
+        return np.repeat([self.strength / self.radius, self.strength], [gains, 3])
+
+    @property
+    def directions(self) -> Array:
+        """(n, 3) of what it measured, unit vectors, at the first guess."""
+        vectors = nominal_of(self.scaled, self.start @ entries(self.symmetric).T)
+        return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
+
+
+@dataclass(frozen=True, eq=False)
+class Dip:
+    """Moments at which both sensors are used together.
+
+    Attributes:
+        time, accel, mag: (n,) s, (n, 3) and (n, 3), without unit.
+        sigma: (n,) of the cosine between them.
+        start: first guess, rad.
+        model: by the field model, rad, and how well that is known; None where the place is unknown.
+        noise: of the cosine.
+    """
+
+    time: Array
+    accel: Array
+    mag: Array
+    sigma: Array
+    start: float
+    model: tuple[float, float] | None
+    noise: Noise
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """What the graph needs: sensors, accelerometer first, what they measured together, and what has to be told."""
+
+    sensors: tuple[Sensor, ...]
+    dip: Dip | None
+    premises: tuple[str, ...]
+    dropped: Mapping[str, int]
+
+
+def prepare(data: TumbleData, config: Config) -> Model:
+    """Raises InputError when there are too few samples or rests, or the date does not do for the field model."""
+    premises: list[str] = []
+    field = None
+    if data.mag is not None and data.latitude is not None and data.longitude is not None:
+        field = field_at(data.latitude, data.longitude, data.height, data.epoch_ns, config.date)
+    sensors: list[Sensor] = []
+    rests = None
+    if data.accel is not None and data.accel_t is not None:
+        rests = _rests(data, config)
+        if rests is None:
+            premises.append(
+                f"The accelerometer has fewer than {_FEWEST_RESTS} rests: every sample counts as one at rest, and its "
+                "motion as noise."
+            )
+        sensors.append(_accelerometer(data, config, rests))
+    if data.mag is not None and data.mag_t is not None:
+        sensors.append(_magnetometer(data, config, field, alone=data.accel is None))
+        if field is None:
+            premises.append(
+                "No position, so that the field's strength is unknown and called 1: K and b give the field in units of "
+                "it; state latitude_deg and longitude_deg in the config for T."
+            )
+    dip = None
+    if len(sensors) > 1:
+        sensors[1], dip, more = _together(data, config, sensors[0], sensors[1], rests, field)
+        premises += more
+    return Model(tuple(sensors), dip, tuple(premises), data.dropped)
+
+
+def _rests(data: TumbleData, config: Config) -> Array | None:
+    """Beginnings and ends (P, 2), s, of when accelerometer and magnetometer were quiet; None where that is too few."""
+    assert data.accel is not None
+    assert data.accel_t is not None
+    t = data.accel_t
+    root_rate = float(np.median(np.diff(t))) ** -0.5
+    size = float(np.median(np.linalg.norm(data.accel - data.accel.mean(axis=0), axis=1))) / _GRAVITY
+    unit = 1.0 if _is_si("accel", data.accel) else max(size, np.finfo(float).tiny)
+    streams = [(data.accel / unit, stated("accel_density", config).stated * root_rate)]
+    if data.mag is not None and data.mag_t is not None:
+        mag = np.stack([np.interp(t, data.mag_t, axis) for axis in data.mag.T], axis=1)
+        streams.append((mag / mag.std(), 1e-3))
+    try:
+        found = quiet_intervals(t, streams)
+    except InputError:
+        return None
+    return found if len(found) >= _FEWEST_RESTS else None
+
+
+def _accelerometer(data: TumbleData, config: Config, rests: Array | None) -> Sensor:
+    assert data.accel is not None
+    assert data.accel_t is not None
+    known = data.latitude is not None
+    strength = float(gravity(data.latitude, data.height)) if data.latitude is not None else _GRAVITY
+    time, raw, number = _means(data.accel_t, data.accel, rests)
+    return _sensor(
+        "accel",
+        (data.accel_t, data.accel_density),
+        (time, raw, number),
+        config,
+        (strength, 0.0 if known else _GRAVITY_SIGMA, "m/s^2"),
+    )
+
+
+def _magnetometer(data: TumbleData, config: Config, field: Array | None, alone: bool) -> Sensor:
+    assert data.mag is not None
+    assert data.mag_t is not None
+    if field is None:
+        known = 1.0, 0.0, "1"
+    else:
+        across = sheet(config, FIELD)
+        known = float(np.linalg.norm(field)), STRENGTH_SIGMA if across <= FIELD.sigma else across, "T"
+    samples = data.mag_t, data.mag, np.ones(len(data.mag))
+    found = _sensor("mag", (data.mag_t, data.mag_density), samples, config, known)
+    return found if alone else replace(found, symmetric=False, start=found.start @ entries(True).T)
+
+
+def _sensor(
+    name: str,
+    stream: tuple[Array, float | None],
+    used: tuple[Array, Array, Array],
+    config: Config,
+    known: tuple[float, float, str],
+) -> Sensor:
+    """A triad whose K is symmetric.
+
+    Args:
+        name: accel or mag.
+        stream: stamps of all samples, and the density that their messages state.
+        used: times, raw numbers, and of how many samples each is the mean.
+        config: in force.
+        known: strength, its sigma, and its unit.
+    """
+    time, raw, number = used
+    if len(raw) < FEWEST:
+        raise InputError(f"{name}: {len(raw)} readings, at least {FEWEST} in different attitudes are needed")
+    is_si = _is_si(name, raw)
+    S, centre = _first_guess(raw)
+    radius = float(np.linalg.det(S)) ** (-1.0 / 3.0)
+    start = np.concatenate([(radius * S)[np.triu_indices(3)], -S @ centre])
+    numbers, root_number = start @ entries(True).T, np.sqrt(number)
+    apart = StrengthFactor(time, raw / radius, np.ones(len(raw)), np.zeros(len(raw)), symmetric=True)
+    distances = apart(np.tile(start, (len(raw), 1)), np.ones((len(raw), 1)))[0][:, 0]
+    seen = radius * robust_sigma(distances * root_number)
+    interval = float(np.median(np.diff(stream[0])))
+    noise = _noise(name, config, stream[1], is_si, seen * interval**0.5)
+    stated_sigma = noise.stated * interval**-0.5
+    believed = stated_sigma if noise.source != "default" or noise.known == 0.0 else seen
+    return Sensor(
+        name=name,
+        time=time,
+        raw=raw,
+        sigma=stated_sigma / radius / root_number,
+        excess=excess(raw / radius, believed / radius / root_number, numbers),
+        symmetric=True,
+        is_si=is_si,
+        radius=radius,
+        strength=known[0],
+        spread=known[1],
+        unit=known[2],
+        start=start,
+        turned=np.eye(3),
+        noise=noise,
+    )
+
+
+def _noise(name: str, config: Config, message: float | None, is_si: bool, seen: float) -> Noise:
+    """What is stated, in the unit recorded; of counts that nobody states, what the first guess leaves."""
+    family = {"accel": "accelerometer", "mag": "magnetometer"}[name]
+    if is_si:
+        return stated(f"{name}_density", config, message, (family,))
+    figure = seen if message is None else message
+    return Noise(f"{name}_counts", figure, "default" if message is None else "message", ROUGHLY, (family,))
+
+
+def _is_si(name: str, raw: Array) -> bool:
+    low, high = _PLAUSIBLE[name]
+    return low <= float(np.median(np.linalg.norm(raw, axis=1))) <= high
+
+
+def _first_guess(raw: Array) -> tuple[Array, Array]:
+    """S and centre of an ellipsoid, or else a sphere, near the readings; those far from it left out."""
+    kept = np.ones(len(raw), dtype=bool)
+    S, centre = _sphere(raw)
+    for _ in range(_ROUNDS):
+        found = ellipsoid(raw[kept])
+        if found is None:
+            break
+        S, centre = found.S, found.centre
+        misses = np.abs(np.linalg.norm((raw - centre) @ S.T, axis=1) - 1.0)
+        near = misses < _FAR * max(robust_sigma(misses), 1e-9)
+        if (near == kept).all() or near.sum() < FEWEST:
+            break
+        kept = near
+    return S, centre
+
+
+def _sphere(raw: Array) -> tuple[Array, Array]:
+    """The sphere through readings (n, 3), the nearest to their mean where there are many."""
+    origin, unit = raw.mean(axis=0), max(float(raw.std()), np.finfo(float).tiny)
+    scaled = (raw - origin) / unit
+    design = np.column_stack([2.0 * scaled, np.ones(len(raw))])
+    solution = np.linalg.lstsq(design, (scaled**2).sum(axis=1), rcond=1e-3)[0]
+    radius = unit * float(np.sqrt(max(solution[3] + solution[:3] @ solution[:3], 1e-6)))
+    return np.eye(3) / radius, origin + unit * solution[:3]
+
+
+def _means(t: Array, values: Array, rests: Array | None) -> tuple[Array, Array, Array]:
+    """Times, means over the rests and numbers of samples in each, empty ones left out; of no rests, all samples."""
+    if rests is None:
+        return t, values, np.ones(len(t))
+    first, last = np.searchsorted(t, rests[:, 0]), np.searchsorted(t, rests[:, 1], side="right")
+    some = last > first
+    means = [values[a:b].mean(axis=0) for a, b in zip(first[some], last[some], strict=True)]
+    return rests[some].mean(axis=1), np.array(means).reshape(-1, 3), (last - first)[some].astype(float)
+
+
+def _together(
+    data: TumbleData, config: Config, accel: Sensor, mag: Sensor, rests: Array | None, field: Array | None
+) -> tuple[Sensor, Dip | None, list[str]]:
+    """The magnetometer turned into the accelerometer's axes, and the angles between what they measured."""
+    assert data.mag_t is not None
+    assert data.mag is not None
+    rows, time, readings, number = _beside(data.mag_t, data.mag, accel.time, rests)
+    up = accel.directions[rows]
+    vectors = nominal_of(readings / mag.radius, mag.start)
+    seen = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    model = None
+    if field is not None:
+        sine = -float(field[2]) / float(np.linalg.norm(field))
+        model = float(np.arcsin(sine)), sheet(config, FIELD) / float(np.linalg.norm(field))
+    rotation, sine, clear = _rotation(up, seen)
+    premises = []
+    if not clear:
+        rotation, sine = np.eye(3), -float(np.mean((up * seen).sum(axis=1)))
+    elif model is not None and abs(np.sin(model[0])) > _SINE and sine * np.sin(model[0]) < 0.0:
+        rotation, sine = -rotation, -sine
+        premises.append(
+            "Beside the accelerometer the magnetometer's axes are left-handed: an axis of one of them has the wrong "
+            "sign, or the accelerometer shows gravity down where it has to show up; K of the magnetometer mends the "
+            "first."
+        )
+    K = rotation @ mag.start[:9].reshape(3, 3)
+    turned = replace(mag, start=np.concatenate([K.ravel(), rotation @ mag.start[9:]]), turned=rotation)
+    interval = float(np.median(np.diff(mag.time)))
+    own = mag.noise.stated * interval**-0.5 / mag.radius / np.sqrt(number)
+    cosine2 = max(1.0 - sine**2, 1e-2)
+    sigma = np.sqrt(cosine2 * (accel.sigma[rows] ** 2 + own**2))
+    noise = Noise("dip", float(np.median(sigma)), "default", 0.0 if config.noise_known == 0.0 else ROUGHLY, ("dip",))
+    dip = Dip(
+        time,
+        accel.scaled[rows],
+        readings / mag.radius,
+        sigma,
+        float(np.arcsin(np.clip(sine, -0.99, 0.99))),
+        model,
+        noise,
+    )
+    return turned, dip, premises
+
+
+def _beside(t: Array, values: Array, at: Array, rests: Array | None) -> tuple[NDArray[np.intp], Array, Array, Array]:
+    """Which of the accelerometer's readings have the magnetometer beside them; times, its readings, their samples."""
+    if rests is not None:
+        first, last = np.searchsorted(t, rests[:, 0]), np.searchsorted(t, rests[:, 1], side="right")
+        rows = np.flatnonzero(last > first)
+        time, readings, number = _means(t, values, rests)
+        return rows, time, readings, number
+    step = 1.5 * float(np.median(np.diff(t)))
+    after = np.clip(np.searchsorted(t, at), 1, len(t) - 1)
+    rows = np.flatnonzero((at >= t[0]) & (at <= t[-1]) & (t[after] - t[after - 1] <= step))
+    readings = np.stack([np.interp(at[rows], t, axis) for axis in values.T], axis=1)
+    return rows, at[rows], readings, np.ones(len(rows))
+
+
+def _rotation(up: Array, field: Array) -> tuple[Array, float, bool]:
+    """R (3, 3), proper, and s with up . R field = -s for unit vectors (n, 3), and whether they tell.
+
+    Linear in the nine entries of R and in s, with one solution up to a factor, whose sign is R's determinant.
+    """
+    if len(up) < FEWEST:
+        return np.eye(3), 0.0, False
+    design = np.column_stack([np.einsum("ni,nj->nij", up, field).reshape(-1, 9), np.ones(len(up))])
+    _, sizes, axes = np.linalg.svd(design, full_matrices=False)
+    M, s = axes[-1, :9].reshape(3, 3), float(axes[-1, 9])
+    sign = 1.0 if np.linalg.det(M) > 0.0 else -1.0
+    size = float(np.linalg.norm(M)) / np.sqrt(3.0)
+    u, _, vt = np.linalg.svd(sign * M)
+    clear = bool(sizes[-2] > _CLEAR * sizes[-1]) and size > 1e-6
+    R = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return R, sign * s / max(size, 1e-12), clear
+
+
+def nearest_axes(rotation: Array) -> Array:
+    """The signed permutation of axes nearest to an orthogonal matrix: how a sensor is meant to be mounted."""
+    mounted = np.zeros((3, 3))
+    left = np.abs(rotation).copy()
+    for _ in range(3):
+        i, j = np.unravel_index(int(np.argmax(left)), (3, 3))
+        mounted[i, j] = np.sign(rotation[i, j])
+        left[i], left[:, j] = -1.0, -1.0
+    return mounted

@@ -1,0 +1,126 @@
+"""What the tumble method calibrates: names, units, priors and the accuracy wanted."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+
+import gtsam
+import numpy as np
+
+from factors.ellipsoid import entries
+from pipelines.graph.priors import prior_sigmas
+from pipelines.graph.problem import Array, Factor, Parameter, Quantity
+from pipelines.methods.triads import triad_names
+from pipelines.methods.tumble.model import Model, Sensor, nearest_axes
+from pipelines.settings import Config, check_names
+
+TRIAD_KEYS = {"accel": int(gtsam.symbol("A", 0)), "mag": int(gtsam.symbol("M", 0))}
+STRENGTH_KEYS = {"accel": int(gtsam.symbol("g", 0)), "mag": int(gtsam.symbol("f", 0))}
+DIP_KEY = int(gtsam.symbol("i", 0))
+STRENGTHS = {"accel": "gravity", "mag": "field_strength"}
+_DIP = "field_dip"
+
+# Priors: of entries of K against a sensor on the body's axes; of b over the strength: an accelerometer in SI is near
+# zero, hard iron and offsets of counts are as large as they like. Of a dip that no model tells, rad.
+_GAIN, _BIAS, _OFFSET, _ANY_DIP = 0.5, 0.2, 10.0, 1.0
+# A strength that is known, over itself, where it is set free.
+_ANY_STRENGTH = 1e-2
+# Accuracies wanted: of gains and of b over the strength; of the dip, rad.
+_REQUIRE_GAIN, _REQUIRE_BIAS, _REQUIRE_DIP = 5e-3, {"accel": 2e-3, "mag": 1e-2}, 2e-2
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A graph variable, its parameter, its first guess, and its prior without unit: mean and sigma."""
+
+    parameter: Parameter
+    start: Array
+    mean: Array
+    sigma: Array
+
+    @property
+    def prior(self) -> Factor:
+        """Its prior factor."""
+        noise = gtsam.noiseModel.Diagonal.Precisions(self.sigma**-2.0)
+        return Factor("prior", gtsam.PriorFactorVector(self.parameter.key, self.mean, noise))
+
+
+def variables(model: Model, config: Config) -> tuple[Variable, ...]:
+    """Triads, strengths and dip, in reporting order. Raises InputError when the config names no such parameter."""
+    _check_names(config)
+    found = [_triad(sensor, config) for sensor in model.sensors]
+    found += [_strength(sensor, config) for sensor in model.sensors]
+    if model.dip is not None:
+        mean, sigma = model.dip.model or (0.0, _ANY_DIP)
+        wanted = config.require.get(_DIP, _REQUIRE_DIP)
+        known = config.priors.get(_DIP, sigma)
+        quantity = Quantity(_DIP, "rad", known, sigma, wanted, prior_mean=mean, nuisance=True)
+        found.append(_variable(DIP_KEY, (quantity,), np.ones(1), np.array([model.dip.start])))
+    return tuple(found)
+
+
+def _triad(sensor: Sensor, config: Config) -> Variable:
+    gains = len(sensor.start) - 3
+    spread = _BIAS if sensor.name == "accel" and sensor.is_si else _OFFSET
+    mounted = np.concatenate([nearest_axes(sensor.turned).ravel(), np.zeros(3)])
+    # What is recorded in SI and measures what is known in SI is about right as it is.
+    nominal = sensor.radius / sensor.strength if sensor.is_si and sensor.unit != "1" else 1.0
+    spread_of = entries(sensor.symmetric)
+    mean = nominal * (spread_of.T @ mounted) / spread_of.sum(axis=0)
+    sigma = np.repeat([_GAIN * nominal, spread], [gains, 3])
+    # An offset of many times the strength, as of counts, goes with the gain.
+    wide = max(1.0, float(np.linalg.norm(sensor.start[-3:])))
+    require = np.repeat([_REQUIRE_GAIN * nominal, _REQUIRE_BIAS[sensor.name] * wide], [gains, 3])
+    quantities = []
+    units = [_gain_unit(sensor)] * gains + [sensor.unit] * 3
+    for i, (name, unit) in enumerate(zip(sensor.names, units, strict=True)):
+        scale = float(sensor.scales[i])
+        prior = config.priors.get(name, scale * float(sigma[i]))
+        wanted = config.require.get(name, scale * float(require[i]))
+        quantities.append(
+            Quantity(name, unit, prior, scale * float(sigma[i]), wanted, prior_mean=scale * float(mean[i]))
+        )
+    return _variable(TRIAD_KEYS[sensor.name], tuple(quantities), sensor.scales, sensor.start)
+
+
+def _gain_unit(sensor: Sensor) -> str:
+    raw = {"accel": "m/s^2", "mag": "T"}[sensor.name] if sensor.is_si else "count"
+    if sensor.unit == raw:
+        return "1"
+    return f"{sensor.unit}/{raw}"
+
+
+def _strength(sensor: Sensor, config: Config) -> Variable:
+    """What the sensor is held against: no motion tells it from the scale, whose sigma has it."""
+    name, usual = STRENGTHS[sensor.name], sensor.spread or _ANY_STRENGTH * sensor.strength
+    quantity = Quantity(
+        name,
+        sensor.unit,
+        config.priors.get(name, sensor.spread),
+        usual,
+        config.require.get(name, math.inf),
+        prior_mean=sensor.strength,
+        group="assumption",
+        sheet="field.model_error" if sensor.unit == "T" else "",
+    )
+    return _variable(STRENGTH_KEYS[sensor.name], (quantity,), np.array([sensor.strength]), np.ones(1))
+
+
+def _variable(key: int, quantities: tuple[Quantity, ...], scales: Array, start: Array) -> Variable:
+    parameter = Parameter(key, quantities, partial(_scaled, scales))
+    mean = np.array([q.prior_mean for q in quantities]) / scales
+    return Variable(parameter, start, mean, prior_sigmas(parameter) / scales)
+
+
+def _scaled(scales: Array, values: gtsam.Values, key: int) -> tuple[Array, Array]:
+    """The reported numbers of a variable, which has no unit, and their Jacobian."""
+    return scales * np.asarray(values.atVector(key), dtype=float), np.diag(scales)
+
+
+def _check_names(config: Config) -> None:
+    known = [name for sensor in TRIAD_KEYS for name in triad_names(sensor)]
+    known += [*STRENGTHS.values(), _DIP]
+    check_names(config.priors, known, "priors")
+    check_names(config.require, known, "require")

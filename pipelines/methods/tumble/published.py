@@ -1,0 +1,126 @@
+"""The usual calibration of a tumbled triad: an ellipsoid through its readings by linear least squares.
+
+Every book on magnetometers has it, for example Merayo, Brauer, Primdahl, Petersen, Nielsen, "Scalar calibration of
+vector magnetometers", Measurement Science and Technology 2000: the coefficients of the quadric x'Qx + 2u'x = 1 by least
+squares of that equation, the centre -Q^-1 u and the root of Q made to a unit length. Errors of the equation are not
+those of the measurements, which biases it where noise is not small; there is no weighing of outliers.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.errors import InputError
+from pipelines.graph.problem import Estimate, Problem
+from pipelines.methods.tumble.recording import TumbleData
+from pipelines.settings import Config
+
+if TYPE_CHECKING:
+    from pipelines.methods.tumble.model import Sensor
+
+Array = NDArray[np.float64]
+
+# Nine coefficients.
+FEWEST = 12
+_STEP = 1e-5
+
+
+@dataclass(frozen=True)
+class Ellipsoid:
+    """|S (raw - centre)| = 1, S (3, 3) symmetric; `covariance` (9, 9) of Q's xx xy xz yy yz zz and u in `scaled` raw.
+
+    Attributes:
+        S, centre: as above, in the unit of raw.
+        coefficients: (9,) of the quadric of (raw - origin) / unit.
+        covariance: of these, by the equation's residuals.
+        origin: (3,).
+        unit: of the scaled raw.
+    """
+
+    S: Array
+    centre: Array
+    coefficients: Array
+    covariance: Array
+    origin: Array
+    unit: float
+
+
+def ellipsoid(raw: Array) -> Ellipsoid | None:
+    """Through readings (n, 3); None where the quadric that fits best is no ellipsoid."""
+    origin, unit = raw.mean(axis=0), max(float(raw.std()), np.finfo(float).tiny)
+    x, y, z = ((raw - origin) / unit).T
+    design = np.stack([x * x, 2 * x * y, 2 * x * z, y * y, 2 * y * z, z * z, 2 * x, 2 * y, 2 * z], axis=1)
+    coefficients, _, rank, _ = np.linalg.lstsq(design, np.ones(len(raw)))
+    found = None if rank < design.shape[1] else _shape(coefficients, origin, unit)
+    if found is None:
+        return None
+    residuals = design @ coefficients - 1.0
+    covariance = np.linalg.inv(design.T @ design) * float(residuals @ residuals) / max(len(raw) - 9, 1)
+    return Ellipsoid(*found, coefficients, covariance, origin, unit)
+
+
+def published_estimate(data: TumbleData, config: Config, problem: Problem) -> Estimate:
+    """K and b of each sensor by itself; of a magnetometer beside an accelerometer turned as the graph's first guess.
+
+    Raises InputError where the best quadric is no ellipsoid.
+    """
+    from pipelines.methods.tumble.model import prepare
+
+    start = time.perf_counter()
+    names: list[str] = []
+    values: list[Array] = []
+    blocks: list[Array] = []
+    for sensor in prepare(data, config).sensors:
+        found = ellipsoid(sensor.raw)
+        if found is None:
+            raise InputError(f"no ellipsoid fits the readings of {sensor.name}: turn it through more attitudes")
+        names += sensor.names
+        values.append(_numbers(sensor, found.coefficients, found))
+        steps = _STEP * np.sqrt(np.diag(found.covariance)) * np.eye(9)
+        ends = [[_numbers(sensor, found.coefficients + sign * step, found) for sign in (1, -1)] for step in steps]
+        J = np.array([(a - b) / (2.0 * np.abs(step).max()) for (a, b), step in zip(ends, steps, strict=True)]).T
+        blocks.append(J @ found.covariance @ J.T)
+    whole = np.concatenate(values)
+    covariance = np.zeros((len(whole), len(whole)))
+    first = 0
+    for block in blocks:
+        covariance[first : first + len(block), first : first + len(block)] = block
+        first += len(block)
+    known = [i for i, name in enumerate(names) if name in {q.name for q in problem.quantities}]
+    return Estimate(
+        solver="published",
+        names=tuple(names[i] for i in known),
+        values=whole[known],
+        covariance=covariance[np.ix_(known, known)],
+        converged=True,
+        message="an ellipsoid by linear least squares",
+        seconds={"solve": time.perf_counter() - start},
+    )
+
+
+def _numbers(sensor: Sensor, coefficients: Array, found: Ellipsoid) -> Array:
+    """K and b of a sensor, as it is reported, of a quadric near the best."""
+    shape = _shape(coefficients, found.origin, found.unit)
+    assert shape is not None
+    S, centre = shape
+    K = sensor.strength * sensor.turned @ S
+    gains = K[np.triu_indices(3)] if sensor.symmetric else K.ravel()
+    return np.concatenate([gains, -K @ centre])
+
+
+def _shape(coefficients: Array, origin: Array, unit: float) -> tuple[Array, Array] | None:
+    """S and centre of a quadric, None if it is no ellipsoid."""
+    xx, xy, xz, yy, yz, zz = coefficients[:6]
+    Q, u = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), coefficients[6:]
+    if np.linalg.cond(Q) > 1e8:
+        return None
+    centre = -np.linalg.solve(Q, u)
+    squares, axes = np.linalg.eigh(Q / (1.0 + centre @ Q @ centre))
+    if squares[0] <= 0.0:
+        return None
+    return (axes * np.sqrt(squares)) @ axes.T / unit, origin + unit * centre

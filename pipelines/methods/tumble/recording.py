@@ -1,0 +1,111 @@
+"""A recording of a tumbled device as arrays, and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.errors import InputError
+from pipelines.methods.place import read_place
+from pipelines.recording import series
+from pipelines.recording.checks import LEAST_ACCEL, LEAST_MAG, check_overlap, clean, count, density, nanoseconds
+from pipelines.recording.reading import Recording
+from pipelines.recording.topics import FIX, IMU, MAG, wanted
+from pipelines.recording.writing import attached, write_session
+from pipelines.settings import Config
+from pipelines.simulation.simulated import Simulated
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class TumbleData:
+    """What was measured. Times are s from epoch_ns (Unix ns), strictly increasing.
+
+    mag_t (N,), mag (N, 3): T, or counts; accel_t (M,), accel (M, 3): m/s^2, or counts; None for a sensor that there is
+    not, but one there is. mag_density, accel_density: from the covariances of the messages, in the unit recorded per
+    sqrt(Hz), None if they say nothing. latitude, longitude, rad, height, m: None if unknown. dropped: reason ->
+    messages.
+    """
+
+    epoch_ns: int
+    mag_t: Array | None = None
+    mag: Array | None = None
+    accel_t: Array | None = None
+    accel: Array | None = None
+    mag_density: float | None = None
+    accel_density: float | None = None
+    latitude: float | None = None
+    longitude: float | None = None
+    height: float = 0.0
+    dropped: dict[str, int] = field(default_factory=dict)
+
+
+def read_tumble(recording: Recording, config: Config) -> TumbleData:
+    """Read and check magnetometer and accelerometer, one of which may be missing.
+
+    Raises InputError when both are, when a topic is unusable, and when they have no time in common.
+    """
+    dropped: dict[str, int] = {}
+    epoch = recording.epoch_ns
+    recording.read_together(dict.fromkeys(map(config.topic, (MAG, IMU, FIX)), ()))
+    spans = {}
+    mag_t = mag = mag_density = accel_t = accel = accel_density = None
+    name = config.topic(MAG)
+    if wanted(recording, config, MAG):
+        measured = recording.magnetic(name)
+        count(dropped, f"{name}: stamped by log time (kept)", measured.stamped_by_log)
+        mag_t, keep = clean(name, measured.t_ns, epoch, measured.field, dropped)
+        mag, mag_density = measured.field[keep], density(name, mag_t, measured.field_cov[keep], LEAST_MAG, dropped)
+        spans[name] = mag_t
+    name = config.topic(IMU)
+    if wanted(recording, config, IMU):
+        imu = recording.imu(name)
+        if np.isfinite(imu.accel).any() and np.nan_to_num(imu.accel).any() and not (imu.accel_cov[:, 0, 0] == -1).all():
+            count(dropped, f"{name}: stamped by log time (kept)", imu.stamped_by_log)
+            accel_t, keep = clean(name, imu.t_ns, epoch, imu.accel, dropped)
+            accel, accel_density = imu.accel[keep], density(name, accel_t, imu.accel_cov[keep], LEAST_ACCEL, dropped)
+            spans[name] = accel_t
+    if not spans:
+        raise InputError(
+            f"neither {config.topic(MAG)} (MagneticField) nor an accelerometer in {config.topic(IMU)} (Imu); "
+            f"{recording.there()}"
+        )
+    check_overlap(spans)
+    latitude, longitude, height = read_place(recording, config, FIX)
+    return TumbleData(
+        epoch, mag_t, mag, accel_t, accel, mag_density, accel_density, latitude, longitude, height, dropped
+    )
+
+
+def write_tumble(path: Path, simulated: Simulated) -> None:
+    """Write simulated data under the default topic names, with truth and config attached."""
+    data: TumbleData = simulated.data
+    epoch = data.epoch_ns
+
+    def covariance(t: Array, noise: float | None) -> Array:
+        return (0.0 if noise is None else noise**2 / float(np.median(np.diff(t)))) * np.eye(3)
+
+    topics: dict[str, series.Topic] = {}
+    if data.mag_t is not None and data.mag is not None:
+        cov = covariance(data.mag_t, data.mag_density)
+        topics[MAG.name] = series.MagneticSeries(nanoseconds(data.mag_t, epoch), data.mag, field_cov=cov, frame_id="b")
+    if data.accel_t is not None and data.accel is not None:
+        cov, absent = covariance(data.accel_t, data.accel_density), np.diag([-1.0, 0.0, 0.0])
+        topics[IMU.name] = series.ImuSeries(
+            nanoseconds(data.accel_t, epoch),
+            np.zeros((len(data.accel_t), 3)),
+            data.accel,
+            gyro_cov=absent,
+            accel_cov=cov,
+            frame_id="b",
+        )
+    if data.latitude is not None and data.longitude is not None:
+        place = np.rad2deg([data.latitude, data.longitude])
+        topics[FIX.name] = series.FixSeries(
+            np.array([epoch]), place[:1], place[1:], np.array([data.height]), frame_id="gnss"
+        )
+    write_session(path, topics, attached(simulated.truth, simulated.config))

@@ -1,0 +1,68 @@
+"""What the simulator of a tumbled device is asked for."""
+
+from __future__ import annotations
+
+from io import StringIO
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+# 2026-11-20 12:00 UTC: simulated sessions start here; and the year of that day for the field model.
+EPOCH_NS, YEAR = 1_795_176_000_000_000_000, 2026.8849315068493
+
+Positive = Annotated[float, Field(gt=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TumbledMagnetometer(_Part):
+    """The magnetometer, with the iron about it."""
+
+    rate_hz: Positive = 50.0
+    density: Positive = 5e-8  # T/sqrt(Hz)
+    soft_iron: NotNegative = 0.05  # sigma of each entry of K - 1
+    hard_iron: NotNegative = 3e-5  # T, sigma of each component of b
+
+
+class TumbledAccelerometer(_Part):
+    """The accelerometer."""
+
+    rate_hz: Positive = 100.0
+    density: Positive = 1.5e-3  # m/s^2/sqrt(Hz)
+    gain: NotNegative = 0.02  # sigma of each entry of K - 1
+    bias: NotNegative = 0.3  # m/s^2
+    mounting_deg: NotNegative = 3.0  # sigma of the magnetometer's rotation against it, each component
+    arm: NotNegative = 0.1  # m, from the centre that the device is turned about
+
+
+class TumbleScenario(_Part):
+    """What the `tumble` simulator is asked for; every key has a default, `null` leaves a sensor out."""
+
+    attitudes: Annotated[int, Field(ge=2)] = 30  # random ones, gone through one after the other
+    turn_rad_s: Positive = 1.5  # mean rate from one to the next
+    rest_s: NotNegative = 0.0  # in each
+    tilt_deg: Annotated[float, Field(gt=0.0, le=180.0)] = 180.0  # the attitudes are within this of level, any heading
+    magnetometer: TumbledMagnetometer | None = TumbledMagnetometer()
+    accelerometer: TumbledAccelerometer | None = None
+    latitude_deg: float | None = 40.0  # null: nobody knows where it was
+    longitude_deg: float = 116.3
+    field_error: NotNegative = 1.33e-7  # T, sigma of the strength about its model
+    priors: dict[str, float | None] = {}  # passed on to the recording's config
+
+
+def tumble_config(scenario: TumbleScenario) -> str:
+    """The recording's config, YAML: the noise simulated, the scenario's priors."""
+    from ruamel.yaml import YAML
+
+    noise = {}
+    if scenario.magnetometer is not None:
+        noise["mag_density"] = scenario.magnetometer.density
+    if scenario.accelerometer is not None:
+        noise["accel_density"] = scenario.accelerometer.density
+    config: dict[str, Any] = {"method": "tumble", "noise": noise, "priors": scenario.priors, "date": "2026-11-20"}
+    text = StringIO()
+    YAML(typ="safe", pure=True).dump(config, text)
+    return text.getvalue()

@@ -1,0 +1,133 @@
+"""Simulator of the `tumble` method: a device turned by hand from one random attitude to the next.
+
+Frames: n level East-North-Up, b the device. The attitude is a closed-form function of time: from one attitude to the
+next about a fixed axis, slow at both ends. A reading is the exact vector at the moment of its stamp.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import so3
+from factors.earth import gravity, magnetic_field
+from pipelines.errors import InputError
+from pipelines.methods.tumble.recording import TumbleData
+from pipelines.methods.tumble.scenario import (
+    EPOCH_NS,
+    YEAR,
+    TumbledAccelerometer,
+    TumbledMagnetometer,
+    TumbleScenario,
+    tumble_config,
+)
+from pipelines.simulation.motion import sample_times
+from pipelines.simulation.simulated import Simulated
+
+Array = NDArray[np.float64]
+
+# Half the step of the differences that an acceleration is made of, s.
+_STEP = 1e-3
+# A field where nobody says, T in n.
+_FIELD = np.array([0.0, 2.2e-5, -4.2e-5])
+
+
+def simulated(scenario: TumbleScenario, seed: int, images: bool = False) -> Simulated:
+    """Data and the true values of the parameters.
+
+    Raises InputError when pictures are asked for, or there is no sensor.
+    """
+    if images:
+        raise InputError("tumble has no camera: leave out --images")
+    if scenario.magnetometer is None and scenario.accelerometer is None:
+        raise InputError("tumble: magnetometer or accelerometer is needed, or both")
+    rng = np.random.default_rng(seed)
+    motion = _Motion(scenario, rng)
+    truth: dict[str, float] = {}
+    place = None if scenario.latitude_deg is None else np.deg2rad([scenario.latitude_deg, scenario.longitude_deg])
+    model = _FIELD if place is None else magnetic_field(float(place[0]), float(place[1]), 0.0, YEAR)
+    strength = float(np.linalg.norm(model))
+    field = model * (1.0 + (0.0 if place is None else scenario.field_error / strength) * rng.standard_normal())
+    found: dict[str, object] = {}
+    if place is not None:
+        found |= {"latitude": float(place[0]), "longitude": float(place[1])}
+    mounting = so3.identity()
+    if (accel := scenario.accelerometer) is not None:
+        g = 9.80665 if place is None else float(gravity(float(place[0]), 0.0))
+        K, b = _drawn(rng, accel.gain, accel.bias)
+        t, raw = _accelerometer(motion, accel, g, K, b, rng)
+        found |= {"accel_t": t, "accel": raw, "accel_density": accel.density}
+        truth |= _truth("accel", K, b, symmetric=True) | {"gravity": g}
+        mounting = so3.exp(np.deg2rad(accel.mounting_deg) * rng.standard_normal(3))
+    if (mag := scenario.magnetometer) is not None:
+        K, b = _drawn(rng, mag.soft_iron, mag.hard_iron)
+        t, raw = _magnetometer(motion, mag, field, so3.matrix(mounting) @ K, so3.rotate(mounting, b), rng)
+        found |= {"mag_t": t, "mag": raw, "mag_density": mag.density}
+        unit = 1.0 if place is not None else float(np.linalg.norm(field))
+        K, b = so3.matrix(mounting) @ K / unit, so3.rotate(mounting, b) / unit
+        truth |= _truth("mag", K, b, symmetric=accel is None)
+        truth |= {"field_strength": float(np.linalg.norm(field)) / unit}
+        if accel is not None:
+            truth |= {"field_dip": float(np.arcsin(-field[2] / np.linalg.norm(field)))}
+    return Simulated(TumbleData(EPOCH_NS, **found), truth, tumble_config(scenario))  # type: ignore[arg-type]
+
+
+class _Motion:
+    """Attitudes nRb over time."""
+
+    def __init__(self, scenario: TumbleScenario, rng: np.random.Generator) -> None:
+        heading = rng.uniform(-np.pi, np.pi, scenario.attitudes)
+        # Evenly over the part of the sphere that may be up, any heading.
+        cosine = rng.uniform(np.cos(np.deg2rad(scenario.tilt_deg)), 1.0, scenario.attitudes)
+        around = rng.uniform(-np.pi, np.pi, scenario.attitudes)
+        lean = np.arccos(cosine)[:, None] * np.stack([np.cos(around), np.sin(around), np.zeros_like(around)], axis=1)
+        about_up = heading[:, None] * np.array([0.0, 0.0, 1.0])
+        self.nRb = so3.multiply(so3.exp(about_up), so3.exp(lean))
+        self.turns = so3.log(so3.multiply(so3.inverse(self.nRb[:-1]), self.nRb[1:]))
+        lasting = np.linalg.norm(self.turns, axis=1) / scenario.turn_rad_s
+        self.starts = scenario.rest_s + np.cumsum(np.append(0.0, lasting[:-1] + scenario.rest_s))
+        self.lasting = np.maximum(lasting, 1e-3)
+        self.duration = float(self.starts[-1] + self.lasting[-1] + scenario.rest_s)
+
+    def attitude(self, t: Array) -> Array:
+        """nRb (n, 4) at the times t (n,), s."""
+        k = np.clip(np.searchsorted(self.starts, t, side="right") - 1, 0, len(self.starts) - 1)
+        s = np.clip((t - self.starts[k]) / self.lasting[k], 0.0, 1.0)
+        # Velocity and acceleration are zero at both ends.
+        share = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+        return so3.multiply(self.nRb[k], so3.exp(share[:, None] * self.turns[k]))
+
+
+def _drawn(rng: np.random.Generator, gain: float, bias: float) -> tuple[Array, Array]:
+    """A symmetric K (3, 3) about the identity, and b (3,)."""
+    K = gain * rng.standard_normal((3, 3))
+    K = np.triu(K) + np.triu(K, 1).T
+    return np.eye(3) + K, bias * rng.standard_normal(3)
+
+
+def _magnetometer(
+    motion: _Motion, sensor: TumbledMagnetometer, field: Array, K: Array, b: Array, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    t = sample_times(motion.duration, sensor.rate_hz)
+    return t, _read(so3.rotate(so3.inverse(motion.attitude(t)), field), K, b, sensor.density, sensor.rate_hz, rng)
+
+
+def _accelerometer(
+    motion: _Motion, sensor: TumbledAccelerometer, g: float, K: Array, b: Array, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    t = sample_times(motion.duration, sensor.rate_hz, 0.3)
+    arm = np.array([sensor.arm, 0.0, 0.0])
+    before, now, after = (so3.rotate(motion.attitude(t + step), arm) for step in (-_STEP, 0.0, _STEP))
+    force = (before - 2.0 * now + after) / _STEP**2 + np.array([0.0, 0.0, g])
+    return t, _read(so3.rotate(so3.inverse(motion.attitude(t)), force), K, b, sensor.density, sensor.rate_hz, rng)
+
+
+def _read(nominal: Array, K: Array, b: Array, density: float, rate_hz: float, rng: np.random.Generator) -> Array:
+    """What a sensor with nominal = K raw + b says, with white noise."""
+    exact = (nominal - b) @ np.linalg.inv(K).T
+    return np.asarray(exact + density * np.sqrt(rate_hz) * rng.standard_normal(nominal.shape))
+
+
+def _truth(name: str, K: Array, b: Array, symmetric: bool) -> dict[str, float]:
+    gains = {f"{name}_k{i + 1}{j + 1}": float(K[i, j]) for i in range(3) for j in range(3) if i <= j or not symmetric}
+    return gains | {f"{name}_b{i + 1}": float(b[i]) for i in range(3)}

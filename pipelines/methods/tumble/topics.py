@@ -1,0 +1,10 @@
+"""What the tumble method reads."""
+
+from __future__ import annotations
+
+from pipelines.recording.topics import FIX, IMU, MAG, Need, Setting
+
+TOPICS = (MAG, IMU, FIX)
+_METHOD = Setting("`method: tumble` in the config", lambda config: config.method == "tumble")
+# An accelerometer by itself is in most recordings, and seldom meant.
+NEEDS: tuple[Need, ...] = (((MAG,), (IMU, _METHOD)),)

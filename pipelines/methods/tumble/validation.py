@@ -1,0 +1,37 @@
+"""Validation: strengths without and with a calibration, which are to be the same in every attitude."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from pipelines.errors import InputError
+from pipelines.judgement.validation import Validation
+from pipelines.methods.triads import triad_of
+from pipelines.methods.tumble.model import prepare
+from pipelines.methods.tumble.parameters import STRENGTHS
+from pipelines.methods.tumble.recording import TumbleData
+from pipelines.settings import Config
+
+_WHAT = {"accel": "specific force at rest, its strength", "mag": "magnetic field, its strength"}
+
+
+def validate(data: TumbleData, config: Config, values: Mapping[str, float]) -> list[Validation]:
+    """Lengths less the strength calibrated against; before compensation scaled to that strength on average.
+
+    Raises InputError when the calibration has none of the recording's sensors.
+    """
+    found = []
+    for sensor in prepare(data, config).sensors:
+        if f"{sensor.name}_k11" not in values:
+            continue
+        K, b = triad_of(sensor.name, values)
+        strength = values.get(STRENGTHS[sensor.name], sensor.strength)
+        raw = np.linalg.norm(sensor.raw, axis=1)
+        after = np.linalg.norm(sensor.raw @ K.T + b, axis=1) - strength
+        before = raw * strength / np.mean(raw) - strength
+        found.append(Validation(_WHAT[sensor.name], sensor.unit, sensor.time, before[:, None], after[:, None]))
+    if not found:
+        raise InputError("the calibration is of none of the sensors in the recording")
+    return found

@@ -1,0 +1,342 @@
+"""The tumble method: magnetometer and accelerometer with nothing beside them, simulated and real."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from factors import so3
+from factors.chi_square import quantile
+from factors.ellipsoid import DipFactor, StrengthFactor
+from factors.testing import assert_jacobians
+from pipelines.errors import InputError
+from pipelines.graph.problem import Estimate
+from pipelines.methods import method
+from pipelines.methods.triads import triad_names, triad_of
+from pipelines.methods.tumble.recording import TumbleData, read_tumble, write_tumble
+from pipelines.methods.tumble.scenario import TumbledAccelerometer, TumbledMagnetometer, TumbleScenario
+from pipelines.recording import series
+from pipelines.recording.checks import nanoseconds
+from pipelines.recording.reading import open_recording
+from pipelines.recording.writing import write_session
+from pipelines.session import Session, resolve_method
+from pipelines.settings import Config
+from pipelines.simulation.simulated import Simulated
+from pipelines.solvers.batch import solve_batch
+from pipelines.solvers.incremental import solve_incremental
+from tests.command import Command
+
+SHARED = Path(__file__).parents[2] / "shared" / "data"
+TUMBLE = method("tumble")
+N = 7
+T0 = 1_700_000_000_000_000_000
+# Few attitudes, gone through quickly, at a low rate: what takes long is the number of samples.
+BRIEF = TumbleScenario(attitudes=25, magnetometer=TumbledMagnetometer(rate_hz=20.0))
+RESTING = TumbleScenario(attitudes=25, rest_s=1.5, accelerometer=TumbledAccelerometer(rate_hz=50.0))
+
+
+def _shared(name: str) -> Path:
+    path = SHARED / name
+    if not path.exists():
+        pytest.skip(f"{path} is not there")
+    return path
+
+
+def _simulated(scenario: TumbleScenario, seed: int) -> Simulated:
+    return TUMBLE.simulate(scenario, seed)
+
+
+def _solved(simulated: Simulated) -> Estimate:
+    session = Session.of(TUMBLE, simulated)
+    return solve_batch(session.problem())
+
+
+def _errors(estimate: Estimate, truth: dict[str, float] | Any) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of what is free, and their covariance."""
+    free = np.diag(estimate.covariance) > 0.0
+    error = estimate.values - np.array([truth[name] for name in estimate.names])
+    return error[free], estimate.covariance[np.ix_(free, free)]
+
+
+def _nees(scenario: TumbleScenario, seeds: Sequence[int]) -> tuple[float, float]:
+    """Sum over the seeds of the NEES, and of its degrees of freedom."""
+    total, dof = 0.0, 0
+    for seed in seeds:
+        simulated = _simulated(scenario, seed)
+        error, covariance = _errors(_solved(simulated), simulated.truth)
+        total += float(error @ np.linalg.solve(covariance, error))
+        dof += len(error)
+    return total, dof
+
+
+def _assert_consistent(scenario: TumbleScenario, seeds: Sequence[int]) -> None:
+    total, dof = _nees(scenario, seeds)
+    assert quantile(0.005, dof) < total < quantile(0.995, dof), f"NEES {total:.1f} for {dof}"
+
+
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_jacobians(symmetric: bool) -> None:
+    rng = np.random.default_rng(0)
+    time, sigma, raw = np.arange(float(N)), rng.uniform(0.5, 2.0, N), rng.normal(size=(N, 3))
+
+    def triads(d: int) -> np.ndarray:
+        near = [1, 0, 0, 1, 0, 1] if d == 9 else np.eye(3).ravel().tolist()
+        return np.array([*near, 0.0, 0.0, 0.0]) + 0.2 * rng.normal(size=(N, d))
+
+    d = 9 if symmetric else 12
+    strength = StrengthFactor(time, raw, sigma, 0.01 * sigma, symmetric)
+    assert_jacobians(strength, [triads(d), rng.uniform(0.5, 2.0, (N, 1))])
+    dip = DipFactor(time, rng.normal(size=(N, 3)), raw, sigma, (True, symmetric))
+    assert_jacobians(dip, [triads(9), triads(d), rng.uniform(-1.0, 1.0, (N, 1))])
+
+
+def test_without_noise_there_is_no_error() -> None:
+    quiet = replace_scenario(
+        RESTING,
+        magnetometer={"density": 1e-13},
+        accelerometer={"density": 1e-9, "arm": 0.0},
+        field_error=0.0,
+    )
+    simulated = _simulated(quiet, 0)
+    estimate = _solved(simulated)
+    for name, value in zip(estimate.names, estimate.values, strict=True):
+        assert value == pytest.approx(simulated.truth[name], rel=2e-6, abs=1e-11), name
+
+
+def replace_scenario(scenario: TumbleScenario, **changes: Any) -> TumbleScenario:
+    """With other values, sensors by their own keys."""
+    content = scenario.model_dump()
+    for key, value in changes.items():
+        content[key] = {**content[key], **value} if isinstance(value, dict) else value
+    return TumbleScenario.model_validate(content)
+
+
+def test_a_magnetometer_alone_is_consistent() -> None:
+    _assert_consistent(BRIEF, range(12))
+
+
+def test_a_magnetometer_of_unknown_place_is_consistent() -> None:
+    _assert_consistent(replace_scenario(BRIEF, latitude_deg=None), range(6))
+
+
+def test_both_sensors_are_consistent() -> None:
+    _assert_consistent(RESTING, range(6))
+
+
+def test_much_noise_biases_an_algebraic_ellipsoid_and_not_the_graph() -> None:
+    # 4 % of the field in each sample: what the mean length has too much is 0.16 % of it.
+    loud = replace_scenario(
+        BRIEF,
+        magnetometer={"density": 5e-7, "rate_hz": 20.0},
+        field_error=0.0,
+        attitudes=60,
+        priors={"field_strength": 0.0},
+    )
+    sums = {"graph": 0.0, "published": 0.0}
+    sigma = 0.0
+    for seed in range(8):
+        simulated = _simulated(loud, seed)
+        session = Session.of(TUMBLE, simulated)
+        problem = session.problem()
+        found = {
+            "graph": solve_batch(problem),
+            "published": TUMBLE.published(session.data, session.config, problem),
+        }
+        for name, estimate in found.items():
+            gains = dict(zip(estimate.names, estimate.values, strict=True))
+            true = sum(simulated.truth[f"mag_k{i}{i}"] for i in "123")
+            sums[name] += sum(gains[f"mag_k{i}{i}"] for i in "123") / true - 1.0
+        graph = found["graph"]
+        rows = [graph.names.index(f"mag_k{i}{i}") for i in "123"]
+        sigma += float(graph.covariance[np.ix_(rows, rows)].sum()) / 9.0
+    assert abs(sums["graph"]) < 3.0 * sigma**0.5
+    assert sums["published"] < -10.0 * sigma**0.5
+
+
+def test_few_directions_are_told_and_not_guessed() -> None:
+    """A device that stays within 20 deg of level sees a strip of the ellipsoid."""
+    narrow = replace_scenario(BRIEF, tilt_deg=20.0)
+    simulated = _simulated(narrow, 1)
+    calibration = Session.of(TUMBLE, simulated).calibrate()
+    assert calibration.status in ("weak", "unobservable")
+    error = calibration.estimate.values - np.array([simulated.truth[n] for n in calibration.estimate.names])
+    assert np.abs(error / calibration.estimate.sigmas).max() < 4.0
+    (row,) = calibration.findings["coverage"]
+    assert "turn it there too" in str(row["says"])
+
+
+def test_the_incremental_solver_agrees() -> None:
+    session = Session.of(TUMBLE, _simulated(BRIEF, 3))
+    batch, step_by_step = solve_batch(session.problem()), solve_incremental(session.problem(), 1.0)
+    assert np.abs((step_by_step.values - batch.values) / batch.sigmas).max() < 0.3
+    np.testing.assert_allclose(step_by_step.sigmas, batch.sigmas, rtol=0.1)
+
+
+def test_a_recording_gives_the_data_back(tmp_path: Path) -> None:
+    simulated = _simulated(RESTING, 0)
+    write_tumble(tmp_path / "s.mcap", simulated)
+    data: TumbleData = read_tumble(open_recording(tmp_path / "s.mcap"), Config())
+    for name in ("mag_t", "mag", "accel", "latitude", "longitude"):
+        np.testing.assert_allclose(getattr(data, name), getattr(simulated.data, name), rtol=1e-12, atol=1e-15)
+    assert data.mag_density == pytest.approx(simulated.data.mag_density, rel=1e-6)
+
+
+def test_left_handed_axes_are_told() -> None:
+    simulated = _simulated(RESTING, 2)
+    mirrored = replace(simulated.data, mag=simulated.data.mag * np.array([1.0, 1.0, -1.0]))
+    calibration = Session.of(TUMBLE, replace(simulated, data=mirrored)).calibrate()
+    assert "left-handed" in calibration.headline + " ".join(calibration.notes)
+    values = dict(zip(calibration.estimate.names, calibration.estimate.values, strict=True))
+    for i in "123":
+        error = values[f"mag_k{i}3"] + simulated.truth[f"mag_k{i}3"]
+        assert abs(error) < 4.0 * calibration.parameters[f"mag_k{i}3"].sigma
+
+
+def test_a_magnetometer_on_other_axes_is_turned_into_those_of_the_accelerometer() -> None:
+    simulated = _simulated(RESTING, 4)
+    turned = so3.exp(np.array([np.pi, 0.0, 0.0]))
+    calibration = Session.of(
+        TUMBLE, replace(simulated, data=replace(simulated.data, mag=so3.rotate(turned, simulated.data.mag)))
+    ).calibrate()
+    assert calibration.status == "calibrated"
+    K = np.array([[calibration.parameters[f"mag_k{i}{j}"].value for j in "123"] for i in "123"])
+    true = np.array([[simulated.truth[f"mag_k{i}{j}"] for j in "123"] for i in "123"]) @ so3.matrix(turned).T
+    np.testing.assert_allclose(K, true, atol=0.01)
+
+
+def _write(path: Path, data: TumbleData, mag: bool = True, accel: bool = True) -> None:
+    topics: dict[str, series.Topic] = {}
+    if mag and data.mag is not None and data.mag_t is not None:
+        topics["/mag"] = series.MagneticSeries(nanoseconds(data.mag_t, data.epoch_ns), data.mag)
+    if accel and data.accel is not None and data.accel_t is not None:
+        still = np.zeros((len(data.accel_t), 3))
+        topics["/imu"] = series.ImuSeries(nanoseconds(data.accel_t, data.epoch_ns), still, data.accel)
+    write_session(path, topics, {})
+
+
+def test_the_command_finds_it_by_itself_and_says_what_there_is(tmp_path: Path, alidade: Command) -> None:
+    _write(tmp_path / "phone.mcap", _simulated(RESTING, 1).data)
+    assert "tumble: yes" in alidade("info", tmp_path / "phone.mcap").out
+    run = alidade("calibrate", tmp_path / "phone.mcap", "--out", tmp_path / "out")
+    assert run.code == 0
+    assert "field's strength is unknown and called 1" in run.out.replace("\n", " ")
+    yaml = (tmp_path / "out" / "calibration.yaml").read_text()
+    assert "hard iron" in yaml
+    assert "* mag + [mag_b1, mag_b2, mag_b3]" in yaml
+    assert (tmp_path / "out" / "report.html").read_text().count("Directions covered by the") == 2
+
+
+def test_an_accelerometer_alone_if_asked_for(tmp_path: Path) -> None:
+    simulated = _simulated(RESTING, 5)
+    _write(tmp_path / "s.mcap", simulated.data, mag=False)
+    with pytest.raises(InputError, match="no usable topics for any method"):
+        Session.read(open_recording(tmp_path / "s.mcap"), None, None)
+    calibration = Session.read(open_recording(tmp_path / "s.mcap"), "tumble", None).calibrate()
+    for name, parameter in calibration.parameters.items():
+        if name.startswith("accel"):
+            assert abs(parameter.value - simulated.truth[name]) < 4.0 * parameter.sigma, name
+            # Gravity is known to 2e-3 where the latitude is not.
+            assert parameter.sigma > 1e-3 or not name.endswith(("11", "22", "33"))
+
+
+def test_other_methods_go_first(tmp_path: Path) -> None:
+    t = T0 + np.arange(0, 10**9, 10**7)
+    still, zeros = np.zeros((100, 3)), np.zeros((100, 2))
+    topics: dict[str, series.Topic] = {"/mag": series.MagneticSeries(t, still)}
+    write_session(tmp_path / "alone.mcap", topics, {})
+    assert resolve_method(None, open_recording(tmp_path / "alone.mcap"), Config()) == "tumble"
+    topics["/imu"] = series.ImuSeries(t, still)
+    topics["/indexer/joint_states"] = series.JointSeries(t, zeros, ("outer_x", "inner_z"))
+    write_session(tmp_path / "turns.mcap", topics, {})
+    assert resolve_method(None, open_recording(tmp_path / "turns.mcap"), Config(latitude_deg=40.0)) == "indexer"
+
+
+def test_too_little_is_an_input_error(tmp_path: Path) -> None:
+    data = _simulated(BRIEF, 0).data
+    few = replace(data, mag_t=data.mag_t[:8], mag=data.mag[:8])
+    with pytest.raises(InputError, match="mag: 8 readings, at least 12"):
+        TUMBLE.problem(few, Config())
+    write_session(tmp_path / "n.mcap", {"/other": series.MagneticSeries(np.arange(9), np.ones((9, 3)))}, {})
+    with pytest.raises(InputError, match="neither /mag"):
+        Session.read(open_recording(tmp_path / "n.mcap"), "tumble", None)
+
+
+def test_a_real_magnetometer_alone(tmp_path: Path) -> None:
+    """ICM-20948 counts, tumbled by hand indoors: the published centre to 0.2 % of the field, and within its sigmas."""
+    counts = np.loadtxt(_shared("icm20948") / "mag3_raw.csv", delimiter=",")
+    rows = [f"{0.2 * k:.1f},{x:g},{y:g},{z:g}" for k, (x, y, z) in enumerate(counts)]
+    (tmp_path / "mag.csv").write_text("\n".join(["t,x,y,z", *rows]))
+    config = Config.model_validate({"columns": {"/mag": {"time": "t", "field": ["x", "y", "z"]}}})
+    calibration = Session.read(open_recording(tmp_path / "mag.csv"), None, config).calibrate()
+    assert calibration.method.name == "tumble"
+    K, b, spread = _centre_with_sigmas(calibration.estimate)
+    centre = -np.linalg.solve(K, b)
+    published = np.array([9955.15, -7948.26, 8511.80])
+    radius = np.linalg.det(K) ** (-1.0 / 3.0)
+    assert np.linalg.norm(centre - published) < 2e-3 * radius
+    assert np.all(np.abs(centre - published) < 3.0 * spread)
+    # Soft iron as published, for a sphere of 1000, within sigmas and to 0.2 %.
+    soft = np.array([[0.25060, 0.02942, -0.02955], [0.02942, 0.31692, 0.00789], [-0.02955, 0.00789, 0.30592]])
+    np.testing.assert_allclose(1e3 * K, soft, atol=7e-4)
+
+
+def _centre_with_sigmas(estimate: Estimate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """K, b, and the sigmas of the centre -K^-1 b, by differences."""
+    names = triad_names("mag", symmetric=True)
+    rows = [estimate.names.index(name) for name in names]
+    values = estimate.values[rows]
+
+    def centre(numbers: np.ndarray) -> np.ndarray:
+        K, b = triad_of("mag", dict(zip(names, numbers.tolist(), strict=True)))
+        return -np.linalg.solve(K, b)
+
+    steps = 1e-3 * np.diag(estimate.sigmas[rows])
+    J = np.array([(centre(values + s) - centre(values - s)) / (2.0 * s.max()) for s in steps]).T
+    spread = np.sqrt(np.diag(J @ estimate.covariance[np.ix_(rows, rows)] @ J.T))
+    return *triad_of("mag", dict(zip(names, values.tolist(), strict=True))), spread
+
+
+def test_a_real_pair_of_accelerometer_and_magnetometer(tmp_path: Path) -> None:
+    """The same device's other take: its data sheet says that the magnetometer's y and z are opposite."""
+    folder = _shared("icm20948")
+    accel, mag = (np.loadtxt(folder / name, delimiter=",") for name in ("acc.csv", "mag.csv"))
+    stamps = 200_000_000 * np.arange(len(mag))
+    topics: dict[str, series.Topic] = {
+        "/imu": series.ImuSeries(stamps, np.zeros_like(accel), accel),
+        "/mag": series.MagneticSeries(stamps, mag),
+    }
+    write_session(tmp_path / "s.mcap", topics, {})
+    calibration = Session.read(open_recording(tmp_path / "s.mcap"), None, None).calibrate()
+    K = np.array([[calibration.parameters[f"mag_k{i}{j}"].value for j in "123"] for i in "123"])
+    K /= np.cbrt(abs(np.linalg.det(K)))
+    np.testing.assert_allclose(K, np.diag([1.0, -1.0, -1.0]), atol=0.04)
+    # 16384 counts a g by the data sheet, whose scale is good to 2.5 % or so.
+    for i in "123":
+        assert calibration.parameters[f"accel_k{i}{i}"].value * 16384.0 == pytest.approx(9.80665, rel=0.03)
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_a_cube_recording_without_all_the_rest(beside: bool, tmp_path: Path) -> None:
+    """K of the cube's truth up to the rotation that nothing tells here: K'K and the offset of the raw numbers."""
+    source = _shared("contract") / "cube_nominal.mcap"
+    recording = open_recording(source)
+    field = recording.magnetic("/mag")
+    topics: dict[str, series.Topic] = {"/mag": series.MagneticSeries(field.t_ns, field.field)}
+    if beside:
+        imu = recording.imu("/imu")
+        topics["/imu"] = series.ImuSeries(imu.t_ns, np.zeros_like(imu.gyro), imu.accel)
+    write_session(tmp_path / "mag.mcap", topics, {})
+    place = Config.model_validate({"latitude_deg": 40.0, "longitude_deg": 116.3, "height": 50.0, "date": "2026-11-20"})
+    calibration = Session.read(open_recording(tmp_path / "mag.mcap"), None, place).calibrate()
+    truth = json.loads((_shared("contract") / "cube_nominal.truth.json").read_text())
+    values = dict(zip(calibration.estimate.names, calibration.estimate.values.tolist(), strict=True))
+    for name in ("accel", "mag") if beside else ("mag",):
+        (K, b), (true_K, true_b) = triad_of(name, values), triad_of(name, truth)
+        np.testing.assert_allclose(np.linalg.solve(K, b), np.linalg.solve(true_K, true_b), atol=0.01 * abs(b).max())
+        np.testing.assert_allclose(K.T @ K, true_K.T @ true_K, atol=0.012)
