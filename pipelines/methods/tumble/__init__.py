@@ -31,6 +31,7 @@ class Tumble(Method):
     topics = TOPICS
     needs = NEEDS
     sheets = ("field",)
+    of_recording = ("accel_b?", "gravity", "field_*")
     yields = True
 
     @property

@@ -55,7 +55,7 @@ def variables(model: Model, config: Config) -> tuple[Variable, ...]:
     if model.dip is not None:
         mean, sigma = model.dip.model or (0.0, _ANY_DIP)
         wanted = config.require.get(_DIP, _REQUIRE_DIP)
-        known = config.priors.get(_DIP, sigma)
+        known = config.prior(_DIP, sigma)
         quantity = Quantity(_DIP, "rad", known, sigma, wanted, prior_mean=mean, nuisance=True)
         found.append(_variable(DIP_KEY, (quantity,), np.ones(1), np.array([model.dip.start])))
     return tuple(found)
@@ -77,7 +77,7 @@ def _triad(sensor: Sensor, config: Config) -> Variable:
     units = [_gain_unit(sensor)] * gains + [sensor.unit] * 3
     for i, (name, unit) in enumerate(zip(sensor.names, units, strict=True)):
         scale = float(sensor.scales[i])
-        prior = config.priors.get(name, scale * float(sigma[i]))
+        prior = config.prior(name, scale * float(sigma[i]))
         wanted = config.require.get(name, scale * float(require[i]))
         quantities.append(
             Quantity(name, unit, prior, scale * float(sigma[i]), wanted, prior_mean=scale * float(mean[i]))
@@ -98,7 +98,7 @@ def _strength(sensor: Sensor, config: Config) -> Variable:
     quantity = Quantity(
         name,
         sensor.unit,
-        config.priors.get(name, sensor.spread),
+        config.prior(name, sensor.spread),
         usual,
         config.require.get(name, math.inf),
         prior_mean=sensor.strength,

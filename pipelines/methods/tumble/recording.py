@@ -12,6 +12,7 @@ from pipelines.errors import InputError
 from pipelines.methods.place import read_place
 from pipelines.recording import series
 from pipelines.recording.checks import LEAST_ACCEL, LEAST_MAG, check_overlap, clean, count, density, nanoseconds
+from pipelines.recording.faults import drop_faults
 from pipelines.recording.reading import Recording
 from pipelines.recording.topics import FIX, IMU, MAG, wanted
 from pipelines.recording.writing import attached, write_session
@@ -59,6 +60,8 @@ def read_tumble(recording: Recording, config: Config) -> TumbleData:
         measured = recording.magnetic(name)
         count(dropped, f"{name}: stamped by log time (kept)", measured.stamped_by_log)
         mag_t, keep = clean(name, measured.t_ns, epoch, measured.field, dropped)
+        sound = drop_faults(name, mag_t, measured.field[keep], dropped, "T")
+        mag_t, keep = mag_t[sound], keep[sound]
         mag, mag_density = measured.field[keep], density(name, mag_t, measured.field_cov[keep], LEAST_MAG, dropped)
         spans[name] = mag_t
     name = config.topic(IMU)
@@ -67,6 +70,8 @@ def read_tumble(recording: Recording, config: Config) -> TumbleData:
         if np.isfinite(imu.accel).any() and np.nan_to_num(imu.accel).any() and not (imu.accel_cov[:, 0, 0] == -1).all():
             count(dropped, f"{name}: stamped by log time (kept)", imu.stamped_by_log)
             accel_t, keep = clean(name, imu.t_ns, epoch, imu.accel, dropped)
+            sound = drop_faults(name, accel_t, imu.accel[keep], dropped, "m/s^2")
+            accel_t, keep = accel_t[sound], keep[sound]
             accel, accel_density = imu.accel[keep], density(name, accel_t, imu.accel_cov[keep], LEAST_ACCEL, dropped)
             spans[name] = accel_t
     if not spans:
