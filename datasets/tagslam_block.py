@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from factors import so3
 from pipelines.errors import InputError
 from pipelines.vision.camera import Camera
-from pipelines.vision.layout import Layout, estimate_layout
+from pipelines.vision.layout import Layout, Shots, estimate_layout
 from pipelines.vision.pose import TagBody, estimate_pose
 from pipelines.vision.tags import Detections
 
@@ -91,7 +91,7 @@ def _detections(rows: Array, body: TagBody) -> Detections:
 
 def compare(block: Block) -> tuple[Layout, Comparison]:
     """Estimate the layout from every other picture and score it on the rest."""
-    layout = estimate_layout(block.camera, block.published, block.pictures[::2])
+    layout = estimate_layout([Shots(block.camera, block.pictures[::2])], block.published)
     errors, published = (_reprojection(block, body) for body in (layout.body, block.published))
     keep = np.isin(block.published.ids, layout.body.ids)
     position, rotation = _apart(layout.body, block.published, keep)

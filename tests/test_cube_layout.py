@@ -41,7 +41,7 @@ def test_tags_are_found_where_they_are_with_honest_sigmas(tmp_path: Path) -> Non
         truth = _session(tmp_path / "s.mcap", seed)
         recording = open_recording(tmp_path / "s.mcap")
         config = load_config(recording.attachment("alidade.yaml"))
-        layout = cube_layout(recording, config)
+        layout = cube_layout([(recording, config)])
         assert layout.body.ids.tolist() == sorted(config.section(CubeConfig).tags)
         assert layout.sigma_px == pytest.approx(SCENARIO.noise.corner_px, rel=0.1)
         error = []
@@ -61,7 +61,7 @@ def test_tags_are_found_where_they_are_with_honest_sigmas(tmp_path: Path) -> Non
 def test_layout_as_a_config_reads_back(tmp_path: Path) -> None:
     _session(tmp_path / "s.mcap", 4)
     recording = open_recording(tmp_path / "s.mcap")
-    layout = cube_layout(recording, load_config(recording.attachment("alidade.yaml")))
+    layout = cube_layout([(recording, load_config(recording.attachment("alidade.yaml")))])
     (tmp_path / "cube.yaml").write_text(layout_yaml(layout))
     config = load_config(None, tmp_path / "cube.yaml")
     for k, tag in enumerate(layout.body.ids.tolist()):
@@ -72,9 +72,9 @@ def test_layout_as_a_config_reads_back(tmp_path: Path) -> None:
 def test_a_tag_never_seen_is_not_placed(tmp_path: Path) -> None:
     _session(tmp_path / "s.mcap", 5, SCENARIO.model_copy(update={"cube": TagCube(hidden=(19,))}))
     recording = open_recording(tmp_path / "s.mcap")
-    layout = cube_layout(recording, load_config(recording.attachment("alidade.yaml")))
-    assert layout.unplaced == (19,)
-    assert "tag 19: could not be placed" in layout_yaml(layout)
+    layout = cube_layout([(recording, load_config(recording.attachment("alidade.yaml")))])
+    assert layout.unplaced == {19: "in no picture"}
+    assert "tag 19 could not be placed: in no picture" in layout_yaml(layout)
 
 
 def test_one_tag_alone_places_nothing(tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_one_tag_alone_places_nothing(tmp_path: Path) -> None:
     write_cube(tmp_path / "s.mcap", data, None, cube_config(SCENARIO))
     recording = open_recording(tmp_path / "s.mcap")
     with pytest.raises(InputError, match="no picture shows tag 16 together with another tag"):
-        cube_layout(recording, load_config(recording.attachment("alidade.yaml")))
+        cube_layout([(recording, load_config(recording.attachment("alidade.yaml")))])
 
 
 @pytest.mark.slow

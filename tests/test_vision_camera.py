@@ -72,3 +72,18 @@ def test_what_has_no_image_is_nan() -> None:
 def test_impossible_cameras_are_refused(k: np.ndarray, model: str, d: list[float], says: str) -> None:
     with pytest.raises(InputError, match=says):
         Camera(640, 480, k, model, np.array(d))
+
+
+@pytest.mark.parametrize("name", [*PINHOLES, "equidistant"])
+def test_jacobians_are_those_of_differences(name: str) -> None:
+    camera = FISHEYE if name == "equidistant" else Camera(640, 480, K, PINHOLES[name][0], np.array(PINHOLES[name][1]))
+    points, h = np.vstack([POINTS[:50], [0.0, 0.0, 1.1]]), 1e-6
+    by_point = [(camera.project(points + h * e) - camera.project(points - h * e)) / (2 * h) for e in np.eye(3)]
+    np.testing.assert_allclose(camera.by_point(points), np.stack(by_point, axis=-1), atol=1e-5)
+    given = camera.intrinsics
+    by_intrinsics = [
+        (camera.with_intrinsics(given + h * e).project(points) - camera.with_intrinsics(given - h * e).project(points))
+        / (2 * h)
+        for e in np.eye(len(given))
+    ]
+    np.testing.assert_allclose(camera.by_intrinsics(points), np.stack(by_intrinsics, axis=-1), atol=1e-5)

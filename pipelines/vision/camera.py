@@ -5,7 +5,7 @@ Optical frame: x right, y down, z forward. Integer pixel coordinates are pixel c
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -85,6 +85,68 @@ class Camera:
             z = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
             flat, _ = self._distort(points[..., :2] / z)
         return np.asarray(flat * self.focal + self.centre)
+
+    @property
+    def intrinsics(self) -> Array:
+        """(4 + n,) fx, fy, cx, cy in px, then the distortion coefficients."""
+        return np.concatenate([self.focal, self.centre, self.coefficients])
+
+    def with_intrinsics(self, intrinsics: Array) -> Camera:
+        """The same camera with other intrinsics, in the order of `intrinsics`."""
+        fx, fy, cx, cy = intrinsics[:4]
+        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        return replace(self, K=K, coefficients=intrinsics[4:])
+
+    def by_point(self, points: Array) -> Array:
+        """Jacobian (..., 2, 3) of the pixels by the points, shape (..., 3); NaN behind the camera."""
+        z = points[..., 2]
+        if self.distortion_model == "equidistant":
+            flat = points[..., :2]
+            rho = np.hypot(flat[..., 0], flat[..., 1])
+            distorted, slope = self._angle(np.arctan2(rho, z))
+            # On the axis the limit of both terms is that of a pinhole.
+            scale = np.where(rho > 0, distorted / np.where(rho > 0, rho, 1.0), 1.0 / z)
+            out = flat / np.where(rho > 0, rho, 1.0)[..., None]
+            square = rho**2 + z**2
+            J = np.zeros((*points.shape[:-1], 2, 3))
+            J[..., :2] = scale[..., None, None] * np.eye(2)
+            J[..., :2] += ((slope * z / square) - scale)[..., None, None] * out[..., :, None] * out[..., None, :]
+            J[..., 2] = -(slope * rho / square)[..., None] * out
+            return np.asarray(J * self.focal[:, None])
+        z = np.where(z > 0, z, np.nan)
+        flat = points[..., :2] / z[..., None]
+        _, bent = self._distort(flat)
+        by_flat = np.concatenate([np.broadcast_to(np.eye(2), (*flat.shape, 2)), -flat[..., None]], axis=-1)
+        return np.asarray(self.focal[:, None] * (bent @ (by_flat / z[..., None, None])))
+
+    def by_intrinsics(self, points: Array) -> Array:
+        """Jacobian (..., 2, 4 + n) of the pixels of points, shape (..., 3), by `intrinsics`; NaN behind the camera."""
+        flat = (self.project(points) - self.centre) / self.focal
+        J = np.zeros((*flat.shape, 4 + len(self.coefficients)))
+        J[..., 0, 0], J[..., 1, 1] = flat[..., 0], flat[..., 1]
+        J[..., 0, 2] = J[..., 1, 3] = 1.0
+        J[..., 4:] = self.focal[:, None] * self._by_coefficients(points)
+        return J
+
+    def _by_coefficients(self, points: Array) -> Array:
+        """Jacobian (..., 2, n) of the distorted z = 1 coordinates by the distortion coefficients."""
+        x, y, z = points[..., 0], points[..., 1], points[..., 2]
+        if self.distortion_model == "equidistant":
+            rho = np.hypot(x, y)
+            theta = np.arctan2(rho, z)
+            out = points[..., :2] / np.where(rho > 0, rho, 1.0)[..., None]
+            return np.stack([out * (theta ** (2 * i + 3))[..., None] for i in range(4)], axis=-1)
+        z = np.where(z > 0, z, np.nan)
+        x, y = x / z, y / z
+        u, r2 = np.stack([x, y], axis=-1), x * x + y * y
+        k1, k2, _, _, k3, k4, k5, k6 = [*self.coefficients.tolist(), 0.0, 0.0, 0.0][:8]
+        over, under = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        up, down = 1 / under, -over / under**2
+        p1 = np.stack([2 * x * y, r2 + 2 * y * y], axis=-1)
+        p2 = np.stack([r2 + 2 * x * x, 2 * x * y], axis=-1)
+        radial = [u * (factor * r2**i)[..., None] for factor in (up, down) for i in (1, 2, 3)]
+        columns = [radial[0], radial[1], p1, p2, *radial[2:]]
+        return np.stack(columns[: len(self.coefficients)], axis=-1)
 
     def rays(self, pixels: ArrayLike) -> Array:
         """Unit directions in the optical frame, shape (..., 3), of pixels, shape (..., 2).

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 # Corners of a tag of size 1 in its own frame (x right, y up, z out of the face), in the AprilTag library's order.
-_SQUARE = 0.5 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
+SQUARE = 0.5 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
 # OpenCV's IPPE_SQUARE wants top left, top right, bottom right, bottom left.
 _IPPE_ORDER = [3, 2, 1, 0]
 # Odds of the flipped pose above which a pose is called ambiguous.
@@ -78,7 +78,7 @@ class TagBody:
     @property
     def corners(self) -> Array:
         """(n, 4, 3) corners in b, m, in the AprilTag library's order."""
-        local = _SQUARE * self.size[:, None, None]
+        local = SQUARE * self.size[:, None, None]
         return np.asarray(self.position[:, None] + so3.rotate(self.bRt[:, None], local))
 
 
@@ -146,7 +146,7 @@ def estimate_pose(
         return solution
     # One wrong tag spoils the fit of all: it is the one without which the others agree.
     rests = [np.arange(len(tags.ids)) != k for k in range(len(tags.ids))]
-    others = [_solve(camera, _part(tags, keep), pixels[keep], noise, expected) for keep in rests]
+    others = [_solve(camera, part(tags, keep), pixels[keep], noise, expected) for keep in rests]
     best = min((o for o in others if o is not None), key=lambda o: o.rms_px, default=solution)
     if best.rms_px * _WRONG_GAIN > solution.rms_px:
         return solution
@@ -171,10 +171,11 @@ def _matched(camera: Camera, body: TagBody, detections: Detections, use: Sequenc
     good &= (camera.rays(detections.corners[seen])[..., 2] > _FORWARD).all(axis=1)
     seen, variances = seen[good], variances[good]
     keep = np.array([int(np.flatnonzero(body.ids == i)[0]) for i in detections.ids[seen]], dtype=np.intp)
-    return _part(body, keep), detections.corners[seen], float(variances.mean()) if len(seen) else 0.0
+    return part(body, keep), detections.corners[seen], float(variances.mean()) if len(seen) else 0.0
 
 
-def _part(body: TagBody, keep: NDArray[Any]) -> TagBody:
+def part(body: TagBody, keep: NDArray[Any]) -> TagBody:
+    """The body with some of its tags only."""
     return TagBody(body.ids[keep], body.size[keep], body.bRt[keep], body.position[keep], body.family)
 
 
@@ -219,26 +220,45 @@ def _angle(p: Array, q: Array) -> float:
 
 def _starts(camera: Camera, tags: TagBody, pixels: Array) -> list[list[tuple[float, Array, Array]]]:
     """For each tag its planar solutions as body poses: (sum of squares over all tags in px^2, cRb, position)."""
-    import cv2
-
-    rays = camera.rays(pixels)
-    flat = rays[..., :2] / rays[..., 2:]
     corners = tags.corners
     starts = []
-    for k, size in enumerate(tags.size):
-        square = (size * _SQUARE)[_IPPE_ORDER]
-        _, vectors, positions, _ = cv2.solvePnPGeneric(
-            square, flat[k][_IPPE_ORDER], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
-        )
+    for k, (attitudes, places) in enumerate(zip(*planar_solutions(camera, tags.size, pixels), strict=True)):
         pair = []
-        for vector, position in zip(vectors, positions, strict=True):
-            cRb = so3.multiply(so3.exp(vector.ravel()), so3.inverse(tags.bRt[k]))
-            origin = position.ravel() - so3.rotate(cRb, tags.position[k])
+        for cRt, place in zip(attitudes, places, strict=True):
+            cRb = so3.multiply(cRt, so3.inverse(tags.bRt[k]))
+            origin = place - so3.rotate(cRb, tags.position[k])
             miss = _miss(camera, corners, pixels, cRb, origin)
             square_sum = float((miss**2).sum())
             pair.append((square_sum if np.isfinite(square_sum) else np.inf, cRb, origin))
         starts.append(pair)
     return starts
+
+
+def planar_solutions(camera: Camera, size: Array, pixels: Array) -> tuple[Array, Array]:
+    """Both poses that each tag by itself may have: cRt (n, 2, 4) and its place in c (n, 2, 3), m.
+
+    Args:
+        camera: the camera.
+        size: (n,) m.
+        pixels: (n, 4, 2) corners.
+    """
+    import cv2
+
+    rays = camera.rays(pixels)
+    flat = rays[..., :2] / rays[..., 2:]
+    vectors, places = np.zeros((len(size), 2, 3)), np.zeros((len(size), 2, 3))
+    for k, edge in enumerate(size):
+        square = (edge * SQUARE)[_IPPE_ORDER]
+        _, turned, origins, _ = cv2.solvePnPGeneric(
+            square, flat[k][_IPPE_ORDER], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE
+        )
+        if len(turned):
+            vectors[k], places[k] = np.squeeze(turned, axis=-1), np.squeeze(origins, axis=-1)
+            continue
+        # It gives up where there is next to no perspective: a tag faced squarely is where both flips meet.
+        extent = float(np.linalg.norm(flat[k] - np.roll(flat[k], 1, axis=0), axis=1).mean())
+        vectors[k], places[k] = [np.pi, 0.0, 0.0], np.append(flat[k].mean(axis=0), 1.0) * edge / extent
+    return so3.exp(vectors), places
 
 
 def _minima(camera: Camera, tags: TagBody, pixels: Array, starts: list[list[tuple[float, Array, Array]]]) -> list[_Fit]:

@@ -26,7 +26,7 @@ def cube_layout(
 
     with progress.shown(quiet), progress.doing("finding where the tags are"):
         recording = open_recording(session)
-        layout = estimate(recording, recorded_config(recording, config))
+        layout = estimate([(recording, recorded_config(recording, config))])
     write_file(out, layout_yaml(layout))
     terminal.say(f"Wrote {out}")
 

@@ -1,7 +1,8 @@
-"""The layout of a cube's tags from a recording of pictures or detections, and as a config."""
+"""The layout of a cube's tags from recordings of pictures or detections, and as a config."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from io import StringIO
 from itertools import islice
 from typing import TYPE_CHECKING
@@ -24,29 +25,37 @@ if TYPE_CHECKING:
 _MOST_PICTURES = 800
 
 
-def cube_layout(recording: Recording, config: Config) -> Layout:
-    """Where the cube's tags are, seen from all sides; the config gives their ids and sizes.
+def cube_layout(recordings: Sequence[tuple[Recording, Config]], refine_camera: bool = False) -> Layout:
+    """Where the cube's tags are, seen from all sides; the first config gives their ids and sizes.
 
     Of a long recording pictures are taken at even distances, a few hundred.
 
+    Args:
+        recordings: each with its config; of one camera or of several.
+        refine_camera: adjust the cameras' intrinsics too.
+
     Raises InputError when there are no pictures or detections, or none that ties the tags together.
     """
-    from pipelines.vision.layout import estimate_layout
+    from pipelines.vision.layout import Shots, estimate_layout
     from pipelines.vision.pose import TagBody
 
-    camera = read_camera(recording, config)
-    topic = config.topic(IMAGE)
-    if topic in recording.topics:
-        from pipelines.vision.parallel import detections
+    shots = [Shots(read_camera(recording, config), _tags(recording, config)) for recording, config in recordings]
+    if not any(len(found) for each in shots for found in each.pictures):
+        pictures = sum(len(each.pictures) for each in shots)
+        raise InputError(f"no tag in any of {pictures} pictures; are they blurred, or the tags of another family?")
+    return estimate_layout(shots, TagBody.from_board(recordings[0][1].section(CubeConfig)), refine_camera)
 
-        pictures = islice(recording.images(topic), None, None, _every(recording.topics[topic].count))
-        seen = detections(pictures, config.section(CubeConfig).tag_family, camera)
-        found = [tags for _, tags in seen if tags is not None]
-    else:
-        found = _detections(recording, config)
-    if not any(len(tags) for tags in found):
-        raise InputError(f"no tag in any of {len(found)} pictures; are they blurred, or the tags of another family?")
-    return estimate_layout(camera, TagBody.from_board(config.section(CubeConfig)), found)
+
+def _tags(recording: Recording, config: Config) -> list[Detections]:
+    """The tags in each picture, in time order."""
+    topic = config.topic(IMAGE)
+    if topic not in recording.topics:
+        return _detections(recording, config)
+    from pipelines.vision.parallel import detections
+
+    pictures = islice(recording.images(topic), None, None, _every(recording.topics[topic].count))
+    seen = detections(pictures, config.section(CubeConfig).tag_family, read_camera(recording, config))
+    return [tags for _, tags in seen if tags is not None]
 
 
 def _every(pictures: int) -> int:
@@ -81,11 +90,11 @@ def layout_yaml(layout: Layout) -> str:
     yaml.default_flow_style = None
     yaml.dump({"cube": {"tag_family": body.family, "tags": tags}}, text)
     sigmas = np.sqrt(np.diag(layout.covariance)).reshape(-1, 6)
-    lines = [f"# From {layout.frames} pictures; corners good to {layout.sigma_px:.3f} px. Sigmas:"]
+    lines = [f"# From {layout.frames} pictures; corners good to {layout.rms_px:.3f} px RMS. Sigmas:"]
     lines.append(f"# tag {body.ids[0]}: defines the body frame")
     lines += [
         f"# tag {i}: {np.rad2deg(s[:3].max()):.3f} deg, {1e3 * s[3:].max():.3f} mm"
         for i, s in zip(body.ids[1:], sigmas, strict=True)
     ]
-    lines += [f"# tag {i}: could not be placed, never seen well with another" for i in layout.unplaced]
+    lines += [f"# tag {i} could not be placed: {why}" for i, why in layout.unplaced.items()]
     return "\n".join([*lines, text.getvalue()])

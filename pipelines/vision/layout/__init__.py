@@ -1,0 +1,171 @@
+"""Where the tags sit on a body, from pictures of it: bundle adjustment of their corners, with covariance.
+
+The tag with the lowest id stays where it is given and so defines the body's frame; the sizes given define its scale.
+Tags are placed by a vote of all pictures (`placing`), then poses of tags and pictures, each tag the rigid square it is,
+are adjusted together (`bundle`, `robust`), with the cameras if asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines import progress
+from pipelines.errors import InputError
+from pipelines.vision.camera import Camera
+from pipelines.vision.layout.bundle import Array, free_cameras
+from pipelines.vision.layout.covariance import covariance
+from pipelines.vision.layout.pictures import Gathered, Shots, gathered
+from pipelines.vision.layout.placing import joint
+from pipelines.vision.layout.robust import Fit, fitted
+from pipelines.vision.layout.whole import adjusted_whole, flip_told
+from pipelines.vision.pose import TagBody, part
+
+__all__ = ["Layout", "Shots", "TagSeen", "estimate_layout"]
+
+# More sights of a tag than this share left out as false: it is not one rigid tag.
+_MOSTLY_FALSE = 0.5
+
+
+@dataclass(frozen=True)
+class TagSeen:
+    """How a tag was seen: in how many pictures used, root mean square error px per axis, sights left out as false.
+
+    `inflation` is by how much its errors from picture to picture exceed what independent corners would give.
+    """
+
+    pictures: int
+    rms_px: float
+    rejected: int
+    inflation: float
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """A body of tags as found.
+
+    Attributes:
+        body: the tags that could be placed.
+        covariance: (6 (n - 1), 6 (n - 1)) of the tags after the first: for each [delta, epsilon], attitude bRt
+            Exp(delta) in rad, position + epsilon in m.
+        sigma_px: standard deviation of a corner in a common picture, px per axis, from the residuals.
+        rms_px: root mean square error of the corners, px per axis, pictures weighted as in the adjustment.
+        frames: number of pictures used.
+        seen: of each placed tag, by id.
+        unplaced: id -> why it could not be placed, and what to do.
+        cameras: as given, or as adjusted.
+        camera_sigma: (c, n) of their intrinsics, None if not adjusted.
+    """
+
+    body: TagBody
+    covariance: Array
+    sigma_px: float
+    rms_px: float
+    frames: int
+    seen: Mapping[int, TagSeen]
+    unplaced: Mapping[int, str]
+    cameras: tuple[Camera, ...]
+    camera_sigma: Array | None
+
+
+def estimate_layout(shots: Sequence[Shots], given: TagBody, refine_camera: bool = False) -> Layout:
+    """The layout of a body.
+
+    Args:
+        shots: recordings of it; those whose cameras say the same are of one camera.
+        given: ids, sizes and, for the tag with the lowest id, its attitude and position; those of the others are not
+            looked at.
+        refine_camera: adjust the cameras' intrinsics too, about those given.
+
+    Raises:
+        InputError: no picture shows the first tag with another, or the pictures do not tell the layout from its mirror
+            image.
+    """
+    unplaced = _apart(gathered(shots, given), given)
+    body: TagBody | None = None
+    while True:
+        placed = part(given, ~np.isin(given.ids, list(unplaced)))
+        views = gathered(shots, placed)
+        with progress.doing("placing tags"):
+            fit = adjusted_whole(views, None if body is None else part(body, np.isin(body.ids, placed.ids)))
+        wrong = _wrong(views, fit)
+        if not wrong:
+            break
+        if int(given.ids[0]) in wrong:
+            raise InputError(f"tag {given.ids[0]}, which defines the body's frame: {wrong[int(given.ids[0])]}")
+        unplaced, body = unplaced | wrong, fit.bundle.body
+    if refine_camera:
+        fit = fitted(fit.bundle, views.sights[fit.whole], 0, free_cameras(fit.bundle.cameras))
+    return _layout(views, fit, unplaced)
+
+
+def _apart(views: Gathered, given: TagBody) -> dict[int, str]:
+    """Tags that no chain of tags seen together ties to the first one."""
+    n, sights = len(given.ids), views.sights
+    times = np.bincount(sights.tag, minlength=n)
+    pictures = joint(sights, n) > 0
+    reached = np.arange(n) == 0
+    for _ in range(n):
+        reached = reached | (pictures & reached).any(axis=1)
+    if reached.sum() < 2:
+        shown = "in no picture" if not times[0] else f"in {times[0]} pictures, never with another tag of the body"
+        raise InputError(
+            f"no picture shows tag {given.ids[0]} together with another tag of the body ({shown}); it defines the "
+            "body's frame: take pictures of its edges and corners from near, or leave it out of the config"
+        )
+    return {
+        int(given.ids[k]): "in no picture"
+        if not times[k]
+        else f"in {times[k]} pictures, never with one that is placed; take pictures that show both"
+        for k in np.flatnonzero(~reached)
+    }
+
+
+def _wrong(views: Gathered, fit: Fit) -> dict[int, str]:
+    """Tags whose pose is not to be believed."""
+    body, sights = fit.bundle.body, views.sights
+    n = len(body.ids)
+    shown, used = np.bincount(sights.tag, minlength=n), np.bincount(fit.sights.tag, minlength=n)
+    looked_at = np.bincount(sights.tag[fit.whole], minlength=n)
+    out = {}
+    for k, tag in enumerate(body.ids.tolist()):
+        if not looked_at[k]:
+            out[tag] = (
+                f"in {shown[k]} pictures, none of which tells the planar flip of all that it shows; take pictures from "
+                "nearer, or that show more tags"
+            )
+        elif used[k] < (1.0 - _MOSTLY_FALSE) * looked_at[k]:
+            out[tag] = (
+                f"disagrees with the others in {looked_at[k] - used[k]} of {looked_at[k]} pictures; is its size right, "
+                "is it glued down, is there another tag of this id?"
+            )
+        elif not flip_told(fit, views.view, k):
+            out[tag] = (
+                f"in {used[k]} pictures that fit its planar flip as well; take pictures of it with its neighbours from "
+                "nearer and from other sides"
+            )
+    # Of tags that disagree each may spoil the next one's pose: the worst goes first.
+    return out
+
+
+def _layout(views: Gathered, fit: Fit, unplaced: Mapping[int, str]) -> Layout:
+    known = covariance(fit, 0, views.view)
+    body = fit.bundle.body
+    seen = {}
+    for k, tag in enumerate(body.ids.tolist()):
+        mine = fit.sights.tag == k
+        rejected = int((views.sights.tag[fit.whole] == k).sum()) - int(mine.sum())
+        seen[tag] = TagSeen(int(mine.sum()), fit.rms_px(mine), rejected, float(known.inflation[k]))
+    return Layout(
+        body=body,
+        covariance=known.tags,
+        sigma_px=fit.sigma_px,
+        rms_px=fit.rms_px(),
+        frames=len(np.unique(fit.sights.picture)),
+        seen=seen,
+        unplaced=dict(sorted(unplaced.items())),
+        cameras=fit.bundle.cameras,
+        camera_sigma=known.cameras,
+    )

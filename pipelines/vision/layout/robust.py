@@ -1,0 +1,154 @@
+"""Bundle adjustment of pictures of which some are better than others, without false detections.
+
+A hand-held body is sharp in some pictures and blurred in others. Each picture has a variance of its own, distributed
+about a common one, which makes the errors of a picture one draw of a multivariate t distribution (K. Lange, R. Little,
+J. Taylor, "Robust statistical modeling using the t distribution", JASA 1989); its weights are found by iteration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.vision.layout.bundle import (
+    Array,
+    Bundle,
+    Cameras,
+    Index,
+    Rows,
+    Sights,
+    adjusted,
+    linearized,
+)
+
+# Degrees of freedom of the t distribution.
+_NU = 4.0
+_ROUNDS, _SETTLED = 12, 1e-3
+# A tag in a picture whose corners miss by this many times the picture's sigma is a false detection.
+_FAR = 4.0
+_MEDIAN_OF_SEVEN = 6.35
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A bundle adjusted.
+
+    Attributes:
+        bundle: with all poses.
+        sights: those used; sigma is that of the picture.
+        rows: their errors, in these sigmas.
+        weight: (f,) of the pictures, about 1; the inverse of their variance over the common one.
+        sigma: of a corner in a common picture, in the sigmas given.
+        sigma_px: of a corner in a common picture, per axis.
+        whole: indices of the sights that were looked at, in a table of the caller's.
+        cameras: what was adjusted of the cameras.
+    """
+
+    bundle: Bundle
+    sights: Sights
+    rows: Rows
+    weight: Array
+    sigma: float
+    sigma_px: float
+    whole: Index
+    cameras: Cameras
+
+    @property
+    def freedom(self) -> Array:
+        """(f,) numbers seen in a picture beyond the six of its pose."""
+        return freedom(self.sights, len(self.weight))
+
+    @property
+    def curvature(self) -> Array:
+        """(f,) what of a picture's information its weight leaves: less, since the weight follows the errors."""
+        squares = np.bincount(self.sights.picture, self.rows.squares, len(self.weight))
+        free = np.maximum(self.freedom, 1.0)
+        return np.asarray(np.maximum(1.0 - 2.0 * squares / ((_NU + free) * free), 0.1))
+
+    @property
+    def errors_px(self) -> Array:
+        """(m, 4, 2) errors of the sights used, px."""
+        return self.rows.miss.reshape(-1, 4, 2) * self.sights.sigma[:, None, None]
+
+    def rms_px(self, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
+        """Root mean square error, px per axis, of some sights, with the weights of their pictures."""
+        weight = self.weight[self.sights.picture][keep]
+        return float(np.sqrt((weight * (self.errors_px**2).mean(axis=(1, 2))[keep]).sum() / weight.sum()))
+
+
+def fitted(bundle: Bundle, sights: Sights, fixed: int, cameras: Cameras) -> Fit:
+    """The most likely bundle; false detections are left out.
+
+    Args:
+        bundle: a start.
+        sights: with sigmas that are right among each other.
+        fixed: index of the tag that stays.
+        cameras: what of the cameras is adjusted.
+    """
+    used = np.ones(len(sights), dtype=bool)
+    # Where the start is it is not yet drawn to what is false.
+    squares, sigma = linearized(bundle, sights).squares, None
+    for _ in range(_ROUNDS):
+        false = _false(sights[used], squares, sigma)
+        if sigma is not None and not false.any():
+            break
+        used[np.flatnonzero(used)[false]] = False
+        used[np.flatnonzero(used)[~_with_others(sights[used])]] = False
+        fit = _reweighted(bundle, sights[used], fixed, cameras)
+        bundle, sigma = fit.bundle, fit.sigma
+        squares = fit.rows.squares * (sigma**2 / fit.weight[fit.sights.picture])
+    return replace(fit, whole=np.arange(len(sights)))
+
+
+def _false(sights: Sights, squares: Array, sigma: float | None) -> NDArray[np.bool_]:
+    """(m,) sights that miss by far more than the others of their picture."""
+    if sigma is None:
+        # The median of a chi-square of seven degrees of freedom; a picture's pose takes one or so of a tag's eight.
+        sigma = float(np.sqrt(np.median(squares) / _MEDIAN_OF_SEVEN))
+    count = np.bincount(sights.picture)[sights.picture]
+    others = np.bincount(sights.picture, squares)[sights.picture] - squares
+    # Of the picture without this tag, with what is known of pictures beforehand.
+    variance = (_NU * sigma**2 + others) / (_NU + np.maximum(8.0 * (count - 1) - 6.0, 0.0))
+    return np.asarray(squares > 8.0 * _FAR**2 * variance)
+
+
+def _with_others(sights: Sights) -> NDArray[np.bool_]:
+    return np.asarray(np.bincount(sights.picture)[sights.picture] > 1)
+
+
+def _reweighted(bundle: Bundle, sights: Sights, fixed: int, cameras: Cameras) -> Fit:
+    f, tags = len(bundle.cRb), len(bundle.body.ids)
+    free = freedom(sights, f)
+    shared = 6.0 * (tags - 1) + cameras.free.sum()
+    # The share of the tags in what a picture determines is theirs, not the noise's.
+    free *= 1.0 - shared / max(free.sum(), shared + 1.0)
+    sigma, weight = 1.0, np.ones(f)
+    for _ in range(_ROUNDS):
+        scaled = replace(sights, sigma=sights.sigma * sigma / np.sqrt(weight[sights.picture]))
+        bundle, rows = adjusted(bundle, scaled, fixed, cameras)
+        squares = np.bincount(sights.picture, rows.squares, f) * sigma**2 / weight
+        before, (sigma, weight) = sigma, _scale(squares, free)
+        if abs(sigma / before - 1.0) < _SETTLED:
+            break
+    scaled = replace(sights, sigma=sights.sigma * sigma / np.sqrt(weight[sights.picture]))
+    bundle, rows = adjusted(bundle, scaled, fixed, cameras)
+    sigma_px = sigma * float(np.median(sights.sigma))
+    return Fit(bundle, scaled, rows, weight, sigma, sigma_px, np.arange(len(sights)), cameras)
+
+
+def freedom(sights: Sights, pictures: int) -> Array:
+    """(f,) numbers seen in a picture beyond the six of its pose."""
+    return np.asarray(np.maximum(8.0 * np.bincount(sights.picture, minlength=pictures) - 6.0, 0.0))
+
+
+def _scale(squares: Array, freedom: Array) -> tuple[float, Array]:
+    """Common sigma and the weights (f,) of pictures with these sums of squares."""
+    variance = float(squares.sum() / freedom.sum())
+    for _ in range(200):
+        weight = (_NU + freedom) / (_NU + squares / variance)
+        before, variance = variance, float((weight * squares).sum() / freedom.sum())
+        if abs(variance / before - 1.0) < 1e-6:
+            break
+    return float(np.sqrt(variance)), np.asarray((_NU + freedom) / (_NU + squares / variance))

@@ -1,0 +1,280 @@
+"""Layouts of tags from their corners in pictures, which are drawn by OpenCV's projection, not the estimator's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import pytest
+
+from datasets import tagslam_block
+from factors import so3
+from pipelines.config import recorded_config
+from pipelines.errors import InputError
+from pipelines.methods.cube.layout import cube_layout
+from pipelines.recording.reading import open_recording
+from pipelines.vision.camera import Camera
+from pipelines.vision.layout import Layout, Shots, estimate_layout
+from pipelines.vision.layout.bundle import Bundle, Sights, fixed_cameras, free_cameras, linearized, moved, shared_rows
+from pipelines.vision.layout.placing import mirrored
+from pipelines.vision.pose import TagBody, estimate_pose
+from pipelines.vision.tags import Detections
+
+K = np.array([[1150.0, 0, 641.3], [0, 1155.0, 477.8], [0, 0, 1]])
+CAMERA = Camera(1280, 960, K, "plumb_bob", np.array([-0.25, 0.1, 1e-3, -5e-4, 0.02]))
+SQUARE = 0.5 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+SIGMA = 0.3
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Tags about a ball, and pictures of it."""
+
+    body: TagBody
+    pictures: list[Detections]
+    sides: np.ndarray
+
+    def given(self) -> TagBody:
+        """Ids, sizes and the first tag's pose."""
+        n = len(self.body.ids)
+        return replace(
+            self.body,
+            bRt=np.concatenate([self.body.bRt[:1], so3.identity(n - 1)]),
+            position=np.concatenate([self.body.position[:1], np.zeros((n - 1, 3))]),
+        )
+
+    def errors(self, layout: Layout) -> np.ndarray:
+        """(6 (n - 1),) of the tags after the first."""
+        rows = np.searchsorted(self.body.ids, layout.body.ids)
+        turned = so3.log(so3.multiply(so3.inverse(self.body.bRt[rows]), layout.body.bRt))
+        return np.concatenate([turned, layout.body.position - self.body.position[rows]], axis=1)[1:].ravel()
+
+
+def scene(
+    tags: int, pictures: int, seed: int, camera: Camera = CAMERA, distance: tuple[float, float] = (0.5, 1.2)
+) -> Scene:
+    rng = np.random.default_rng(seed)
+    k = np.arange(tags) + 0.5
+    up, turn = 1 - 2 * k / tags, np.pi * (1 + 5**0.5) * k
+    out = np.stack([np.sqrt(1 - up**2) * np.cos(turn), np.sqrt(1 - up**2) * np.sin(turn), up], axis=1)
+    R = []
+    for direction in out:
+        z = direction + 0.15 * rng.normal(size=3)
+        z /= np.linalg.norm(z)
+        x = np.cross(rng.normal(size=3), z)
+        x /= np.linalg.norm(x)
+        R.append(np.stack([x, np.cross(z, x), z], axis=1))
+    body = TagBody(np.arange(tags), rng.uniform(0.02, 0.035, tags), so3.from_matrix(np.array(R)), 0.1 * out)
+    found: list[Detections] = []
+    sides: list[float] = []
+    while len(found) < pictures:
+        seen = _picture(body, np.array(R), camera, distance, rng)
+        if seen:
+            ids, corners = np.array(list(seen)), np.array(list(seen.values()))
+            sides += np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(axis=1).tolist()
+            found.append(detections(ids, corners + SIGMA * rng.normal(size=corners.shape)))
+    return Scene(body, found, np.array(sides))
+
+
+def detections(ids: np.ndarray, corners: np.ndarray) -> Detections:
+    return Detections(ids, corners, np.tile(SIGMA**2 * np.eye(2), (len(ids), 4, 1, 1)))
+
+
+def _picture(
+    body: TagBody, R: np.ndarray, camera: Camera, distance: tuple[float, float], rng: np.random.Generator
+) -> dict[int, np.ndarray]:
+    vector = rng.normal(size=3)
+    vector *= rng.uniform(0, np.pi) / np.linalg.norm(vector)
+    at = np.append(rng.uniform([-0.12, -0.09], [0.12, 0.09]), 1) * rng.uniform(*distance)
+    turn, _ = cv2.Rodrigues(vector)
+    seen = {}
+    for i in range(len(R)):
+        centre = turn @ body.position[i] + at
+        if -(turn @ R[i][:, 2]) @ centre / np.linalg.norm(centre) < 0.35:
+            continue
+        points = (R[i] @ (body.size[i] * SQUARE).T).T + body.position[i]
+        pixels = cv2.projectPoints(points, vector, at, camera.K, camera.coefficients)[0][:, 0]
+        if ((pixels > 5) & (pixels < [1275, 955])).all():
+            seen[i] = pixels
+    return seen
+
+
+def nees(tags: int, pictures: int, seeds: range) -> float:
+    """Mean over sessions of the squared error of a layout in its own sigmas, per number."""
+    squares = []
+    for seed in seeds:
+        drawn = scene(tags, pictures, seed)
+        layout = estimate_layout([Shots(CAMERA, drawn.pictures)], drawn.given())
+        assert len(layout.body.ids) == tags
+        error = drawn.errors(layout)
+        squares.append(float(error @ np.linalg.solve(layout.covariance, error)) / len(error))
+    return float(np.mean(squares))
+
+
+def test_sigmas_of_a_small_layout_hold() -> None:
+    # Mean of 5 * 42 squares: 1 +- 0.1.
+    assert 0.75 < nees(8, 40, range(5)) < 1.3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("tags", "pictures"), [(18, 80), (30, 100)])
+def test_sigmas_of_large_layouts_hold(tags: int, pictures: int) -> None:
+    spread = 1.96 * (2 / (20 * 6 * (tags - 1))) ** 0.5
+    assert abs(nees(tags, pictures, range(20)) - 1.0) < spread
+
+
+def test_tags_whose_own_pose_no_picture_tells_are_placed() -> None:
+    far = Camera(1280, 960, np.array([[4600.0, 0, 641.3], [0, 4620.0, 477.8], [0, 0, 1]]))
+    drawn = scene(8, 60, 3, far, (3.0, 4.0))
+    one = replace(drawn.body, bRt=so3.identity(8), position=np.zeros((8, 3)))
+    alone = [
+        estimate_pose(far, TagBody(one.ids[i : i + 1], one.size[i : i + 1], one.bRt[:1], one.position[:1]), seen)
+        for seen in drawn.pictures[:20]
+        for i in seen.ids.tolist()
+    ]
+    assert sum(pose is not None and pose.decided for pose in alone) < 0.1 * len(alone)
+    layout = estimate_layout([Shots(far, drawn.pictures)], drawn.given())
+    assert len(layout.body.ids) == 8
+    assert np.abs(drawn.errors(layout).reshape(-1, 6)[:, :3]).max() < np.deg2rad(1.0)
+
+
+def test_false_detections_are_left_out() -> None:
+    drawn, rng = scene(14, 45, 1), np.random.default_rng(1)
+    many = [k for k, seen in enumerate(drawn.pictures) if len(seen) > 3][::3]
+    for k in many:
+        seen = drawn.pictures[k]
+        ids = seen.ids.copy()
+        ids[rng.integers(len(ids))] = next(i for i in rng.permutation(14) if i not in ids)
+        drawn.pictures[k] = detections(ids, seen.corners)
+    layout = estimate_layout([Shots(CAMERA, drawn.pictures)], drawn.given())
+    assert sum(seen.rejected for seen in layout.seen.values()) == len(many) > 8
+    error = drawn.errors(layout)
+    assert float(error @ np.linalg.solve(layout.covariance, error)) / len(error) < 2.0
+
+
+def test_a_tag_that_was_moved_is_not_placed() -> None:
+    drawn = scene(8, 60, 2)
+    rng = np.random.default_rng(2)
+    for k, seen in enumerate(drawn.pictures):
+        corners = seen.corners.copy()
+        corners[seen.ids == 5] += rng.uniform(-60, 60, 2)
+        drawn.pictures[k] = detections(seen.ids, corners)
+    layout = estimate_layout([Shots(CAMERA, drawn.pictures)], drawn.given())
+    assert list(layout.unplaced) == [5]
+    assert "disagrees" in layout.unplaced[5] or "flip" in layout.unplaced[5]
+
+
+def test_pictures_without_perspective_do_not_tell_inside_from_outside() -> None:
+    far = Camera(1280, 960, np.array([[115000.0, 0, 640.0], [0, 115000.0, 480.0], [0, 0, 1]]))
+    drawn = scene(5, 30, 0, far, (95.0, 100.0))
+    with pytest.raises(InputError, match=r"mirror image|planar flip"):
+        estimate_layout([Shots(far, drawn.pictures)], drawn.given())
+
+
+def test_mirror_image_of_the_mirror_image_is_the_body() -> None:
+    body = scene(6, 1, 0).body
+    twice = mirrored(mirrored(body, 2), 2)
+    np.testing.assert_allclose(so3.matrix(twice.bRt), so3.matrix(body.bRt), atol=1e-12)
+    np.testing.assert_allclose(twice.position, body.position, atol=1e-12)
+    assert np.linalg.norm(mirrored(body, 2).position - body.position, axis=1).max() > 0.05
+
+
+def test_a_camera_that_is_off_is_found() -> None:
+    drawn = scene(8, 60, 4)
+    wrong = CAMERA.with_intrinsics(CAMERA.intrinsics + [5.0, 5.0, 4.0, -4.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    shots = [Shots(wrong, drawn.pictures)]
+    layout = estimate_layout(shots, drawn.given(), refine_camera=True)
+    assert layout.camera_sigma is not None
+    off = (layout.cameras[0].intrinsics - CAMERA.intrinsics) / layout.camera_sigma[0]
+    assert np.abs(off[:4]).max() < 3.5
+    assert (layout.camera_sigma[0, :4] < [5.0, 5.0, 4.9, 4.9]).all()  # the priors' are 5.75 and 5 px
+    error = drawn.errors(layout)
+    assert float(error @ np.linalg.solve(layout.covariance, error)) / len(error) < 1.6
+
+
+def test_recordings_of_two_cameras_are_one_layout() -> None:
+    other = Camera(1280, 960, np.array([[900.0, 0, 600.0], [0, 900.0, 500.0], [0, 0, 1]]))
+    first, second = scene(8, 30, 5), scene(8, 30, 5, other)
+    second = replace(second, body=first.body)
+    shots = [Shots(CAMERA, first.pictures), Shots(other, second.pictures)]
+    both, alone = estimate_layout(shots, first.given()), estimate_layout(shots[:1], first.given())
+    assert len(both.cameras) == 2
+    assert np.trace(both.covariance) < 0.8 * np.trace(alone.covariance)
+    error = first.errors(both)
+    assert float(error @ np.linalg.solve(both.covariance, error)) / len(error) < 2.0
+
+
+@pytest.mark.parametrize("refined", [False, True])
+def test_jacobians_are_those_of_differences(refined: bool) -> None:
+    drawn = scene(4, 3, 0)
+    rows = [(f, i, c) for f, seen in enumerate(drawn.pictures) for i, c in zip(seen.ids, seen.corners, strict=True)]
+    frame, tag = (np.array([row[k] for row in rows]) for k in (0, 1))
+    sights = Sights(frame, tag, np.array([row[2] for row in rows]), np.full(len(rows), SIGMA))
+    rng = np.random.default_rng(0)
+    cRb = so3.normalize(np.array([1.0, 0.1, -0.2, 0.1]) + 0.1 * rng.normal(size=(3, 4)))
+    bundle = Bundle((CAMERA,), np.zeros(3, dtype=np.intp), drawn.body, cRb, np.tile([0.02, 0.01, 0.8], (3, 1)))
+    cameras = free_cameras((CAMERA,)) if refined else fixed_cameras((CAMERA,))
+    found = linearized(bundle, sights)
+    shared = shared_rows(bundle, sights, found, cameras)
+    h = 1e-6
+
+    def change(step: np.ndarray, pictures: np.ndarray) -> np.ndarray:
+        ahead, behind = (linearized(moved(bundle, s * step, s * pictures, cameras), sights).miss for s in (h, -h))
+        return (ahead - behind) / (2 * h)
+
+    still = np.zeros((3, 6))
+    for column in range(shared.shape[2]):
+        step = np.zeros(shared.shape[2])
+        step[column] = 1.0
+        np.testing.assert_allclose(change(step, still), shared[..., column], rtol=1e-5, atol=1e-3)
+    for column in range(6):
+        pictures = np.tile(np.eye(6)[column], (3, 1))
+        np.testing.assert_allclose(
+            change(np.zeros(shared.shape[2]), pictures), found.by_picture[..., column], rtol=1e-5, atol=1e-3
+        )
+
+
+def apart(a: Layout, b: Layout) -> np.ndarray:
+    """(n, 6) difference of the tags of two layouts, in its sigmas."""
+    ids = sorted(set(a.body.ids[1:].tolist()) & set(b.body.ids[1:].tolist()))
+    i, j = np.searchsorted(a.body.ids, ids), np.searchsorted(b.body.ids, ids)
+    turned = so3.log(so3.multiply(so3.inverse(a.body.bRt[i]), b.body.bRt[j]))
+    difference = np.concatenate([turned, b.body.position[j] - a.body.position[i]], axis=1)
+    sigma = [np.sqrt(np.diag(each.covariance)).reshape(-1, 6)[k - 1] for each, k in ((a, i), (b, j))]
+    return np.asarray(difference / np.hypot(*sigma))
+
+
+@pytest.mark.slow
+def test_a_real_cube_of_18_tags(shared_data) -> None:  # type: ignore[no-untyped-def]
+    recording = open_recording(shared_data / "tagslam_cube18" / "cam1.mcap")
+    config = recorded_config(recording, shared_data / "tagslam_cube18" / "ids.yaml")
+    layout = cube_layout([(recording, config)])
+    assert len(layout.body.ids) == 18
+    assert not layout.unplaced
+    assert layout.rms_px < 0.35
+    from pipelines.methods.cube.layout import _tags
+    from pipelines.methods.cube.sightings import read_camera
+    from pipelines.methods.cube.topics import CubeConfig
+
+    pictures, camera = _tags(recording, config), read_camera(recording, config)
+    given = TagBody.from_board(config.section(CubeConfig))
+    halves = [estimate_layout([Shots(camera, pictures[k::2])], given) for k in (0, 1)]
+    assert all(len(half.body.ids) == 18 for half in halves)
+    assert np.abs(apart(*halves)).max() < 3.0
+
+
+@pytest.mark.slow
+def test_a_real_block_of_ten_tags(shared_data) -> None:  # type: ignore[no-untyped-def]
+    block = tagslam_block.read_block(shared_data / "tagslam_block")
+    layout, comparison = tagslam_block.compare(block)
+    assert len(layout.body.ids) == 10
+    assert layout.rms_px < 0.35
+    assert comparison.held_out_px < 0.35
+    assert comparison.position_mm < 0.4
+    assert comparison.rotation_deg < 0.12
+    middle = len(block.pictures) // 2
+    parts = (block.pictures[::2], block.pictures[1::2]), (block.pictures[:middle], block.pictures[middle:])
+    for halves in parts:
+        found = [estimate_layout([Shots(block.camera, half)], block.published) for half in halves]
+        assert np.abs(apart(*found)).max() < 3.0
