@@ -7,15 +7,16 @@ import re
 import sys
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 from typer.core import TyperGroup
 
 from pipelines import exit_codes
-from pipelines.options import ConfigFile, Quiet, RecordingPath
+from pipelines.options import ConfigFile, Quiet, RecordingPath, RecordingPaths
 
 if TYPE_CHECKING:
     from pipelines.reports.result import Calibration
@@ -95,7 +96,7 @@ def _options(
 
 @app.command()
 def calibrate(
-    session: RecordingPath,
+    sessions: RecordingPaths,
     method: _MethodName = None,
     config: ConfigFile = None,
     solver: Annotated[Solver, typer.Option(help="How to solve.")] = Solver.batch,
@@ -109,19 +110,45 @@ def calibrate(
     as_json: _Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Calibrate a recording. Exit code 0 calibrated, 2 unusable input, 3 weak or unobservable, 4 inconsistent."""
-    from pipelines import progress
-    from pipelines.reports.write import write_results
+    """Calibrate a recording, or several of one device together.
+
+    Exit code 0 calibrated, 2 unusable input, 3 weak or unobservable, 4 inconsistent.
+    """
+    from pipelines import progress, terminal
+    from pipelines.errors import InputError
+    from pipelines.recording.opening import recordings_of, told
+    from pipelines.reports.write import adopt_parts, write_part, write_results
     from pipelines.session import calibrate as run
+    from pipelines.together import calibrate_device
     from pipelines.vision import parallel
 
-    folder = out or _beside(session, solver.value)
-    with progress.shown(quiet or as_json), parallel.processes(jobs):
-        (calibration,) = run(
-            session, [solver.value], method, config, _seconds(window), strict, auto_topics, not no_check, prior
-        )
+    recordings, folder = recordings_of(sessions), out or _beside(sessions[0], solver.value)
+    if len(recordings) > 1:
+        if solver != Solver.batch:
+            raise InputError(f"--solver {solver.value}: several recordings are calibrated together by batch alone")
+        folder = out or _beside(sessions[0], "device")
+        if not as_json:
+            terminal.say(f"{len(recordings)} recordings of one device: {told(recordings)}")
+    with progress.shown(quiet or as_json), parallel.processes(jobs), TemporaryDirectory(prefix="alidade-") as parts:
+        if len(recordings) > 1:
+            by_itself = partial(write_part, Path(parts))
+            calibration = calibrate_device(recordings, method, config, strict, auto_topics, prior, by_itself)
+        else:
+            (calibration,) = run(
+                recordings[0],
+                [solver.value],
+                method,
+                config,
+                _seconds(window),
+                strict,
+                auto_topics,
+                not no_check,
+                prior,
+            )
         with progress.doing("writing"):
             written = write_results(folder, calibration)
+            if len(recordings) > 1:
+                adopt_parts(folder, Path(parts))
     _tell(calibration, folder, written, as_json)
 
 

@@ -10,5 +10,9 @@ import typer
 RecordingPath = Annotated[
     Path, typer.Argument(metavar="RECORDING", help="A file, a bag folder, or a pattern in quotes.")
 ]
+RecordingPaths = Annotated[
+    list[Path],
+    typer.Argument(metavar="RECORDING...", help="A file, a bag folder, or a pattern in quotes; several: one device's."),
+]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML that overrides the recording's own config.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars.")]

@@ -33,12 +33,13 @@ from pipelines.judgement.stability import Moved, Stability, stability
 from pipelines.methods import Method
 from pipelines.recording.info import SessionFacts, facts_of, lacking
 from pipelines.recording.message_reader import ENCODING
+from pipelines.recording.opening import Where
 from pipelines.recording.reading import Recording, open_recording
 from pipelines.reports.known import load_known
 from pipelines.reports.result import Calibration
 from pipelines.reports.units import human_unit, to_digits_of
 from pipelines.settings import TRUTH, Config
-from pipelines.sharing import device_belief
+from pipelines.sharing import device_belief, walks
 from pipelines.simulation.simulated import Simulated
 
 SOLVERS = ("batch", "incremental", "published")
@@ -325,8 +326,9 @@ class Session:
             return solve_incremental(shown, window), problem
         from pipelines.solvers.batch import solve_batch
 
+        device = walks(self.method, self.config, [q.name for q in problem.quantities])
         with progress.doing("solving"):
-            return solve_batch(problem, budget=True, changed=self._changed()), problem
+            return solve_batch(problem, budget=True, changed=self._changed(), device=device), problem
 
     def _changed(self) -> Iterator[tuple[str, Problem]]:
         """Each input that the graph takes for exact, and the graph with that input off by its step."""
@@ -356,7 +358,7 @@ class Session:
 
 
 def calibrate(
-    path: Path,
+    path: Where,
     solvers: Sequence[str],
     method_name: str | None = None,
     config_file: Path | None = None,
@@ -369,7 +371,7 @@ def calibrate(
     """One calibration a solver, from one reading of the recording.
 
     Args:
-        path: the recording: a file, a folder of parts, or a pattern.
+        path: the recording: a file, a folder of parts, a pattern, or a list of parts.
         solvers: of SOLVERS.
         method_name: overrides the config's.
         config_file: overrides the recording's own config key by key.

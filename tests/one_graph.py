@@ -6,11 +6,13 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 
 import gtsam
+import numpy as np
 
 from factors.vectorized import VectorizedFactor
 from pipelines.graph.problem import Factor, Parameter, Problem, Step
 from pipelines.solvers.assembly import Assembly
-from pipelines.solvers.batch import CHUNK
+from pipelines.solvers.batch import CHUNK, optimize
+from pipelines.solvers.marginals import joint_covariance, reported
 
 # Indices of one recording's variables stay below this.
 _APART = 10_000_000
@@ -69,3 +71,17 @@ def _copy(values: gtsam.Values, key: int, to: int, out: gtsam.Values) -> None:
         out.insert(to, values.atRot3(key))
     except RuntimeError:
         out.insert(to, values.atVector(key))
+
+
+def solved(problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
+    """Values and sigmas by name of the problem's solution, steps made until nothing is left of them."""
+    whole = Assembly.of(problem.steps(CHUNK))
+    shared = whole.shared(problem)
+    solution = optimize(whole.factors, whole.initial, shared, problem.loss, held=problem.assumed)
+    values, system = solution.values, solution.system
+    for _ in range(4):
+        values = values.retract(system.linearize(values).optimize(system.ordering, gtsam.EliminateQR))
+    covariance = joint_covariance(problem, system.linearize(values), system.ordering, values, whole.current_keys)
+    names = [q.name for q in problem.quantities]
+    numbers, sigmas = reported(problem, values, whole.current_keys).tolist(), np.sqrt(np.diag(covariance)).tolist()
+    return dict(zip(names, numbers, strict=True)), dict(zip(names, sigmas, strict=True))

@@ -58,6 +58,17 @@ def about(factor: gtsam.GaussianFactor, parameters: Sequence[Parameter], values:
     return np.asarray(size > _ROUNDING * size.max(axis=1, keepdims=True, initial=0.0))
 
 
+def about_alone(
+    factor: gtsam.GaussianFactor, parameters: Sequence[Parameter], values: gtsam.Values, names: Collection[str]
+) -> NDArray[np.bool_]:
+    """(m,) which rows of a linearised prior are about some of these numbers and no others, but for fixed ones."""
+    quantities = [q for p in parameters for q in p.quantities]
+    among = np.array([q.name in names for q in quantities])
+    others = np.array([q.name not in names and q.prior_sigma != 0.0 for q in quantities])
+    rows = about(factor, parameters, values)
+    return np.asarray((rows & among).any(axis=1) & ~(rows & others).any(axis=1))
+
+
 def _believing(problem: Problem, belief: Belief) -> Problem:
     own = {q.name: q for q in problem.quantities}
     for name, mean, sigma in zip(belief.names, belief.mean, belief.sigmas, strict=True):
@@ -130,9 +141,7 @@ class _Told:
 
     def _rest(self, prior: Factor, values: gtsam.Values) -> list[Factor]:
         """What of a prior is not replaced."""
-        names = [q.name for p in self.parameters for q in p.quantities]
-        others = np.array([name not in self.replaced for name in names])
-        kept = (about(prior.factor.linearize(values), self.parameters, values) & others).any(axis=1)
+        kept = ~about_alone(prior.factor.linearize(values), self.parameters, values, self.replaced)
         if kept.all():
             return [prior]
         return [Factor("prior", _rows_of(prior.factor, np.flatnonzero(kept), values))] if kept.any() else []

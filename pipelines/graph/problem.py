@@ -286,6 +286,35 @@ class Pull:
     sigmas: float
 
 
+@dataclass(frozen=True, eq=False)
+class Told:
+    """What a graph says of its reported numbers, linear about the estimate: R (x - at) = d, rows of unit variance.
+
+    Numbers that are fixed are left out.
+
+    Attributes:
+        names: (n,) of the numbers.
+        at: (n,) the estimate.
+        R: (r, n) all that the graph says but for the priors about numbers of the device alone.
+        d: (r,).
+        prior_R: (p, n) these priors.
+        prior_d: (p,).
+        scales: (n,) of the numbers' priors, so that angles, rates and seconds can be told beside each other.
+    """
+
+    names: tuple[str, ...]
+    at: Array
+    R: Array
+    d: Array
+    prior_R: Array
+    prior_d: Array
+    scales: Array
+
+    def with_priors_of(self, other: Told) -> Told:
+        """The same with the device's priors as they are in another telling of the same graph."""
+        return replace(self, prior_R=other.prior_R, prior_d=other.prior_d + other.prior_R @ (other.at - self.at))
+
+
 @dataclass(frozen=True)
 class Estimate:
     """A calibration by one solver; `names`, `values` (n,) and `covariance` (n, n) belong together.
@@ -310,6 +339,7 @@ class Estimate:
         levels: of the noises; none: all are as stated.
         colours: family -> how many of its measurements in a row count as one, of those whose residuals are correlated.
         inflation: (n,) by what the sigmas are larger because residuals are correlated in time; None: by nothing.
+        told: what the graph says without the device's priors; None: not asked for.
         seconds: phase -> wall time.
     """
 
@@ -331,6 +361,7 @@ class Estimate:
     levels: tuple[Level, ...] = ()
     colours: Mapping[str, float] = field(default_factory=dict)
     inflation: Array | None = None
+    told: Told | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
 
     @property

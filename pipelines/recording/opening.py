@@ -49,6 +49,32 @@ def open_container(where: Where, strict: bool = False) -> Container:
     return _together([path], strict)
 
 
+def recordings_of(paths: Sequence[Path]) -> list[Where]:
+    """The recordings that several paths name: each is one, but for parts of one bag, by the metadata.yaml beside them.
+
+    Folders and patterns stand for all of their parts.
+    """
+    found: list[list[Path]] = []
+    bags: dict[Path, list[Path]] = {}
+    for path in paths:
+        metadata = path.with_name(_METADATA)
+        if path.is_file() and path.name in _listed(_metadata(metadata)):
+            bag = metadata.resolve()
+            if bag in bags:
+                bags[bag].append(path)
+                continue
+            found.append(bags.setdefault(bag, [path]))
+        else:
+            found.append([path])
+    return [parts[0] if len(parts) == 1 else parts for parts in found]
+
+
+def told(recordings: Sequence[Where]) -> str:
+    """Recordings in words, parts of one side by side."""
+    each = [[one] if isinstance(one, (str, Path)) else list(one) for one in recordings]
+    return ", ".join(" + ".join(Path(part).name for part in parts) for parts in each)
+
+
 def _together(paths: Sequence[Path], strict: bool, at: Path | None = None, remarks: Sequence[str] = ()) -> Container:
     """Several files as one recording."""
     if not paths:

@@ -86,6 +86,7 @@ class Calibration:
         stability: whether what was calibrated stayed as it was; None where that cannot be said.
         self_check: an incremental estimate beside batch's; None where it was not made.
         findings: what the method found beside its parameters.
+        recordings: of a joint calibration, what each of them has of its own.
     """
 
     method: Method
@@ -104,6 +105,7 @@ class Calibration:
     stability: Stability | None = None
     self_check: SelfCheck | None = None
     findings: Findings = field(default_factory=dict)
+    recordings: Sequence[PartResult] = ()
 
     @property
     def parameters(self) -> dict[str, ParameterResult]:
@@ -507,6 +509,32 @@ class SelfCheckResult(_Record):
     sigma_ratio: float
 
 
+class PartParameter(_Record):
+    """A number of one recording; SI."""
+
+    name: str
+    value: float
+    sigma: float
+    unit: str
+
+
+class PartResult(_Record):
+    """One recording of a joint calibration.
+
+    `parameters` are its own numbers, and the device's that walk, from all recordings; `alone` is what it says of the
+    device by itself, `status` and `headline` are its own.
+    """
+
+    recording: str
+    sha256: str
+    start: str
+    duration_s: float
+    status: Status
+    headline: str
+    parameters: list[PartParameter]
+    alone: list[PartParameter]
+
+
 class Result(_Record):
     """result.json."""
 
@@ -533,6 +561,7 @@ class Result(_Record):
     sensitivity: dict[str, SensitivityResult] | None
     measurements: list[MeasurementResult] | None
     findings: dict[str, list[dict[str, object]]]
+    recordings: list[PartResult] | None = None
     truth: dict[str, TruthResult] | None = None
 
 
@@ -566,14 +595,16 @@ def result(calibration: Calibration) -> Result:
         sensitivity=c.sensitivity,
         measurements=c.measurements,
         findings={name: [dict(row) for row in rows] for name, rows in c.findings.items()},
+        recordings=list(c.recordings) or None,
         truth=truth_errors(c) if c.truth is not None else None,
     )
 
 
 def result_json(calibration: Calibration) -> str:
-    """The text of result.json; without truth it has no key `truth`."""
+    """The text of result.json; without truth it has no key `truth`, of one recording none `recordings`."""
     model = result(calibration)
-    return model.model_dump_json(by_alias=True, indent=1, exclude={"truth"} if model.truth is None else None) + "\n"
+    left_out = {name for name in ("truth", "recordings") if getattr(model, name) is None}
+    return model.model_dump_json(by_alias=True, indent=1, exclude=left_out) + "\n"
 
 
 def truth_errors(calibration: Calibration) -> dict[str, TruthResult]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 from functools import partial
 from pathlib import Path
 
+from pipelines.errors import InputError
 from pipelines.reports.calibration import calibration_yaml
 from pipelines.reports.estimates import write_estimates
 from pipelines.reports.foxglove import foxglove_layout
@@ -15,6 +17,8 @@ from pipelines.reports.whole import write_whole
 
 # In the order in which they take their places: result.json, gone first and back last, says that the others are its own.
 FILES = ("calibration.yaml", "attitude.tum", "estimates.mcap", "foxglove.json", "report.html", "result.json")
+# Folder of the recordings of a joint calibration.
+PARTS = "recordings"
 
 
 def write_results(out_dir: Path, calibration: Calibration) -> tuple[Path, ...]:
@@ -24,6 +28,24 @@ def write_results(out_dir: Path, calibration: Calibration) -> tuple[Path, ...]:
         InputError: out_dir is a file, or cannot be written to.
     """
     return write_whole(out_dir, FILES, partial(_make, calibration=calibration))
+
+
+def write_part(out_dir: Path, calibration: Calibration) -> None:
+    """Write the calibration of one of several recordings into a folder of its own. Raises as `write_results` does."""
+    stem, taken = Path(calibration.recording).stem, 1
+    name = stem
+    while (out_dir / PARTS / name).exists():
+        taken += 1
+        name = f"{stem}-{taken}"
+    write_results(out_dir / PARTS / name, calibration)
+
+
+def adopt_parts(out_dir: Path, written: Path) -> None:
+    """Put what `write_part` wrote into another folder under it. Raises InputError when it cannot be written to."""
+    try:
+        shutil.copytree(written / PARTS, out_dir / PARTS, dirs_exist_ok=True)
+    except (OSError, shutil.Error) as error:
+        raise InputError(f"{out_dir / PARTS}: cannot be written ({error})") from error
 
 
 def _make(folder: Path, calibration: Calibration) -> None:

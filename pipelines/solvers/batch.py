@@ -8,7 +8,7 @@ is by QR: tight processes beside loose priors cost Cholesky its digits, and QR c
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
@@ -33,6 +33,7 @@ from pipelines.solvers.marginals import (
     smoothed,
 )
 from pipelines.solvers.noise_levels import far, refined, weigh
+from pipelines.solvers.told import told
 
 # Frames in one vectorised factor: past this the Jacobians' zeros cost more than the Python calls they save.
 CHUNK = 20
@@ -168,6 +169,7 @@ def solve_batch(
     most: int = _MOST_ITERATIONS,
     budget: bool = False,
     changed: Iterable[tuple[str, Problem]] = (),
+    device: Collection[str] = (),
 ) -> Estimate:
     """The maximum a-posteriori estimate with the joint marginal covariance of its parameters.
 
@@ -180,6 +182,7 @@ def solve_batch(
         budget: also where the variance of each number comes from, which measurements move it most, and by how much it
             is elsewhere in the `changed` graphs.
         changed: names and graphs of the same recording in which something is a little different.
+        device: names of the numbers whose priors are not the recording's; asks for what it says without them.
 
     Raises:
         IndeterminateError: states other than the parameters are not determined; names the variable.
@@ -236,6 +239,7 @@ def solve_batch(
         strongest=pulls,
         rejected={family: int((~r.used).sum()) for family, r in residuals.items()},
         levels=levels,
+        told=told(problem, factors, linear, values, whole.current_keys, device) if device else None,
         seconds={"build": built - start, "solve": solved - built, "marginals": done - solved},
     )
 

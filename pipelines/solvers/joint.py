@@ -1,0 +1,239 @@
+"""Recordings of one device put together: what each says of its numbers, joined by square roots of information.
+
+Numbers of the device are one unknown, or one for each recording where they walk between dates; those of a recording are
+its own. Each recording's own numbers are eliminated first, so that what is left is as small as the device.
+
+    joined = join([first.told, second.told], rates, days)
+    joined.device(0), joined.own(0)         # the numbers of the first recording, from all recordings
+    joined.others(0)                        # what the others say of the device as it was then
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from pipelines.belief import Belief
+from pipelines.graph.noise import Level
+from pipelines.graph.problem import Array, Problem, Told
+from pipelines.solvers.assembly import Assembly
+from pipelines.solvers.batch import CHUNK, optimize
+from pipelines.solvers.marginals import eliminated
+from pipelines.solvers.noise_levels import weigh
+from pipelines.solvers.told import fewest, told
+
+# Two dates are never nearer than this, days.
+_LEAST_DAYS = 1e-6
+# Of what recordings say of the device, directions with a sigma beyond so many times the priors' are not compared.
+_FAINT = 1e4
+
+# A number of the device: its name and, where it walks, the recording.
+Unknown = tuple[str, int | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A recording with its own numbers eliminated: R y = d of the device's, S y + T z = e of its own z beside them.
+
+    Attributes:
+        names: (n,) of the device's numbers.
+        own: (m,) of the recording's.
+        R, d: (r, n), (r,), rows of unit variance.
+        S, T, e: (m, n), (m, m), (m,).
+        scales: (n,) of the priors.
+    """
+
+    names: tuple[str, ...]
+    own: tuple[str, ...]
+    R: Array
+    d: Array
+    S: Array
+    T: Array
+    e: Array
+    scales: Array
+
+    @classmethod
+    def of(cls, told: Told, device: Mapping[str, float]) -> Part:
+        """y and z are the numbers themselves, not steps from an estimate."""
+        shared = [i for i, name in enumerate(told.names) if name in device]
+        own = [i for i, name in enumerate(told.names) if name not in device]
+        n, scales = len(own), told.scales[shared]
+        whole = np.column_stack([told.R[:, own + shared], told.d + told.R @ told.at])
+        triangle = np.linalg.qr(whole).R
+        R, d = fewest(triangle[n:, n:-1], triangle[n:, -1], scales)
+        return cls(
+            names=tuple(told.names[i] for i in shared),
+            own=tuple(told.names[i] for i in own),
+            R=R,
+            d=d,
+            S=triangle[:n, n:-1],
+            T=triangle[:n, :n],
+            e=triangle[:n, -1],
+            scales=scales,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Joined:
+    """The joint estimate of several recordings.
+
+    Attributes:
+        parts: the recordings, in the order of their dates.
+        unknowns: of the device.
+        rows: for each recording, of its walk and of the priors: coefficients (r, n) of the unknowns, right sides (r,).
+        scales: (n,) of the unknowns' priors.
+        values: (n,) of the unknowns.
+        covariance: (n, n).
+    """
+
+    parts: Sequence[Part]
+    unknowns: tuple[Unknown, ...]
+    rows: Sequence[tuple[Array, Array]]
+    scales: Array
+    values: Array
+    covariance: Array
+
+    def device(self, recording: int) -> Belief:
+        """The device's numbers as they are in a recording."""
+        return self._belief(recording, self.values, self.covariance)
+
+    def others(self, recording: int) -> Belief:
+        """The same without that recording: what all others and the priors say."""
+        rows = [each for i, each in enumerate(self.rows) if i != recording]
+        return self._belief(recording, *_solved(rows, self.scales))
+
+    def own(self, recording: int) -> Belief:
+        """A recording's own numbers, from all recordings."""
+        return self.all(recording).of(self.parts[recording].own)
+
+    def all(self, recording: int) -> Belief:
+        """The device's numbers as they are in a recording, those that only others know as they were last, its own."""
+        part = self.parts[recording]
+        latest = {name: i for i, (name, _) in enumerate(self.unknowns)}
+        missing = [name for name in latest if name not in part.names]
+        places = [*self._places(recording), *(latest[name] for name in missing)]
+        select = np.eye(len(self.unknowns))[places]
+        inverse = np.linalg.inv(part.T)
+        gain = np.vstack([select, -inverse @ part.S @ select[: len(part.names)]])
+        covariance, mean = gain @ self.covariance @ gain.T, gain @ self.values
+        own = slice(len(places), None)
+        covariance[own, own] += inverse @ inverse.T
+        mean[own] += inverse @ part.e
+        return Belief((*part.names, *missing, *part.own), mean, covariance)
+
+    @property
+    def walking(self) -> tuple[str, ...]:
+        """Names of the device's numbers that walk."""
+        return tuple(dict.fromkeys(name for name, recording in self.unknowns if recording is not None))
+
+    def sigmas_to(self, other: Joined) -> float:
+        """The largest difference of two joint estimates of the same unknowns, in the sigmas of this one."""
+        return float(np.max(np.abs(other.values - self.values) / np.sqrt(np.diag(self.covariance)), initial=0.0))
+
+    @property
+    def disagreement(self) -> tuple[float, int]:
+        """Chi-square of what the recordings say of the device beside each other, priors apart, and its freedoms."""
+        A, b = (np.concatenate(each) for each in zip(*self.rows[:-1], strict=True))
+        u, s, _ = np.linalg.svd(A * self.scales, full_matrices=False)
+        fitted = u[:, s > 1.0 / _FAINT]
+        left = b - fitted @ (fitted.T @ b)
+        return float(left @ left), len(b) - fitted.shape[1]
+
+    def _belief(self, recording: int, values: Array, covariance: Array) -> Belief:
+        at = np.array(self._places(recording), dtype=np.intp)
+        return Belief(
+            self.parts[recording].names, values[at], covariance[np.ix_(at, at)], "that of the other recordings"
+        )
+
+    def _places(self, recording: int) -> list[int]:
+        """Where the numbers of the device are, as they are in a recording."""
+        places = {unknown: i for i, unknown in enumerate(self.unknowns)}
+        names = self.parts[recording].names
+        return [places[name, None] if (name, None) in places else places[name, recording] for name in names]
+
+
+def tell(problem: Problem, levels: Sequence[Level], device: Collection[str]) -> Told:
+    """What a problem says of its numbers, linear about its solution with noise levels that are known.
+
+    Raises:
+        IndeterminateError: a state is not determined.
+    """
+    whole = Assembly.of(problem.steps(CHUNK))
+    factors = weigh(whole.factors, levels or problem.noises)
+    solution = optimize(factors, whole.initial, whole.shared(problem), problem.loss, held=problem.assumed)
+    # The solution is where its error is, to 0.005 sigmas; a last step is nearer to where it is linear about.
+    system = solution.system
+    last = eliminated(system.linearize(solution.values), system.ordering).optimize()
+    values = solution.values.retract(last)
+    return told(problem, factors, system.linearize(values), values, whole.current_keys, device)
+
+
+def join(tellings: Sequence[Told], rates: Mapping[str, float], days: Sequence[float]) -> Joined:
+    """Put recordings together.
+
+    Args:
+        tellings: what each says, in the order of their dates.
+        rates: of the device's numbers, how far they walk in the root of a day; 0: not at all.
+        days: of the recordings, from any.
+    """
+    parts = [Part.of(each, rates) for each in tellings]
+    unknowns: dict[Unknown, float] = {}
+    for i, part in enumerate(parts):
+        for name, scale in zip(part.names, part.scales, strict=True):
+            unknowns.setdefault((name, i if rates[name] else None), float(scale))
+    places = {unknown: k for k, unknown in enumerate(unknowns)}
+
+    def spread(R: Array, names: Sequence[str], i: int) -> Array:
+        """Rows about a recording's numbers as rows about the unknowns."""
+        out = np.zeros((len(R), len(unknowns)))
+        for k, name in enumerate(names):
+            out[:, places[name, i if rates[name] else None]] = R[:, k]
+        return out
+
+    rows = [(spread(part.R, part.names, i), part.d) for i, part in enumerate(parts)]
+    rows += [_walks(places, rates, days), _priors(tellings, rates, spread)]
+    scales = np.array(list(unknowns.values()))
+    return Joined(parts, tuple(unknowns), rows, scales, *_solved(rows, scales))
+
+
+def _walks(places: Mapping[Unknown, int], rates: Mapping[str, float], days: Sequence[float]) -> tuple[Array, Array]:
+    """Numbers that walk from one recording to the next."""
+    rows = [np.empty((0, len(places)))]
+    for name, rate in rates.items():
+        for before, after in pairwise([i for i in range(len(days)) if rate and (name, i) in places]):
+            row = np.zeros((1, len(places)))
+            sigma = rate * max(abs(days[after] - days[before]), _LEAST_DAYS) ** 0.5
+            row[0, [places[name, before], places[name, after]]] = -1.0 / sigma, 1.0 / sigma
+            rows.append(row)
+    A = np.concatenate(rows)
+    return A, np.zeros(len(A))
+
+
+def _priors(
+    tellings: Sequence[Told], rates: Mapping[str, float], spread: Callable[[Array, Sequence[str], int], Array]
+) -> tuple[Array, Array]:
+    """The device's priors, each as the first recording has it that knows the number."""
+    rows, rights = [], []
+    covered: set[str] = set()
+    for i, each in enumerate(tellings):
+        of_device = [k for k, name in enumerate(each.names) if name in rates]
+        names = [each.names[k] for k in of_device]
+        R = each.prior_R[:, of_device]
+        new = [name not in covered for name in names]
+        kept = (R[:, new] != 0.0).any(axis=1)
+        rows.append(spread(R[kept], names, i))
+        rights.append((each.prior_d + each.prior_R @ each.at)[kept])
+        covered.update(names)
+    return np.concatenate(rows), np.concatenate(rights)
+
+
+def _solved(rows: Sequence[tuple[Array, Array]], scales: Array) -> tuple[Array, Array]:
+    """The unknowns and their covariance."""
+    A, b = (np.concatenate(each) for each in zip(*rows, strict=True))
+    triangle = np.linalg.qr(np.column_stack([A * scales, b])).R
+    n = len(scales)
+    inverse = np.linalg.inv(triangle[:n, :n])
+    return scales * (inverse @ triangle[:n, n]), (inverse @ inverse.T) * np.outer(scales, scales)

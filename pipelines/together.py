@@ -1,0 +1,356 @@
+"""Several recordings of one device as one calibration.
+
+Each recording is solved by itself, and what it says of the device is joined with what the others say. Then each is
+solved again with that of the others as prior, which moves its linearisation to the joint estimate, until the joint
+estimate stays. What is kept of a recording meanwhile is small; its data wait in a temporary file.
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import pickle
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from pipelines import progress
+from pipelines.belief import Belief
+from pipelines.errors import InputError
+from pipelines.graph.believing import believing
+from pipelines.graph.problem import ChiSquare, Estimate, Parameter, Problem, Quantity, Step, Told
+from pipelines.judgement import noise_levels
+from pipelines.judgement.observability import Assessment, Fit, assess
+from pipelines.methods import Method
+from pipelines.recording.info import SessionFacts
+from pipelines.recording.opening import Where
+from pipelines.recording.reading import open_recording
+from pipelines.reports.over_time import recordings_shown
+from pipelines.reports.result import Calibration, PartParameter, PartResult
+from pipelines.session import Session
+from pipelines.sharing import DAY_S, walks
+from pipelines.solvers.joint import Joined, join, tell
+
+# The joint estimate stays when another linearisation moves it by less than this, in sigmas (what is left is about the
+# square); so many are tried.
+_STAYS, _MOST_PASSES = 1e-2, 6
+# So many recordings are named in a sentence.
+_MOST_NAMED = 3
+_OVERLAP = (
+    "recordings overlap in time and count as several all the same; parts of one are named by a folder or a pattern in "
+    "quotes"
+)
+# Of parameters that the last recording's graph does not have.
+_NO_VARIABLE = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Alone:
+    """What is kept of a recording that was calibrated by itself.
+
+    Attributes:
+        calibration: what result.json says of it by itself, without the data behind it.
+        day: its date, days since 1970.
+        told: what it says of its numbers.
+        quantities: of its graph.
+        data: the file in which its data wait.
+    """
+
+    calibration: Calibration
+    day: float
+    told: Told
+    quantities: Mapping[str, Quantity]
+    data: Path
+
+    @classmethod
+    def of(cls, session: Session, calibration: Calibration, data: Path) -> Alone:
+        """Of a session's calibration by batch; its data go into a file."""
+        estimate = calibration.estimate
+        assert estimate.told is not None
+        with data.open("wb") as stream:
+            pickle.dump(session.data, stream)
+        date = session.config.date
+        noon = None if date is None else datetime.datetime(date.year, date.month, date.day, 12, tzinfo=datetime.UTC)
+        small = Estimate(
+            solver=estimate.solver,
+            names=estimate.names,
+            values=estimate.values,
+            covariance=estimate.covariance,
+            converged=estimate.converged,
+            message=estimate.message,
+            chi_square=estimate.chi_square,
+            rejected=estimate.rejected,
+            levels=estimate.levels,
+            inflation=estimate.inflation,
+        )
+        problem = replace(calibration.problem, steps=_no_steps, steps_after=None, onward=None, attitudes=None)
+        return cls(
+            calibration=replace(calibration, estimate=small, problem=problem, plots=None, beside=None),
+            day=(calibration.facts.epoch_ns * 1e-9 if noon is None else noon.timestamp()) / DAY_S,
+            told=estimate.told,
+            quantities={q.name: q for q in problem.quantities},
+            data=data,
+        )
+
+    @property
+    def name(self) -> str:
+        """Of the file."""
+        return self.calibration.recording
+
+    @property
+    def start(self) -> datetime.datetime:
+        """Its date."""
+        return datetime.datetime.fromtimestamp(self.day * DAY_S, datetime.UTC)
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Of what it estimated by itself."""
+        found = self.calibration.parameters
+        return {name: p.sigma for name, p in found.items() if p.sigma > 0.0}
+
+    def loaded(self) -> Any:
+        """Its data."""
+        with self.data.open("rb") as stream:
+            return pickle.load(stream)  # written above, into a folder of our own
+
+
+def _no_steps(_: int) -> Iterator[Step]:
+    return iter(())
+
+
+def calibrate_device(
+    recordings: Sequence[Where],
+    method_name: str | None = None,
+    config_file: Path | None = None,
+    strict: bool = False,
+    auto_topics: bool = False,
+    prior: Path | None = None,
+    written: Callable[[Calibration], None] = lambda _: None,
+) -> Calibration:
+    """The joint calibration of several recordings of one device (arguments as `session.calibrate` has them).
+
+    Raises:
+        InputError: a recording cannot be used, or they are of different methods.
+        IndeterminateError: states other than the parameters are not determined.
+    """
+
+    def read(where: Where) -> Session:
+        return Session.read(open_recording(where, strict), method_name, config_file, auto_topics, prior)
+
+    return calibrate_together([partial(read, where) for where in recordings], written)
+
+
+def calibrate_together(
+    sessions: Sequence[Callable[[], Session]], written: Callable[[Calibration], None] = lambda _: None
+) -> Calibration:
+    """The joint calibration by batch.
+
+    Args:
+        sessions: open the recordings, one after the other.
+        written: is given the calibration of each recording by itself.
+
+    Raises:
+        InputError: a recording cannot be used, or they are of different methods.
+        IndeterminateError: states other than the parameters are not determined.
+    """
+    with TemporaryDirectory(prefix="alidade-") as folder:
+        alone: list[Alone] = []
+        for i, read in enumerate(sessions):
+            with progress.doing("reading"):
+                session = read()
+            calibration = session.calibrate()
+            alone.append(Alone.of(session, calibration, Path(folder) / str(i)))
+            written(calibration)
+            del session, calibration
+        method = _one_device(alone)
+        alone.sort(key=lambda each: each.day)
+        names = list(dict.fromkeys(name for each in alone for name in each.quantities))
+        rates = walks(method, alone[0].calibration.config, names)
+        joined, step = _joined(method, alone, rates)
+        newest = alone[-1]
+        problem = method.graph(newest.loaded(), newest.calibration.config)
+        return _calibration(problem, method, alone, joined, step)
+
+
+def _one_device(alone: Sequence[Alone]) -> Method:
+    """The method of all. Raises InputError when they cannot be of one device, or one is named twice."""
+    if not alone:
+        raise InputError("no recordings are named")
+    first = alone[0].calibration
+    seen: set[str] = set()
+    for each in alone:
+        found = each.calibration
+        if found.method is not first.method:
+            raise InputError(
+                f"{each.name}: is calibrated by {found.method.name}, {first.recording} by {first.method.name}"
+            )
+        if found.sha256 in seen:
+            raise InputError(f"{each.name}: the same recording is named twice; it would count twice")
+        seen.add(found.sha256)
+    return first.method
+
+
+def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) -> tuple[Joined, float]:
+    """The joint estimate, and by how much it moved last, in sigmas."""
+    told, days = [each.told for each in alone], [each.day for each in alone]
+    joined, step = join(told, rates, days), np.inf
+    for _ in range(_MOST_PASSES if len(alone) > 1 else 0):
+        told = [
+            _again(method, each, joined.others(i), rates).with_priors_of(before)
+            for i, (each, before) in enumerate(zip(progress.track(alone, "joining", len(alone)), told, strict=True))
+        ]
+        before, joined = joined, join(told, rates, days)
+        step = before.sigmas_to(joined)
+        if step < _STAYS:
+            break
+    return joined, step
+
+
+def _again(method: Method, alone: Alone, others: Belief, rates: Mapping[str, float]) -> Told:
+    """What a recording says, linear where the others have the device to be."""
+    problem = believing(method.graph(alone.loaded(), alone.calibration.config), [others])
+    return tell(problem, alone.calibration.estimate.levels, rates)
+
+
+def _calibration(problem: Problem, method: Method, alone: Sequence[Alone], joined: Joined, step: float) -> Calibration:
+    """The joint estimate as a calibration: of the device as it was last, with that recording's own numbers."""
+    last = len(alone) - 1
+    belief = joined.all(last)
+    found = dict(zip(belief.names, belief.mean.tolist(), strict=True))
+    names = tuple(dict.fromkeys([*(q.name for q in problem.quantities), *found]))
+    problem = replace(problem, parameters=_with_others(problem, alone, found), premises=())
+    quantities = {q.name: q for q in problem.quantities}
+    rows = np.array([names.index(name) for name in belief.names], dtype=np.intp)
+    values = np.array([found.get(name, quantities[name].prior_mean) for name in names])
+    of_device = {name for name, _ in joined.unknowns}
+    inflation = np.array([_inflation(name, alone if name in of_device else alone[last:]) for name in names])
+    covariance = np.zeros((len(names), len(names)))
+    covariance[np.ix_(rows, rows)] = belief.covariance
+    extra = np.diag([quantities[name].extra_sigma ** 2 if name in found else 0.0 for name in names])
+    covariance = covariance * np.outer(inflation, inflation) + extra
+    converged = len(alone) == 1 or step < _STAYS
+    estimate = Estimate(
+        solver="batch",
+        names=names,
+        values=values,
+        covariance=covariance,
+        converged=converged,
+        message=f"{len(alone)} recordings; the joint estimate moved last by {step:.1g} sigmas",
+        chi_square=_sum([each.calibration.estimate.chi_square for each in alone]),
+        rejected=_counts([each.calibration.estimate.rejected for each in alone]),
+        inflation=inflation,
+    )
+    decides = not any(noise_levels.asked(each.calibration.estimate.levels) for each in alone)
+    ordered = [quantities[name] for name in names]
+    assessment = assess(ordered, covariance, estimate.chi_square, problem.advice, decides)
+    return Calibration(
+        method=method,
+        problem=problem,
+        estimate=estimate,
+        assessment=_judged(assessment, alone, joined, converged),
+        recording=_named([each.name for each in alone]),
+        sha256=hashlib.sha256(b"".join(bytes.fromhex(each.calibration.sha256) for each in alone)).hexdigest(),
+        facts=_facts([each.calibration.facts for each in alone]),
+        config=alone[last].calibration.config,
+        recordings=[_part(each, joined, i) for i, each in enumerate(alone)],
+        plots=recordings_shown,
+    )
+
+
+def _with_others(problem: Problem, alone: Sequence[Alone], found: Mapping[str, float]) -> tuple[Parameter, ...]:
+    """The parameters of the last recording, and those of the device that others alone determine.
+
+    What is fixed in the last recording and known from others is as the others have it.
+    """
+    known: dict[str, Quantity] = {}
+    for each in alone:
+        known.update({q.name: q for q in each.quantities.values() if q.prior_sigma != 0.0 and q.name in found})
+    own = tuple(replace(p, quantities=tuple(known.get(q.name, q) for q in p.quantities)) for p in problem.parameters)
+    there = {q.name for p in own for q in p.quantities}
+    missing = tuple(q for name, q in known.items() if name not in there)
+    return (*own, *((Parameter(_NO_VARIABLE, missing),) if missing else ()))
+
+
+def _inflation(name: str, alone: Sequence[Alone]) -> float:
+    """By what a number's sigma grows: the recordings' own factors, each weighed by what it says of the number."""
+    found = [p for each in alone if (p := each.calibration.parameters.get(name)) is not None and p.sigma > 0.0]
+    if not found:
+        return 1.0
+    return float(np.average([p.inflation**2 for p in found], weights=[p.sigma**-2.0 for p in found]) ** 0.5)
+
+
+def _judged(assessment: Assessment, alone: Sequence[Alone], joined: Joined, converged: bool) -> Assessment:
+    """With what the recordings say beside each other."""
+    if not converged:
+        return assessment.unsolved("linearised at the joint estimate the recordings lead elsewhere again and again")
+    wrong = [each.calibration for each in alone if each.calibration.status == "inconsistent"]
+    for each in wrong[:_MOST_NAMED]:
+        assessment = assessment.misfit(f"{each.recording} by itself: {each.headline}")
+    value, dof = joined.disagreement
+    if dof >= 1 and value > Fit.of(value, dof).high:
+        assessment = assessment.misfit(
+            f"The recordings disagree about the device: chi-square {value:.4g} for {dof} degrees of freedom."
+        )
+    return assessment.remarked(f"{len(alone)} recordings of one device.")
+
+
+def _sum(found: Sequence[ChiSquare | None]) -> ChiSquare:
+    each = [c for c in found if c is not None]
+    families: dict[str, tuple[float, float]] = {}
+    for chi_square in each:
+        for family, (value, dof) in chi_square.families.items():
+            before = families.get(family, (0.0, 0.0))
+            families[family] = before[0] + value, before[1] + dof
+    return ChiSquare(sum(c.value for c in each), sum(c.dof for c in each), families)
+
+
+def _counts(each: Sequence[Mapping[str, int]]) -> dict[str, int]:
+    total: Counter[str] = Counter()
+    for counts in each:
+        total.update(counts)
+    return dict(total)
+
+
+def _named(names: Sequence[str]) -> str:
+    """Recordings in a few words."""
+    return ", ".join(names) if len(names) <= _MOST_NAMED else f"{names[0]} to {names[-1]}, {len(names)} recordings"
+
+
+def _facts(facts: Sequence[SessionFacts]) -> SessionFacts:
+    """The recordings' as one's: it starts when the last does, with which the result is up to date."""
+    last = facts[-1]
+    lost = _counts([each.lost for each in facts])
+    notes = tuple(dict.fromkeys(note for each in facts for note in each.notes))
+    if any(0 < b.epoch_ns - a.epoch_ns < 1e9 * a.duration_s for a, b in pairwise(facts)):
+        notes = (*notes, _OVERLAP)
+    return SessionFacts(last.epoch_ns, sum(each.duration_s for each in facts), (), (), last.missing, lost, notes)
+
+
+def _part(alone: Alone, joined: Joined, i: int) -> PartResult:
+    """What a recording has of its own, from all recordings, and what it says of the device by itself."""
+    by_itself, part = alone.calibration, joined.parts[i]
+    belief = joined.all(i).of([*part.own, *joined.walking])
+
+    def number(name: str, value: float, sigma: float) -> PartParameter:
+        quantity = alone.quantities[name]
+        whole = float(np.hypot(sigma * by_itself.parameters[name].inflation, quantity.extra_sigma))
+        return PartParameter(name=name, value=value, sigma=whole, unit=quantity.unit)
+
+    found = [by_itself.parameters[name] for name in part.names]
+    return PartResult(
+        recording=alone.name,
+        sha256=by_itself.sha256,
+        start=alone.start.isoformat(timespec="seconds"),
+        duration_s=by_itself.facts.duration_s,
+        status=by_itself.assessment.status,
+        headline=by_itself.headline,
+        parameters=[number(*each) for each in zip(belief.names, belief.mean, belief.sigmas, strict=True)],
+        alone=[PartParameter(name=p.name, value=p.value, sigma=p.sigma, unit=p.unit) for p in found],
+    )

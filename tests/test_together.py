@@ -1,0 +1,242 @@
+"""Several recordings of one device as one calibration."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import alidade
+from alidade import Config
+from pipelines import together
+from pipelines.cli import app
+from pipelines.config import load_config
+from pipelines.errors import InputError
+from pipelines.fleet.statistics import mean_nees
+from pipelines.graph.problem import Array, Told
+from pipelines.recording.opening import recordings_of
+from pipelines.reports.result import Calibration
+from pipelines.session import Session
+from pipelines.sharing import walks
+from pipelines.solvers.joint import join
+from pipelines.together import calibrate_together
+from tests.one_graph import one_graph, solved
+
+EXACT = "noise_known: 0\nsensors: ideal\n"
+
+
+def sessions(name: str, seeds: Sequence[int], config: str, scenario: object = None) -> list[Session]:
+    settings = load_config(config.encode())
+    return [alidade.open(alidade.simulate(name, scenario, seed=seed), config=settings) for seed in seeds]  # type: ignore[arg-type]
+
+
+def jointly(opened: Sequence[Session]) -> Calibration:
+    return calibrate_together([partial(lambda session: session, each) for each in opened])
+
+
+# Wide enough that the recordings alone decide.
+WIDE = EXACT + "priors: {theta_x: 10.0, theta_y: 10.0, theta_z: 10.0}\n"
+CASES = {
+    "indexer, ideal": ("indexer", EXACT, None),
+    "indexer": ("indexer", "noise_known: 0", None),
+    "head with mounts, ideal": ("head", EXACT, "head_mounts"),
+    "head, its clock the device's": (
+        "head",
+        "noise_known: 0\nshare: {time_offset: device, clock_skew: device, 'platform_bias_*': device}",
+        None,
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_it_is_one_big_graph(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """To 1e-6 sigmas at fixed noise levels, the device's numbers and those of the last recording, and their sigmas."""
+    monkeypatch.setattr(together, "_STAYS", 1e-7)
+    name, config, scenario = CASES[case]
+    opened = sessions(name, [1, 2, 3], config, scenario)
+    problems = [each.problem() for each in opened]
+    shared = walks(opened[0].method, opened[0].config, [q.name for q in problems[0].quantities])
+    values, sigmas = solved(one_graph(problems, shared))
+    found = jointly(opened).parameters
+    for p in found.values():
+        one = p.name if p.name in shared else f"{p.name}@2"
+        if p.sigma > 0.0:
+            assert abs(p.value - values[one]) < 1e-6 * sigmas[one], p.name
+            assert p.sigma == pytest.approx(p.inflation * sigmas[one], rel=1e-6), p.name
+    assert found.keys() == {q.name for q in problems[0].quantities}
+
+
+def test_once_linearised_anew_it_is_as_good_as_that() -> None:
+    opened = sessions("indexer", [1, 2, 3], "noise_known: 0")
+    values, sigmas = solved(
+        one_graph([each.problem() for each in opened], walks(opened[0].method, Config(), _names(opened[0])))
+    )
+    for p in jointly(opened).parameters.values():
+        if p.name in values and not p.name.startswith("gyro_bias"):
+            assert abs(p.value - values[p.name]) < 1e-3 * sigmas[p.name]
+
+
+def _names(session: Session) -> list[str]:
+    return [q.name for q in session.problem().quantities]
+
+
+def test_five_recordings_make_sigmas_smaller_by_their_root() -> None:
+    """With ideal sensors and wide priors, of what is shared; what belongs to a recording stays nearly as it is."""
+    opened = sessions("indexer", range(5), WIDE)
+    one, five = opened[0].calibrate().parameters, jointly(opened).parameters
+    for axis in "xyz":
+        assert five[f"theta_{axis}"].sigma * 5**0.5 == pytest.approx(one[f"theta_{axis}"].sigma, rel=2e-3)
+        assert five[f"gyro_bias_{axis}"].sigma == pytest.approx(one[f"gyro_bias_{axis}"].sigma, rel=0.05)
+
+
+def test_one_after_the_other_it_is_the_same(tmp_path: Path) -> None:
+    """Each recording with the result of those before it as prior."""
+    opened = sessions("indexer", range(4), EXACT)
+    opened[0].calibrate().write(tmp_path)
+    for session in opened[1:]:
+        last = session.beginning_from(tmp_path / "result.json").calibrate()
+        last.write(tmp_path)
+    both = jointly(opened).parameters
+    for p in last.parameters.values():
+        assert abs(p.value - both[p.name].value) < 1e-6 * p.sigma, p.name
+        assert p.sigma == pytest.approx(both[p.name].sigma, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_errors_are_as_large_as_their_covariance_says() -> None:
+    """NEES of the device's parameters over histories of five recordings each lies in its interval."""
+    squares, freedoms = [], []
+    for history in range(25):
+        seeds = range(100 + 5 * history, 105 + 5 * history)
+        simulated = [alidade.simulate("head", {"duration_s": 8.0, **TURNING}, seed=seed) for seed in seeds]
+        opened = [alidade.open(each, config=load_config(EXACT.encode())) for each in simulated]
+        found = jointly(opened)
+        kept = [i for i, name in enumerate(found.estimate.names) if "mount" in name and found.estimate.sigmas[i] > 0.0]
+        truth = np.array([simulated[0].truth[found.estimate.names[i]] for i in kept], dtype=float)
+        error = found.estimate.values[kept] - truth
+        squares.append(float(error @ np.linalg.solve(found.covariance[np.ix_(kept, kept)], error)))
+        freedoms.append(float(len(kept)))
+    nees = mean_nees(np.array(squares), np.array(freedoms))
+    assert nees.consistent, nees
+
+
+TURNING = {
+    "helmet_mount_deg": [3.0, -4.0, 2.0],
+    "camera_mount_deg": [-1.0, 2.0, 1.5],
+    "priors": {},
+    "platform": {
+        "yaw": [{"amplitude_deg": 20, "frequency_hz": 0.25}],
+        "pitch": [{"amplitude_deg": 8, "frequency_hz": 0.31}],
+        "roll": [{"amplitude_deg": 12, "frequency_hz": 0.17}],
+    },
+}
+
+
+def linear(rng: np.random.Generator, names: tuple[str, ...], truth: Array, device: int) -> Told:
+    """A recording that says something of its numbers, those of the device first; the estimate is anywhere."""
+    n = len(names)
+    R, at = rng.standard_normal((n, n)) + 2.0 * np.eye(n), rng.standard_normal(n)
+    d = R @ (truth - at) + rng.standard_normal(n)
+    prior = np.eye(n)[:device] / 3.0
+    return Told(names, at, R, d, prior, -prior @ at, np.ones(n))
+
+
+def test_joining_is_least_squares_of_everything() -> None:
+    """Two numbers of the device, one that walks, one of the recording: against all unknowns in one system."""
+    rng, names, days = np.random.default_rng(3), ("a", "b", "walking", "own"), [0.0, 4.0, 13.0]
+    rates = {"a": 0.0, "b": 0.0, "walking": 0.2}
+    told = [linear(rng, names, np.array([1.0, -1.0, 0.5, i]), 3) for i in range(3)]
+    joined = join(told, rates, days)
+    # Unknowns: a, b, then walking and own of each recording.
+    rows, rights = [], []
+    for i, each in enumerate(told):
+        place = np.zeros((4, 8))
+        place[[0, 1, 2, 3], [0, 1, 2 + 2 * i, 3 + 2 * i]] = 1.0
+        rows.append(each.R @ place)
+        rights.append(each.d + each.R @ each.at)
+        if i == 0:
+            rows.append(each.prior_R @ place)
+            rights.append(np.zeros(3))
+        else:
+            step = np.zeros((1, 8))
+            step[0, [2 + 2 * i, 2 * i]] = np.array([1.0, -1.0]) / (0.2 * (days[i] - days[i - 1]) ** 0.5)
+            rows.append(step)
+            rights.append(np.zeros(1))
+    A, b = np.concatenate(rows), np.concatenate(rights)
+    x, P = np.linalg.solve(A.T @ A, A.T @ b), np.linalg.inv(A.T @ A)
+    for i in range(3):
+        at = [0, 1, 2 + 2 * i, 3 + 2 * i]
+        belief = joined.all(i)
+        assert belief.names == names
+        np.testing.assert_allclose(belief.mean, x[at], atol=1e-10)
+        np.testing.assert_allclose(belief.covariance, P[np.ix_(at, at)], atol=1e-10)
+    # What the others say and what the recording says make the whole again.
+    others, own = joined.others(1), joined.parts[1]
+    information = np.linalg.inv(others.covariance) + own.R.T @ own.R
+    np.testing.assert_allclose(np.linalg.inv(information), joined.device(1).covariance, atol=1e-10)
+
+
+def test_recordings_that_are_of_another_device_are_told() -> None:
+    opened = sessions("indexer", [1, 2], EXACT)
+    moved = alidade.simulate("indexer", {"mounting_deg": [0.5, -0.3 - 1.0 / 3600.0, 0.4]}, seed=3)
+    opened.append(alidade.open(moved, config=load_config(EXACT.encode())))
+    found = jointly(opened)
+    assert found.status == "inconsistent"
+    assert "The recordings disagree about the device" in found.headline
+
+
+def test_a_recording_that_does_not_fit_is_named() -> None:
+    opened = sessions("indexer", [1, 2], EXACT)
+    wrong = alidade.simulate("indexer", None, seed=3)
+    louder = load_config((EXACT + "noise: {gyro_density: 1.0e-9, encoder: 1.0e-8}").encode())
+    opened.append(alidade.open(wrong, config=louder))
+    found = jointly(opened)
+    assert found.status == "inconsistent"
+    assert "by itself:" in found.headline
+
+
+def test_the_command_takes_several_recordings(tmp_path: Path) -> None:
+    paths = [tmp_path / f"{name}.mcap" for name in ("march", "june")]
+    for seed, path in enumerate(paths):
+        CliRunner().invoke(app, ["simulate", "indexer", "--seed", str(seed), "--out", str(path)])
+    out = tmp_path / "out"
+    ended = CliRunner().invoke(app, ["calibrate", *map(str, paths), "--out", str(out)])
+    assert ended.exit_code == 0, ended.output
+    assert "2 recordings of one device: march.mcap, june.mcap" in ended.output
+    result = json.loads((out / "result.json").read_text())
+    assert [part["recording"] for part in result["recordings"]] == ["march.mcap", "june.mcap"]
+    own = [{p["name"]: p["value"] for p in part["parameters"]} for part in result["recordings"]]
+    assert own[0].keys() == {"gyro_bias_x", "gyro_bias_y", "gyro_bias_z"}
+    assert own[0]["gyro_bias_x"] != own[1]["gyro_bias_x"]
+    first = json.loads((out / "recordings" / "march" / "result.json").read_text())
+    sigma = {p["name"]: p["sigma"] for p in first["parameters"]}
+    joint = {p["name"]: p["sigma"] for p in result["parameters"]}
+    assert joint["theta_y"] < 0.8 * sigma["theta_y"]
+    page = (out / "report.html").read_text()
+    assert "march.mcap" in page
+    assert "What each recording has of its own" in page
+    twice = CliRunner().invoke(app, ["calibrate", str(paths[0]), str(paths[0]), "--out", str(tmp_path / "no")])
+    assert isinstance(twice.exception, InputError)
+    assert "named twice" in str(twice.exception)
+    assert not (tmp_path / "no").exists()
+    other = CliRunner().invoke(app, ["calibrate", *map(str, paths), "--solver", "incremental"])
+    assert isinstance(other.exception, InputError)
+    assert "together by batch alone" in str(other.exception)
+
+
+def test_parts_of_one_bag_are_one_recording(tmp_path: Path) -> None:
+    names = ["ride_0.mcap", "ride_1.mcap", "other.mcap"]
+    for name in names:
+        (tmp_path / name).write_bytes(b"")
+    text = "rosbag2_bagfile_information: {relative_file_paths: [ride_0.mcap, ride_1.mcap]}"
+    (tmp_path / "metadata.yaml").write_text(text)
+    paths = [tmp_path / name for name in names]
+    assert recordings_of(paths) == [paths[:2], paths[2]]
+    shutil.rmtree(tmp_path)
+    assert recordings_of([tmp_path / "a*.mcap", tmp_path]) == [tmp_path / "a*.mcap", tmp_path]
