@@ -66,15 +66,22 @@ def nanoseconds(t: Array, epoch_ns: int) -> NDArray[np.int64]:
     return np.rint(t * 1e9).astype(np.int64) + epoch_ns
 
 
-def check_gyro(topic: str, t: Array, gyro: Array, otherwise: str = "") -> None:
-    """Raise InputError if rates, shape (N, 3), are too high to be rad/s; `otherwise`: what else could be done."""
+def check_gyro(topic: str, t: Array, gyro: Array) -> None:
+    """Raise InputError if rates, shape (N, 3), are too high to be rad/s."""
+    if said := too_fast(topic, t, gyro):
+        raise InputError(said)
+
+
+def too_fast(topic: str, t: Array, gyro: Array) -> str:
+    """What is wrong with rates, shape (N, 3), that are too high to be rad/s; empty if nothing is."""
     rate = np.linalg.norm(gyro, axis=1)
     worst = int(np.argmax(rate))
-    if rate[worst] > MAX_RATE_RAD_S:
-        raise InputError(
-            f"topic {topic}: rate of {rate[worst]:.4g} at {t[worst]:.6f} s, beyond {MAX_RATE_RAD_S:g} rad/s; "
-            f"is the gyro in deg/s? angular_velocity has to be in rad/s{otherwise}"
-        )
+    if rate[worst] <= MAX_RATE_RAD_S:
+        return ""
+    return (
+        f"topic {topic}: rate of {rate[worst]:.4g} at {t[worst]:.6f} s, beyond {MAX_RATE_RAD_S:g} rad/s; "
+        "is the gyro in deg/s? angular_velocity has to be in rad/s"
+    )
 
 
 def unit_quaternions(topic: str, t: Array, wxyz: Array) -> Array:

@@ -7,17 +7,16 @@ from dataclasses import replace
 import numpy as np
 
 from pipelines.errors import InputError
-from pipelines.methods.cube.data import Array, CubeData, nominal
+from pipelines.methods.cube.data import Array, CubeData
 from pipelines.methods.cube.sightings import read_camera, read_sightings
 from pipelines.methods.cube.topics import REFERENCE_FIX, REFERENCE_IMU, TAG_DETECTIONS, CubeConfig
-from pipelines.methods.cube.units import check_accel, check_mag
+from pipelines.methods.cube.units import Readings, check_units
 from pipelines.methods.place import read_place
 from pipelines.recording.checks import (
     LEAST_ACCEL,
     LEAST_GYRO,
     LEAST_MAG,
     believed,
-    check_gyro,
     check_overlap,
     clean,
     count,
@@ -56,8 +55,8 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
     )
     imu_t, keep = imu_t[sound], keep[sound]
     gyro, accel = imu.gyro[keep], imu.accel[keep]
-    check_gyro(name, imu_t, nominal(gyro, config.section(CubeConfig).raw.gyro), ", or its conversion under cube.raw")
-    check_accel(name, nominal(accel, config.section(CubeConfig).raw.accel))
+    raw = config.section(CubeConfig).raw
+    sensors = [Readings(name, imu_t, accel, raw.accel), Readings(name, imu_t, gyro, raw.gyro)]
     gyro_density = density(name, imu_t, imu.gyro_cov[keep], LEAST_GYRO, dropped)
     accel_density = density(name, imu_t, imu.accel_cov[keep], LEAST_ACCEL, dropped)
     spans = {name: imu_t}
@@ -70,8 +69,9 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
         sound = drop_faults(name, mag_t, field_.field[keep], dropped, "T")
         mag_t, keep = mag_t[sound], keep[sound]
         mag, mag_density = field_.field[keep], density(name, mag_t, field_.field_cov[keep], LEAST_MAG, dropped)
-        check_mag(name, nominal(mag, config.section(CubeConfig).raw.mag))
+        sensors.append(Readings(name, mag_t, mag, raw.mag))
         spans[name] = mag_t
+    check_units(*sensors)
 
     reference_t = reference_wxyz = reference_cov = None
     if wanted(recording, config, REFERENCE_IMU):

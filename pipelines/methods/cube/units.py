@@ -1,40 +1,159 @@
-"""Whether the sensors of a cube session are in the units that they have to be in."""
+"""Whether the sensors of a cube session are in the units that they have to be in, and what would convert them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from pipelines.errors import InputError
-from pipelines.methods.cube.data import Array
+from pipelines.methods.cube.data import Array, nominal
+from pipelines.methods.cube.topics import RawConversion
+from pipelines.recording.checks import too_fast
 
 # Norms at rest that no accelerometer in m/s^2 and no magnetometer in T shows, and what they are likely to be.
-_ACCEL_RANGE, _MAG_RANGE = (3.0, 30.0), (1e-6, 1e-3)
+_PLAUSIBLE = {"accel": (3.0, 30.0), "mag": (1e-6, 1e-3)}
+_UNITS = {"accel": "m/s^2", "gyro": "rad/s", "mag": "T"}
 _ACCEL_UNITS = {"g": (0.5, 2.0), "mg": (500.0, 2000.0), "raw counts": (2000.0, np.inf)}
 _MAG_UNITS = {"gauss": (0.05, 5.0), "uT": (5.0, 1000.0), "mG or raw counts": (1000.0, 2e4), "nT": (2e4, np.inf)}
+_LIKELY = {"accel": _ACCEL_UNITS, "mag": _MAG_UNITS}
+
+# SI of what sensors count in: units, and the full scales of 16 bits.
+_G, _DEG = 9.80665, np.pi / 180.0
+_USUAL = {
+    "accel": {"g": _G, "mg": 1e-3 * _G, **{f"{2**k} counts a g": _G / 2**k for k in range(8, 15)}},
+    "gyro": {
+        "rad/s": 1.0,
+        "deg/s": _DEG,
+        "mdeg/s": 1e-3 * _DEG,
+        **{f"{n:g} counts a deg/s": _DEG / n for n in (131.0, 65.5, 32.8, 16.4)},
+        **{f"{m:g} mdeg/s a count": 1e-3 * _DEG * m for m in (8.75, 35.0, 70.0)},
+    },
+    "mag": {"gauss": 1e-4, "mG": 1e-7, "uT": 1e-6, "nT": 1e-9, "0.15 uT a count": 1.5e-7},
+}
+# How far a guess may be from one of these: gravity is known best; iron makes a field of the wrong size.
+_NEAR = {"accel": 0.06, "gyro": 0.07, "mag": 0.35}
+# The earth's field is within a third of this almost everywhere, T.
+_FIELD = 4.8e-5
+# A gyro is held against how gravity turns in means over this time, s, where the force is within this of its median.
+_MEAN, _STEADY = 0.1, 0.15
+# Norms that scatter by less than this share are those of readings without an offset.
+_ROUND = 0.12
 
 
-def check_accel(topic: str, values: Array) -> None:
-    """Raise InputError if the specific force (n, 3) is not in m/s^2."""
-    _check_norm(f"{topic}: acceleration", values, _ACCEL_RANGE, "m/s^2", _ACCEL_UNITS)
+@dataclass(frozen=True)
+class Readings:
+    """What a sensor said: its topic, stamps (n,), s, values (n, 3) as recorded, and the config's conversion."""
+
+    topic: str
+    t: Array
+    values: Array
+    conversion: RawConversion | None
 
 
-def check_mag(topic: str, values: Array) -> None:
-    """Raise InputError if the magnetic field (n, 3) is not in T."""
-    _check_norm(f"{topic}: field", values, _MAG_RANGE, "T", _MAG_UNITS)
-
-
-def _check_norm(
-    what: str, values: Array, plausible: tuple[float, float], unit: str, units: Mapping[str, tuple[float, float]]
-) -> None:
-    """Raise InputError if the median norm is no such quantity in that unit; says in which unit it would be one."""
-    norm = float(np.median(np.linalg.norm(values, axis=1)))
-    if plausible[0] <= norm <= plausible[1]:
+def check_units(accel: Readings, gyro: Readings, mag: Readings | None = None) -> None:
+    """Raise InputError for sensors that are not in SI: names all of them, with conversions to be pasted."""
+    sensors = {"accel": accel, "gyro": gyro} | ({} if mag is None else {"mag": mag})
+    wrong = {name: said for name, readings in sensors.items() if (said := _wrong(name, readings))}
+    if not wrong:
         return
-    likely = next((name for name, (low, high) in units.items() if low <= norm < high), None)
+    guesses = {
+        "accel": lambda: _accel(accel.values),
+        "gyro": lambda: _gyro(accel, gyro),
+        "mag": lambda: None if mag is None else _mag(mag.values),
+    }
+    found = {name: guess for name in sensors if name in wrong and (guess := guesses[name]()) is not None}
+    raise InputError("; ".join(wrong.values()) + _section(found))
+
+
+def _wrong(name: str, readings: Readings) -> str:
+    """What is implausible about a sensor, empty if nothing is."""
+    values = nominal(readings.values, readings.conversion)
+    if name == "gyro":
+        said = too_fast(readings.topic, readings.t, values)
+        return said and f"{said}, or its conversion under cube.raw"
+    low, high = _PLAUSIBLE[name]
+    norm = float(np.median(np.linalg.norm(values, axis=1)))
+    if low <= norm <= high:
+        return ""
+    likely = next((unit for unit, (a, b) in _LIKELY[name].items() if a <= norm < b), None)
+    what, unit = {"accel": "acceleration", "mag": "field"}[name], _UNITS[name]
     hint = f"; is it in {likely}?" if likely else ";"
-    raise InputError(
-        f"topic {what} has a norm of {norm:.4g} (median), implausible in {unit}{hint} It has to be in {unit}, or "
-        "its conversion in the config under cube.raw"
+    return (
+        f"topic {readings.topic}: {what} has a norm of {norm:.4g} (median), implausible in {unit}{hint} It has to be "
+        f"in {unit}, or its conversion in the config under cube.raw"
     )
+
+
+def _section(found: dict[str, tuple[float, float]]) -> str:
+    """The conversions guessed as a section of the config in one line, and what they are."""
+    if not found:
+        return ""
+    entries, words = [], []
+    for name, (scale, offset) in found.items():
+        usual = _usual(name, scale)
+        shown = f"{_USUAL[name][usual] if usual else scale:.6g}" if usual else f"{scale:.3g}"
+        number = shown if "." in shown else shown.replace("e", ".0e")
+        entries.append(f"{name}: {{scale: {number}{f', offset: {offset:.1f}' if offset else ''}}}")
+        words.append(f"{name} {usual or f'{1.0 / scale:.4g} counts a {_UNITS[name]}'}")
+    return (
+        f". By these data it is about cube: {{raw: {{{', '.join(entries)}}}}} ({'; '.join(words)}): check it against "
+        "the data sheet; what it is off by is calibrated"
+    )
+
+
+def _usual(name: str, scale: float) -> str:
+    """The usual unit or full scale nearest to a guess, empty if none is near."""
+    away = {unit: abs(np.log(scale / si)) for unit, si in _USUAL[name].items()}
+    best = min(away, key=lambda unit: away[unit])
+    return best if away[best] < _NEAR[name] else ""
+
+
+def _accel(values: Array) -> tuple[float, float] | None:
+    """SI of a count by gravity, and the offset."""
+    radius, offset = _ball(values)
+    return (_G / radius, offset) if radius > 0.0 else None
+
+
+def _mag(values: Array) -> tuple[float, float] | None:
+    """By what is usual for the field's strength, all directions seen; no offset, which is iron as well."""
+    low, high = np.quantile(values, [0.005, 0.995], axis=0)
+    radius = 0.5 * float(np.median(high - low))
+    return (_FIELD / radius, 0.0) if radius > 0.0 else None
+
+
+def _ball(values: Array) -> tuple[float, float]:
+    """Radius and offset, the same on all axes, of readings of a vector of one length in many directions."""
+    norms = np.linalg.norm(values, axis=1)
+    middle = float(np.median(norms))
+    if float(np.median(np.abs(norms - middle))) < _ROUND * middle:
+        low, high = np.quantile(values, [0.02, 0.98], axis=0)
+        if float(np.median(high - low)) > 0.5 * middle:
+            return middle, 0.0
+    low, high = np.quantile(values, [0.02, 0.98], axis=0)
+    offset = float(np.median(0.5 * (low + high)))
+    about = np.linalg.norm(values - 0.5 * (low + high), axis=1)
+    radius = float(np.median(about))
+    return (radius, offset) if abs(offset) > radius else (middle, 0.0)
+
+
+def _gyro(accel: Readings, gyro: Readings) -> tuple[float, float] | None:
+    """By how the direction of gravity turns: of its unit vector a the rate is -w x a; None where nothing turned."""
+    radius, offset = _ball(accel.values)
+    size = max(2, round(_MEAN / float(np.median(np.diff(gyro.t)))))
+    whole = len(gyro.t) // size * size
+    if whole < 5 * size or radius <= 0.0:
+        return None
+    means = [values[:whole].reshape(-1, size, 3).mean(axis=1) for values in (accel.values - offset, gyro.values)]
+    time = gyro.t[:whole].reshape(-1, size).mean(axis=1)
+    length = np.linalg.norm(means[0], axis=1)
+    a = means[0] / length[:, None]
+    rest = np.median(means[1], axis=0)
+    expected = -np.cross(means[1] - rest, a)[1:-1]
+    turned = (a[2:] - a[:-2]) / (time[2:] - time[:-2])[:, None]
+    steady = np.abs(length / np.median(length) - 1.0) < _STEADY
+    kept = steady[2:] & steady[1:-1] & steady[:-2]
+    square = float((expected[kept] ** 2).sum())
+    scale = float((expected[kept] * turned[kept]).sum()) / square if square > 0.0 else 0.0
+    offset = float(np.median(rest))
+    return (scale, offset if abs(offset) * scale > 1.0 else 0.0) if scale > 0.0 else None
