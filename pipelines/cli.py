@@ -442,7 +442,7 @@ def fleet(
 @app.command()
 def export(
     calibration: Annotated[Path, typer.Argument(metavar="CALIBRATION.yaml", help="The calibration.")],
-    form: Annotated[str, typer.Option("--format", help="Of a cube: px4, ardupilot, ros2 or kalibr.")],
+    form: Annotated[str, typer.Option("--format", help="px4, ardupilot, ros2, kalibr (sensors); tf, urdf (mounts).")],
     out: Annotated[Path | None, typer.Option(help="The file to write; default: printed.")] = None,
     as_json: _Json = False,
 ) -> None:

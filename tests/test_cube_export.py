@@ -153,11 +153,33 @@ def test_what_is_lost_is_said(form: str) -> None:
     assert "its mounting, 90.00 deg in all" in text
 
 
+def test_ros2_has_the_covariance_of_a_sample() -> None:
+    noise: list[dict[str, object]] = [{"sensor": "accel", "rate_hz": 100.0, "density": [1e-3, 2e-3, 3e-3]}]
+    saved = _calibration(
+        {"accel": np.eye(3), "gyro": np.eye(3)}, {n: np.zeros(3) for n in ("accel", "gyro")}, noise=noise
+    )
+    parameters = YAML(typ="safe", pure=True).load(exported(saved, "ros2"))["/**"]["ros__parameters"]
+    np.testing.assert_allclose(np.reshape(parameters["accel"]["covariance"], (3, 3)), np.diag([1e-4, 4e-4, 9e-4]))
+    assert "covariance" not in parameters["gyro"]
+
+
+def test_a_magnetometer_without_a_known_strength_keeps_its_scale() -> None:
+    S = np.eye(3) + 0.1 * np.diag([1.0, -1.0, 0.5])
+    S /= np.cbrt(np.linalg.det(S))
+    offset = np.array([1e-5, -2e-5, 3e-5])
+    saved = _calibration({"mag": 2.1e4 * S}, {"mag": -2.1e4 * S @ offset}, method="tumble", unit="1/T")
+    text = exported(saved, "ardupilot")
+    values = {name: float(value) for name, value in (x.split(",") for x in text.splitlines() if x[0] != "#")}
+    np.testing.assert_allclose(_three(values, "COMPASS_OFS_{}"), -1e7 * offset, rtol=1e-6)
+    np.testing.assert_allclose(_three(values, "COMPASS_DIA_{}"), np.diag(S), rtol=1e-6)
+    assert "its scale is as recorded" in text
+
+
 def test_wrong_format_and_method() -> None:
     saved, _, _ = _fits(_diagonal())
     with pytest.raises(InputError, match="unknown format yaml; there are px4, ardupilot, ros2, kalibr"):
         exported(saved, "yaml")
-    with pytest.raises(InputError, match="only calibrations of the cube and tumble method"):
+    with pytest.raises(InputError, match="this calibration of head holds nothing"):
         exported(_calibration({"accel": np.eye(3)}, {"accel": np.zeros(3)}, "head"), "px4")
 
 

@@ -38,10 +38,10 @@ def _check(
     )
 
 
-def _refused(data: CubeData, *factors: float) -> tuple[str, dict[str, Any]]:
+def _refused(data: CubeData, accel: float, gyro: float, mag: float) -> tuple[str, dict[str, Any]]:
     """What is said, and the section in it."""
     with pytest.raises(InputError) as caught:
-        _check(data, *factors)
+        _check(data, accel, gyro, mag)
     found = re.search(r"(cube: \{raw: .*\}\}\})", str(caught.value))
     assert found
     return str(caught.value), YAML(typ="safe", pure=True).load(found.group(1))["cube"]["raw"]

@@ -29,14 +29,24 @@ def _triads(saved: SavedCalibration) -> dict[str, tuple[Array, Array]]:
     return {name: _triad(saved, name) for name in names}
 
 
-def _in_si(saved: SavedCalibration) -> dict[str, tuple[Array, Array]]:
-    """K and b of sensors that are recorded in SI. Raises InputError when one is recorded in counts."""
-    for name in (triads := _triads(saved)):
-        if (unit := saved.parameters[f"{name}_k11"].unit) != "1":
+def _in_si(saved: SavedCalibration) -> tuple[dict[str, tuple[Array, Array]], list[str]]:
+    """K and b of sensors that are recorded in SI, and what has to be said of them.
+
+    A magnetometer in T that was held against a field of unknown strength keeps its scale on average: its K has the
+    determinant 1. Raises InputError when a sensor is recorded in counts.
+    """
+    triads, notes = _triads(saved), []
+    for name, (K, b) in triads.items():
+        unit = saved.parameters[f"{name}_k11"].unit
+        if unit == "1/T":
+            scale = np.cbrt(abs(float(np.linalg.det(K))))
+            triads[name] = K / scale, b / scale
+            notes.append("magnetometer: calibrated without the field's strength, its scale is as recorded")
+        elif unit != "1":
             raise InputError(
                 f"{name} is calibrated in {unit}; this format corrects SI units: calibrate what the program has"
             )
-    return triads
+    return triads, notes
 
 
 def _triad(saved: SavedCalibration, name: str) -> tuple[Array, Array]:
@@ -74,8 +84,7 @@ class _Autopilot:
     def parameters(self, saved: SavedCalibration) -> tuple[list[tuple[str, float]], list[str]]:
         """Names and values, and comments on what has no place. Raises InputError for sensors recorded in counts."""
         rows: list[tuple[str, float]] = []
-        notes = []
-        triads = _in_si(saved)
+        triads, notes = _in_si(saved)
         if "accel" in triads:
             K, b = triads["accel"]
             rows += _xyz(self.accel[0], zero_offset(K, b)) + _xyz(self.accel[1], np.diag(K))
@@ -123,18 +132,27 @@ def _ardupilot(saved: SavedCalibration) -> str:
 
 
 def _ros2(saved: SavedCalibration) -> str:
-    """Parameters of a node: rows of K and b of each sensor, in the units of sensor_msgs, whole."""
+    """Parameters of a node: rows of K and b of each sensor, in the units of sensor_msgs, whole.
+
+    Where noise was measured, the covariance that its messages may state: of one sample, calibrated, by rows.
+    """
     from ruamel.yaml import YAML
 
-    parameters = {
-        name: {"gain": [float(x) for x in K.ravel()], "bias": [float(x) for x in b]}
-        for name, (K, b) in _triads(saved).items()
-    }
+    noise: dict[str, Any] = {str(row.get("sensor")): row for row in saved.findings.get("noise", [])}
+    parameters: dict[str, dict[str, list[float]]] = {}
+    for name, (K, b) in _triads(saved).items():
+        parameters[name] = {"gain": [float(x) for x in K.ravel()], "bias": [float(x) for x in b]}
+        if name in noise and min(noise[name]["density"]) > 0.0:
+            variance = noise[name]["rate_hz"] * np.square(noise[name]["density"])
+            parameters[name]["covariance"] = [float(x) for x in np.diag(variance).ravel()]
     text = StringIO()
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style = None
     yaml.dump({"/**": {"ros__parameters": parameters}}, text)
-    return "# calibrated = gain raw + bias, gain a 3x3 matrix by rows\n" + text.getvalue()
+    return (
+        "# calibrated = gain raw + bias, gain a 3x3 matrix by rows; covariance, by rows, of one calibrated sample\n"
+        + text.getvalue()
+    )
 
 
 def _kalibr(saved: SavedCalibration) -> str:

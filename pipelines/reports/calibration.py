@@ -6,6 +6,7 @@ saved.value("gyro_bias_x"), saved.rotations["helmet_mount"]
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from io import StringIO
 from pathlib import Path
@@ -16,8 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from factors import so3
 from pipelines.errors import InputError
-from pipelines.graph.problem import rotation_vector_coordinates
+from pipelines.graph.problem import Array, rotation_vector_coordinates
 from pipelines.judgement.observability import Status, Verdict
+from pipelines.methods.formula import Formula, apply
 from pipelines.reports.result import Calibration
 
 _HEAD = """\
@@ -26,6 +28,9 @@ _HEAD = """\
 """
 # More digits than any sigma needs, fewer than tire the eye.
 _DIGITS = 12
+# A rotation's meaning in the formulas begins with its frames, and this is a step for its derivatives.
+_FRAMES = re.compile(r"([\w ]+) to ([\w ]+)(?:,|$)")
+_STEP = 1e-6
 # Of what was found beside the parameters.
 _FEWER_DIGITS = 6
 
@@ -50,6 +55,18 @@ class SavedRotation(_Record):
     wxyz: tuple[float, float, float, float]
 
 
+class SavedTransform(_Record):
+    """A mounting rotation as programs want it: the attitude of the frame `child` in `parent`.
+
+    The covariance, 3x3 by rows, is that of small rotations about the parent's axes, rad^2.
+    """
+
+    parent: str
+    child: str
+    wxyz: tuple[float, float, float, float]
+    covariance: Annotated[tuple[float, ...], Field(min_length=9, max_length=9)]
+
+
 class SavedRecording(_Record):
     """What it was calibrated on."""
 
@@ -68,6 +85,7 @@ class SavedCalibration(_Record):
     recording: SavedRecording
     parameters: dict[str, SavedParameter]
     rotations: dict[str, SavedRotation] = {}
+    transforms: dict[str, SavedTransform] = {}
     findings: dict[str, list[dict[str, object]]] = {}
     formulas: list[str] = []
 
@@ -94,7 +112,7 @@ def calibration_yaml(calibration: Calibration) -> str:
 
     Representer.add_representer(float, _float)
     content = saved(calibration).model_dump(by_alias=True, mode="json")
-    for section in ("parameters", "rotations"):
+    for section in ("parameters", "rotations", "transforms"):
         content[section] = {name: one_line(entry) for name, entry in content[section].items()}
     content["findings"] = {name: [one_line(row) for row in rows] for name, rows in content["findings"].items()}
     yaml = YAML()
@@ -119,6 +137,7 @@ def saved(calibration: Calibration) -> SavedCalibration:
         recording=SavedRecording(file=calibration.recording, sha256=calibration.sha256, start=calibration.start),
         parameters=parameters,
         rotations=_rotations(calibration),
+        transforms=_transforms(calibration),
         findings={name: [_plain(row) for row in rows] for name, rows in calibration.findings.items()},
         formulas=[formula.text for formula in calibration.formulas],
     )
@@ -156,6 +175,44 @@ def _rotations(calibration: Calibration) -> dict[str, SavedRotation]:
             w, x, y, z = (_rounded(v) for v in so3.exp(np.array([values[n] for n in names])).tolist())
             found[name] = SavedRotation(name=known.get(name, name), wxyz=(w, x, y, z))
     return found
+
+
+def _transforms(calibration: Calibration) -> dict[str, SavedTransform]:
+    """The formulas that are rotations and need nothing measured, by the frames in their meaning: "a to b, ..."."""
+    estimate, covariance = calibration.estimate, calibration.covariance
+    unknown = dict.fromkeys((q.name for q in calibration.problem.quantities), 0.0)
+    formulas: list[Formula] = []
+
+    def at(values: Array) -> dict[str, Array]:
+        return apply(formulas, {**unknown, **dict(zip(estimate.names, values.tolist(), strict=True))}, {})
+
+    for formula in calibration.formulas:
+        if not formula.measured:
+            formulas.append(formula)
+            try:
+                at(estimate.values)
+            except AttributeError:  # of parameters that this graph has not got
+                formulas.pop()
+    results = at(estimate.values)
+    rotations = {f.name: f for f in formulas if results[f.name].shape == (4,) and _FRAMES.match(f.meaning)}
+    if not rotations:
+        return {}
+    ends = [(at(estimate.values + step), at(estimate.values - step)) for step in _STEP * np.eye(len(estimate.names))]
+    found = {}
+    for name, formula in rotations.items():
+        turns = [so3.log(so3.multiply(ahead[name], so3.inverse(behind[name]))) for ahead, behind in ends]
+        J = np.array(turns).T / (2.0 * _STEP)
+        child, parent = (word.strip().lower().replace(" ", "_") for word in _frames(formula.meaning))
+        w, x, y, z = (_rounded(v) for v in results[name].tolist())
+        spread = tuple(_rounded(float(v), _FEWER_DIGITS) for v in (J @ covariance @ J.T).ravel())
+        found[name] = SavedTransform(parent=parent, child=child, wxyz=(w, x, y, z), covariance=spread)
+    return found
+
+
+def _frames(meaning: str) -> tuple[str, str]:
+    match = _FRAMES.match(meaning)
+    assert match is not None
+    return match[1], match[2]
 
 
 def _float(representer: Any, value: float) -> Any:

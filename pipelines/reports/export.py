@@ -5,16 +5,19 @@ from __future__ import annotations
 from pipelines import methods
 from pipelines.errors import InputError
 from pipelines.reports.calibration import SavedCalibration
+from pipelines.reports.transforms import FORMATS
 
 
 def exported(saved: SavedCalibration, form: str) -> str:
-    """The text of a parameter file. Raises InputError when the calibration's method has no such format."""
-    formats = methods.method(saved.method).exporters
+    """The text of a parameter file.
+
+    Any method's mounting rotations go out as static transforms; methods have formats of their own beside.
+
+    Raises InputError when there is no such format for the calibration.
+    """
+    formats = {**methods.method(saved.method).exporters, **(FORMATS if saved.transforms else {})}
     if not formats:
-        able = [name for name in methods.names() if methods.method(name).exporters]
-        raise InputError(
-            f"only calibrations of the {' and '.join(able)} method can be exported, this one is of {saved.method}"
-        )
+        raise InputError(f"this calibration of {saved.method} holds nothing that another program could be given")
     if form not in formats:
         raise InputError(f"unknown format {form}; there are {', '.join(formats)}")
     return formats[form](saved)
