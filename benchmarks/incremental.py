@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from benchmarks.batch import IMAGES_PER_S, los_problem
-from benchmarks.measure import Ratio, peak_mib
+from benchmarks.measure import Ratio, peak_mib, resident_mib
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.incremental import DEFAULT_WINDOW, Run
 
@@ -32,7 +32,7 @@ def run() -> Iterator[Ratio]:
         solver.add_step(step)
         seconds.append((step.time, made - begun, time.process_time() - made))
         if len(seconds) % 500 == 0:
-            memory.append((step.time, _resident_mib()))
+            memory.append((step.time, resident_mib()))
         begun = time.process_time()
     t, making, cost = np.array(seconds).T
     first, last = (t >= _FILLED) & (t < _FILLED + 60.0), t >= t[-1] - 60.0
@@ -60,8 +60,3 @@ def run() -> Iterator[Ratio]:
     yield Ratio(
         "incremental.answer", "largest difference of the angles from batch, sigmas", off, tolerance=1.0, wanted=0.3
     )
-
-
-def _resident_mib() -> float:
-    with open("/proc/self/statm") as stream:
-        return int(stream.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20

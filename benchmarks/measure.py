@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import importlib
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -117,6 +118,12 @@ def peak_mib() -> float:
     """High-water mark of this process; getrusage would give the parent's, if that was larger."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(float(line.split()[1]) / 1024.0 for line in lines if line.startswith("VmHWM:"))
+
+
+def resident_mib() -> float:
+    """Memory of this process by now."""
+    with open("/proc/self/statm") as stream:
+        return int(stream.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def _forget_peak() -> None:

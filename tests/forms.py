@@ -86,9 +86,12 @@ def zstd(source: Path, path: Path) -> Path:
     return path
 
 
-def rosbag1(source: Path, path: Path, compression: Ros1Writer.CompressionFormat | None = None) -> Path:
-    """A ROS 1 bag."""
+def rosbag1(
+    source: Path, path: Path, compression: Ros1Writer.CompressionFormat | None = None, chunk: int = 1 << 20
+) -> Path:
+    """A ROS 1 bag with chunks of so many bytes."""
     writer = Ros1Writer(path)
+    writer.chunk_threshold = chunk
     if compression is not None:
         writer.set_compression(compression)
     with writer:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import struct
 import threading
 from collections.abc import Callable, Iterator
@@ -28,6 +29,7 @@ from pipelines.methods.los.simulation import LosScenario, los_config, simulate_l
 from pipelines.reports.result import Calibration
 from pipelines.session import calibrate
 from pipelines.simulation.motion import EulerMotion, Swing
+from tests import forms
 from tests.live import Bridge, messages, write
 
 connect = websockets().sync.client.connect
@@ -139,6 +141,38 @@ def test_a_pipe_of_something_else_is_one_line() -> None:
         follow(StandardInput(None, io.BytesIO(b"%PDF-1.7" + bytes(100))), Settings())
     with pytest.raises(InputError, match=r"standard input: nothing there, or nothing in it$"):
         follow(StandardInput(None, io.BytesIO(b"")), Settings())
+
+
+class _KilledError(Exception):
+    """As a process is that is killed: nothing is done any more."""
+
+
+@pytest.mark.slow
+def test_a_ros_1_bag_is_followed_killed_and_resumed_when_it_is_closed(tmp_path: Path) -> None:
+    """What tells a bag from others is not its head, which is written anew when the bag is closed."""
+    scenario = SCENARIO.model_copy(update={"duration_s": 75.0, "image_rate_hz": 3.0, "gyro_rate_hz": 25.0})
+    whole, config = tmp_path / "whole.mcap", tmp_path / "c.yaml"
+    write_los(whole, *simulate_los(scenario, 2), los_config(scenario))
+    config.write_text(los_config(scenario))
+    closed = forms.rosbag1(whole, tmp_path / "closed.bag", chunk=8_000).read_bytes()
+    path, settings = tmp_path / "s.bag", Settings(config=config, checkpoint=tmp_path / "s.checkpoint")
+    # Before it is closed, the head does not say where the index is.
+    open_ = re.sub(rb"index_pos=.{8}", b"index_pos=" + bytes(8), closed, count=1, flags=re.DOTALL)
+    path.write_bytes(open_[: round(0.85 * len(open_))])
+    assert not Source(path).is_finished
+
+    def kill(view: View) -> None:
+        if view.time > 60.0:
+            raise _KilledError
+
+    with pytest.raises(_KilledError):
+        Follower(Source(path), settings, kill, lambda _: None, lambda: False).follow()
+    path.write_bytes(closed)
+    assert Source(path).is_finished
+    resumed, _, said = follow(Source(path), settings)
+    assert any(sentence.startswith("resumed at ") for sentence in said)
+    at_once = calibrate(path, ["incremental"], None, config)[0]
+    agree(resumed, at_once, 0.1)
 
 
 def test_a_bridge_that_hangs_up_and_comes_back(whole: Path, config: Path, tmp_path: Path) -> None:

@@ -27,10 +27,16 @@ from pipelines.recording.sources import TopicSource, inverted
 from pipelines.recording.topics import IMU
 from pipelines.recording.writing import write_session
 from pipelines.session import calibrate
+from pipelines.simulation.motion import EulerMotion, Swing
 from tests import forms, live
 from tests.recorded import T0, assert_same, session
 from tests.turning import turning, write_csv
 
+BRISK = EulerMotion(
+    roll=[Swing(amplitude_deg=6, frequency_hz=1.1)],
+    pitch=[Swing(amplitude_deg=5, frequency_hz=0.7)],
+    yaw=[Swing(amplitude_deg=6, frequency_hz=0.9)],
+)
 MCAP, SQLITE = StoragePlugin.MCAP, StoragePlugin.SQLITE3
 
 
@@ -738,16 +744,44 @@ def test_messages_without_a_stamp_are_told_with_the_jitter_of_what_stands_in(tmp
     assert recording.stamp_sigma_s == pytest.approx(np.hypot(0.01, 4e-4), rel=0.01)
 
 
-def test_log_times_in_place_of_stamps_stand_in_the_sigma_of_the_time_offset(tmp_path: Path) -> None:
-    """Vision without stamps, logged 8 ms late: the offset reported is 8 ms off, and says that it may be."""
-    chosen, few = method("head"), {"gyro_rate_hz": 100.0, "platform_gyro_rate_hz": 100.0, "vision_rate_hz": 10.0}
-    simulated = chosen.simulate(chosen.settings("head_mounts").model_copy(update={"duration_s": 10.0, **few}), 2)
+@pytest.mark.parametrize(
+    ("name", "scenario", "brief", "topic", "delay"),
+    [
+        (
+            "head",
+            "head_mounts",
+            {"duration_s": 10.0, "gyro_rate_hz": 100.0, "platform_gyro_rate_hz": 100.0, "vision_rate_hz": 10.0},
+            "/vision/attitude",
+            "time_offset",
+        ),
+        (
+            "los",
+            None,
+            {
+                "duration_s": 30.0,
+                "gyro_rate_hz": 100.0,
+                "gimbal_rate_hz": 100.0,
+                "image_rate_hz": 10.0,
+                "carrier": BRISK,
+            },
+            "/los/error",
+            "time_offset",
+        ),
+        ("indexer", None, {"gyro_rate_hz": 20.0}, "/indexer/joint_states", "encoder_delay"),
+    ],
+)
+def test_log_times_in_place_of_stamps_stand_in_the_sigma_of_the_delay(
+    name: str, scenario: str | None, brief: dict[str, Any], topic: str, delay: str, tmp_path: Path
+) -> None:
+    """A topic without stamps, logged 8 ms late: the delay reported is 8 ms off, and says that it may be."""
+    chosen = method(name)
+    simulated = chosen.simulate(chosen.settings(scenario).model_copy(update=brief), 2)
     chosen.write(tmp_path / "s.mcap", simulated)
     late = 8_000_000
 
     def unstamped(message: live.Message) -> live.Message:
         schema, channel, log_ns, data = message
-        if channel.topic != "/vision/attitude":
+        if channel.topic != topic:
             return message
         return schema, channel, log_ns + late, data[:4] + bytes(8) + data[12:]
 
@@ -756,9 +790,12 @@ def test_log_times_in_place_of_stamps_stand_in_the_sigma_of_the_time_offset(tmp_
         live.write(whole, out)
     config = tmp_path / "c.yaml"
     config.write_bytes(open_recording(tmp_path / "s.mcap").attachment("alidade.yaml") or b"")
-    offset = calibrate(tmp_path / "late.mcap", ["batch"], None, config)[0].parameters["time_offset"]
-    assert simulated.truth["time_offset"] - offset.value == pytest.approx(8e-3, abs=2e-3)
+    found = calibrate(tmp_path / "late.mcap", ["batch"], name, config)[0]
+    offset = found.parameters[delay]
+    assert abs(simulated.truth.get(delay, 0.0) - offset.value) == pytest.approx(8e-3, abs=2e-3)
     assert 0.01 < offset.sigma < 0.012
+    assert found.assessment.status in ("calibrated", "weak"), found.headline
+    assert any("no stamp; the log times stand in" in note for note in found.notes)
 
 
 @pytest.mark.parametrize(

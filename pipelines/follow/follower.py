@@ -8,7 +8,6 @@ following never takes more than a third of a core for reading.
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -24,13 +23,14 @@ from pipelines.follow.sources import Source
 from pipelines.graph.problem import Problem, Step
 from pipelines.judgement.checklist import ChecklistItem
 from pipelines.recording.growing import Growing
+from pipelines.recording.opening import identity
 from pipelines.recording.reading import Recording, open_recording
 from pipelines.reports.result import Calibration
 from pipelines.session import Session
 from pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
 from pipelines.solvers.incremental import Run
 
-# At least so long from one look to the next, s, and so many times what a look cost.
+# At least so long from one look to the next, s, and so many times what it took to read: steps wait for nothing.
 _PAUSE, _REST = 0.05, 2.0
 # The files' size is looked at so often, s.
 _POLL = 0.01
@@ -41,7 +41,6 @@ _MARGINS = (2.0, 20.0)
 _LONG_AGO = 1.5
 # While a long recording is caught up with, the view is renewed this often, s.
 _VIEW = 1.0
-_FINGERPRINT = 4096
 # Times are differences of stamps, which are whole ns: they are told apart beyond this, s.
 _ROUNDING = 1e-9
 # A picture serves once gyro and gimbal have been read after it: so long a picture is waited for beyond its time, s.
@@ -123,22 +122,24 @@ class Follower:
             if over:
                 return self._end(finished, size)
             if new and now >= due and size > 0 and self._may_settle():
-                started, new = time.monotonic(), False
-                self._look()
-                cost = time.monotonic() - started
+                new = False
+                cost = self._look()
                 due = time.monotonic() + max(_PAUSE, _REST * cost)
             time.sleep(_POLL)
 
     # -- one look
 
-    def _look(self) -> None:
-        """Take what is settled of what is there now."""
+    def _look(self) -> float:
+        """Take what is settled of what is there now; returns what it took of a core to read it, s."""
+        started = time.thread_time()
         try:
             problem, steps = self._end_alone() or self._whole()
         except InputError as error:
             self._wait(str(error))
-            return
+            return time.thread_time() - started
+        cost = time.thread_time() - started
         self._take(problem, self._settled(steps, problem.unsettled))
+        return cost
 
     def _may_settle(self) -> bool:
         """Whether what has come may settle a step: to look takes long, and another look has to wait for this one."""
@@ -207,10 +208,10 @@ class Follower:
 
     def _new_steps(self, session: Session, problem: Problem) -> Iterator[Step]:
         """The steps not taken yet, for a run that is the one to take them: a new one if the past has changed."""
-        identity = self._identify(session)
-        if problem.steps_after is None or identity != self._identity or session.origin.epoch_ns != self._epoch_ns:
+        belongs = self._identify(session)
+        if problem.steps_after is None or belongs != self._identity or session.origin.epoch_ns != self._epoch_ns:
             self._run = None
-        self._identity, self._epoch_ns = identity, session.origin.epoch_ns
+        self._identity, self._epoch_ns = belongs, session.origin.epoch_ns
         if self._run is None and problem.steps_after is not None:
             self._run = self._resumed(problem)
         if self._run is None:
@@ -269,10 +270,8 @@ class Follower:
 
     def _identify(self, session: Session) -> dict[str, str]:
         """What a checkpoint belongs to, in words."""
-        with self.source.parts[0].open("rb") as stream:
-            head = hashlib.sha256(stream.read(_FINGERPRINT)).hexdigest()[:12]
         return {
-            "recording": f"one that starts at {session.origin.epoch_ns} ns ({head})",
+            "recording": f"one that starts at {session.origin.epoch_ns} ns ({identity(self.source.parts[0])})",
             "method": session.method.name,
             "config": session.config.model_dump_json(exclude_defaults=True),
             "window": f"{self.settings.window} s",

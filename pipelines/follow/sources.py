@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 from pipelines.errors import InputError
 from pipelines.recording.mcap_records import MAGIC
-from pipelines.recording.opening import Where, parts_in
+from pipelines.recording.opening import Where, is_closed, parts_in
 
 _PIECE = 1 << 16
 # Names of the files in which a stream is written down.
@@ -55,7 +55,7 @@ class Source(AbstractContextManager["Source"]):
     def is_finished(self) -> bool:
         """Whether the recording is closed: a file by its closing mark, a folder when its metadata.yaml is there too."""
         parts = self.parts
-        closed = bool(parts) and _is_closed(parts[-1])
+        closed = bool(parts) and is_closed(parts[-1])
         return closed and (not self.path.is_dir() or (self.path / "metadata.yaml").is_file())
 
     def __exit__(
@@ -160,13 +160,3 @@ def _size(path: Path) -> int:
     except OSError:
         return 0
     return size if size >= len(MAGIC) else 0
-
-
-def _is_closed(path: Path) -> bool:
-    """Whether an MCAP file has its closing mark."""
-    with path.open("rb") as stream:
-        size = stream.seek(0, 2)
-        if size < 2 * len(MAGIC):
-            return False
-        stream.seek(size - len(MAGIC))
-        return stream.read() == MAGIC

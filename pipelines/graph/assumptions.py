@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pipelines.graph.problem import Findings, Parameter, Quantity
 from pipelines.settings import Config
@@ -93,6 +93,20 @@ def parameter(key: int, assumptions: Sequence[Assumption], config: Config) -> Pa
     """One variable of several assumptions; None if all are fixed, so that the graph can do without."""
     all_of_them = tuple(q for assumption in assumptions for q in quantities(assumption, config))
     return Parameter(key, all_of_them) if any(q.prior_sigma for q in all_of_them) else None
+
+
+def stamped(parameter: Parameter | None, name: str, sigma: float) -> Parameter | None:
+    """The variable with the sigma of stamps, s, where log times stand in for them, in one of its numbers: a delay.
+
+    How late log times are nobody knows: that is part of what the delay may be, and of what it may be off.
+    """
+
+    def known(q: Quantity) -> Quantity:
+        if q.name != name or not q.prior_sigma:
+            return q
+        return replace(q, prior_sigma=math.hypot(q.prior_sigma, sigma), extra_sigma=sigma)
+
+    return parameter and replace(parameter, quantities=tuple(map(known, parameter.quantities)))
 
 
 def fixed_without_force(assumption: Assumption, config: Config, topic: str) -> Findings:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import glob
+import hashlib
 import re
 import tempfile
 from collections.abc import Sequence
@@ -15,12 +16,17 @@ from pipelines.errors import InputError
 from pipelines.recording import ros1_bag
 from pipelines.recording.container import Container
 from pipelines.recording.mcap_file import McapFile
+from pipelines.recording.mcap_records import MAGIC
 from pipelines.recording.parts import Parts
 
 _ZSTD, _SQLITE, _ULOG, _ARDUPILOT = b"\x28\xb5\x2f\xfd", b"SQLite format 3\0", b"ULog\x01\x12\x35", b"\xa3\x95"
 _TABLES = {".csv", ".tum", ".txt"}
 # How the parts of a recording may be called.
 PARTS = (".mcap", ".db3", ".bag", ".zstd", ".zst")
+# The bytes of a file that tell it from others of its form and stay as they are while it grows: the heads of some forms
+# count what has come. ROS 1: behind the bag's header; SQLite: of the first page, which defines the tables.
+_IDENTITY = {ros1_bag.MAGIC: (4096, 8192), _SQLITE: (100, 4096)}
+_USUAL_IDENTITY = (0, 4096)
 # A compressed file may unpack to so many times its size, beyond so many bytes.
 _LARGEST_RATIO, _SMALL = 100, 1 << 28
 _METADATA, _LONGEST_METADATA = "metadata.yaml", 1 << 24
@@ -178,6 +184,25 @@ def _folder(path: Path, strict: bool) -> Container:
     if not there:
         raise InputError(f"{path}: a folder without a recording")
     return _together(there, strict, path)
+
+
+def identity(path: Path) -> str:
+    """What tells a file from others while it grows, in a few letters."""
+    with path.open("rb") as stream:
+        start = stream.read(16)
+        first, last = next((at for mark, at in _IDENTITY.items() if start.startswith(mark)), _USUAL_IDENTITY)
+        stream.seek(first)
+        return hashlib.sha256(stream.read(last - first)).hexdigest()[:12]
+
+
+def is_closed(path: Path) -> bool:
+    """Whether a file has the mark of one that nobody writes any more; False too of forms that have none."""
+    with path.open("rb") as stream:
+        if stream.read(len(ros1_bag.MAGIC)) == ros1_bag.MAGIC:
+            return ros1_bag.is_closed(stream)
+        size = stream.seek(0, 2)
+        stream.seek(max(0, size - len(MAGIC)))
+        return size >= 2 * len(MAGIC) and stream.read() == MAGIC
 
 
 def parts_in(path: Path) -> list[Path]:

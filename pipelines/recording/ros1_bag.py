@@ -205,6 +205,16 @@ class Ros1Bag(Container):
         raise InputError(f"{self.path}: {'; '.join(self.notes(None))}; {what}: record again")
 
 
+def is_closed(stream: BinaryIO) -> bool:
+    """Whether a bag has been closed: its header says where the index is."""
+    size = stream.seek(0, 2)
+    try:
+        header, _, _ = _record(stream, len(MAGIC), size)
+    except DamagedError:
+        return False
+    return 0 < int.from_bytes(header.get(b"index_pos", b""), "little") < size
+
+
 def _record(stream: BinaryIO, position: int, stop: int) -> tuple[dict[bytes, bytes], int, int]:
     """Header of the record at a byte of the file, and where its data begin and end. Raises DamagedError."""
     stream.seek(position)

@@ -115,7 +115,7 @@ def _mean_rates(groups: Sequence[Group], gyro: Level, encoders: Level) -> tuple[
 
 
 def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]:
-    parameters = indexer_parameters(config)
+    parameters = indexer_parameters(config, data.stamp_sigma)
     motion = axis_motion(data)
     gyro, encoders = (
         sampled(stated("gyro_density", config, data.gyro_density), data.gyro_t, data.gyro),

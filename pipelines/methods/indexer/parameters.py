@@ -9,7 +9,7 @@ from itertools import chain
 import gtsam
 import numpy as np
 
-from pipelines.graph.assumptions import encoder_assumptions, parameter, quantities, scale_assumptions
+from pipelines.graph.assumptions import encoder_assumptions, parameter, quantities, scale_assumptions, stamped
 from pipelines.graph.problem import Array, Parameter, Quantity
 from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
 from pipelines.methods.indexer.recording import JOINTS
@@ -35,10 +35,11 @@ KEYS: dict[str, int] = {
 THETA_UNIT = 1e-3
 
 
-def indexer_parameters(config: Config) -> tuple[Parameter, ...]:
+def indexer_parameters(config: Config, stamp_sigma: float = 0.0) -> tuple[Parameter, ...]:
     """The method's parameters with their priors in force; of the assumptions those that are not all fixed.
 
-    That the axes are not perpendicular is assumed only where the config gives it a prior.
+    That the axes are not perpendicular is assumed only where the config gives it a prior. `stamp_sigma`, s: how well
+    the stamps are known.
     """
     assumed = chain.from_iterable(quantities(each, config) for each in ASSUMPTIONS)
     known = [*THETA, *BIAS, *(q.name for q in assumed), *EPSILON]
@@ -58,7 +59,7 @@ def indexer_parameters(config: Config) -> tuple[Parameter, ...]:
         Parameter(KEYS["theta"], calibrated(THETA, "rad", 0.1, 5e-5), theta_coordinates),
         Parameter(FIRST_BIAS, calibrated(BIAS, "rad/s", 1e-3, 1e-5)),
         parameter(KEYS["errors"], (SCALE, SKEW), config),
-        parameter(KEYS["encoder"], (ONCE_PER_TURN, DELAY), config),
+        stamped(parameter(KEYS["encoder"], (ONCE_PER_TURN, DELAY), config), DELAY.names[0], stamp_sigma),
         Parameter(KEYS["epsilon"], axes) if any(q.prior_sigma != 0.0 for q in axes) else None,
     )
     return tuple(each for each in found if each is not None)

@@ -40,7 +40,8 @@ class IndexerData:
     gyro_t (N,), gyro (N, 3) rad/s: rate w_im of the IMU on the indexer, in m. encoder_t (M,), outer (M,), inner (M,)
     rad: axis angles as recorded, wrapped or continuous. latitude_deg: from /fix or the config, None if unknown.
     attitude (N, 4): nRm as the INS puts it out with each gyro sample, unit, or None. gyro_density, rad/s/sqrt(Hz): from
-    the covariances of the messages, None if they say nothing. dropped: reason -> messages.
+    the covariances of the messages, None if they say nothing. dropped: reason -> messages. stamp_sigma, s: how well the
+    stamps are known.
     """
 
     epoch_ns: int
@@ -53,6 +54,7 @@ class IndexerData:
     attitude: Array | None = None
     gyro_density: float | None = None
     dropped: dict[str, int] = field(default_factory=dict)
+    stamp_sigma: float = 0.0
 
 
 def read_indexer(recording: Recording, config: Config) -> IndexerData:
@@ -89,6 +91,7 @@ def read_indexer(recording: Recording, config: Config) -> IndexerData:
         attitude,
         density(imu_topic, gyro_t, imu.gyro_cov[keep], LEAST_GYRO, dropped),
         dropped,
+        recording.stamp_sigma_s,
     )
 
 

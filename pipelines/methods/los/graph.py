@@ -107,7 +107,7 @@ def _prepare(
     data: LosData, config: Config, before: _Model | None = None, trunk: Trunk | None = None, start: float = -np.inf
 ) -> tuple[_Model, dict[str, int]]:
     """The model of a recording, or of one that grows from a keyframe of its model until now on."""
-    parameters = LosParameters.of(config, data.force is not None)
+    parameters = LosParameters.of(config, data.force is not None, data.stamp_sigma)
     noises = _noises(data, config) if before is None else before.noises
     gimbal, gyro = GimbalPath(data.gimbal_t, data.gimbal), GyroPath(data.gyro_t, data.gyro)
     covariance = _covariance(data, gimbal, config)

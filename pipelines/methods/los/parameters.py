@@ -15,6 +15,7 @@ from pipelines.graph.assumptions import (
     quantities,
     scale_assumptions,
     sensitivity_assumption,
+    stamped,
 )
 from pipelines.graph.problem import Parameter, Quantity
 from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
@@ -65,12 +66,13 @@ class LosParameters:
     gyro: Parameter | None
 
     @classmethod
-    def of(cls, config: Config, accelerometer: bool) -> LosParameters:
+    def of(cls, config: Config, accelerometer: bool, stamp_sigma: float = 0.0) -> LosParameters:
         """With the priors in force.
 
         Args:
             config: priors, data sheets, accuracies wanted.
             accelerometer: whether the gyro's IMU measures specific force.
+            stamp_sigma: s, how well the stamps are known.
         """
         if config.noise.gyro_scale:
             figure = config.noise.gyro_scale
@@ -98,7 +100,7 @@ class LosParameters:
         return cls(
             angles=Parameter(_key("a"), (*angles, *mounted)),
             bias=Parameter(FIRST_BIAS, calibrated(BIAS, "rad/s", _PRIOR_BIAS)),
-            sight=parameter(_key("S"), SIGHT, config),
+            sight=stamped(parameter(_key("S"), SIGHT, config), OFFSET, stamp_sigma),
             gyro=parameter(_key("G"), (*SCALE, SENSITIVITY) if sensitive else SCALE, config),
         )
 

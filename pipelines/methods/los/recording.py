@@ -41,7 +41,8 @@ class LosData:
     elevation. image_t (K,), error (K, 3) rad: phx, phz and the camera's roll since its target was found, NaN where the
     roll was not measured. error_cov (K, 3, 3) rad^2: the tracker's covariance, None if unknown. gyro_density,
     rad/s/sqrt(Hz): from the covariances of the messages, None if they say nothing. force (N, 3) m/s^2: specific force
-    by the IMU's accelerometer in m, at gyro_t; None if it has none. dropped: reason -> messages.
+    by the IMU's accelerometer in m, at gyro_t; None if it has none. dropped: reason -> messages. stamp_sigma, s: how
+    well the stamps are known.
     """
 
     epoch_ns: int
@@ -55,6 +56,7 @@ class LosData:
     gyro_density: float | None = None
     force: Array | None = None
     dropped: dict[str, int] = field(default_factory=dict)
+    stamp_sigma: float = 0.0
 
 
 def read_los(recording: Recording, config: Config) -> LosData:
@@ -78,7 +80,10 @@ def read_los(recording: Recording, config: Config) -> LosData:
     else:
         image_t, error = _error(recording, error_name, epoch, dropped)
     check_overlap({gyro_name: gyro_t, gimbal_name: gimbal_t, error_name: image_t})
-    data = LosData(epoch, gyro_t, gyro, gimbal_t, gimbal, image_t, error, covariance, density, force, dropped)
+    stamp_sigma = recording.stamp_sigma_s
+    data = LosData(
+        epoch, gyro_t, gyro, gimbal_t, gimbal, image_t, error, covariance, density, force, dropped, stamp_sigma
+    )
     check_gimbal(gimbal_name, data)
     check_signs(gyro_name, data)
     return data
