@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets import tagslam_block
 from factors import so3
 from pipelines.config import load_config
 from pipelines.errors import InputError
@@ -18,6 +17,8 @@ from pipelines.methods.cube.simulation import simulate_cube
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.methods.cube.writing import write_cube
 from pipelines.recording.reading import open_recording
+from tests.command import Command
+from tests.pages import Page
 
 SCENARIO = CubeScenario(
     poses=16,
@@ -89,10 +90,25 @@ def test_one_tag_alone_places_nothing(tmp_path: Path) -> None:
         cube_layout([(recording, load_config(recording.attachment("alidade.yaml")))])
 
 
-@pytest.mark.slow
-def test_tagslams_block(shared_data: Path) -> None:
-    layout, comparison = tagslam_block.compare(tagslam_block.read_block(shared_data / "tagslam_block"))
-    assert len(layout.body.ids) == 10
-    assert comparison.held_out_px < 0.4
-    assert comparison.position_mm < 1.0
-    assert comparison.rotation_deg < 0.3
+def test_the_command_says_what_was_found(alidade: Command, tmp_path: Path) -> None:
+    hidden = SCENARIO.model_copy(update={"cube": TagCube(hidden=(19,))})
+    _session(tmp_path / "5.mcap", 5, hidden)
+    out = tmp_path / "cube.yaml"
+    run = alidade("cube-layout", tmp_path / "5.mcap", tmp_path / "5.mcap", "--out", out, "--refine-camera")
+    assert run.code == 0
+    assert "5 of 6 tags placed" in run.out
+    assert "tag 19 could not be placed: in no picture" in run.out
+    assert "camera 1: fx, px" in run.out
+    page = Page((tmp_path / "cube.html").read_text())
+    assert not page.loaded
+    assert "5 of 6 tags placed" in page.text
+    assert "Tag 19: in no picture." in page.text
+    assert "distortion 1" in page.text
+
+
+def test_the_page_takes_no_name_from_the_config(alidade: Command, tmp_path: Path) -> None:
+    _session(tmp_path / "s.mcap", 5)
+    run = alidade("cube-layout", tmp_path / "s.mcap", "--out", tmp_path / "cube.html")
+    assert run.code == 2
+    assert "call it .yaml" in run.err
+    assert not (tmp_path / "cube.html").exists()

@@ -3,32 +3,66 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipelines.options import ConfigFile, Quiet, RecordingPath
+from pipelines import terminal
+from pipelines.errors import InputError
+from pipelines.options import ConfigFile, Quiet
+
+if TYPE_CHECKING:
+    from pipelines.vision.layout import Layout
 
 
 def cube_layout(
-    session: RecordingPath,
-    out: Annotated[Path, typer.Option(help="The config to write, with where the tags are.")],
+    sessions: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Of one camera or of several.")],
+    out: Annotated[Path, typer.Option(help="The config to write, with where the tags are; its page beside it, .html.")],
     config: ConfigFile = None,
+    refine_camera: Annotated[
+        bool, typer.Option("--refine-camera", help="Adjust focal length, centre and distortion too.")
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """Where the tags are on a cube, from pictures of it on all sides; the config gives their ids and sizes."""
-    from pipelines import progress, terminal
+    from pipelines import progress
     from pipelines.config import recorded_config
     from pipelines.methods.cube.layout import cube_layout as estimate
     from pipelines.methods.cube.layout import layout_yaml
+    from pipelines.methods.cube.layout_page import layout_html
     from pipelines.recording.reading import open_recording
     from pipelines.reports.whole import write_file
 
+    page = out.with_suffix(".html")
+    if page == out:
+        raise InputError(f"{out}: --out names the config, and its page takes the name with .html; call it .yaml")
     with progress.shown(quiet), progress.doing("finding where the tags are"):
-        recording = open_recording(session)
-        layout = estimate([(recording, recorded_config(recording, config))])
+        recordings = [open_recording(session) for session in sessions]
+        layout = estimate([(each, recorded_config(each, config)) for each in recordings], refine_camera)
     write_file(out, layout_yaml(layout))
-    terminal.say(f"Wrote {out}")
+    write_file(page, layout_html(layout, [session.name for session in sessions]))
+    _show(layout)
+    terminal.say(f"Wrote {out} for calibrate --config, and {page}")
+
+
+def _show(layout: Layout) -> None:
+    """A table of the tags, what became of them, and what to do."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    from pipelines.methods.cube.layout_page import COLUMNS, advice, camera_rows, headline, rows
+
+    table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
+    for column in COLUMNS:
+        table.add_column(column, justify="right", no_wrap=True)
+    for row in rows(layout):
+        table.add_row(*row)
+    terminal.console.print(table)
+    terminal.say(headline(layout))
+    for sentence in advice(layout):
+        terminal.say(f"  {sentence}")
+    for camera, name, given, found, sigma in camera_rows(layout):
+        terminal.say(f"  camera {camera}: {name} {found} ± {sigma}, given {given}")
 
 
 def cube_print(
@@ -37,7 +71,6 @@ def cube_print(
     first_id: Annotated[int, typer.Option(help="Tag on the top face; the others follow.")] = 16,
 ) -> None:
     """Sheets with the six faces of a tag cube, true to scale."""
-    from pipelines import terminal
     from pipelines.methods.cube.printing import print_cube
 
     print_cube(out, edge, first_id)

@@ -55,7 +55,7 @@ class Layout:
         frames: number of pictures used.
         seen: of each placed tag, by id.
         unplaced: id -> why it could not be placed, and what to do.
-        cameras: as given, or as adjusted.
+        cameras, given_cameras: as used in the end, and as given.
         camera_sigma: (c, n) of their intrinsics, None if not adjusted.
     """
 
@@ -67,6 +67,7 @@ class Layout:
     seen: Mapping[int, TagSeen]
     unplaced: Mapping[int, str]
     cameras: tuple[Camera, ...]
+    given_cameras: tuple[Camera, ...]
     camera_sigma: Array | None
 
 
@@ -167,5 +168,6 @@ def _layout(views: Gathered, fit: Fit, unplaced: Mapping[int, str]) -> Layout:
         seen=seen,
         unplaced=dict(sorted(unplaced.items())),
         cameras=fit.bundle.cameras,
+        given_cameras=views.start.cameras,
         camera_sigma=known.cameras,
     )
