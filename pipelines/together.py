@@ -27,12 +27,13 @@ from pipelines.errors import InputError
 from pipelines.graph.believing import believing
 from pipelines.graph.problem import ChiSquare, Estimate, Parameter, Problem, Quantity, Step, Told
 from pipelines.judgement import noise_levels
+from pipelines.judgement.changes import changes
 from pipelines.judgement.observability import Assessment, Fit, assess
 from pipelines.methods import Method
 from pipelines.recording.info import SessionFacts
 from pipelines.recording.opening import Where
 from pipelines.recording.reading import open_recording
-from pipelines.reports.over_time import recordings_shown
+from pipelines.reports.over_time import recordings_shown, sentences
 from pipelines.reports.result import Calibration, PartParameter, PartResult
 from pipelines.session import Session
 from pipelines.sharing import DAY_S, walks
@@ -43,6 +44,7 @@ from pipelines.solvers.joint import Joined, join, tell
 _STAYS, _MOST_PASSES = 1e-2, 6
 # So many recordings are named in a sentence.
 _MOST_NAMED = 3
+_ADVICE = "Calibrate those after the last change together, or let what changed walk: `share` in the config."
 _OVERLAP = (
     "recordings overlap in time and count as several all the same; parts of one are named by a folder or a pattern in "
     "quotes"
@@ -247,6 +249,8 @@ def _calibration(problem: Problem, method: Method, alone: Sequence[Alone], joine
         rejected=_counts([each.calibration.estimate.rejected for each in alone]),
         inflation=inflation,
     )
+    parts = [_part(each, joined, i) for i, each in enumerate(alone)]
+    changed = changes(joined, [each.day for each in alone], dict(zip(names, inflation.tolist(), strict=True)))
     decides = not any(noise_levels.asked(each.calibration.estimate.levels) for each in alone)
     ordered = [quantities[name] for name in names]
     assessment = assess(ordered, covariance, estimate.chi_square, problem.advice, decides)
@@ -254,12 +258,13 @@ def _calibration(problem: Problem, method: Method, alone: Sequence[Alone], joine
         method=method,
         problem=problem,
         estimate=estimate,
-        assessment=_judged(assessment, alone, joined, converged),
+        assessment=_judged(assessment, alone, joined, converged, sentences(changed, parts, problem.quantities)),
         recording=_named([each.name for each in alone]),
         sha256=hashlib.sha256(b"".join(bytes.fromhex(each.calibration.sha256) for each in alone)).hexdigest(),
         facts=_facts([each.calibration.facts for each in alone]),
         config=alone[last].calibration.config,
-        recordings=[_part(each, joined, i) for i, each in enumerate(alone)],
+        recordings=parts,
+        changes=changed,
         plots=recordings_shown,
     )
 
@@ -286,15 +291,19 @@ def _inflation(name: str, alone: Sequence[Alone]) -> float:
     return float(np.average([p.inflation**2 for p in found], weights=[p.sigma**-2.0 for p in found]) ** 0.5)
 
 
-def _judged(assessment: Assessment, alone: Sequence[Alone], joined: Joined, converged: bool) -> Assessment:
-    """With what the recordings say beside each other."""
+def _judged(
+    assessment: Assessment, alone: Sequence[Alone], joined: Joined, converged: bool, changed: Sequence[str]
+) -> Assessment:
+    """With what the recordings say beside each other; `changed` are sentences about steps of the device."""
     if not converged:
         return assessment.unsolved("linearised at the joint estimate the recordings lead elsewhere again and again")
     wrong = [each.calibration for each in alone if each.calibration.status == "inconsistent"]
     for each in wrong[:_MOST_NAMED]:
         assessment = assessment.misfit(f"{each.recording} by itself: {each.headline}")
     value, dof = joined.disagreement
-    if dof >= 1 and value > Fit.of(value, dof).high:
+    if changed:
+        assessment = assessment.misfit(f"The device is not the same in all recordings. {' '.join(changed)} {_ADVICE}")
+    elif dof >= 1 and value > Fit.of(value, float(dof)).high:
         assessment = assessment.misfit(
             f"The recordings disagree about the device: chi-square {value:.4g} for {dof} degrees of freedom."
         )

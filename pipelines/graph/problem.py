@@ -299,7 +299,7 @@ class Told:
         d: (r,).
         prior_R: (p, n) these priors.
         prior_d: (p,).
-        scales: (n,) of the numbers' priors, so that angles, rates and seconds can be told beside each other.
+        scales: (n,) the usual priors' sigmas, so that angles, rates and seconds can be told beside each other.
     """
 
     names: tuple[str, ...]

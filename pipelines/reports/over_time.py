@@ -1,36 +1,158 @@
-"""Tables of a joint calibration: the recordings, and what they say by themselves."""
+"""A device over several recordings in words, tables and figures."""
 
 from __future__ import annotations
 
+import datetime
+import math
 from collections.abc import Sequence
+from itertools import cycle
 
-from pipelines.reports.result import Calibration, Plot, Table
+from pipelines.graph.assumptions import kind
+from pipelines.graph.problem import Quantity
+from pipelines.judgement.changes import Change, Changes
+from pipelines.reports.plots import COLORS, figure
+from pipelines.reports.result import Calibration, PartResult, Plot, Table
 from pipelines.reports.units import human_unit, to_digits_of
 
+# Beyond so many days a forecast says nothing.
+_FAR_DAYS = 36_525.0
+_RECORDINGS = ("recording", "start", "length", "by itself")
 
-def recordings_shown(calibration: Calibration) -> Sequence[Plot | Table]:
-    """For the report."""
-    parts = calibration.recordings
-    units = {q.name: human_unit(q) for q in calibration.problem.quantities}
 
-    def shown(value: float, sigma: float, name: str) -> str:
-        unit, factor = units.get(name, ("", 1.0))
-        number = to_digits_of(factor * value, factor * sigma)
-        return f"{number} ± {to_digits_of(factor * sigma, factor * sigma)} {unit.removeprefix('1')}".strip()
-
-    rows = tuple((p.recording, p.start[:16].replace("T", " "), f"{p.duration_s:.0f} s", p.status) for p in parts)
-    own = tuple(
-        (
-            n.name,
-            *(next((shown(m.value, m.sigma, m.name) for m in p.parameters if m.name == n.name), "") for p in parts),
-        )
-        for n in parts[-1].parameters
-    )
-    heads = tuple(p.recording for p in parts)
+def sentences(changes: Changes, parts: Sequence[PartResult], quantities: Sequence[Quantity]) -> list[str]:
+    """What changed, when, and by how much."""
+    known = {q.name: q for q in quantities}
+    said = [
+        f"{_what(step)} by {_shown(step.size, step.sigma, known[step.name])} {_between(step.after, parts)}."
+        for step in sorted(changes.found, key=lambda step: step.after)
+    ]
+    if said:
+        return said
     return [
-        Table("Recordings", "In the order of their dates, each with its verdict by itself.", _RECORDINGS, rows),
-        Table("Of the recordings", "What each recording has of its own, from all of them.", ("parameter", *heads), own),
+        f"All parameters together changed {_between(each.after, parts)}, chi-square {each.chi_square:.4g} for "
+        f"{each.dof} degrees of freedom, none by more than chance for itself."
+        for each in changes.together
+        if each.significant
     ]
 
 
-_RECORDINGS = ("recording", "start", "length", "by itself")
+def forecasts(calibration: Calibration) -> list[tuple[str, str]]:
+    """Kind of parameters -> when it is to be calibrated again, in words."""
+    changes = calibration.changes
+    if changes is None:
+        return []
+    told = []
+    for q in calibration.problem.quantities:
+        rate = changes.rates.get(kind(q.name))
+        found = calibration.parameters.get(q.name)
+        if rate is None or found is None or not q.judged:
+            continue
+        unit, factor = human_unit(q)
+        per_day = f"{factor * rate.rate:.2g} {unit.removeprefix('1')}".strip()
+        at_most = f"{factor * rate.upper:.2g}" if math.isfinite(rate.upper) else "unknown"
+        likely, soonest = (_days(q.require, found.sigma, each) for each in (rate.rate, rate.upper))
+        told.append((q.name, f"walks {per_day} in the root of a day (at most {at_most}); {_when(likely, soonest)}"))
+    return told
+
+
+def _days(require: float, sigma: float, rate: float) -> float:
+    """Until a sigma that grows by a walk is more than required."""
+    return max(require**2 - sigma**2, 0.0) / rate**2 if rate > 0.0 else math.inf
+
+
+def _when(likely: float, soonest: float) -> str:
+    if likely > _FAR_DAYS and soonest > _FAR_DAYS:
+        return "within what is required for longer than anybody asks"
+    first = "for good" if likely > _FAR_DAYS else f"for {likely:.0f} days"
+    surely = "surely" if math.isfinite(soonest) else "perhaps"
+    return f"within what is required {first}, {surely} for {min(soonest, _FAR_DAYS):.0f}"
+
+
+def recordings_shown(calibration: Calibration) -> list[Plot | Table]:
+    """Tables and figures for the report."""
+    parts, known = calibration.recordings, {q.name: q for q in calibration.problem.quantities}
+    rows = tuple((p.recording, p.start[:16].replace("T", " "), f"{p.duration_s:.0f} s", p.status) for p in parts)
+    own = []
+    for name in dict.fromkeys(n.name for p in parts for n in p.parameters if n.name in known):
+        numbers = [next((n for n in p.parameters if n.name == name), None) for p in parts]
+        own.append((name, *("" if n is None else _shown(n.value, n.sigma, known[name]) for n in numbers)))
+    heads = ("parameter", *(p.recording for p in parts))
+    changes = calibration.changes
+    found = [] if changes is None else sorted(changes.found, key=lambda step: step.after)
+    steps = tuple(
+        (_what(s), _between(s.after, parts), _shown(s.size, s.sigma, known[s.name]), f"{s.z:+.1f}") for s in found
+    )
+    tables = [
+        Table("Recordings", "In the order of their dates, each with its verdict by itself.", _RECORDINGS, rows),
+        Table("Of the recordings", "What each recording has of its own, from all of them.", heads, tuple(own)),
+        Table("Changes", _CHANGES, ("what", "when", "step", "sigmas"), steps),
+        Table("Calibration interval", _INTERVAL, ("parameter", "forecast"), tuple(forecasts(calibration))),
+    ]
+    return [*(table for table in tables if table.rows), *_figures(calibration)]
+
+
+_CHANGES = "Steps of the device between recordings that are more than chance, which makes any in one history of twenty."
+_INTERVAL = (
+    "How far the parameters walk, by the likelihood of all recordings, and how long the calibration stays within the "
+    "accuracy wanted if they go on so."
+)
+
+
+def _figures(calibration: Calibration) -> list[Plot]:
+    """What each recording says by itself of a kind of parameters, with the joint estimate as a band."""
+    parts, names = calibration.recordings, [p.name for p in calibration.recordings[-1].alone]
+    known = {q.name: q for q in calibration.problem.quantities if q.judged and q.name in names}
+    plots = []
+    for which in dict.fromkeys(map(kind, known)):
+        own = [q for name, q in known.items() if kind(name) == which]
+        unit, factor = human_unit(own[0])
+        out = figure(f"{which}, {unit.removeprefix('1')}", x_title="date of the recording")
+        for q, color in zip(own, cycle(COLORS), strict=False):
+            _add(out, calibration, q, factor, color)
+        caption = (
+            f"Points: each of the {len(parts)} recordings by itself, less the joint estimate, with two sigmas. Bands: "
+            "two sigmas of the joint estimate; steps that were found are lines."
+        )
+        plots.append(Plot(f"{which} over time", caption, out))
+    return plots
+
+
+def _add(out: object, calibration: Calibration, q: Quantity, factor: float, color: str) -> None:
+    import plotly.graph_objects as go
+
+    assert isinstance(out, go.Figure)
+    parts, joint = calibration.recordings, calibration.parameters[q.name]
+    told = [(p.start, n) for p in parts for n in p.alone if n.name == q.name]
+    out.add_scatter(
+        x=[start for start, _ in told],
+        y=[factor * (n.value - joint.value) for _, n in told],
+        error_y={"type": "data", "array": [2.0 * factor * n.sigma for _, n in told], "thickness": 1},
+        mode="markers",
+        name=q.name,
+        marker={"color": color, "size": 7},
+    )
+    band = 2.0 * factor * joint.sigma
+    out.add_hrect(y0=-band, y1=band, fillcolor=color, opacity=0.12, line_width=0)
+    for step in calibration.changes.found if calibration.changes else ():
+        if step.name == q.name:
+            out.add_vline(x=parts[step.after + 1].start, line={"color": color, "dash": "dash", "width": 1})
+
+
+def _what(step: Change) -> str:
+    """What moved: a turn about an axis, or a number."""
+    which, _, axis = step.name.rpartition("_")
+    return f"{which} about {axis} moved" if which.endswith("mount") and axis in "xyz" else f"{step.name} changed"
+
+
+def _between(after: int, parts: Sequence[PartResult]) -> str:
+    """Two dates in words, or two recordings where these are of one day."""
+    dates = [datetime.datetime.fromisoformat(parts[i].start).date() for i in (after, after + 1)]
+    if dates[0] == dates[1]:
+        return f"between {parts[after].recording} and {parts[after + 1].recording}"
+    return f"between {' and '.join(f'{date.day} {date:%B %Y}' for date in dates)}"
+
+
+def _shown(value: float, sigma: float, quantity: Quantity) -> str:
+    unit, factor = human_unit(quantity)
+    number, spread = (to_digits_of(factor * x, factor * sigma) for x in (value, sigma))
+    return f"{number} ± {spread} {unit.removeprefix('1')}".strip()

@@ -20,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler
 from pipelines.graph.assumptions import determined, pull
 from pipelines.graph.noise import Level, Source
 from pipelines.graph.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
+from pipelines.judgement.changes import Changes
 from pipelines.judgement.observability import Assessment, Fit, Innovations, Learning, Status, Verdict, learning
 from pipelines.judgement.rejection import rejection_sentence
 from pipelines.judgement.self_check import SelfCheck
@@ -87,6 +88,7 @@ class Calibration:
         self_check: an incremental estimate beside batch's; None where it was not made.
         findings: what the method found beside its parameters.
         recordings: of a joint calibration, what each of them has of its own.
+        changes: of a joint calibration, whether the device changed from one to another.
     """
 
     method: Method
@@ -106,6 +108,7 @@ class Calibration:
     self_check: SelfCheck | None = None
     findings: Findings = field(default_factory=dict)
     recordings: Sequence[PartResult] = ()
+    changes: Changes | None = None
 
     @property
     def parameters(self) -> dict[str, ParameterResult]:
@@ -535,6 +538,32 @@ class PartResult(_Record):
     alone: list[PartParameter]
 
 
+class ChangeResult(_Record):
+    """A step of a number, SI, between two recordings; it is `found` where it is more than chance."""
+
+    parameter: str
+    before: str
+    after: str
+    step: float
+    sigma: float
+    found: bool
+
+
+class RateResult(_Record):
+    """How far numbers of a kind walk in the root of a day, SI; `upper` is the 95 % bound, null: there is none."""
+
+    rate: float
+    upper: float | None
+
+
+class ChangesResult(_Record):
+    """Changes of the device between recordings; chance makes any found one in a history with this level."""
+
+    level: float
+    steps: list[ChangeResult]
+    rates: dict[str, RateResult]
+
+
 class Result(_Record):
     """result.json."""
 
@@ -562,6 +591,7 @@ class Result(_Record):
     measurements: list[MeasurementResult] | None
     findings: dict[str, list[dict[str, object]]]
     recordings: list[PartResult] | None = None
+    changes: ChangesResult | None = None
     truth: dict[str, TruthResult] | None = None
 
 
@@ -596,14 +626,15 @@ def result(calibration: Calibration) -> Result:
         measurements=c.measurements,
         findings={name: [dict(row) for row in rows] for name, rows in c.findings.items()},
         recordings=list(c.recordings) or None,
+        changes=_changes(c),
         truth=truth_errors(c) if c.truth is not None else None,
     )
 
 
 def result_json(calibration: Calibration) -> str:
-    """The text of result.json; without truth it has no key `truth`, of one recording none `recordings`."""
+    """The text of result.json; without truth it has no key `truth`, of one recording none of several."""
     model = result(calibration)
-    left_out = {name for name in ("truth", "recordings") if getattr(model, name) is None}
+    left_out = {name for name in ("truth", "recordings", "changes") if getattr(model, name) is None}
     return model.model_dump_json(by_alias=True, indent=1, exclude=left_out) + "\n"
 
 
@@ -643,6 +674,32 @@ def _stability(found: Stability | None) -> StabilityResult | None:
         return None
     change = found.departures if found.changed else {}
     return StabilityResult(statistic=found.statistic, level=found.level, time_s=found.time_s, change=change)
+
+
+def _changes(c: Calibration) -> ChangesResult | None:
+    """Every step as it is with nothing else changed; those found as they are with all found."""
+    if c.changes is None:
+        return None
+    found = {(step.name, step.after): step for step in c.changes.found}
+    steps = []
+    for step in c.changes.steps:
+        told = found.get((step.name, step.after), step)
+        names = [c.recordings[i].recording for i in (step.after, step.after + 1)]
+        steps.append(
+            ChangeResult(
+                parameter=step.name,
+                before=names[0],
+                after=names[1],
+                step=told.size,
+                sigma=told.sigma,
+                found=(step.name, step.after) in found,
+            )
+        )
+    rates = {
+        name: RateResult(rate=rate.rate, upper=rate.upper if math.isfinite(rate.upper) else None)
+        for name, rate in c.changes.rates.items()
+    }
+    return ChangesResult(level=c.changes.level, steps=steps, rates=rates)
 
 
 def _chi_square(assessment: Assessment) -> ChiSquareResult:

@@ -54,7 +54,7 @@ def told(
 
     quantities = problem.quantities
     free = np.flatnonzero([q.prior_sigma != 0.0 for q in quantities])
-    scales = np.array([quantities[i].scale for i in free])
+    scales = np.array([quantities[i].prior_scale for i in free])
     sizes = [p.coordinates(values, key)[1].shape[1] for p, key in zip(problem.parameters, keys, strict=True)]
     inverse = coordinate_inverse(problem.parameters, values, keys)[:, free]
     columns = dict(zip(keys, np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1]), strict=True))
