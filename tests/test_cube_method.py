@@ -170,6 +170,21 @@ def test_wrong_heading_is_absorbed_and_reported() -> None:
     assert max(_sigmas_off(estimate, truth, "mag_k").values()) < 3.0
 
 
+def test_poses_near_iron_are_named() -> None:
+    data, _, config = _simulated(11, poses=14, static_s=2.0, camera=None, reference=None)
+    assert data.mag is not None
+    assert data.mag_t is not None
+    mag = data.mag.copy()
+    spans = static_intervals(data, config)
+    for k, size in ((3, 2e-6), (8, 7e-7)):
+        mag[(data.mag_t > spans[k, 0] - 0.5) & (data.mag_t < spans[k, 1] + 0.5), 1] += size
+    _, estimate, _ = _solved(replace(data, mag=mag), config)
+    rows = findings(replace(data, mag=mag), config, estimate)["disturbed_poses"]
+    assert [row["pose"] for row in rows] == [4, 9]
+    # By K, which is within some per cent of the identity.
+    assert [row["size"] for row in rows] == pytest.approx([2e-6, 7e-7], rel=0.15)
+
+
 @pytest.mark.slow
 def test_poses_near_iron_are_left_out() -> None:
     data, truth, config = _simulated(11, magnetometer=Magnetometer(disturbed=0.1))

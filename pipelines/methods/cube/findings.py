@@ -6,12 +6,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from factors import so3
 from pipelines.graph.problem import Array, Estimate, Findings
 from pipelines.methods.cube.compensation import calibrated
-from pipelines.methods.cube.data import CubeData, noise_densities, nominal
+from pipelines.methods.cube.data import CubeData, local_field, noise_densities, nominal
 from pipelines.methods.cube.noises import noises
 from pipelines.methods.cube.poses import StaticPoses, static_poses
 from pipelines.methods.cube.topics import CubeConfig
+from pipelines.methods.place import FIELD
 from pipelines.methods.triads import TRIADS, parts_row, parts_with_sigmas, triad_names
 from pipelines.recording.topics import IMU, MAG
 from pipelines.settings import Config
@@ -22,7 +24,7 @@ _UNITS = {"accel": "m/s^2/sqrt(Hz)", "gyro": "rad/s/sqrt(Hz)", "mag": "T/sqrt(Hz
 
 
 def findings(data: CubeData, config: Config, estimate: Estimate) -> Findings:
-    """Rows of `triads`, `noise` and `static_poses`, SI, for the triads that the estimate knows.
+    """Rows of `triads`, `noise`, `static_poses` and `disturbed_poses`, SI, for the triads that the estimate knows.
 
     triads: scale of each axis against the nominal one; nonorthogonality, rad, of x and y, x and z, y and z, positive
     where they are closer than a right angle; mounting, rad, the rotation vector that turns the body's axes into the
@@ -30,6 +32,8 @@ def findings(data: CubeData, config: Config, estimate: Estimate) -> Findings:
     noise: white noise density of each axis with K applied, measured over the static poses, beside the one that the
     solution took; walk of the bias per sqrt(s), stated or an upper bound.
     static_poses: beginning and end, s, the direction of up in the body, and the kinds of measurement that were used.
+    disturbed_poses: those whose magnetometer was left out: number, beginning and end, s, and by what vector, T in n,
+    and how much the field was off there.
     """
     values = dict(zip(estimate.names, estimate.values.tolist(), strict=True))
     poses = static_poses(data, config)
@@ -38,6 +42,7 @@ def findings(data: CubeData, config: Config, estimate: Estimate) -> Findings:
         "triads": [row for name in known if (row := _triad(name, config, estimate)) is not None],
         "noise": [_noise(name, data, config, poses, values) for name in known],
         "static_poses": _poses(poses, config, estimate, values),
+        "disturbed_poses": _disturbed(data, poses, config, estimate, values),
     }
 
 
@@ -48,6 +53,32 @@ def _triad(name: str, config: Config, estimate: Estimate) -> dict[str, object] |
     K, covariance = estimate.values[rows].reshape(3, 3) / unit, estimate.covariance[np.ix_(rows, rows)] / unit**2
     parts = parts_with_sigmas(K, covariance)
     return None if parts is None else parts_row(name, *parts)
+
+
+def _disturbed(
+    data: CubeData, poses: StaticPoses, config: Config, estimate: Estimate, values: Mapping[str, float]
+) -> list[dict[str, object]]:
+    """The poses near iron, or in reach of a current: their magnetometer was rejected."""
+    residuals, attitudes = estimate.residuals.get("magnetometer"), estimate.attitudes
+    if residuals is None or attitudes is None or poses.mag is None or "mag_k11" not in values:
+        return []
+    middle = poses.span.mean(axis=1)
+    field = np.array([values[name] for name in FIELD.names]) if FIELD.names[0] in values else local_field(data, config)
+    rows = []
+    for time in residuals.time[~residuals.used]:
+        k = int(np.argmin(np.abs(middle - time)))
+        nRb = attitudes.wxyz[int(np.argmin(np.abs(attitudes.time - time)))]
+        off = so3.rotate(nRb, calibrated("mag", poses.mag[k : k + 1], config, values)[0]) - field
+        rows.append(
+            {
+                "pose": k + 1,
+                "start_s": float(poses.span[k, 0]),
+                "end_s": float(poses.span[k, 1]),
+                "off": off.tolist(),
+                "size": float(np.linalg.norm(off)),
+            }
+        )
+    return rows
 
 
 def _noise(

@@ -24,7 +24,7 @@ _UNKNOWN = 20.0
 
 def cube_tables(calibration: Calibration) -> list[Table]:
     """Of what was found beside the parameters; empty ones are left out."""
-    tables = (_taken_apart(calibration), _noise(calibration), _static_poses(calibration))
+    tables = (_taken_apart(calibration), _noise(calibration), _static_poses(calibration), _disturbed(calibration))
     return [table for table in tables if table.rows]
 
 
@@ -70,6 +70,19 @@ def _noise(calibration: Calibration) -> Table:
         "With K applied, from the Allan deviation over a quarter of a second in the static poses; stated is what "
         "the solution took it to be.",
         ("sensor", "x", "y", "z", "stated", "unit", "rate, Hz"),
+        tuple(rows),
+    )
+
+
+def _disturbed(calibration: Calibration) -> Table:
+    rows = [
+        (str(row["pose"]), f"{row['start_s']:.2f}", f"{row['end_s']:.2f}", f"{1e6 * row['size']:.2g}")
+        for row in rows_of(calibration, "disturbed_poses")
+    ]
+    return Table(
+        "Poses with another field",
+        "Their magnetometer was left out: the field there is off by more than noise, as near iron or a current.",
+        ("pose", "from, s", "to, s", "off by, µT"),
         tuple(rows),
     )
 
