@@ -4,13 +4,15 @@
     plan.now.assessment.status, [step.change for step in plan.steps]
 
 The motion is simulated with the noise that its scenario states and goes through the method's own graph; the joint
-covariance there depends on motion and noise levels, and next to nothing on the noise drawn.
+covariance there depends on motion and noise levels, and next to nothing on the noise drawn. Where the motion itself, or
+sensors far from nominal, are drawn, several draws are predicted, and what is promised is the largest sigma of each
+parameter.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,14 +20,14 @@ import numpy as np
 from pipelines import methods, progress
 from pipelines.errors import InputError
 from pipelines.graph.problem import Quantity
-from pipelines.judgement.observability import Assessment, assess
+from pipelines.judgement.observability import Advice, Assessment, assess
 from pipelines.methods import Method, Scenario
 
 _MOST_STEPS = 3
 # A change that brings less information than this on what is missing, nats, is not worth the trouble.
 _LEAST_GAIN = 0.1
-# Of all simulations.
-_SEED = 0
+# Simulations of a scenario whose motion is drawn; of others there is one.
+_DRAWS = 5
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,9 @@ class Prediction:
         duration: of the recording, s.
         quantities: what is estimated.
         assessment: its sigmas and verdicts are the predicted ones.
-        budget: parameter -> source -> its share of the variance.
+        budget: parameter -> source -> its share of the variance, of the worst draw.
+        worst: the seed of the draw that falls shortest of what is required.
+        advice: of the graph, for weak directions.
     """
 
     scenario: Scenario
@@ -45,6 +49,8 @@ class Prediction:
     quantities: tuple[Quantity, ...]
     assessment: Assessment
     budget: Mapping[str, Mapping[str, float]]
+    worst: int = 0
+    advice: Advice | None = None
 
     @property
     def sigmas(self) -> dict[str, float]:
@@ -128,19 +134,48 @@ def make_plan(
         step = max(found, key=lambda each: each.gain)
         if step.gain < _LEAST_GAIN:
             break
-        steps.append(step)
-        best = step.prediction
+        best = predict(method_name, step.prediction.scenario, config_file, wanted)
+        steps.append(replace(step, prediction=best))
     return Plan(method_name, now, tuple(steps))
 
 
-def predict(method_name: str, scenario: Scenario, config_file: Path | None, require: Mapping[str, float]) -> Prediction:
-    """The sigmas that a recording of this motion would end with. Raises InputError when it would be unusable."""
+def predict(
+    method_name: str,
+    scenario: Scenario,
+    config_file: Path | None,
+    require: Mapping[str, float],
+    seeds: Sequence[int] | None = None,
+) -> Prediction:
+    """The sigmas that a recording of this motion would end with, the largest of some draws of what is drawn in it.
+
+    Args:
+        method_name, config_file, require: as in `make_plan`.
+        scenario: the motion.
+        seeds: of the draws; None: as many as the method's scenarios need.
+
+    Raises:
+        InputError: the recording would be unusable.
+    """
+    drawn = range(_DRAWS if methods.method(method_name).drawn else 1) if seeds is None else seeds
+    each = [_predicted(method_name, scenario, config_file, require, seed) for seed in drawn]
+    worst = max(each, key=lambda prediction: max(prediction.missing.values(), default=0.0))
+    largest = np.max([prediction.assessment.sigmas for prediction in each], axis=0)
+    own = worst.assessment.sigmas
+    grown = np.divide(largest, own, out=np.ones_like(own), where=own > 0.0)
+    covariance = worst.assessment.covariance * np.outer(grown, grown)
+    return replace(worst, assessment=assess(worst.quantities, covariance, None, worst.advice))
+
+
+def _predicted(
+    method_name: str, scenario: Scenario, config_file: Path | None, require: Mapping[str, float], seed: int
+) -> Prediction:
+    """Of one draw."""
     from pipelines.session import Session
     from pipelines.solvers.batch import solve_batch
     from pipelines.solvers.marginals import IndeterminateError
 
     method = methods.method(method_name)
-    session = Session.of(method, method.simulate(method.scenario.model_validate(scenario), _SEED), config_file)
+    session = Session.of(method, method.simulate(method.scenario.model_validate(scenario), seed), config_file)
     # The noise asked about is that of the config; the recording is only simulated.
     config = session.config.model_copy(update={"require": {**session.config.require, **require}, "noise_known": 0.0})
     problem = method.graph(session.data, config)
@@ -149,7 +184,9 @@ def predict(method_name: str, scenario: Scenario, config_file: Path | None, requ
     except IndeterminateError as error:
         raise InputError(f"scenario: {error}") from error
     assessment = assess(problem.quantities, estimate.covariance, None, problem.advice)
-    return Prediction(scenario, session.facts.duration_s, problem.quantities, assessment, estimate.budget or {})
+    return Prediction(
+        scenario, session.facts.duration_s, problem.quantities, assessment, estimate.budget or {}, seed, problem.advice
+    )
 
 
 def requirements(given: Sequence[str]) -> dict[str, float]:
@@ -191,13 +228,15 @@ def scenario_yaml(scenario: Scenario) -> str:
 def _candidates(
     method: Method, before: Prediction, config_file: Path | None, require: Mapping[str, float]
 ) -> Iterator[Step]:
-    """Each possible change with what it would bring; those that cannot be recorded are left out."""
+    """Each possible change with what it would bring to the worst draw; those that cannot be recorded are left out."""
+    seeds = (before.worst,)
+    now = predict(method.name, before.scenario, config_file, require, seeds)
     for change, scenario in method.candidates(before.scenario):
         try:
-            after = predict(method.name, scenario, config_file, require)
+            after = predict(method.name, scenario, config_file, require, seeds)
         except InputError:
             continue
-        yield Step(change, _gain(before, after), after)
+        yield Step(change, _gain(now, after), after)
 
 
 def _gain(before: Prediction, after: Prediction) -> float:

@@ -160,3 +160,17 @@ def test_requirements_are_read_and_checked() -> None:
         make_plan("los", require={"deltapx": 1.0})
     with pytest.raises(InputError, match="no method 'gimbal'"):
         make_plan("gimbal")
+
+
+def test_a_drawn_motion_is_promised_no_more_than_other_draws_keep() -> None:
+    """Random attitudes of one draw determine the accelerometer half as well again as those of another."""
+    scenario = CubeScenario(poses=8, static_s=1.5, camera=None, reference=None, imu_rate_hz=50.0)
+    gains = [f"{sensor}_k{i}{j}" for sensor in ("accel", "gyro") for i in "123" for j in "123"]
+    promised = predict("cube", scenario.model_dump(), None, {}).sigmas
+    single = [predict("cube", scenario.model_dump(), None, {}, (seed,)).sigmas for seed in (0, 11, 12, 13)]
+
+    def ratios(others: list[dict[str, float]], said: dict[str, float]) -> list[float]:
+        return [other[name] / said[name] for other in others for name in gains if said[name] > 0.0]
+
+    assert max(ratios(single[1:], promised)) < 1.3
+    assert max(ratios(single[1:], single[0])) > 1.3

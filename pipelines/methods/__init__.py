@@ -56,6 +56,8 @@ class Method(ABC):
         of_recording: patterns of the parameters that belong to a recording; the others are the device's.
         rotations: parameters that are rotation vectors, without their _x, _y, _z -> the rotation each is.
         scenarios: folder with scenarios that come with the method, if it brings its own.
+        drawn: whether its simulator draws motions, or sensors far from nominal, from the seed, so that one recording of
+            a scenario determines more than another.
         yields: whether it is chosen by itself only where no other method is served: it makes do with what others read
             too.
     """
@@ -69,6 +71,7 @@ class Method(ABC):
     of_recording: ClassVar[tuple[str, ...]] = ()
     rotations: ClassVar[Mapping[str, str]] = {}
     scenarios: ClassVar[Path | None] = None
+    drawn: ClassVar[bool] = False
     yields: ClassVar[bool] = False
 
     # -- from a recording to estimates

@@ -33,6 +33,7 @@ class Cube(Method):
     needs = NEEDS
     section = CubeConfig
     sheets = ("gyro", "accel", "reference", "field")
+    drawn = True
     of_recording = ("gyro_b?", "accel_b?", "field_?", "reference_*")
     rotations: ClassVar[Mapping[str, str]] = {"camera_mount": "correction of BRC"}
 

@@ -32,6 +32,7 @@ class Tumble(Method):
     needs = NEEDS
     sheets = ("field",)
     of_recording = ("accel_b?", "gravity", "field_*")
+    drawn = True
     yields = True
 
     @property
