@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from factors import so3
-from factors.model import ROT3, Array, Model, Residuals
+from factors.model import ROT3, Array, Block, Model, Residuals
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class TagAttitudeFactor(Model):
     seen at (Px, Py) / Pz. All tags seen in one pose share nRb and p, so they settle the attitude together. Blocks: nRb
     (rotations), p (3; origin of b in C, m), nRB (rotations), said (3, rad about East, North and Up: correction of what
     the reference says as nRB), correction of BRC (rotations, on the right), correction D of bRt (rotations, on the
-    right).
+    right) and, where places are not known exactly, correction of the tag's position (3, m, in b).
 
     Attributes:
         time: (n,) s; a measurement is one tag seen in one pose.
@@ -32,6 +32,7 @@ class TagAttitudeFactor(Model):
         bRt: (n, 4) attitude of the tag in b as the layout has it.
         position: (n, 3) of the tag in b, m.
         BRC: (4,) camera mount as given.
+        placed: whether positions have corrections.
     """
 
     time: Array
@@ -41,17 +42,25 @@ class TagAttitudeFactor(Model):
     bRt: Array
     position: Array
     BRC: Array
+    placed: bool = False
     rows: int = 8
-    blocks = (ROT3, 3, ROT3, 3, ROT3, ROT3)
 
-    def __call__(self, nRb: Array, p: Array, nRB: Array, said: Array, mount: Array, tag: Array) -> Residuals:
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """Body, its place, reference, what it says, mount, tag and, with `placed`, the tag's position."""
+        return (ROT3, 3, ROT3, 3, ROT3, ROT3, 3) if self.placed else (ROT3, 3, ROT3, 3, ROT3, ROT3)
+
+    def __call__(
+        self, nRb: Array, p: Array, nRB: Array, said: Array, mount: Array, tag: Array, *moved: Array
+    ) -> Residuals:
         """Residual sqrt_information (predicted - measured), (n, 8)."""
         n = len(self.time)
         BRC = so3.multiply(self.BRC, mount)
         nRC = so3.compose(so3.exp(said), nRB, BRC)
         cRb = so3.multiply(so3.inverse(nRC), nRb)
         bRt = so3.multiply(self.bRt, tag)
-        in_body = self.position[:, None] + so3.rotate(bRt[:, None], self.corners)
+        position = self.position + moved[0] if moved else self.position
+        in_body = position[:, None] + so3.rotate(bRt[:, None], self.corners)
         turned = so3.rotate(cRb[:, None], in_body)
         P = turned + p[:, None]
         # A corner behind the camera cannot be seen: a residual that no step may leave there.
@@ -73,6 +82,7 @@ class TagAttitudeFactor(Model):
                 camera @ (so3.matrix(so3.inverse(nRC)) @ so3.right_jacobian(-said))[:, None],
                 camera,
                 -body @ so3.matrix(bRt)[:, None] @ so3.hat(self.corners),
+                *([body] if moved else []),
             )
             return tuple(block.reshape(n, 8, -1) for block in blocks)
 

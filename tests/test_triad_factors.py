@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -181,6 +183,12 @@ def test_tag_jacobians(angle: float) -> None:
     blocks = _tag_blocks(angle)
     assert_jacobians(_tags(np.arange(N), None), blocks)
     assert_rows_are_independent(lambda rows: _tags(rows, None), blocks)
+
+
+@pytest.mark.parametrize("angle", [1.0, 1e-7])
+def test_jacobians_of_tags_that_may_be_elsewhere(angle: float) -> None:
+    blocks, model = _tag_blocks(angle), replace(_tags(np.arange(N), None), placed=True)
+    assert_jacobians(model, [*blocks, 1e-2 * _rng(8).normal(size=(N, 3))])
 
 
 def test_tags_are_met_at_the_truth_and_missed_beside_it() -> None:

@@ -20,6 +20,7 @@ import numpy as np
 
 from factors import so3
 from factors.turns import Turn
+from pipelines.graph.believing import believing
 from pipelines.graph.problem import Attitudes, Factor, Problem, Step
 from pipelines.methods.cube.advice import advice
 from pipelines.methods.cube.data import CubeData
@@ -34,6 +35,7 @@ from pipelines.methods.cube.measurements import (
 from pipelines.methods.cube.model import Model, prepare
 from pipelines.methods.cube.noises import noises
 from pipelines.methods.cube.parameters import SENSITIVITY_KEY, TRIAD_KEYS, first_priors
+from pipelines.methods.cube.tag_places import layout_belief
 from pipelines.methods.cube.wandering import deviation_key
 from pipelines.settings import Config
 
@@ -53,8 +55,8 @@ def problem(data: CubeData, config: Config) -> Problem:
         InputError: there is no static pose, the position is unknown, the date is outside the field model, or no tag of
             the cube is seen well though there is a camera.
     """
-    model = prepare(data, config)
-    return Problem(
+    model, layout = prepare(data, config), layout_belief(config)
+    graph = Problem(
         method="cube",
         parameters=model.parameters.all,
         steps=partial(_steps, model),
@@ -66,6 +68,7 @@ def problem(data: CubeData, config: Config) -> Problem:
         premises=(_NO_FIELD,) if model.poses.mag is not None and model.field is None else (),
         noises=tuple(noises(data, config).values()),
     )
+    return graph if layout is None or data.camera is None else believing(graph, [layout])
 
 
 def _steps(model: Model, _: int) -> Iterator[Step]:

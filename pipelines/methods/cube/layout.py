@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from pipelines.vision.tags import Detections
 
 
+# A row of the covariance stands on a line of its own.
+_WIDE = 10_000
 # Many pictures of one pose tell little more than a few; each is a pose to be found.
 _MOST_PICTURES = 800
 
@@ -88,7 +90,9 @@ def layout_yaml(layout: Layout) -> str:
     text = StringIO()
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style = None
-    yaml.dump({"cube": {"tag_family": body.family, "tags": tags}}, text)
+    cube: dict[str, object] = {"tag_family": body.family, "tags": tags, "covariance": _covariance(layout)}
+    yaml.width = _WIDE
+    yaml.dump({"cube": cube}, text)
     sigmas = np.sqrt(np.diag(layout.covariance)).reshape(-1, 6)
     lines = [f"# From {layout.frames} pictures; corners good to {layout.rms_px:.3f} px RMS. Sigmas:"]
     lines.append(f"# tag {body.ids[0]}: defines the body frame")
@@ -98,3 +102,9 @@ def layout_yaml(layout: Layout) -> str:
     ]
     lines += [f"# tag {i} could not be placed: {why}" for i, why in layout.unplaced.items()]
     return "\n".join([*lines, text.getvalue()])
+
+
+def _covariance(layout: Layout) -> dict[str, object]:
+    """As the config's cube.covariance has it."""
+    rows = [" ".join(f"{x:.7g}" for x in row[: i + 1]) for i, row in enumerate(layout.covariance.tolist())]
+    return {"tags": [int(i) for i in layout.body.ids[1:]], "rows": rows}

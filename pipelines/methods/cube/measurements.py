@@ -21,6 +21,7 @@ from pipelines.methods.cube.parameters import (
     tag_key,
 )
 from pipelines.methods.cube.poses import SeenTags
+from pipelines.methods.cube.tag_places import tag_place_key
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.methods.cube.wandering import deviation_key
 
@@ -84,6 +85,7 @@ def tag_factor(model: Model, k: int, seen: SeenTags) -> Factor:
         bRt=body.bRt[rows],
         position=body.position[rows],
         BRC=model.reference.BRC,
+        placed=bool(model.parameters.places),
     )
     reference = reference_key(k if model.reference.moves else 0)
     measurement = tags.on(
@@ -93,6 +95,7 @@ def tag_factor(model: Model, k: int, seen: SeenTags) -> Factor:
         SAID_KEY,
         MOUNT_KEY,
         [tag_key(int(i)) for i in seen.ids],
+        *([[tag_place_key(int(i)) for i in seen.ids]] if tags.placed else []),
         loss=model.loss,
     )
     return Factor.of("tags", measurement)

@@ -17,6 +17,7 @@ from pipelines.graph.assumptions import Assumption, quantities, sensitivity_assu
 from pipelines.graph.linear import linear_factor
 from pipelines.graph.priors import prior_sigmas, rotation_prior, vector_prior
 from pipelines.graph.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
+from pipelines.methods.cube.tag_places import tag_place_names, tag_places
 from pipelines.methods.cube.topics import CubeConfig, RawConversion
 from pipelines.methods.place import FIELD, STRENGTH_SIGMA
 from pipelines.methods.triads import TRIADS, triad_names
@@ -56,6 +57,7 @@ class Parameters:
         triads: name -> parameter, reported for the raw numbers as recorded.
         priors: name -> (12,) sigmas of rows of K and of b in nominal units; 0 fixed, inf free.
         rotations: mount and tags, corrections about the identity; none without a camera.
+        places: corrections of the tags' positions; none where these are exact.
         said: correction of what the reference says, tilt about East and North and heading; None without a camera.
         field: the earth's field in n about the model, None without a magnetometer.
         field_model: (3,) T.
@@ -66,6 +68,7 @@ class Parameters:
     triads: Mapping[str, Parameter]
     priors: Mapping[str, Array]
     rotations: tuple[Parameter, ...]
+    places: tuple[Parameter, ...]
     said: Parameter | None
     field: Parameter | None
     field_model: Array | None
@@ -75,13 +78,21 @@ class Parameters:
     @property
     def all(self) -> tuple[Parameter, ...]:
         """In reporting order."""
-        rest = [*self.rotations[:1], self.said, *self.rotations[1:], self.field, self.sensitivity, self.curvature]
+        rest = [
+            *self.rotations[:1],
+            self.said,
+            *self.rotations[1:],
+            *self.places,
+            self.field,
+            self.sensitivity,
+            self.curvature,
+        ]
         return (*self.triads.values(), *(p for p in rest if p is not None))
 
     @property
     def zeros(self) -> tuple[Parameter, ...]:
         """Vectors with priors about zero."""
-        return tuple(p for p in (self.said, self.sensitivity, self.curvature) if p is not None)
+        return tuple(p for p in (self.said, *self.places, self.sensitivity, self.curvature) if p is not None)
 
     def initial(self, gyro_bias: Array) -> gtsam.Values:
         """First values: nominal sensors but for the gyro's offset (3,), mounts as given, the model's field."""
@@ -183,6 +194,7 @@ def cube_parameters(config: Config, camera: bool, reference: bool, field: Array 
         triads=triads,
         priors=priors,
         rotations=tuple(rotations),
+        places=tag_places(config) if camera else (),
         said=said,
         field=field_parameter,
         field_model=field,
@@ -195,6 +207,7 @@ def _check_names(config: Config, tags: Sequence[int]) -> None:
     """Raise InputError for priors or requirements of unknown parameters, whatever the recording holds."""
     known = [entry for name in TRIADS for entry in triad_names(name)]
     known += [f"{name}_{axis}" for name in ("camera_mount", *(f"tag_{tag}" for tag in tags)) for axis in "xyz"]
+    known += tag_place_names(config)
     known += ["reference_heading", *(name for each in (*ASSUMPTIONS, FIELD) for name in each.names)]
     check_names(config.priors, known, "priors")
     check_names(config.require, known, "require")

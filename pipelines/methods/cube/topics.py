@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import datetime
-from typing import ClassVar
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import model_validator
 
 from pipelines.recording import messages
 from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, MAG, Need, Setting, Topic
@@ -11,6 +15,9 @@ from pipelines.settings import Board, Config, Date, MethodSection, Quaternion, S
 
 REFERENCE_FIX = Topic("reference_fix", "/reference/fix", (messages.NAV_SAT_FIX,))
 REFERENCE_IMU = Topic("reference_imu", "/reference/imu", (messages.IMU,))
+# Of a covariance in decimal digits, the negative share that is rounding.
+_ROUNDING = 1e-5
+
 TAG_DETECTIONS = Topic("tag_detections", "/tag_detections", (messages.TAG_DETECTIONS,))
 
 
@@ -29,14 +36,47 @@ class Raw(Section):
     mag: RawConversion | None = None
 
 
+class LayoutCovariance(Section):
+    """What cube-layout knows of its tags: the covariance of rotation (rad) and position (m) of each, six numbers a tag.
+
+    tags: ids in order; rows: the lower triangle, each row its numbers with blanks between them.
+    """
+
+    tags: list[int]
+    rows: list[str]
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        if len(self.rows) != 6 * len(self.tags):
+            raise ValueError(f"{len(self.tags)} tags need {6 * len(self.tags)} rows, there are {len(self.rows)}")
+        if np.linalg.eigvalsh(self.matrix).min(initial=0.0) < -_ROUNDING * np.diag(self.matrix).max(initial=0.0):
+            raise ValueError("rows are no covariance: a combination of the numbers has a negative variance")
+        return self
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """(6 n, 6 n)."""
+        out = np.zeros((len(self.rows), len(self.rows)))
+        for i, row in enumerate(self.rows):
+            try:
+                numbers = [float(number) for number in row.split()]
+            except ValueError as error:
+                raise ValueError(f"row {i + 1} holds something that is no number: {row[:40]!r}") from error
+            if len(numbers) != i + 1:
+                raise ValueError(f"row {i + 1} of a lower triangle has {i + 1} numbers, not {len(numbers)}")
+            out[i, : i + 1] = out[: i + 1, i] = numbers
+        return out
+
+
 class CubeConfig(Board, MethodSection):
-    """The cube: its tags, the camera on the reference (BRC: w, x, y, z), counts, the date for the field model."""
+    """The cube: its tags and how well they are known, the camera on the reference (BRC: w, x, y, z), counts, date."""
 
     key: ClassVar[str] = "cube"
 
     camera_rotation: Quaternion | None = None
     raw: Raw = Raw()
     date: Date | None = None
+    covariance: LayoutCovariance | None = None
 
 
 def field_date(config: Config) -> datetime.date | None:
