@@ -139,6 +139,20 @@ def coloured(seed: int, tau: float) -> tuple[Problem, Array]:
     return problem, np.array([truth[q.name] for q in problem.quantities])
 
 
+def coloured_tracker(seed: int, tau: float) -> tuple[Problem, Array]:
+    """A los recording whose LOS errors err by a Gauss-Markov process, its sigma stated; and the truth."""
+    sigma = 2e-5
+    simulated = simulate("los", {"sensors": "ideal", "noise": {"los_error": 1e-12}}, seed=seed)
+    config = load_config(simulated.config.encode())
+    config = config.model_copy(update={"noise": config.noise.model_copy(update={"los_error": sigma})})
+    keep = np.exp(-1.0 / (50.0 * tau))
+    white = np.random.default_rng([seed, 7]).standard_normal((len(simulated.data.image_t) + 400, 2))
+    error = simulated.data.error.copy()
+    error[:, :2] += sigma * np.sqrt(1.0 - keep**2) * lfilter([1.0], [1.0, -keep], white, axis=0)[400:]
+    problem = methods.method("los").problem(replace(simulated.data, error=error, error_cov=None), config)
+    return problem, np.array([simulated.truth[q.name] for q in problem.quantities])
+
+
 def in_sigmas(problem: Problem, truth: Array, solve: Callable[[Problem], Estimate]) -> tuple[Array, Array]:
     """Errors and inflations of what is estimated."""
     estimate = solve(problem)
@@ -168,23 +182,63 @@ def test_sigmas_survive_coloured_noise(tau: float) -> None:
     assert 0.85 < np.sqrt((errors**2).mean()) < 1.15
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("tau", [0.03, 0.1, 0.5])
+def test_sigmas_survive_a_coloured_tracker(tau: float) -> None:
+    errors = np.concatenate([in_sigmas(*coloured_tracker(seed, tau), solve_batch)[0] for seed in range(40)])
+    assert 0.85 < np.sqrt((errors**2).mean()) < 1.15
+
+
 # Noise of sensors that nobody states: navigation, tactical and consumer grade.
-GRADES: dict[str, dict[str, Any]] = {
-    "navigation": {"gyro_density": 2e-6, "gyro_bias_walk": 1e-8, "vision_attitude": 1e-3},
-    "tactical": {"gyro_density": 3e-5, "gyro_bias_walk": 1e-6, "vision_attitude": 5e-3},
-    "consumer": {"gyro_density": 3e-4, "gyro_bias_walk": 1e-6, "vision_attitude": 3e-2},
-}
+GRADES: dict[str, dict[str, dict[str, float]]] = {
+    "head": {
+        "navigation": {"gyro_density": 2e-6, "gyro_bias_walk": 1e-8, "vision_attitude": 1e-3},
+        "tactical": {"gyro_density": 3e-5, "gyro_bias_walk": 1e-6, "vision_attitude": 5e-3},
+        "consumer": {"gyro_density": 3e-4, "gyro_bias_walk": 1e-6, "vision_attitude": 3e-2},
+    },
+    "los": {
+        "navigation": {"gyro_density": 2e-6, "gyro_bias_walk": 1e-8, "encoder": 2e-6, "los_error": 5e-6},
+        "tactical": {"gyro_density": 3e-5, "gyro_bias_walk": 2e-7, "encoder": 5e-6, "los_error": 2e-5},
+        "consumer": {"gyro_density": 3e-4, "gyro_bias_walk": 1e-6, "encoder": 5e-5, "los_error": 1e-4},
+    },
+    "indexer": {
+        "navigation": {"gyro_density": 5.8e-7, "gyro_bias_walk": 0.0, "encoder": 1e-6},
+        "tactical": {"gyro_density": 3e-5, "gyro_bias_walk": 2e-7, "encoder": 5e-6},
+        "consumer": {"gyro_density": 3e-4, "gyro_bias_walk": 1e-6, "encoder": 5e-5},
+    },
+    "cube": {
+        "navigation": {
+            "gyro_density": 2e-6, "gyro_bias_walk": 1e-8, "accel_density": 2e-4, "mag_density": 5e-9, "corner_px": 0.05
+        },
+        "tactical": {
+            "gyro_density": 3e-5, "gyro_bias_walk": 1e-6, "accel_density": 1e-3, "mag_density": 2e-8, "corner_px": 0.2
+        },
+        "consumer": {
+            "gyro_density": 3e-4, "gyro_bias_walk": 5e-6, "accel_density": 3e-3, "mag_density": 2e-7, "corner_px": 0.5
+        },
+    },
+}  # fmt: skip
+# Such a gyro's scale is as good as its noise is.
+NAVIGATION = {"los": {"gyro": {"scale": 3e-4, "skew": 3e-4}}}
 
 
-def unstated(grade: str, seeds: Sequence[int]) -> float:
-    """NEES per number of head recordings without a word about noise."""
+def silent(data: Any) -> Any:
+    """The data without a word about noise."""
+    said = ("vision_cov", "error_cov", "gyro_density", "platform_gyro_density", "accel_density", "mag_density")
+    data = replace(data, **{name: None for name in said if hasattr(data, name)})
+    seen = getattr(data, "sightings", None)
+    return data if seen is None else replace(data, sightings=replace(seen, covariance=None))
+
+
+def unstated(method: str, grade: str, seeds: Sequence[int]) -> float:
+    """NEES per number of recordings whose noise nobody states."""
+    sensors = NAVIGATION.get(method, {}) if grade == "navigation" else {}
+    scenario = {**CASES[method][0], "sensors": sensors, "noise": GRADES[method][grade]}
     nees = []
     for seed in seeds:
-        scenario = {"duration_s": 30.0, "sensors": {}, "noise": GRADES[grade]}
-        simulated = simulate("head", scenario, seed=seed)
-        silent = replace(simulated.data, vision_cov=None, gyro_density=None, platform_gyro_density=None)
+        simulated = simulate(method, scenario, seed=seed)
         config = load_config(simulated.config.encode()).model_copy(update={"noise": NoiseSettings()})
-        problem = methods.method("head").problem(silent, config)
+        problem = methods.method(method).problem(silent(simulated.data), config)
         estimate = solve_batch(problem)
         error = estimate.values - np.array([simulated.truth[q.name] for q in problem.quantities])
         free = estimate.sigmas > 0.0
@@ -193,13 +247,15 @@ def unstated(grade: str, seeds: Sequence[int]) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("grade", GRADES)
-def test_nothing_stated_and_honest(grade: str) -> None:
-    assert 0.8 < unstated(grade, range(50)) < 1.25
+@pytest.mark.parametrize("grade", GRADES["head"])
+@pytest.mark.parametrize("method", GRADES)
+def test_nothing_stated_and_honest(method: str, grade: str) -> None:
+    assert 0.8 < unstated(method, grade, range(50)) < 1.25
 
 
-def test_nothing_stated_and_honest_on_a_few() -> None:
-    assert 0.6 < unstated("consumer", range(4)) < 1.6
+@pytest.mark.parametrize(("method", "grade"), [("head", "consumer"), ("indexer", "navigation")])
+def test_nothing_stated_and_honest_on_a_few(method: str, grade: str) -> None:
+    assert 0.6 < unstated(method, grade, range(4)) < 1.6
 
 
 def test_white_noise_of_a_sensor_in_motion() -> None:

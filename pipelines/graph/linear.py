@@ -32,3 +32,17 @@ def linear_factor(
     jacobian: Any = gtsam.JacobianFactor  # its stubs cannot be called with as many blocks as there are
     linear = jacobian(*terms, np.zeros(rows), gtsam.noiseModel.Unit.Create(rows))
     return gtsam.LinearContainerFactor(linear, values)
+
+
+def rescaled(factor: gtsam.LinearContainerFactor, scale: float) -> gtsam.LinearContainerFactor:
+    """A factor of linear_factor, between variables of one size, with the sigma of its rows times `scale`."""
+    keys = list(factor.keys())
+    size = factor.toJacobian().getA().shape[1] // len(keys)
+    zero = gtsam.Values()
+    for key in keys:
+        zero.insert(key, np.zeros(size))
+    linear: Any = factor.linearize(zero)
+    A, b = linear.getA() / scale, linear.getb() / scale
+    terms = [part for i, key in enumerate(keys) for part in (key, A[:, size * i : size * (i + 1)])]
+    jacobian: Any = gtsam.JacobianFactor
+    return gtsam.LinearContainerFactor(jacobian(*terms, b, gtsam.noiseModel.Unit.Create(len(b))), zero)

@@ -31,6 +31,8 @@ _FEWEST, _TRUSTED = 200, 0.05
 _STEP, _FEWEST_MEANS, _SURE = 0.25, 12, 4.0
 # How well repeatability is known, in the logarithm, where nobody states it.
 _HARDLY = 2.0
+# A walk that nobody states is no smaller than this, over the default.
+_SMALLEST_WALK = 1e-3
 # A process is not made smaller than this without its residuals being asked.
 _MUCH_SMALLER = 0.8
 
@@ -126,6 +128,17 @@ def walked(noise: Noise, time: Array, means: Array, force: Array) -> Level:
     bend = float(2.0 * fit[best] - fit[best - 1] - fit[best + 1]) / _STEP**2
     ratio, spread = float(tried[best]) / noise.stated, max(bend, 1e-6) ** -0.5
     return _weighed(Level(noise, 1.0, ratio, ratio * spread))
+
+
+def walking(config: Config) -> Level:
+    """The level of a bias's random walk whose steps are processes of the graph: as stated, or smaller.
+
+    A default is that of no particular sensor, and a better one's residuals say how far below it is.
+    """
+    noise = stated("gyro_bias_walk", config)
+    if noise.source != _DEFAULT or noise.known == 0.0:
+        return Level(noise)
+    return Level(replace(noise, families=("bias walk", "definition")), least=_SMALLEST_WALK)
 
 
 def _likelihood(means: Array, follows: Array, covariance: Array) -> float:

@@ -17,7 +17,7 @@ _SPAN = 0.5
 _SHORTEST = 0.5
 # The scatter over the span is below the first many times the noise somewhere in an interval, and below the second all
 # through it: a hand's tremor does not end a rest.
-_QUIET, _STILL = 2.0, 6.0
+_QUIET, _STILL = 3.0, 6.0
 # A motion starts slower than the test can see: this much, s, is cut off at both ends.
 _MARGIN = 0.25
 # The noise is what the quietest twentieth of the recording shows, between these multiples of the stated one.

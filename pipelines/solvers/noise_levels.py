@@ -21,6 +21,7 @@ import gtsam
 import numpy as np
 
 from factors.vectorized import VectorizedFactor
+from pipelines.graph.linear import rescaled
 from pipelines.graph.noise import Level, Noise
 from pipelines.graph.problem import Array, Factor
 from pipelines.graph.robust import robust_sigma
@@ -74,6 +75,8 @@ def _at_level(factor: Factor, level: Level) -> Factor:
             weights[:, _rows(level.noise, weights.shape[1])] /= level.scale
         weighed, of = vectorized.weighed(weights), Factor.process_of if factor.measurement is None else Factor.of
         return of(factor.family, weighed, factor.beside)
+    if isinstance(factor.factor, gtsam.LinearContainerFactor):
+        return Factor(factor.family, rescaled(factor.factor, level.scale))
     native = cast(gtsam.NoiseModelFactor, factor.factor)
     stated = cast(gtsam.noiseModel.Gaussian, native.noiseModel())
     noise = gtsam.noiseModel.Gaussian.Information(stated.information() / level.scale**2)

@@ -28,7 +28,7 @@ from pipelines.graph.priors import rotation_prior, vector_prior
 from pipelines.graph.problem import Array, Attitudes, Factor, Problem, Step
 from pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, HeadParameters
 from pipelines.methods.head.recording import HeadData
-from pipelines.methods.noise import sampled, stated, typical
+from pipelines.methods.noise import sampled, stated, typical, walking
 from pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 # Pictures share a keyframe within this time, s, and keyframes are never farther apart than this, s: increments are
@@ -95,7 +95,7 @@ def _noises(data: HeadData, config: Config) -> dict[str, Level]:
     found = [
         Level(stated("vision_attitude", config, typical(data.vision_cov, 0, 1, 2), (_FAMILY,))),
         sampled(stated("gyro_density", config, data.gyro_density, ("gyro",)), data.head_t, data.head_gyro),
-        Level(stated("gyro_bias_walk", config)),
+        walking(config),
     ]
     if data.platform_t is not None and data.platform_gyro is not None:
         platform = stated("platform_gyro_density", config, data.platform_gyro_density)

@@ -41,7 +41,7 @@ from pipelines.methods.indexer.parameters import (
 )
 from pipelines.methods.indexer.recording import IndexerData
 from pipelines.methods.indexer.runs import AxisMotion, axis_motion, cut_turns, encoder_scatter
-from pipelines.methods.noise import sampled, stated
+from pipelines.methods.noise import sampled, stated, walking
 from pipelines.recording.topics import FIX
 from pipelines.settings import Config
 
@@ -52,6 +52,8 @@ _KEPT = 64
 _SLOW = 2.0
 # Encoder errors below this, rad, are beneath notice.
 _NO_ERROR = 1e-8
+# How well the scatter at rest tells their noise, in the logarithm.
+_SCATTERED = 0.05
 
 
 @dataclass(frozen=True)
@@ -109,20 +111,29 @@ def _mean_rates(groups: Sequence[Group], gyro: Level, encoders: Level) -> tuple[
         windows = [np.diff(g.rates.edges) for g in groups if g.kind == kind]
         if windows:
             window = float(np.median(np.concatenate(windows)))
-            sigma = float(np.hypot(gyro.used / window**0.5, 2.0**0.5 * encoders.used / window))
-            found.append(Level(Noise(f"{kind}_rate", sigma, source, known, (kind,), least=1.0)))
+            white = gyro.used / window**0.5
+            sigma = float(np.hypot(white, 2.0**0.5 * encoders.used / window))
+            found.append(Level(Noise(f"{kind}_rate", sigma, source, known, (kind,), least=white / sigma)))
     return tuple(found)
+
+
+def _encoders(noise: Noise, scatter: float) -> Level:
+    """The level of the encoders' noise: as stated, else what they show at rest, if they show any (rad)."""
+    if noise.source != "default" or noise.known == 0.0 or scatter <= _NO_ERROR:
+        return Level(noise)
+    ratio = scatter / noise.stated
+    return Level(noise, ratio, ratio, _SCATTERED * ratio)
 
 
 def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]:
     parameters = indexer_parameters(config, data.stamp_sigma)
     motion = axis_motion(data)
+    scatter = encoder_scatter(motion)
     gyro, encoders = (
         sampled(stated("gyro_density", config, data.gyro_density), data.gyro_t, data.gyro),
-        Level(stated("encoder", config)),
+        _encoders(stated("encoder", config), scatter),
     )
     density, encoder = gyro.used, encoders.used
-    scatter = encoder_scatter(motion)
     slow = float(np.sqrt(encoder**2 - scatter**2)) if encoder > max(_SLOW * scatter, _NO_ERROR) else 0.0
     groups = groups_of(data, config, motion, split=slow == 0.0)
     if not any(g.kind != "dwell" for g in groups):
@@ -137,7 +148,7 @@ def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]
     groups, disagreeing = agreeing(groups, parameters, density, encoder)
     theta_guess, bias_guess = guess(groups)
     starts = np.array([g.rates.edges[0] for g in groups])
-    walks = Level(stated("gyro_bias_walk", config))
+    walks = walking(config)
     walk = walks.used
     rows = frames(data, motion)
     reasons = {

@@ -30,7 +30,7 @@ from pipelines.methods.los.guess import camera, foreseen, guess, initial_attitud
 from pipelines.methods.los.parameters import BIAS, OFFSET, SPLIT, LosParameters
 from pipelines.methods.los.pictures import select_pictures
 from pipelines.methods.los.recording import LosData
-from pipelines.methods.noise import sampled, stated, typical
+from pipelines.methods.noise import sampled, stated, typical, walking
 from pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 # Sigmas, rad, of a chain's first attitude about t's axes: wide where pictures tell. Its turn about the line of sight is
@@ -90,7 +90,7 @@ def _noises(data: LosData, config: Config) -> dict[str, Level]:
     if np.isfinite(data.error[:, 2]).any():
         found.append(Level(stated("los_roll", config, roll, _FAMILIES[1:], (2,))))
     found.append(sampled(stated("gyro_density", config, data.gyro_density, ("gyro",)), data.gyro_t, data.gyro))
-    found.extend(Level(stated(name, config)) for name in ("gyro_bias_walk", "encoder"))
+    found += [walking(config), Level(stated("encoder", config))]
     return {level.noise.name: level for level in found}
 
 
