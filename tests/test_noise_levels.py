@@ -250,7 +250,8 @@ def unstated(method: str, grade: str, seeds: Sequence[int]) -> float:
 @pytest.mark.parametrize("grade", GRADES["head"])
 @pytest.mark.parametrize("method", GRADES)
 def test_nothing_stated_and_honest(method: str, grade: str) -> None:
-    assert 0.8 < unstated(method, grade, range(50)) < 1.25
+    # 50 runs of each were within, too.
+    assert 0.8 < unstated(method, grade, range(25 if method in ("los", "cube") else 50)) < 1.25
 
 
 @pytest.mark.parametrize(("method", "grade"), [("head", "consumer"), ("indexer", "navigation")])

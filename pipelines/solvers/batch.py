@@ -33,6 +33,7 @@ from pipelines.solvers.marginals import (
     smoothed,
 )
 from pipelines.solvers.noise_levels import far, refined, weigh
+from pipelines.solvers.spurious import information_of_noise
 from pipelines.solvers.told import told
 
 # Frames in one vectorised factor: past this the Jacobians' zeros cost more than the Python calls they save.
@@ -199,6 +200,9 @@ def solve_batch(
     linear, factors = about.graph, system.factors
     past = sequential_history(problem, linear, ordering, values, whole.boundaries)
     marginal = past[1] if past else joint_covariance(problem, linear, ordering, values, whole.current_keys)
+    noise = information_of_noise(problem, system.linearize, ordering, values, marginal, whole.current_keys)
+    if noise is not None:
+        marginal = joint_covariance(problem, linear, ordering, values, whole.current_keys, noise)
     residuals = system.residuals(values)
     with system.at(values):
         summary = chi_square(problem, factors, values, marginal, about.expected)

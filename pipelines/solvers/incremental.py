@@ -27,6 +27,7 @@ from pipelines.solvers.marginals import IndeterminateError, reported, reported_c
 from pipelines.solvers.noise_levels import weigh
 from pipelines.solvers.rows import Rows
 from pipelines.solvers.smoother import Smoother, linearized, unweighed, used_part
+from pipelines.solvers.spurious import information_of_noise
 from pipelines.solvers.state import State, explained, require_known, require_sound
 
 DEFAULT_WINDOW = 1.0
@@ -121,6 +122,7 @@ class Run:
         self._solved: _Solved | None = None  # the last batch solution while young
         self._looked = 0.0  # from so many s on it is to be seen again whether the past may be folded
         self._trouble = ""
+        self._noise: Array | None = None  # information of a young run that is its states' noise
 
     @classmethod
     def resumed(cls, problem: Problem, window: float, base: State, scales: Mapping[str, float]) -> Run:
@@ -188,7 +190,7 @@ class Run:
             raise IndeterminateError(f"the parameters' covariance at {self.time:.3f} s is singular: {error}") from error
         if not np.isfinite(information).all():
             raise IndeterminateError(f"the parameters' covariance at {self.time:.3f} s is not finite")
-        return reported_covariance(self.problem.parameters, information, self._estimate(), self.keys)
+        return reported_covariance(self.problem.parameters, information, self._estimate(), self.keys, self._noise)
 
     def chi_square(self) -> ChiSquare:
         """The sum of the squared innovations of the measurements used."""
@@ -307,6 +309,12 @@ class Run:
             foldable = self.window is None or since >= _OLDEST
             self._young = not (foldable or is_linear(self.problem, solution, self.keys))
         self._restart(solution, whole.timestamps)
+        self._noise = None
+        if self._young:
+            system, current = solution.system, self.current_keys
+            self._noise = information_of_noise(
+                self.problem, system.linearize, system.ordering, values, self.covariance(), current
+            )
         if from_start:
             self.attitudes.clear()
         self._record(whole.keyframes if from_start else last, values)
@@ -364,7 +372,7 @@ class Run:
 
     def _continue_from(self, state: State) -> None:
         """Go on from a state alone."""
-        self.base, self.past = state, []
+        self.base, self.past, self._noise = state, [], None
         self._start([state.factor], state.estimate, state.stamps)
 
     def _start(self, factors: Sequence[Factor], values: gtsam.Values, stamps: Mapping[int, float]) -> None:

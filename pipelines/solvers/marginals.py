@@ -43,13 +43,25 @@ def joint_covariance(
     ordering: gtsam.Ordering,
     values: gtsam.Values,
     current_keys: Mapping[int, int],
+    noise: Array | None = None,
 ) -> Array:
     """Covariance (n, n) of the reported numbers, everything else marginalised out; works for singular systems.
+
+    `noise` is information that counts for nothing, see pipelines.solvers.spurious.
 
     Raises:
         IndeterminateError: another variable is undetermined.
     """
     keys = [current_keys.get(p.key, p.key) for p in problem.parameters]
+    return reported_covariance(problem.parameters, joint_information(linear, ordering, keys), values, keys, noise)
+
+
+def joint_information(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, keys: Sequence[int]) -> Array:
+    """Information (d, d) of some variables, in their order, everything else marginalised out.
+
+    Raises:
+        IndeterminateError: another variable is undetermined.
+    """
     rest = [ordering.at(i) for i in range(ordering.size()) if ordering.at(i) not in set(keys)]
     remaining = linear
     if rest:
@@ -57,8 +69,7 @@ def joint_covariance(
             remaining = linear.eliminatePartialMultifrontal(ordering_of(rest), gtsam.EliminateQR)[1]
         except RuntimeError as error:
             raise IndeterminateError(explain(str(error))) from None
-    information = remaining.hessian(ordering_of(keys))[0]
-    return reported_covariance(problem.parameters, information, values, keys)
+    return np.asarray(remaining.hessian(ordering_of(keys))[0])
 
 
 def smoothed(
@@ -107,16 +118,24 @@ def _sigmas_of(
 
 
 def reported_covariance(
-    parameters: Sequence[Parameter], information: Array, values: gtsam.Values, keys: Sequence[int]
+    parameters: Sequence[Parameter],
+    information: Array,
+    values: gtsam.Values,
+    keys: Sequence[int],
+    noise: Array | None = None,
 ) -> Array:
-    """Covariance of the reported numbers from the information matrix of the variables' tangents, in this order."""
+    """Covariance of the reported numbers from the information matrix of the variables' tangents, in this order.
+
+    `noise` is as joint_covariance has it.
+    """
     quantities = [q for p in parameters for q in p.quantities]
     # Fixed numbers are left out: their huge information would cost the others their digits.
     free = np.flatnonzero([q.prior_sigma != 0.0 for q in quantities])
     scale, extra = np.array([(q.prior_scale, q.extra_sigma) for q in quantities])[free].T
     # Information in units of the prior scales, so that one threshold serves angles, rates and seconds.
     unit = coordinate_inverse(parameters, values, keys)[:, free] * scale
-    eigenvalues, vectors = np.linalg.eigh(unit.T @ information @ unit)
+    own = unit.T @ information @ unit
+    eigenvalues, vectors = np.linalg.eigh(own if noise is None else own - noise)
     variance = 1.0 / np.maximum(eigenvalues, _UNKNOWN**-2)
     covariance = np.zeros((len(quantities), len(quantities)))
     covariance[np.ix_(free, free)] = (vectors * variance) @ vectors.T * np.outer(scale, scale) + np.diag(extra**2)

@@ -1,0 +1,106 @@
+"""Information that a linearised graph has only because it is linearised at noisy states.
+
+About the only axis of a motion a mount cannot be told: turned about it, all measurements stay the same. But the states
+at which the graph is linearised are off by their noise, their axis of motion wavers, and by the wavering the mount
+seems to be known a little. Each state adds to that, so that minutes of motion would pass for a calibration.
+
+How much of the information is of this kind other linearisations tell, at states as far from the estimated ones as these
+are from the true ones, drawn from their covariance: it is quadratic in what the states are off by, so that the noise of
+a draw adds what the noise of the estimate has added already (a bootstrap of the bias, Efron, Tibshirani, "An
+Introduction to the Bootstrap", 1993, chapter 10).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import gtsam
+import numpy as np
+
+from pipelines.graph.problem import Array, Problem
+from pipelines.solvers.marginals import IndeterminateError, coordinate_inverse, eliminated, joint_information
+
+# Directions in which sigma is beyond this share of the prior are looked at; in others noise adds next to nothing.
+_WEAK = 0.3
+# ... and so are only those of which the recording says at least this much, in units of the prior's information.
+_TOLD = 0.01
+_DRAWS = 3
+
+
+def information_of_noise(
+    problem: Problem,
+    linearize: Callable[[gtsam.Values], gtsam.GaussianFactorGraph],
+    ordering: gtsam.Ordering,
+    values: gtsam.Values,
+    covariance: Array,
+    current_keys: Mapping[int, int],
+) -> Array | None:
+    """Information about the reported numbers that is the states' noise; None: there is none.
+
+    (m, m) of those that are free, in units of their prior scales.
+
+    Args:
+        problem: the graph's.
+        linearize: the graph about some values.
+        ordering: of its elimination, the parameters' variables last.
+        values: the solution.
+        covariance: (n, n) of the reported numbers as the linearised graph has it.
+        current_keys: parameter key -> variable that holds its value.
+    """
+    keys = [current_keys.get(p.key, p.key) for p in problem.parameters]
+    doubtful = _doubtful(problem, keys, covariance)
+    if not doubtful:
+        return None
+    linear = linearize(values)
+    try:
+        moved = _moved(eliminated(linear, ordering), values, doubtful)
+        own, *drawn = (joint_information(graph, ordering, keys) for graph in (linear, *map(linearize, moved)))
+    except (RuntimeError, IndeterminateError):
+        return None
+    noise = np.mean(drawn, axis=0) - own
+    free = [i for i, q in enumerate(problem.quantities) if q.prior_sigma != 0.0]
+    scale = np.array([problem.quantities[i].prior_scale for i in free])
+    unit = coordinate_inverse(problem.parameters, values, keys)[:, free] * scale
+    own, noise = unit.T @ own @ unit, unit.T @ noise @ unit
+    priors = [problem.quantities[i].prior_sigma for i in free]
+    told = own - np.diag([(s / sigma) ** 2 if sigma else 0.0 for s, sigma in zip(scale, priors, strict=True)])
+    eigenvalues, vectors = np.linalg.eigh(own)
+    weak = vectors[:, eigenvalues < _WEAK**-2.0]
+    return np.asarray(weak @ _part(weak.T @ told @ weak, weak.T @ noise @ weak) @ weak.T)
+
+
+def _doubtful(problem: Problem, keys: Sequence[int], covariance: Array) -> list[int]:
+    """Variables of what is calibrated of which the recording tells a direction, but little of it."""
+    found, start = [], 0
+    for parameter, key in zip(problem.parameters, keys, strict=True):
+        of = [start + i for i, q in enumerate(parameter.quantities) if q.prior_sigma != 0.0 and not q.assumed]
+        start += len(parameter.quantities)
+        scale = np.array([problem.quantities[i].scale for i in of])
+        widest = np.linalg.eigvalsh(covariance[np.ix_(of, of)] / np.outer(scale, scale))
+        if ((widest > _WEAK**2) & (widest < 1.0 / (1.0 + _TOLD))).any():
+            found.append(key)
+    return found
+
+
+def _moved(bayes_net: gtsam.GaussianBayesNet, values: gtsam.Values, but: Sequence[int]) -> list[gtsam.Values]:
+    """Values drawn from their covariance about the estimate but for what some variables add to it."""
+    generator = np.random.default_rng(0)
+    zero = gtsam.VectorValues.Zero(bayes_net.optimize())
+    found = []
+    for _ in range(_DRAWS):
+        drawn = gtsam.VectorValues()
+        for key in values.keys():
+            size = len(zero.at(key))
+            drawn.insert(key, np.zeros(size) if key in but else generator.standard_normal(size))
+        found.append(values.retract(bayes_net.backSubstitute(drawn)))
+    return found
+
+
+def _part(told: Array, noise: Array) -> Array:
+    """What of the information (m, m) that a recording tells is noise: none at least, all of it at most."""
+    eigenvalues, vectors = np.linalg.eigh(0.5 * (told + told.T))
+    root = vectors * np.sqrt(np.maximum(eigenvalues, 1e-12))
+    inverse = np.linalg.inv(root)
+    shares, directions = np.linalg.eigh(inverse @ (0.5 * (noise + noise.T)) @ inverse.T)
+    part = root @ directions
+    return np.asarray((part * np.clip(shares, 0.0, 1.0)) @ part.T)
