@@ -218,7 +218,7 @@ def follow(
 @app.command()
 def validate(
     session: RecordingPath,
-    calibration: Annotated[Path, typer.Option(help="The calibration.yaml to try on the recording.")],
+    calibration: Annotated[Path, typer.Option(help="The calibration.yaml or result.json to try on the recording.")],
     method: _MethodName = None,
     config: ConfigFile = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the page; default: SESSION-validation.")] = None,
@@ -226,7 +226,10 @@ def validate(
     as_json: _Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Errors of a recording before and after compensation with a calibration made on another one."""
+    """Whether a calibration made on another recording still holds, and errors before and after compensation with it.
+
+    Exit code 0 it holds, 2 unusable input, 3 the recording cannot say, 4 it does not hold.
+    """
     from pipelines import progress, terminal
     from pipelines.reports.plain_json import validation_json
     from pipelines.validate import table, write_validation
@@ -237,12 +240,13 @@ def validate(
         written = write_validation(out or _beside(session, "validation"), validated)
     if as_json:
         print(validation_json(validated))
-        return
-    for line in table(validated):
-        terminal.say(line)
-    for note in validated.notes:
-        terminal.say(f"  note: {note}")
-    terminal.say(f"Plots in {written}")
+    else:
+        for line in table(validated):
+            terminal.say(line)
+        for note in validated.notes:
+            terminal.say(f"  note: {note}")
+        terminal.say(f"Plots in {written}")
+    raise typer.Exit(exit_codes.OF_VALIDATION[validated.verdict])
 
 
 @app.command()

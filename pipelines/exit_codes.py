@@ -16,3 +16,5 @@ OF_STATUS = {
     "weak": UNDETERMINED,
     "inconsistent": INCONSISTENT,
 }
+
+OF_VALIDATION = {"holds": CALIBRATED, "same": CALIBRATED, "unknown": UNDETERMINED, "changed": INCONSISTENT}

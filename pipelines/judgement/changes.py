@@ -13,7 +13,8 @@ the recordings is white they are then independent, and the rate is that of the l
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -82,6 +83,7 @@ class Changes:
 
     Attributes:
         level: how often chance alone makes any step.
+        limit: from so many sigmas on the first step of a number is more than chance.
         found: the steps that are more than chance, in the order in which they were found.
         steps: every number's step after every recording, with nothing else changed.
         together: steps of all numbers at once.
@@ -89,6 +91,7 @@ class Changes:
     """
 
     level: float
+    limit: float = math.inf
     found: tuple[Change, ...] = ()
     steps: tuple[Change, ...] = ()
     together: tuple[Together, ...] = ()
@@ -100,18 +103,22 @@ class Changes:
         return bool(self.found) or any(each.significant for each in self.together)
 
 
-def changes(joined: Joined, days: Sequence[float], inflations: Mapping[str, float]) -> Changes:
+def changes(
+    joined: Joined, days: Sequence[float], inflations: Mapping[str, float], asked: Collection[str] | None = None
+) -> Changes:
     """Of the device's numbers that are taken for the same in all recordings.
 
     Args:
         joined: the recordings, in the order of their dates.
         days: of these.
         inflations: by what sigmas of the numbers are larger because noise is coloured; 1 where not given.
+        asked: the numbers whose steps are looked for; None: all.
     """
     if len(joined.parts) < 2:
         return Changes(LEVEL)
     A, b = (np.concatenate(each) for each in zip(*joined.rows, strict=True))
     steady = [(name, k) for k, (name, recording) in enumerate(joined.unknowns) if recording is None]
+    steady = [(name, k) for name, k in steady if asked is None or name in asked]
     questions = [(name, k, after) for after in range(len(joined.parts) - 1) for name, k in steady]
     columns = _columns(joined, questions)
     left, residual = _without(A * joined.scales, columns, b)
@@ -121,10 +128,11 @@ def changes(joined: Joined, days: Sequence[float], inflations: Mapping[str, floa
         return Changes(LEVEL)
     columns, left = columns[:, told], left[:, told]
     grown = np.array([inflations.get(name, 1.0) for name, _, _ in questions])
-    steps = _steps(questions, left, residual, grown)
+    steps, limit = _steps(questions, left, residual, grown), _limit(left)
     return Changes(
         LEVEL,
-        tuple(_found(A * joined.scales, b, columns, questions, grown)),
+        limit,
+        tuple(_found(A * joined.scales, b, columns, questions, grown, limit)),
         tuple(steps),
         tuple(_together(left, residual, questions, grown)),
         _rates(left, residual, questions, days, grown),
@@ -157,18 +165,17 @@ def _steps(questions: Sequence[tuple[str, int, int]], left: Array, residual: Arr
     ]
 
 
-def _found(A: Array, b: Array, columns: Array, questions: Sequence[tuple[str, int, int]], grown: Array) -> list[Change]:
+def _found(
+    A: Array, b: Array, columns: Array, questions: Sequence[tuple[str, int, int]], grown: Array, limit: float
+) -> list[Change]:
     """One step after the other, each with those before it in the system."""
     taken: list[int] = []
-    limit = np.inf
     while len(taken) < _MOST_STEPS:
         left, residual = _without(np.hstack([A, columns[:, taken]]), columns, b)
         open_ = np.flatnonzero((left**2).sum(axis=0) > _ROUNDING * (columns**2).sum(axis=0)).tolist()
         if not open_:
             break
         some = _steps([questions[i] for i in open_], left[:, open_], residual, grown[open_])
-        if not taken:
-            limit = _limit(left[:, open_])
         best = int(np.argmax([abs(step.z) for step in some]))
         if abs(some[best].z) < limit:
             break

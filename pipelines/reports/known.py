@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pipelines.belief import Belief, independent
 from pipelines.errors import InputError
 from pipelines.judgement.observability import Status
-from pipelines.reports.calibration import load_calibration
+from pipelines.reports.calibration import SavedCalibration, SavedParameter, SavedRecording, load_calibration
 
 # A covariance is symmetric, and none of its eigenvalues negative, to this share.
 _ROUNDING = 1e-6
@@ -38,6 +38,36 @@ class Known:
     sha256: str
     start_ns: int
     belief: Belief
+
+
+def with_covariance(known: Known, path: Path) -> Known:
+    """The same from the result.json beside a calibration.yaml, where it is of the same calibration."""
+    beside = path.with_name("result.json")
+    if path == beside or not beside.is_file():
+        return known
+    try:
+        joint = load_known(beside)
+    except InputError:
+        return known
+    same = (joint.sha256, joint.solver, joint.belief.names) == (known.sha256, known.solver, known.belief.names)
+    return joint if same else known
+
+
+def saved_of(known: Known, path: Path) -> SavedCalibration:
+    """As calibration.yaml has it. Raises InputError when that is a file that cannot be used."""
+    if path.suffix != ".json":
+        return load_calibration(path)
+    parameters = {
+        name: SavedParameter(value=value, sigma=sigma, unit="", verdict=None)
+        for name, value, sigma in zip(
+            known.belief.names, known.belief.mean.tolist(), known.belief.sigmas.tolist(), strict=True
+        )
+    }
+    start = datetime.datetime.fromtimestamp(known.start_ns // 1_000_000_000, datetime.UTC).isoformat()
+    recording = SavedRecording(file=path.name, sha256=known.sha256, start=start)
+    return SavedCalibration(
+        method=known.method, solver=known.solver, status=known.status, recording=recording, parameters=parameters
+    )
 
 
 class _Record(BaseModel):

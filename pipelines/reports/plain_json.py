@@ -23,16 +23,25 @@ def plain_json(kind: str, content: Mapping[str, Any]) -> str:
 
 
 def validation_json(validated: Validated) -> str:
-    """Of `validate`: RMS and peak of every kind of error, before and after."""
+    """Of `validate`: the verdict, what changed, and RMS and peak of every kind of error, before and after."""
+    others = {"device": {v.name: v for v in validated.device}, "expected": {v.name: v for v in validated.best}}
+    found = validated.held.changes.found if validated.held else ()
     return plain_json(
         "validation",
         {
             "recording": validated.recording,
             "method": validated.calibration.method,
+            "verdict": validated.verdict,
+            "headline": validated.sentence,
+            "parameters": [
+                {"name": s.name, "change": s.size, "sigma": s.sigma, "changed": s in found}
+                for s in (validated.held.steps if validated.held else ())
+            ],
             "validations": [
                 {"name": v.name, "unit": v.unit}
                 | {
                     size.__name__: {"before": size(v.before), "after": size(v.after)}  # both of lengths of errors
+                    | {what: size(each[v.name].after) for what, each in others.items() if v.name in each}
                     for size in (rms, peak)
                 }
                 for v in validated.validations

@@ -16,33 +16,61 @@ from pipelines.reports.templating import environment
 _FINE = 2e-4
 
 
-def validation_rows(validations: Sequence[Validation]) -> list[tuple[str, str, str, str, str, str]]:
-    """For each: its name, RMS before and after, peak before and after, and the unit of the four."""
+def validation_rows(
+    validations: Sequence[Validation], device: Sequence[Validation] = (), best: Sequence[Validation] = ()
+) -> list[tuple[str, str, str, str, str, str, str, str]]:
+    """For each: its name, RMS before, after, of the device, expected; peak before, after; the unit of the six.
+
+    Args:
+        validations: with the calibration.
+        device: with the calibration's device and the recording's own bias; none where that is not known.
+        best: with the recording's own calibration, which tells what is to be expected; likewise.
+    """
+    others = [{v.name: rms(v.after) for v in each} for each in (device, best)]
     rows = []
     for v in validations:
         unit, factor = _readable(v)
-        sizes = (factor * size(errors) for size in (rms, peak) for errors in (v.before, v.after))
-        numbers = [np.format_float_positional(size, precision=3, fractional=False, trim="-") for size in sizes]
-        rows.append((v.name, numbers[0], numbers[1], numbers[2], numbers[3], unit))
+        sizes = (rms(v.before), rms(v.after), *(each.get(v.name) for each in others), peak(v.before), peak(v.after))
+        a, b, c, d, e, f = ("" if size is None else _three(factor * size) for size in sizes)
+        rows.append((v.name, a, b, c, d, e, f, unit))
     return rows
 
 
-def validation_html(validations: Sequence[Validation], calibration: SavedCalibration, recording: str) -> str:
+def _three(number: float) -> str:
+    """To three digits."""
+    return np.format_float_positional(number, precision=3, fractional=False, trim="-")
+
+
+def validation_html(
+    rows: Sequence[Sequence[str]],
+    validations: Sequence[Validation],
+    calibration: SavedCalibration,
+    recording: str,
+    verdict: str,
+    sentence: str,
+    parameters: Sequence[tuple[str, str, str, str, str]],
+) -> str:
     """The page as one HTML text.
 
     Args:
+        rows: of errors, see `validation_rows`.
         validations: what the method says.
         calibration: the one validated.
         recording: name of the file it was validated on.
+        verdict: holds, changed or unknown.
+        sentence: that in words.
+        parameters: name, change, sigma, from what on it would be noticed, unit.
     """
-
     return (
         environment("pipelines.reports")
         .get_template("validation.html")
         .render(
             c=calibration,
             recording=recording,
-            rows=validation_rows(validations),
+            verdict=verdict,
+            sentence=sentence,
+            parameters=parameters,
+            rows=rows,
             plots=[(v.name, v.note, _plot(v, first=i == 0)) for i, v in enumerate(validations)],
         )
     )
