@@ -22,7 +22,8 @@ class TagAttitudeFactor(Model):
     seen at (Px, Py) / Pz. All tags seen in one pose share nRb and p, so they settle the attitude together. Blocks: nRb
     (rotations), p (3; origin of b in C, m), nRB (rotations), said (3, rad about East, North and Up: correction of what
     the reference says as nRB), correction of BRC (rotations, on the right), correction D of bRt (rotations, on the
-    right) and, where places are not known exactly, correction of the tag's position (3, m, in b).
+    right), where places are not known exactly correction of the tag's position (3, m, in b), and of a camera whose
+    intrinsics may be off by how much (3: share of the focal length, centre in px).
 
     Attributes:
         time: (n,) s; a measurement is one tag seen in one pose.
@@ -33,6 +34,8 @@ class TagAttitudeFactor(Model):
         position: (n, 3) of the tag in b, m.
         BRC: (4,) camera mount as given.
         placed: whether positions have corrections.
+        by_lens: (n, 4, 2, 3) derivatives of `measured` by the intrinsics, which enter linearly: half a per cent of
+            focal length is off by 3e-5 of that; None: the intrinsics are exact.
     """
 
     time: Array
@@ -43,15 +46,17 @@ class TagAttitudeFactor(Model):
     position: Array
     BRC: Array
     placed: bool = False
+    by_lens: Array | None = None
     rows: int = 8
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Body, its place, reference, what it says, mount, tag and, with `placed`, the tag's position."""
-        return (ROT3, 3, ROT3, 3, ROT3, ROT3, 3) if self.placed else (ROT3, 3, ROT3, 3, ROT3, ROT3)
+        """Body, its place, reference, what it says, mount, tag; with `placed` its position, with `by_lens` these."""
+        more = (3,) * (int(self.placed) + int(self.by_lens is not None))
+        return (ROT3, 3, ROT3, 3, ROT3, ROT3, *more)
 
     def __call__(
-        self, nRb: Array, p: Array, nRB: Array, said: Array, mount: Array, tag: Array, *moved: Array
+        self, nRb: Array, p: Array, nRB: Array, said: Array, mount: Array, tag: Array, *more: Array
     ) -> Residuals:
         """Residual sqrt_information (predicted - measured), (n, 8)."""
         n = len(self.time)
@@ -59,14 +64,17 @@ class TagAttitudeFactor(Model):
         nRC = so3.compose(so3.exp(said), nRB, BRC)
         cRb = so3.multiply(so3.inverse(nRC), nRb)
         bRt = so3.multiply(self.bRt, tag)
-        position = self.position + moved[0] if moved else self.position
+        position = self.position + more[0] if self.placed else self.position
         in_body = position[:, None] + so3.rotate(bRt[:, None], self.corners)
         turned = so3.rotate(cRb[:, None], in_body)
         P = turned + p[:, None]
         # A corner behind the camera cannot be seen: a residual that no step may leave there.
         depth = np.where(P[..., 2:] > 0.0, P[..., 2:], np.inf)
         seen = np.where(P[..., 2:] > 0.0, P[..., :2] / depth, 1e3)
-        error = np.einsum("nkij,nkj->nki", self.sqrt_information, seen - self.measured)
+        measured = self.measured
+        if self.by_lens is not None:
+            measured = measured + np.einsum("nkij,nj->nki", self.by_lens, more[-1])
+        error = np.einsum("nkij,nkj->nki", self.sqrt_information, seen - measured)
 
         def jacobians() -> tuple[Array, ...]:
             by_point = np.zeros((n, 4, 2, 3))
@@ -82,7 +90,8 @@ class TagAttitudeFactor(Model):
                 camera @ (so3.matrix(so3.inverse(nRC)) @ so3.right_jacobian(-said))[:, None],
                 camera,
                 -body @ so3.matrix(bRt)[:, None] @ so3.hat(self.corners),
-                *([body] if moved else []),
+                *([body] if self.placed else []),
+                *([] if self.by_lens is None else [-self.sqrt_information @ self.by_lens]),
             )
             return tuple(block.reshape(n, 8, -1) for block in blocks)
 

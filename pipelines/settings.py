@@ -136,11 +136,14 @@ class PlatformGyroSheet(Sheet):
 class CameraSheet(Sheet):
     """Of a camera, or of what makes angles of its pictures.
 
-    scale of the angles, no unit; roll, rad: about its line of sight as it is mounted.
+    scale of the angles, no unit; roll, rad: about its line of sight as it is mounted; focal, a share of CameraInfo's
+    focal length, and centre, px: what these are off by.
     """
 
     scale: SigmaOrZero | None = None
     roll: SigmaOrZero | None = None
+    focal: SigmaOrZero | None = None
+    centre: SigmaOrZero | None = None
 
 
 class EncoderSheet(Sheet):

@@ -181,7 +181,12 @@ def _tag_blocks(angle: float) -> list[Array]:
 @pytest.mark.parametrize("angle", [1.0, 1e-7])
 def test_tag_jacobians(angle: float) -> None:
     blocks = _tag_blocks(angle)
-    assert_jacobians(_tags(np.arange(N), None), blocks)
+    whole = _tags(np.arange(N), None)
+    assert_jacobians(whole, blocks)
+    off = replace(whole, by_lens=_rng(8).normal(size=(N, 4, 2, 3)))
+    assert_jacobians(off, [*blocks, 0.1 * _rng(9).normal(size=(N, 3))])
+    both = replace(off, placed=True)
+    assert_jacobians(both, [*blocks, *(0.01 * _rng(9).normal(size=(2, N, 3)))])
     assert_rows_are_independent(lambda rows: _tags(rows, None), blocks)
 
 

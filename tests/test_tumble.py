@@ -321,6 +321,20 @@ def test_a_real_pair_of_accelerometer_and_magnetometer(tmp_path: Path) -> None:
         assert calibration.parameters[f"accel_k{i}{i}"].value * 16384.0 == pytest.approx(9.80665, rel=0.03)
 
 
+def test_a_real_accelerometer_alone() -> None:
+    """38 static poses of an ADXL355 against the published calibration, in the axes in which that K is symmetric."""
+    path = _shared("openaxes_imu9") / "adxl.mcap"
+    calibration = Session.read(open_recording(path), "tumble", Config(latitude_deg=52.38)).calibrate()
+    scale = 9.8126 / 9.81744
+    K = scale * np.array([[0.96276, 0.0015751, -0.00018891], [0.0, 0.96732, 0.000859], [0.0, 0.0, 0.97079]])
+    squares, axes = np.linalg.eigh(K.T @ K)
+    symmetric = (axes * np.sqrt(squares)) @ axes.T
+    b = symmetric @ np.linalg.solve(K, -scale * np.array([0.064447, 0.011034, 0.034253]))
+    published = [*symmetric[np.triu_indices(3)], *b]
+    for name, value in zip(triad_names("accel", symmetric=True), published, strict=True):
+        assert abs(calibration.parameters[name].value - value) < 3.0 * calibration.parameters[name].sigma, name
+
+
 @pytest.mark.parametrize("beside", [False, True])
 def test_a_cube_recording_without_all_the_rest(beside: bool, tmp_path: Path) -> None:
     """K of the cube's truth up to the rotation that nothing tells here: K'K and the offset of the raw numbers."""

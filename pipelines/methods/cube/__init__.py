@@ -32,7 +32,7 @@ class Cube(Method):
     topics = TOPICS
     needs = NEEDS
     section = CubeConfig
-    sheets = ("gyro", "accel", "reference", "field")
+    sheets = ("gyro", "accel", "reference", "field", "camera")
     drawn = True
     of_recording = ("gyro_b?", "accel_b?", "field_?", "reference_*")
     rotations: ClassVar[Mapping[str, str]] = {"camera_mount": "correction of BRC"}

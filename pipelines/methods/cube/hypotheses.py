@@ -8,6 +8,7 @@ import numpy as np
 
 from pipelines.judgement.hypotheses import AXES, ExactInput, Hypotheses, Scaling
 from pipelines.methods.cube.data import CubeData
+from pipelines.methods.cube.parameters import FOCAL, is_stated
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.settings import Config
 
@@ -33,7 +34,8 @@ def _tag_size(data: CubeData, config: Config, change: float) -> tuple[CubeData, 
 
 
 def _focal_length(data: CubeData, config: Config, change: float) -> tuple[CubeData, Config] | None:
-    if data.camera is None:
+    # Of one that is free the parameter tells.
+    if data.camera is None or is_stated(FOCAL, config):
         return None
     K = data.camera.K * np.array([1.0 + change, 1.0 + change, 1.0])[:, None]
     K[:2, 2] = data.camera.centre

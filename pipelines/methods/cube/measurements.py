@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import gtsam
 import numpy as np
 
@@ -9,11 +11,12 @@ from factors import so3
 from factors.tags import TagAttitudeFactor
 from factors.triad import AccelFactor, GyroStaticFactor, MagFactor
 from factors.turns import GyroRotationFactor
-from pipelines.graph.problem import Factor
+from pipelines.graph.problem import Array, Factor
 from pipelines.methods.cube.model import Model
 from pipelines.methods.cube.parameters import (
     CURVATURE_KEY,
     FIELD_KEY,
+    LENS_KEY,
     MOUNT_KEY,
     SAID_KEY,
     SENSITIVITY_KEY,
@@ -24,6 +27,13 @@ from pipelines.methods.cube.poses import SeenTags
 from pipelines.methods.cube.tag_places import tag_place_key
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.methods.cube.wandering import deviation_key
+
+if TYPE_CHECKING:
+    from pipelines.vision.camera import Camera
+
+
+# Steps of derivatives by a share of the focal length and by the centre, px.
+_FOCAL_STEP, _CENTRE_STEP = 1e-4, 0.1
 
 
 def pose_key(k: int) -> int:
@@ -86,6 +96,7 @@ def tag_factor(model: Model, k: int, seen: SeenTags) -> Factor:
         position=body.position[rows],
         BRC=model.reference.BRC,
         placed=bool(model.parameters.places),
+        by_lens=None if model.parameters.lens is None else _by_lens(camera, seen.corners),
     )
     reference = reference_key(k if model.reference.moves else 0)
     measurement = tags.on(
@@ -96,9 +107,24 @@ def tag_factor(model: Model, k: int, seen: SeenTags) -> Factor:
         MOUNT_KEY,
         [tag_key(int(i)) for i in seen.ids],
         *([[tag_place_key(int(i)) for i in seen.ids]] if tags.placed else []),
+        *([] if model.parameters.lens is None else [LENS_KEY]),
         loss=model.loss,
     )
     return Factor.of("tags", measurement)
+
+
+def _by_lens(camera: Camera, corners: Array) -> Array:
+    """Derivatives (n, 4, 2, 3) of the corners' z = 1 coordinates by the share of focal length and the centre in px."""
+    columns = []
+    for step, moved in (
+        (_FOCAL_STEP, np.append(camera.focal, [0.0, 0.0])),
+        (_CENTRE_STEP, np.array([0.0, 0.0, 1.0, 0.0])),
+        (_CENTRE_STEP, np.array([0.0, 0.0, 0.0, 1.0])),
+    ):
+        change = step * np.append(moved, np.zeros(len(camera.coefficients)))
+        ahead, behind = (camera.with_intrinsics(camera.intrinsics + sign * change).rays(corners) for sign in (1, -1))
+        columns.append((ahead[..., :2] / ahead[..., 2:] - behind[..., :2] / behind[..., 2:]) / (2.0 * step))
+    return np.stack(columns, axis=-1)
 
 
 def turn_factor(model: Model, k: int) -> Factor:

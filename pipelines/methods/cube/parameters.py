@@ -24,14 +24,17 @@ from pipelines.methods.triads import TRIADS, triad_names
 from pipelines.settings import Config, check_names
 
 TRIAD_KEYS: dict[str, int] = {name: int(gtsam.symbol(c, 0)) for name, c in zip(TRIADS, "AGM", strict=True)}
-MOUNT_KEY, SAID_KEY, FIELD_KEY, SENSITIVITY_KEY, CURVATURE_KEY = (int(gtsam.symbol(c, 0)) for c in "CHFSQ")
+MOUNT_KEY, SAID_KEY, FIELD_KEY, SENSITIVITY_KEY, CURVATURE_KEY, LENS_KEY = (int(gtsam.symbol(c, 0)) for c in "CHFSQL")
 
 # The grades of consumer MEMS sensors and of a dual-antenna reference, one sigma.
 SENSITIVITY = sensitivity_assumption("gyro", "gyro", 2e-4)
 SQUARE = Assumption(tuple(f"accel_square_{i}" for i in "123"), "s^2/m", "accel", "square", 1e-5)
 CUBE = Assumption(tuple(f"accel_cube_{i}" for i in "123"), "s^4/m^2", "accel", "cube", 1e-6)
 TILT = Assumption(("reference_tilt_e", "reference_tilt_n"), "rad", "reference", "tilt", 1e-3)
-ASSUMPTIONS = (SENSITIVITY, SQUARE, CUBE, TILT)
+# What CameraInfo is off by; taken for exact unless the config says something of it.
+FOCAL = Assumption(("camera_focal",), "", "camera", "focal", 5e-3)
+CENTRE = Assumption(("camera_centre_x", "camera_centre_y"), "px", "camera", "centre", 3.0)
+ASSUMPTIONS = (SENSITIVITY, SQUARE, CUBE, TILT, FOCAL, CENTRE)
 
 # Triad -> unit of its nominal value, default prior sigma and accuracy wanted of its bias.
 _BIAS: Mapping[str, tuple[str, float, float]] = {
@@ -63,6 +66,7 @@ class Parameters:
         field_model: (3,) T.
         sensitivity: G of the gyro, None where it does not feel force.
         curvature: square and cube terms of the accelerometer, None where it has none.
+        lens: what the camera's focal length and centre are off by, None where they are exact.
     """
 
     triads: Mapping[str, Parameter]
@@ -74,6 +78,7 @@ class Parameters:
     field_model: Array | None
     sensitivity: Parameter | None
     curvature: Parameter | None
+    lens: Parameter | None = None
 
     @property
     def all(self) -> tuple[Parameter, ...]:
@@ -84,15 +89,19 @@ class Parameters:
             *self.rotations[1:],
             *self.places,
             self.field,
-            self.sensitivity,
-            self.curvature,
+            *self.assumed,
         ]
         return (*self.triads.values(), *(p for p in rest if p is not None))
 
     @property
+    def assumed(self) -> tuple[Parameter | None, ...]:
+        """Assumptions alone."""
+        return (self.sensitivity, self.curvature, self.lens)
+
+    @property
     def zeros(self) -> tuple[Parameter, ...]:
         """Vectors with priors about zero."""
-        return tuple(p for p in (self.said, *self.places, self.sensitivity, self.curvature) if p is not None)
+        return tuple(p for p in (self.said, *self.places, *self.assumed) if p is not None)
 
     def initial(self, gyro_bias: Array) -> gtsam.Values:
         """First values: nominal sensors but for the gyro's offset (3,), mounts as given, the model's field."""
@@ -200,7 +209,24 @@ def cube_parameters(config: Config, camera: bool, reference: bool, field: Array 
         field_model=field,
         sensitivity=assumptions.parameter(SENSITIVITY_KEY, (SENSITIVITY,), config),
         curvature=assumptions.parameter(CURVATURE_KEY, (SQUARE, CUBE), config),
+        lens=_lens(config) if camera else None,
     )
+
+
+def is_stated(assumption: Assumption, config: Config) -> bool:
+    """Whether the config says anything of it."""
+    sheet = getattr(config.sensors, assumption.sheet)
+    return assumption.figure in sheet.model_fields_set or any(name in config.priors for name in assumption.names)
+
+
+def _lens(config: Config) -> Parameter | None:
+    """Focal length and centre, those of which nothing is stated fixed; None where that is both."""
+    free = [
+        q if is_stated(each, config) else replace(q, prior_sigma=0.0)
+        for each in (FOCAL, CENTRE)
+        for q in quantities(each, config)
+    ]
+    return Parameter(LENS_KEY, tuple(free)) if any(q.prior_sigma for q in free) else None
 
 
 def _check_names(config: Config, tags: Sequence[int]) -> None:

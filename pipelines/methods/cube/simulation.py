@@ -21,7 +21,16 @@ from pipelines.graph.assumptions import stated
 from pipelines.methods.cube.data import CubeData, Sightings
 from pipelines.methods.cube.faces import FACES
 from pipelines.methods.cube.motion import drawn_motion
-from pipelines.methods.cube.parameters import ASSUMPTIONS, CUBE, SENSITIVITY, SQUARE, TILT
+from pipelines.methods.cube.parameters import (
+    ASSUMPTIONS,
+    CENTRE,
+    CUBE,
+    FOCAL,
+    SENSITIVITY,
+    SQUARE,
+    TILT,
+    is_stated,
+)
 from pipelines.methods.cube.scenario import (
     EPOCH_NS,
     FORWARD,
@@ -34,7 +43,7 @@ from pipelines.methods.cube.scenario import (
     cube_config,
 )
 from pipelines.methods.place import FIELD
-from pipelines.settings import Config
+from pipelines.settings import Config, Sensors
 from pipelines.simulation.motion import sample_times
 from pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
 from pipelines.simulation.sensors import true_values
@@ -80,6 +89,10 @@ class _World:
         # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
         self.rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
         self.effects = true_values(ASSUMPTIONS, scenario.sensors, scenario.effects, rng_of_sensors)
+        config = Config(sensors=scenario.sensors or Sensors())
+        for assumption in (FOCAL, CENTRE):
+            if not is_stated(assumption, config):
+                self.effects |= {name: scenario.effects.get(name, 0.0) for name in assumption.names}
         self.place_rad = np.deg2rad([scenario.place.latitude_deg, scenario.place.longitude_deg])
         latitude, longitude = self.place_rad
         self.field, self.heading = self._surroundings(magnetic_field(latitude, longitude, scenario.place.height, YEAR))
@@ -90,6 +103,11 @@ class _World:
             "plumb_bob",
             np.array((scenario.camera or CubeCamera()).distortion),
         )
+        off = np.array([self.effects[name] for name in (*FOCAL.names, *CENTRE.names)])
+        intrinsics = self.camera.intrinsics.copy()
+        intrinsics[:4] += np.append(off[0] * self.camera.focal, off[1:])
+        # What is recorded is what CameraInfo says.
+        self.lens = self.camera.with_intrinsics(intrinsics)
         self.nRB = so3.compose(
             so3.exp([0.0, 0.0, self.rng.uniform(-np.pi, np.pi)]), so3.exp(0.02 * self.rng.standard_normal(3))
         )
@@ -222,7 +240,7 @@ class _World:
         for i in self._shown():
             cRt, centre, facing = self._tag(i, times)
             rows = np.flatnonzero((facing > _LEAST_COSINE) & (self.rng.random(len(times)) >= sensor.occluded))
-            seen = self.camera.project(centre[rows, None] + so3.rotate(cRt[rows, None], s.cube.tag_size * _SQUARE))
+            seen = self.lens.project(centre[rows, None] + so3.rotate(cRt[rows, None], s.cube.tag_size * _SQUARE))
             inside = ((seen > 5.0) & (seen < size - 6.0)).all(axis=(1, 2))
             frames.append(rows[inside])
             ids.append(np.full(int(inside.sum()), i))
@@ -233,7 +251,7 @@ class _World:
 
     def pictures(self, times: Array, kind: Pictures) -> Iterator[bytes]:
         """JPEG files of what the camera sees at the times, blurred by the motion while the shutter is open."""
-        renderer = Renderer(self.camera)
+        renderer = Renderer(self.lens)
         for t in times:
             finger = self._finger(float(t))
             still = bool(((self.motion.start <= t) & (t <= self.motion.stop)).any())
@@ -267,6 +285,7 @@ class _World:
         if self.scenario.magnetometer:
             truth |= {f"field_{axis}": float(x) for axis, x in zip("enu", self.field, strict=True)}
         if self.scenario.camera:
+            truth |= {name: self.effects[name] for each in (FOCAL, CENTRE) for name in each.names}
             vectors = {f"tag_{i}": vector for i, vector in self.tags.items()}
             if self.scenario.reference:
                 vectors["camera_mount"] = self.mount
