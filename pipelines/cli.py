@@ -469,6 +469,23 @@ def export(
         terminal.say(f"Wrote {out}")
 
 
+@app.command()
+def certificate(
+    results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a calibration, or its result.json.")],
+    fields: Annotated[Path | None, typer.Option(help="YAML of what only people know: number, item, serial ...")] = None,
+    before: Annotated[Path | None, typer.Option(help="An earlier result.json or calibration.yaml of the item.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the certificate; default: that of the results.")] = None,
+) -> None:
+    """A calibration certificate, certificate.html to be printed and certificate.json."""
+    from pipelines import terminal
+    from pipelines.reports.certificate import write_certificate
+
+    written, missing = write_certificate(results, fields, before, out)
+    terminal.say(f"Wrote {', '.join(map(str, written))}")
+    if missing:
+        terminal.say(f"not stated: {', '.join(missing)}")
+
+
 def _beside(session: Path, what: str) -> Path:
     """The folder for results where none is named: beside the recording, under its name."""
     session = session if session.name else session.resolve()

@@ -15,7 +15,7 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.chi_square import quantile
+from factors.chi_square import quantile, student
 
 Array = NDArray[np.float64]
 
@@ -124,9 +124,7 @@ def limit(tests: int, values: int | None = None) -> float:
     z = NormalDist().inv_cdf(1.0 - 0.5 * FALSE_ALARM / max(tests, 1))
     if values is None:
         return z
-    dof = _EFFICIENCY * (values - 1)
-    exponent = (z * (8.0 * dof + 3.0) / (8.0 * dof + 1.0)) ** 2 / dof
-    return math.sqrt(dof * math.expm1(exponent)) if exponent < 500.0 else math.inf
+    return student(z, _EFFICIENCY * (values - 1))
 
 
 @dataclass(frozen=True)

@@ -16,18 +16,22 @@ from pipelines.reports.units import human_unit, to_digits_of
 
 # Beyond so many days a forecast says nothing.
 _FAR_DAYS = 36_525.0
+# So many changes are told in sentences, the surest; the table has all.
+_MOST_TOLD = 3
 _RECORDINGS = ("recording", "start", "length", "by itself")
 
 
 def sentences(changes: Changes, parts: Sequence[PartResult], quantities: Sequence[Quantity]) -> list[str]:
     """What changed, when, and by how much."""
     known = {q.name: q for q in quantities}
-    said = [
-        f"{_what(step)} by {_shown(step.size, step.sigma, known[step.name])} {_between(step.after, parts)}."
-        for step in sorted(changes.found, key=lambda step: step.after)
-    ]
-    if said:
-        return said
+    surest = sorted(changes.found, key=lambda step: -abs(step.z))
+    if surest:
+        said = [
+            f"{_what(step)} by {_shown(step.size, step.sigma, known[step.name])} {_between(step.after, parts)}."
+            for step in surest[:_MOST_TOLD]
+        ]
+        more = len(surest) - len(said)
+        return [*said, f"So did {more} more, by less for what they are known to."] if more else said
     return [
         f"All parameters together changed {_between(each.after, parts)}, chi-square {each.chi_square:.4g} for "
         f"{each.dof} degrees of freedom, none by more than chance for itself."
