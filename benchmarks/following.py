@@ -50,17 +50,20 @@ def run() -> Iterator[Ratio]:
     yield Ratio("following.delay", compared, float(np.median(late)), wanted=0.3, tolerance=1.0)
 
     told = _followed(60.0 * MINUTES, 2.0, 50.0, _SPEED)
-    length = min(300.0, told[-1, 0] / 3.0)
-    first, last = (_share(told, start, start + length) for start in (_FILLED, told[-1, 0] - length))
+    # When the recording is closed all of it is read once more.
+    told = told[told[:, 1] < 60.0 * MINUTES / _SPEED]
+    end = told[-1, 0]
+    length = min(300.0, end / 3.0)
+    first, last = (_share(told, start, start + length) for start in (_FILLED, end - length))
     compared = (
         f"processor of the last {length:.0f} s over that of {length:.0f} s from {_FILLED:.0f} s on, of {MINUTES:g} min "
         f"at {_SPEED:g} times their speed; {100.0 * _SPEED * first:.0f} and {100.0 * _SPEED * last:.0f} % of a core, "
         f"{1e3 * first:.1f} and {1e3 * last:.1f} ms a second recorded"
     )
     yield Ratio("following.growth", compared, last / first, wanted=1.2)
-    filled = float(np.interp(_FILLED, told[:, 0], told[:, 3]))
-    compared = f"memory at the end over that at {_FILLED:.0f} s: {told[-1, 3]:.0f} and {filled:.0f} MiB"
-    yield Ratio("following.memory", compared, float(told[-1, 3]) / filled)
+    filled, late_mib = (float(np.interp(at, told[:, 0], told[:, 3])) for at in (_FILLED, end))
+    compared = f"memory at the end over that at {_FILLED:.0f} s: {late_mib:.0f} and {filled:.0f} MiB"
+    yield Ratio("following.memory", compared, late_mib / filled)
 
 
 def _followed(seconds: float, images_hz: float, rate_hz: float, speed: float) -> Array:

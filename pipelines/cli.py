@@ -202,6 +202,7 @@ def follow(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: SOURCE-incremental.")] = None,
     no_check: _NoCheck = False,
+    as_json: _Json = False,
 ) -> None:
     """Calibrate a recording while it is being written, and say what is still missing. Ctrl-C ends it."""
     from pipelines.follow.follow import follow as run
@@ -209,10 +210,10 @@ def follow(
     from pipelines.reports.write import write_results
 
     settings = Settings(method, config, _seconds(window), patience, checkpoint, not no_check)
-    calibration = run(source, settings, port if serve else None, record)
+    calibration = run(source, settings, port if serve else None, record, as_json)
     folder = out or _beside(Path(_file_name(source)), "incremental")
     written = write_results(folder, calibration)
-    _tell(calibration, folder, written)
+    _tell(calibration, folder, written, as_json)
 
 
 @app.command()

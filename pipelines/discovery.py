@@ -24,6 +24,8 @@ from pipelines.settings import Config
 _BELONGS = 0.7
 # Names are alike above this ratio of difflib.
 _ALIKE = 0.6
+# Of the pairs of frames of a TFMessage so many are tried, those with so many transforms at least.
+_MOST_PAIRS, _FEWEST = 12, 20
 # Delays worth a word, s.
 _DELAY = 0.002
 
@@ -169,48 +171,64 @@ def _pair_up(
     recording: Recording,
     config: Config,
     pair_of: tuple[Topic, Topic],
-    free: list[list[str]],
+    free: list[list[TopicSource]],
     pairings: dict[tuple[str, str], Pairing | None],
     topics: dict[str, TopicSource],
     reasons: list[str],
 ) -> None:
     """The gyro and the attitude that turn together most alike, of those that may serve."""
     attitude, gyro = pair_of
-    best: tuple[float, str, str, Pairing] | None = None
+    best: tuple[float, TopicSource, TopicSource, Pairing] | None = None
     for a in free[0]:
         for g in free[1]:
-            if a == g:
+            if a.name == g.name:
                 continue
-            if (g, a) not in pairings:
-                pairings[g, a] = _paired(recording, g, a)
-            found = pairings[g, a]
+            if (g.name, a.name) not in pairings:
+                pairings[g.name, a.name] = _paired(recording, g.name, a)
+            found = pairings[g.name, a.name]
             if found is not None and found.correlation > _BELONGS and (best is None or found.correlation > best[0]):
                 best = found.correlation, g, a, found
     if best is None:
         return
     _, g, a, found = best
-    if config.topic(gyro) != g:
-        topics[gyro.key] = TopicSource(topic=g)
-    if config.topic(attitude) != a or found.inverted:
-        topics[attitude.key] = TopicSource(topic=a, invert=found.inverted)
+    if config.topic(gyro) != g.name:
+        topics[gyro.key] = g
+    if config.topic(attitude) != a.name or found.inverted:
+        topics[attitude.key] = a.model_copy(update={"invert": a.invert != found.inverted})
     way = ", as the inverse of the attitude meant" if found.inverted else ""
     delay = f", {1e3 * abs(found.offset_s):.0f} ms {'early' if found.offset_s > 0.0 else 'late'}"
     late = delay if abs(found.offset_s) > _DELAY else ""
-    reasons.append(f"{a} turns with {g} (correlation {found.correlation:.2f}{late}){way}")
+    reasons.append(f"{a.name} turns with {g.name} (correlation {found.correlation:.2f}{late}){way}")
 
 
-def _candidates(recording: Recording, config: Config, topic: Topic, taken: set[str]) -> list[str]:
-    """Recorded topics of a type of the topic that serve nothing else: the one the config names, if it is there."""
+def _candidates(recording: Recording, config: Config, topic: Topic, taken: set[str]) -> list[TopicSource]:
+    """Recorded topics of a type of the topic that serve nothing else: the one the config names, if it is there.
+
+    An attitude may be between any two frames of a TFMessage.
+    """
     own = config.topic(topic)
     if own in recording.topics:
-        return [own]
-    there = recording.topics.items()
-    return [n for n, t in there if t.type in topic.types and t.count and t.is_readable and n not in taken]
+        return [config.topics.get(topic.key, TopicSource(topic=own))]
+    there = [(n, t) for n, t in recording.topics.items() if t.count and t.is_readable and n not in taken]
+    found = [TopicSource(topic=n) for n, t in there if t.type in topic.types]
+    if _is_attitude(topic):
+        for name in (n for n, t in there if t.type == messages.TF):
+            found += [TopicSource(topic=name, frames=pair) for pair in _moving_pairs(recording, name)]
+    return found
 
 
-def _paired(recording: Recording, gyro: str, attitude: str) -> Pairing | None:
+def _moving_pairs(recording: Recording, topic: str) -> list[tuple[str, str]]:
+    """The pairs of frames of a TFMessage topic that are told of most often, as moving ones are."""
     try:
-        rates, poses = recording.imu(gyro), recording.poses(attitude)
+        counts = {pair: len(found) for pair, found in recording.transforms(topic).items()}
+    except InputError:
+        return []
+    return sorted((pair for pair, n in counts.items() if n >= _FEWEST), key=lambda pair: -counts[pair])[:_MOST_PAIRS]
+
+
+def _paired(recording: Recording, gyro: str, attitude: TopicSource) -> Pairing | None:
+    try:
+        rates, poses = recording.imu(gyro), recording.poses_of(attitude)
     except InputError:
         return None
     there = (name for name, topic in recording.topics.items() if topic.type == messages.IMU and name != gyro)
@@ -249,10 +267,12 @@ def _is_other_gyro(topic: Topic, there: list[str]) -> bool:
 
 
 def _flow(value: object) -> str:
-    """A name, or a mapping in one line of YAML."""
-    if not isinstance(value, dict):
-        return str(value)
-    return f"{{{', '.join(f'{key}: {str(one).lower() if one is True else one}' for key, one in value.items())}}}"
+    """A name, a list or a mapping in one line of YAML."""
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{key}: {_flow(one)}' for key, one in value.items())}}}"
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_flow, value))}]"
+    return "true" if value is True else str(value)
 
 
 def _short(recording: Recording, name: str) -> str:

@@ -48,6 +48,16 @@ def raw_messages(path: Path) -> Iterator[Message]:
             yield channel.topic, schema.name, message.log_time, message.data
 
 
+def schemas(path: Path) -> Iterator[tuple[str, str, bytes]]:
+    """Topic, name and text of the schemas of an MCAP file."""
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    for channel in summary.channels.values():
+        schema = summary.schemas[channel.schema_id]
+        yield channel.topic, schema.name, schema.data
+
+
 def rosbag2(source: Path, path: Path, storage: StoragePlugin, mode: CompressionMode = CompressionMode.NONE) -> Path:
     """A bag folder."""
     writer = Ros2Writer(path, version=9, storage_plugin=storage)
@@ -127,6 +137,22 @@ def mcap(
     return path
 
 
+def ros2_recording(path: Path, topics: dict[str, list[tuple[int, Any]]]) -> Path:
+    """Messages, (log time, message) by topic, of rosbags' types."""
+    whole = [
+        (name, message.__msgtype__, log_ns, bytes(ROS2.serialize_cdr(message, message.__msgtype__)))
+        for name, found in topics.items()
+        for log_ns, message in found
+    ]
+    return mcap(whole, path, lambda _, data: data, "cdr", "ros2msg", ros2_schema)
+
+
+def header(t_ns: int, frame: str = "") -> Any:
+    types = ROS2.types
+    time = types["builtin_interfaces/msg/Time"](*divmod(t_ns, 10**9))
+    return types["std_msgs/msg/Header"](time, frame)
+
+
 def mcap_ros1(source: Path, path: Path) -> Path:
     """MCAP with ROS 1 messages."""
 
@@ -138,10 +164,10 @@ def mcap_ros1(source: Path, path: Path) -> Path:
 
 def mcap_idl(source: Path, path: Path) -> Path:
     """MCAP with ROS 2 messages defined in IDL."""
-    return mcap(raw_messages(source), path, lambda _, data: data, "cdr", "ros2idl", _idl)
+    return mcap(raw_messages(source), path, lambda _, data: data, "cdr", "ros2idl", idl)
 
 
-def _idl(kind: str) -> tuple[str, bytes]:
+def idl(kind: str) -> tuple[str, bytes]:
     """A type, and those it holds, as rosidl writes them: arrays are types of their own."""
     parts: dict[str, str] = {}
 
@@ -243,43 +269,44 @@ def ulog(path: Path, topics: dict[str, dict[str, np.ndarray[Any, Any]]]) -> Path
 
 
 def h264(pictures: Any) -> list[bytes]:
-    """Grey pictures (n, height, width), in multiples of 16, as H.264: a key picture a message, of raw macroblocks.
-
-    Each message has its sequence and picture parameter sets (ITU-T H.264, 7.3.2), with the full range of brightness.
-    """
+    """Grey pictures (n, height, width), in multiples of 16, as H.264: a key picture a message, of raw macroblocks."""
     _, height, width = pictures.shape
-
-    def ue(value: int) -> str:
-        digits = f"{value + 1:b}"
-        return "0" * (len(digits) - 1) + digits
-
-    def unit(head: int, bits: str, blocks: bytes = b"") -> bytes:
-        bits += "" if blocks else "1"
-        bits += "0" * (-len(bits) % 8)
-        body = int(bits, 2).to_bytes(len(bits) // 8, "big") + blocks
-        return b"\0\0\0\1" + bytes([head]) + re.sub(rb"\0\0(?=[\0-\3])", b"\0\0\3", body)
-
-    vui = "0" + "0" + "1" + "101" + "1" + "0" + "0" + "0" + "0" + "0" + "0" + "0"
-    size = ue(width // 16 - 1) + ue(height // 16 - 1)
-    sequence = unit(
-        0x67, f"{66:08b}{0:08b}{40:08b}" + ue(0) + ue(0) + ue(2) + ue(0) + "0" + size + "1" + "0" + "0" + "1" + vui
-    )
-    picture = unit(
-        0x68, ue(0) + ue(0) + "0" + "0" + ue(0) + ue(0) + ue(0) + "0" + "00" + ue(0) + ue(0) + ue(0) + "1" + "0" + "0"
-    )
     out = []
     for i, grey in enumerate(pictures):
-        bits, slice_ = ue(0) + ue(7) + ue(0) + f"{0:04b}" + ue(i % 2) + "0" + "0" + ue(0) + ue(1), b""
+        # The slice's head, in the order of ITU-T H.264, 7.3.3: first macroblock, kind, parameters, numbers, filter off.
+        bits, blocks = "".join([_ue(0), _ue(7), _ue(0), "0000", _ue(i % 2), "00", _ue(0), _ue(1)]), b""
         for row in range(0, height, 16):
             for column in range(0, width, 16):
-                bits += ue(25)
-                bits += "0" * (-len(bits) % 8)
-                slice_ += int(bits, 2).to_bytes(len(bits) // 8, "big")
-                slice_ += grey[row : row + 16, column : column + 16].tobytes() + bytes([128]) * 128
+                blocks += _bytes(bits + _ue(25))
+                blocks += grey[row : row + 16, column : column + 16].tobytes() + bytes([128]) * 128
                 bits = ""
-        whole = slice_ + b"\x80"
-        out.append(sequence + picture + b"\0\0\0\1\x65" + re.sub(rb"\0\0(?=[\0-\3])", b"\0\0\3", whole))
+        out.append(h264_parameters(width, height) + _unit(0x65, blocks + b"\x80"))
     return out
+
+
+def h264_parameters(width: int, height: int) -> bytes:
+    """Sequence and picture parameter sets (7.3.2.1 and 7.3.2.2): baseline profile, the full range of brightness."""
+    vui = "00110110000000"
+    size = _ue(width // 16 - 1) + _ue(height // 16 - 1)
+    sequence = "".join([f"{66:08b}{0:08b}{40:08b}", _ue(0), _ue(0), _ue(2), _ue(0), "0", size, "1001", vui, "1"])
+    picture = "".join([_ue(0), _ue(0), "00", 3 * _ue(0), "000", 3 * _ue(0), "100", "1"])
+    return _unit(0x67, _bytes(sequence)) + _unit(0x68, _bytes(picture))
+
+
+def _ue(value: int) -> str:
+    """An exponential Golomb code."""
+    digits = f"{value + 1:b}"
+    return "0" * (len(digits) - 1) + digits
+
+
+def _bytes(bits: str) -> bytes:
+    bits += "0" * (-len(bits) % 8)
+    return int(bits, 2).to_bytes(len(bits) // 8, "big")
+
+
+def _unit(head: int, body: bytes) -> bytes:
+    """A unit after its start code, with what looks like one in it told apart."""
+    return b"\0\0\0\1" + bytes([head]) + re.sub(rb"\0\0(?=[\0-\3])", b"\0\0\3", body)
 
 
 def ros2_schema(kind: str) -> tuple[str, bytes]:

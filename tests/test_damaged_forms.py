@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 import zstandard
 from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from pipelines.config import load_config
 from pipelines.errors import InputError
+from pipelines.recording import messages, video
 from pipelines.recording.reading import open_recording
 from pipelines.recording.ros1_bag import MAGIC
 from pipelines.recording.writing import write_session
@@ -43,18 +44,48 @@ def make_ulog(_: Path, folder: Path) -> Path:
     return forms.ulog(folder / "s.ulg", {"sensor_combined": columns})
 
 
+def make_tum(_: Path, folder: Path) -> Path:
+    t_ns, position, wxyz = turning(200)
+    path = folder / "s.tum"
+    rows = np.hstack([position, wxyz]).tolist()
+    stamps = [f"{t // 10**9}.{t % 10**9:09d}" for t in t_ns.tolist()]
+    path.write_text("".join(f"{t} {' '.join(map(repr, row))}\n" for t, row in zip(stamps, rows, strict=True)))
+    return path
+
+
+def make_euroc(_: Path, folder: Path) -> Path:
+    """The table of a data set's IMU."""
+    t_ns, gyro, _wxyz = turning(200)
+    path = folder / "set" / "mav0" / "imu0" / "data.csv"
+    path.parent.mkdir(parents=True)
+    names = [f"w_RS_S_{a} [rad s^-1]" for a in "xyz"] + [f"a_RS_S_{a} [m s^-2]" for a in "xyz"]
+    return write_csv(path, ["#timestamp [ns]", *names], t_ns, np.hstack([gyro, -gyro]))
+
+
 MAKERS: dict[str, Callable[[Path, Path], Path]] = {
     "db3": lambda s, f: forms.rosbag2(s, f / "bag", StoragePlugin.SQLITE3) / "bag.db3",
     "bag": lambda s, f: forms.rosbag1(s, f / "s.bag"),
     "bag bz2": lambda s, f: forms.rosbag1(s, f / "s.bag", Ros1Writer.CompressionFormat.BZ2),
+    "bag lz4": lambda s, f: forms.rosbag1(s, f / "s.bag", Ros1Writer.CompressionFormat.LZ4),
+    "db3 by message": lambda s, f: (
+        forms.rosbag2(s, f / "bag", StoragePlugin.SQLITE3, CompressionMode.MESSAGE) / "bag.db3"
+    ),
+    "mcap ros 1": lambda s, f: forms.mcap_ros1(s, f / "r.mcap"),
+    "mcap IDL": lambda s, f: forms.mcap_idl(s, f / "i.mcap"),
     "mcap json": lambda s, f: forms.mcap_json(s, f / "j.mcap"),
     "mcap protobuf": lambda s, f: forms.mcap_protobuf(s, f / "p.mcap"),
     "mcap.zstd": lambda s, f: forms.zstd(s, f / "s.mcap.zstd"),
     "ulg": make_ulog,
     "csv": make_csv,
+    "tum": make_tum,
+    "euroc": make_euroc,
 }
 # Forms that have checksums of all data: what is read of a damaged copy is what was recorded.
-CHECKED = ("mcap json", "mcap protobuf", "bag bz2")
+CHECKED = ("mcap json", "mcap protobuf", "mcap ros 1", "mcap IDL", "bag bz2")
+# Tables: a line may end within a number, and a number that is none is refused with its line.
+TABLES = ("csv", "tum", "euroc")
+# Folders, of which a file is damaged: so many levels above it.
+FOLDERS = {"euroc": 2, "db3 by message": 0}
 
 
 class Small:
@@ -64,18 +95,24 @@ class Small:
         write_session(folder / "whole.mcap", topics(), {"alidade.yaml": CONFIG})
         path = MAKERS[form](folder / "whole.mcap", folder)
         self.form, self.data, self.copy = form, path.read_bytes(), folder / f"copy{''.join(path.suffixes)}"
+        if form in FOLDERS:
+            self.copy = path
         self.whole = self._read(path)
         assert self.whole
 
     def _read(self, path: Path) -> Whole:
-        recording = open_recording(path)
+        recording = open_recording(path.parents[FOLDERS[self.form]] if self.form in FOLDERS else path)
         if self.form == "csv":
             config = load_config(CSV)
             recording.use(config.topics.values(), config.columns)
-        if self.form != "ulg":
+        if self.form == "tum":
+            poses = recording.poses("/trajectory")
+            return {"/trajectory": (poses.t_ns, np.hstack([poses.position, poses.wxyz]))}
+        own = {"ulg": "/sensor_combined", "euroc": "/imu0"}.get(self.form)
+        if own is None:
             return read(recording)
-        imu = recording.imu("/sensor_combined")
-        return {"/sensor_combined": (imu.t_ns, np.hstack([imu.gyro, imu.accel]))}
+        imu = recording.imu(own)
+        return {own: (imu.t_ns, np.hstack([imu.gyro, imu.accel]))}
 
     def outcomes(self, copies: Iterable[bytes], is_sound: bool) -> Counter[str]:
         """How many damaged copies were read, or refused in one line; anything else goes through."""
@@ -106,17 +143,15 @@ def small(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 
 def test_cut_anywhere(small: Small) -> None:
-    """A line of a table may end within a number, and be taken for a whole one."""
     places = np.linspace(1, len(small.data) - 1, 25).astype(int)
-    found = small.outcomes((small.data[:at] for at in places), is_sound=small.form != "csv")
+    found = small.outcomes((small.data[:at] for at in places), is_sound=small.form not in TABLES)
     assert sum(found.values()) == 25
     assert found["read"] > 0
 
 
 def test_flipped_bytes(small: Small) -> None:
     found = small.outcomes(flips(small.data, 30, 1), is_sound=small.form in CHECKED)
-    # A table with one number that is none is refused, with its line.
-    assert found["read"] > 0 or small.form == "csv"
+    assert found["read"] > 0 or small.form in TABLES
 
 
 def test_stretches_zeroed_missing_inserted_random(small: Small) -> None:
@@ -127,11 +162,42 @@ def test_stretches_zeroed_missing_inserted_random(small: Small) -> None:
 def test_many_cuts_and_flips(small: Small) -> None:
     rng = np.random.default_rng(3)
     for name, copies, is_sound in (
-        ("cut", (small.data[:at] for at in rng.integers(1, len(small.data), 150)), small.form != "csv"),
+        ("cut", (small.data[:at] for at in rng.integers(1, len(small.data), 150)), small.form not in TABLES),
         ("one byte", flips(small.data, 200, 3), small.form in CHECKED),
         ("stretches and several bytes", spoilt(small.data, 200, 4), small.form in CHECKED),
     ):
         print(small.form, name, dict(small.outcomes(copies, is_sound)))
+
+
+def damaged_videos(whole: list[bytes], number: int, seed: int) -> Counter[str]:
+    """What becomes of videos whose messages are damaged: as many pictures as messages, or one line."""
+    rng = np.random.default_rng(seed)
+    found: Counter[str] = Counter()
+    for i in range(number):
+        packets = list(whole)
+        at = int(rng.integers(len(packets)))
+        if i % 3 == 0:
+            packets[at] = packets[at][: int(rng.integers(1, len(packets[at])))]
+        else:
+            packets[at] = next(iter((flips if i % 3 == 1 else spoilt)(packets[at], 1, seed + i)))
+        try:
+            pictures = list(video.decoded(enumerate(packets)))
+        except ValueError as error:
+            found["refused" if "\n" not in str(error) else "refused in several lines"] += 1
+            continue
+        assert [t_ns for t_ns, _ in pictures] == list(range(len(whole)))
+        found["read"] += 1
+    return found
+
+
+@pytest.mark.parametrize("number", [20, pytest.param(500, marks=pytest.mark.slow)])
+def test_damaged_videos(number: int) -> None:
+    """A video has no checksums: what is damaged in a picture is seen, if at all, by what is measured in it."""
+    whole = forms.h264(np.random.default_rng(1).integers(0, 256, (4, 32, 48), dtype=np.uint8))
+    found = damaged_videos(whole, number, 5)
+    print("video", dict(found))
+    assert found["read"] + found["refused"] == number
+    assert found["read"] > 0
 
 
 # -- hostile
@@ -208,7 +274,43 @@ def long_arrays(path: Path) -> None:
     forms.mcap([("/imu", "", 1, b"")], path, lambda *_: data, "json", "jsonschema", lambda _: ("a.Imu", b""))
 
 
+def idl_of(text: str) -> Callable[[Path], None]:
+    def make(path: Path) -> None:
+        name = "sensor_msgs/msg/Imu"
+        forms.mcap(
+            [("/imu", "", 1, b"")], path, lambda *_: bytes(400), "cdr", "ros2idl", lambda _: (name, text.encode())
+        )
+
+    return make
+
+
+def huge_video(path: Path) -> None:
+    """One macroblock of a picture that its parameters say is 16,384 pixels wide and high."""
+    import foxglove
+    from foxglove import channels
+    from foxglove import messages as fox
+
+    small, large = (forms.h264_parameters(size, size) for size in (16, 16_384))
+    data = large + forms.h264(np.zeros((1, 16, 16), np.uint8))[0][len(small) :]
+    context = foxglove.Context()
+    with foxglove.open_mcap(path, context=context):
+        channel = channels.CompressedVideoChannel("/imu", context=context)
+        for i in range(3):
+            channel.log(fox.CompressedVideo(timestamp=fox.Timestamp(i), data=data, format="h264"), log_time=i)
+
+
 HOSTILE = {
+    "IDL of 250 KB": (idl_of("module a { " + "const long x = 1; " * 13_000 + "};"), ".mcap"),
+    "IDL nested deep": (idl_of("module a { " * 20_000), ".mcap"),
+    "IDL of long sums": (
+        idl_of("module a { const long x = " + "(1 + " * 20_000 + "1" + ")" * 20_000 + "; };"),
+        ".mcap",
+    ),
+    "IDL of a large array": (
+        idl_of("module sensor_msgs { module msg { typedef double a__9[4000000000]; " + "struct Imu { a__9 x; }; }; };"),
+        ".mcap",
+    ),
+    "a video of 16,384 x 16,384": (huge_video, ".mcap"),
     "bz2 bomb": (bz2_bomb, ".bag"),
     "20,000 connections": (bag_of_connections, ".bag"),
     "lengths": (bag_lengths, ".bag"),
@@ -232,6 +334,8 @@ def test_a_hostile_file_is_one_line(name: str, tmp_path: Path) -> None:
 
     def read_imu() -> Any:
         recording = open_recording(path)
+        if recording.topics and recording.topics["/imu"].type == messages.COMPRESSED_IMAGE:
+            list(recording.images("/imu"))
         imu = recording.imu("/imu")
         assert np.isnan(imu.gyro).all()  # what is not said
         raise InputError("nothing")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from pipelines.recording.reading import Recording, open_recording
 from pipelines.recording.sources import inverted
 from pipelines.recording.writing import write_session
 from pipelines.session import Session
+from tests import forms
 from tests.command import Command
 
 NONE = load_config(None)
@@ -95,6 +97,47 @@ def test_what_is_suggested_reads_as_the_recording_did_under_its_own_names(simula
     np.testing.assert_array_equal(data.head_gyro, expected.head_gyro)
     np.testing.assert_allclose(data.vision_wxyz, expected.vision_wxyz, atol=1e-15)
     assert unused(recording, config) == ()
+
+
+def test_the_pair_of_frames_that_turns_with_a_gyro_is_found(simulated: Path, tmp_path: Path) -> None:
+    """Among others: one at rest, one of something else that turns, told of child before parent."""
+    whole = open_recording(simulated)
+    poses = whole.poses("/vision/attitude")
+    back = inverted(poses)
+    noise = np.random.default_rng(1).normal(size=(len(poses), 4))
+    other = noise / np.linalg.norm(noise, axis=1, keepdims=True)
+    still = np.tile([1.0, 0.0, 0.0, 0.0], (len(poses), 1))
+    frames = [("map", "base", still), ("map", "drone", other), ("helmet", "camera", back.wxyz)]
+    types = forms.ROS2.types
+
+    def transform(t_ns: int, parent: str, child: str, w: float, x: float, y: float, z: float) -> Any:
+        nowhere = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
+        turn = types["geometry_msgs/msg/Transform"](nowhere, types["geometry_msgs/msg/Quaternion"](x, y, z, w))
+        return types["geometry_msgs/msg/TransformStamped"](forms.header(t_ns, parent), child, turn)
+
+    tf = [
+        (t, types["tf2_msgs/msg/TFMessage"]([transform(t, a, b, *wxyz[i].tolist()) for a, b, wxyz in frames]))
+        for i, t in enumerate(poses.t_ns[:400].tolist())
+    ]
+    imu = [
+        (t, forms.ROS2.deserialize_cdr(data, kind))
+        for topic, kind, t, data in forms.raw_messages(simulated)
+        if topic == "/head/imu" and t < poses.t_ns[400]
+    ]
+    path = forms.ros2_recording(tmp_path / "tf.mcap", {"/tf": tf, "/xsens": imu})
+    (head,) = (found for found in suggestions(open_recording(path), NONE) if found.method == "head")
+    assert head.missing == ()
+    assert head.yaml.split("\n") == [
+        "topics:",
+        "  head_imu: /xsens",
+        "  vision_attitude: {topic: /tf, frames: [helmet, camera], invert: true}",
+    ]
+    assert "/tf (helmet to camera) turns with /xsens" in head.reasons[0]
+    config = load_config(head.yaml.encode())
+    recording = open_recording(path)
+    recording.use(config.topics.values(), config.columns)
+    data, expected = read_head(recording, config), read_head(open_recording(simulated), NONE)
+    np.testing.assert_allclose(data.vision_wxyz, expected.vision_wxyz[: len(data.vision_wxyz)], atol=1e-12)
 
 
 def test_a_sensor_that_is_there_but_not_used_is_told(simulated: Path, tmp_path: Path) -> None:

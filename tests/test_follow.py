@@ -216,6 +216,12 @@ def test_what_is_missing_is_said_until_the_accuracy_is_reached(whole: Path, tmp_
     assert {c.what for c in last.checklist} >= {"target", "sway about x", "sway about y", "sway about z"}
 
 
+def test_json_is_all_that_is_printed(whole: Path, tmp_path: Path) -> None:
+    command = _alidade("follow", str(whole), "--json", "--no-check", "--out", str(tmp_path / "out"))
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    assert json.loads(done.stdout) == json.loads((tmp_path / "out" / "result.json").read_text())
+
+
 def test_no_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"s\.mcap: nothing there, or nothing in it, after 0\.3 s of waiting"):
         _follow(tmp_path / "s.mcap", Settings(patience=0.3))

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 from pipelines.config import load_config
 from pipelines.errors import InputError
-from pipelines.recording import messages
+from pipelines.recording import messages, video
 from pipelines.recording.reading import open_recording
 from pipelines.settings import Config
+from tests import forms
 from tests.damage import Whole, check_sound, read, write_small
 from tests.raw_messages import T0, read_any, write_raw
 
@@ -125,6 +126,55 @@ def test_texts_as_definitions(trial: settings, tmp_path: Path) -> None:
         path = write_raw(tmp_path / "x.mcap", "/x", messages.JOINT_STATE, text, [b"\0\1\0\0" + data], [T0])
         with suppress(InputError):
             read_any(path, messages.JOINT_STATE)
+
+    property_()
+
+
+@fuzzed(6, 300)
+def test_texts_as_idl(trial: settings, tmp_path: Path) -> None:
+    kind = messages.IMU
+    lines = forms.idl(kind)[1].decode().splitlines()
+    words = [
+        "module a {",
+        "};",
+        "struct x {",
+        "double y;",
+        "sequence<double, 3> z;",
+        "typedef long a__3[3];",
+        "@a(b=1)",
+    ]
+    letters = st.text(st.characters(codec="utf-8"), max_size=20)
+    line = st.sampled_from(lines) | st.sampled_from(words) | letters
+    edits = st.lists(st.tuples(st.integers(0, len(lines)), st.integers(0, 3), line), max_size=3)
+
+    @trial
+    @given(edits, st.binary(max_size=60))
+    def property_(edits: list[tuple[int, int, str]], data: bytes) -> None:
+        text = list(lines)
+        for at, removed, put in edits:
+            text[at : at + removed] = [put]
+        written = "\n".join(text).encode(errors="replace")
+        path = tmp_path / "x.mcap"
+        message = b"\0\1\0\0" + data
+        forms.mcap([("/x", "", T0, b"")], path, lambda *_: message, "cdr", "ros2idl", lambda _: (kind, written))
+        with suppress(InputError):
+            read_any(path, kind)
+
+    property_()
+
+
+@fuzzed(20, 500)
+def test_bytes_as_a_video(trial: settings) -> None:
+    head = forms.h264_parameters(32, 32)
+    unit = st.binary(max_size=60).map(lambda body: b"\0\0\0\1" + body)
+
+    @trial
+    @given(
+        st.lists(st.tuples(st.booleans(), unit, unit).map(lambda m: (head if m[0] else b"") + m[1] + m[2]), max_size=4)
+    )
+    def property_(packets: list[bytes]) -> None:
+        with suppress(ValueError):
+            assert len(list(video.decoded(enumerate(packets)))) == len(packets)
 
     property_()
 

@@ -29,6 +29,7 @@ from pipelines.recording.writing import write_session
 from pipelines.session import calibrate
 from pipelines.simulation.motion import EulerMotion, Swing
 from tests import forms, live
+from tests.forms import header, ros2_recording
 from tests.recorded import T0, assert_same, session
 from tests.turning import turning, write_csv
 
@@ -476,22 +477,6 @@ def test_an_ardupilot_log_names_the_converter(tmp_path: Path) -> None:
 
 
 # -- messages
-
-
-def ros2_recording(path: Path, topics: dict[str, list[tuple[int, Any]]]) -> Path:
-    """Messages, (log time, message) by topic, of rosbags' types."""
-    whole = [
-        (name, message.__msgtype__, log_ns, bytes(forms.ROS2.serialize_cdr(message, message.__msgtype__)))
-        for name, found in topics.items()
-        for log_ns, message in found
-    ]
-    return forms.mcap(whole, path, lambda _, data: data, "cdr", "ros2msg", forms.ros2_schema)
-
-
-def header(t_ns: int, frame: str = "") -> Any:
-    types = forms.ROS2.types
-    time = types["builtin_interfaces/msg/Time"](*divmod(t_ns, 10**9))
-    return types["std_msgs/msg/Header"](time, frame)
 
 
 def test_attitudes_of_all_types(tmp_path: Path) -> None:

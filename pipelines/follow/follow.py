@@ -9,6 +9,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
 
+from rich.console import Console
+
 from pipelines.follow.follower import Follower, Settings
 from pipelines.follow.guidance import View
 from pipelines.follow.screen import Screen
@@ -18,7 +20,9 @@ from pipelines.reports.result import Calibration
 from pipelines.terminal import console
 
 
-def follow(what: str, settings: Settings, port: int | None, record: Path | None = None) -> Calibration:
+def follow(
+    what: str, settings: Settings, port: int | None, record: Path | None = None, on_stderr: bool = False
+) -> Calibration:
     """Follow a recording until it ends, shown in the terminal and, with a port, served on it.
 
     The first Ctrl-C ends it with what is there, the second at once. Raises as `source_of` and `Follower.follow` do.
@@ -28,11 +32,12 @@ def follow(what: str, settings: Settings, port: int | None, record: Path | None 
         settings: how.
         port: of the server.
         record: folder where streams are kept.
+        on_stderr: show it there, for standard output is a program's.
     """
     with ExitStack() as stack:
         server = None if port is None else stack.enter_context(LiveServer(port))
         stopped = stack.enter_context(_interrupted())
-        screen = stack.enter_context(Screen(console))
+        screen = stack.enter_context(Screen(Console(stderr=True, highlight=False) if on_stderr else console))
         if server is not None:
             screen.say(f"estimates live at {server.url} (Foxglove: open connection)")
 

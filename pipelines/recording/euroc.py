@@ -6,7 +6,7 @@ is the name of its folder, `/imu0`; of a camera `/cam0/image` and `/cam0/camera_
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pipelines.errors import InputError
 from pipelines.recording import series
 from pipelines.recording.arrays import ArrayContainer
+from pipelines.recording.container import sha256_of, sha256_together
 from pipelines.recording.tables import column_names, nanoseconds, numbers, read_columns
 
 _DISTORTION = {"radial-tangential": "plumb_bob", "equidistant": "equidistant"}
@@ -37,14 +38,28 @@ def read_euroc(path: Path, root: Path) -> ArrayContainer:
         topics |= found
         if not found:
             remarks.append(f"{table.parent.name} is not used: columns {', '.join(column_names(table, table))}")
-    container = ArrayContainer(path, topics, remarks)
-    container.data = next(iter(sorted(root.glob("*/data.csv"))))
-    return container
+    return _DataSet(path, topics, remarks, sorted(root.glob("*/data.csv")))
+
+
+class _DataSet(ArrayContainer):
+    """A folder of tables."""
+
+    def __init__(
+        self, path: Path, topics: Mapping[str, series.Topic], remarks: Sequence[str], tables: Sequence[Path]
+    ) -> None:
+        super().__init__(path, topics, remarks)
+        self.data, self._tables = tables[0], tables
+
+    def sha256(self) -> str:
+        """SHA-256 of the tables' own digests, in the order of their names."""
+        return sha256_together(map(sha256_of, self._tables))
 
 
 def _topics(table: Path, name: str, sensor: Mapping[str, Any]) -> dict[str, series.Topic]:
     """What a sensor's table holds."""
     names = column_names(table, table)
+    if not names:
+        raise InputError(f"{table}: a table without columns")
     columns = read_columns(table, table, names)
     t_ns = nanoseconds(table, columns[names[0]], "ns")
 

@@ -75,8 +75,8 @@ _ROS1_TIMES = {
     if name in ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 }
 
-# No message of sensors comes near any of these.
-_LONGEST_TEXT, _MOST_FIELDS, _DEEPEST = 1 << 18, 10_000, 32
+# No message of sensors comes near any of these. The parser of IDL takes a tenth of a second for a thousand letters.
+_LONGEST_TEXT, _LONGEST_IDL, _MOST_FIELDS, _DEEPEST = 1 << 18, 1 << 15, 10_000, 32
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ class Definition:
 
     def __init__(self, name: str, text: str, wire: Wire = "cdr", language: Language = "msg") -> None:
         self.name, self.wire = name, wire
-        if len(text) > _LONGEST_TEXT:
+        if len(text) > (_LONGEST_TEXT if language == "msg" else _LONGEST_IDL):
             raise MessageError(f"the definition of message type {name} has {len(text)} letters")
         try:
             self._types = get_types_from_msg(text, name) if language == "msg" else _types_of_idl(text)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from pipelines.recording.container import Channel, Container, Rows, Schema
+from pipelines.recording.container import Channel, Container, Rows, Schema, sha256_together
 from pipelines.recording.data_loss import DataLoss
 
 # Ids of channels and schemas in a part; each part has its own range of them.
@@ -80,7 +79,4 @@ class Parts(Container):
 
     def sha256(self) -> str:
         """SHA-256 of the parts' own digests (their 32 bytes each), in the order of the parts."""
-        digest = hashlib.sha256()
-        for part in self.parts:
-            digest.update(bytes.fromhex(part.sha256()))
-        return digest.hexdigest()
+        return sha256_together(part.sha256() for part in self.parts)

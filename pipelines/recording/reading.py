@@ -67,6 +67,7 @@ class Recording:
         self._epoch_ns = epoch_ns
         self._reader = MessageReader(container, str(container.path), epoch_ns)
         self._made: dict[str, TopicSource] = {}
+        self._transforms: dict[str, dict[tuple[str, str], series.PoseSeries]] = {}
         self.stamp_sigma_s = 0.0
 
     @property
@@ -203,6 +204,24 @@ class Recording:
         attitude = self.quaternion(topic)
         return series.PoseSeries(attitude.t_ns, attitude.wxyz, stamped_by_log=attitude.stamped_by_log)
 
+    def poses_of(self, source: TopicSource) -> series.PoseSeries:
+        """As `poses`, of a source that `use` need not know."""
+        return self._made_poses(source.name, source)
+
+    def transforms(self, topic: str) -> Mapping[tuple[str, str], series.PoseSeries]:
+        """Frames, parent and child -> the transforms between them, on a tf2_msgs/msg/TFMessage topic."""
+        if topic not in self._transforms:
+            rows: dict[tuple[str, str], list[tuple[int, bool, Any]]] = {}
+            for log_ns, _, message, definition in self._reader.decoded(topic, messages.TF):
+                with self._reader.fields(topic):
+                    for one in message.transforms:
+                        t_ns = one.header.stamp.sec * 1_000_000_000 + one.header.stamp.nanosec
+                        row = t_ns or log_ns, not t_ns, definition.numbers(one.transform)
+                        pair = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
+                        rows.setdefault(pair, []).append(row)
+            self._transforms[topic] = {pair: _series_of_transforms(found) for pair, found in rows.items()}
+        return self._transforms[topic]
+
     def fixes(self, topic: str) -> series.FixSeries:
         """A sensor_msgs/msg/NavSatFix topic."""
         return self._series(series.FixSeries, topic)
@@ -314,7 +333,7 @@ class Recording:
     def _made_poses(self, name: str, source: TopicSource) -> series.PoseSeries:
         if source.topic is None:
             raise InputError(f"{self.path}: topic {name} is made of rates; it holds no attitude")
-        poses = self._transforms(source.topic, source.frames) if source.frames else self.poses(source.topic)
+        poses = self._between(source.topic, source.frames) if source.frames else self.poses(source.topic)
         return inverted(poses) if source.invert else poses
 
     def _made_imu(self, name: str, source: TopicSource) -> series.ImuSeries:
@@ -331,28 +350,17 @@ class Recording:
         imu = self._series(series.ImuSeries, topic)
         return series.VectorSeries(imu.t_ns, getattr(imu, which), stamped_by_log=imu.stamped_by_log)
 
-    def _transforms(self, topic: str, frames: tuple[str, str]) -> series.PoseSeries:
+    def _between(self, topic: str, frames: tuple[str, str]) -> series.PoseSeries:
         """The transforms of a pair of frames, parent and child, in the messages of a TFMessage topic."""
-        pairs: set[tuple[str, str]] = set()
-        rows: list[tuple[int, bool, Any]] = []
-        for log_ns, _, message, definition in self._reader.decoded(topic, messages.TF):
-            with self._reader.fields(topic):
-                for one in message.transforms:
-                    pair = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
-                    if pair == (frames[0].lstrip("/"), frames[1].lstrip("/")):
-                        t_ns = one.header.stamp.sec * 1_000_000_000 + one.header.stamp.nanosec
-                        rows.append((t_ns or log_ns, not t_ns, definition.numbers(one.transform)))
-                    elif len(pairs) < _MOST_PAIRS:
-                        pairs.add(pair)
-        if not rows:
-            there = ", ".join(f"{parent} to {child}" for parent, child in sorted(pairs))
+        pairs = self.transforms(topic)
+        found = pairs.get((frames[0].lstrip("/"), frames[1].lstrip("/")))
+        if found is None:
+            there = ", ".join(f"{parent} to {child}" for parent, child in sorted(pairs)[:_MOST_PAIRS])
             raise InputError(
                 f"{self.path}: topic {topic} has no transform from {frames[0]} to {frames[1]}; there: {there or 'none'}"
             )
-        numbers = np.array([row for _, _, row in rows]).reshape(len(rows), 7)
-        t_ns = np.array([row[0] for row in rows], dtype=np.int64)
-        by_log = sum(row[1] for row in rows)
-        return series.PoseSeries(t_ns, numbers[:, [6, 3, 4, 5]], numbers[:, :3], stamped_by_log=by_log)
+        self._tell_unstamped(topic, found.t_ns, found.stamped_by_log)
+        return found
 
     def _attitudes(self, topic: str) -> series.PoseSeries:
         """The orientations of an Imu topic. Raises InputError where it has none."""
@@ -388,3 +396,11 @@ class Recording:
         )
         if sentence not in self._container.remarks:
             self.remark(sentence)
+
+
+def _series_of_transforms(rows: Sequence[tuple[int, bool, Any]]) -> series.PoseSeries:
+    """Transforms as (stamp, whether it is a log time, translation and quaternion x, y, z, w)."""
+    numbers = np.array([row[2] for row in rows]).reshape(len(rows), 7)
+    t_ns = np.array([row[0] for row in rows], dtype=np.int64)
+    by_log = sum(row[1] for row in rows)
+    return series.PoseSeries(t_ns, numbers[:, [6, 3, 4, 5]], numbers[:, :3], stamped_by_log=by_log)

@@ -11,6 +11,7 @@ from pipelines.recording.netpbm import colour_file
 # How the formats of messages are called; what is read, and what else a video may be.
 H264 = ("h264", "avc", "x264", "libx264")
 OTHERS = ("h265", "hevc", "vp8", "vp9", "av1")
+_LARGEST = 1 << 26
 # What a message of H.264 begins with (Annex B of ITU-T H.264).
 _STARTS = (b"\0\0\1", b"\0\0\0\1")
 
@@ -34,7 +35,10 @@ def decoded(packets: Iterable[tuple[int, bytes]]) -> Iterator[tuple[int, bytes]]
             stamps.append(t_ns)
         whole.flush()
         video = cv2.VideoCapture(whole.name, cv2.CAP_FFMPEG)
+        width, height = (int(video.get(size)) for size in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
         try:
+            if width * height > _LARGEST:
+                raise ValueError(f"pictures of {width} x {height}, which no camera makes")
             for i, t_ns in enumerate(stamps):
                 is_there, pixels = video.read()
                 if not is_there:
