@@ -16,8 +16,11 @@ from pipelines.methods.cube.layout import cube_layout
 from pipelines.recording.reading import open_recording
 from pipelines.vision.camera import Camera
 from pipelines.vision.layout import Layout, Shots, estimate_layout
-from pipelines.vision.layout.bundle import Bundle, Sights, fixed_cameras, free_cameras, linearized, moved, shared_rows
+from pipelines.vision.layout.bundle import moved
+from pipelines.vision.layout.cameras import fixed_cameras, free_cameras
+from pipelines.vision.layout.normal import shared_rows
 from pipelines.vision.layout.placing import mirrored
+from pipelines.vision.layout.sights import Bundle, Sights, linearized
 from pipelines.vision.pose import TagBody, estimate_pose
 from pipelines.vision.tags import Detections
 
@@ -164,6 +167,31 @@ def test_a_tag_that_was_moved_is_not_placed() -> None:
     layout = estimate_layout([Shots(CAMERA, drawn.pictures)], drawn.given())
     assert list(layout.unplaced) == [5]
     assert "disagrees" in layout.unplaced[5] or "flip" in layout.unplaced[5]
+
+
+def test_a_tag_seen_once_from_afar_is_not_placed() -> None:
+    far = Camera(1280, 960, np.array([[4600.0, 0, 641.3], [0, 4620.0, 477.8], [0, 0, 1]]))
+    drawn = scene(8, 60, 3, far, (3.0, 4.0))
+    once = next(k for k, seen in enumerate(drawn.pictures) if len(seen) == 2 and 5 in seen.ids)
+    for k, seen in enumerate(drawn.pictures):
+        keep = (seen.ids != 5) | (k == once)
+        drawn.pictures[k] = detections(seen.ids[keep], seen.corners[keep])
+    layout = estimate_layout([Shots(far, drawn.pictures)], drawn.given())
+    assert list(layout.unplaced) == [5]
+    assert "flip" in layout.unplaced[5]
+
+
+def test_tags_that_a_wrong_tag_alone_ties_to_the_others_are_not_placed() -> None:
+    """Tags 0 to 3 and 4 to 7, never in one picture but for tag 8, which lies about loose."""
+    drawn, rng = scene(9, 120, 6), np.random.default_rng(0)
+    pictures = []
+    for k, seen in enumerate(drawn.pictures):
+        keep = (seen.ids < 4 if k % 2 else (seen.ids > 3) & (seen.ids < 8)) | (seen.ids == 8)
+        corners = seen.corners + (seen.ids == 8)[:, None, None] * rng.uniform(-60, 60, 2)
+        pictures.append(detections(seen.ids[keep], corners[keep]))
+    layout = estimate_layout([Shots(CAMERA, [seen for seen in pictures if len(seen)])], drawn.given())
+    assert set(layout.unplaced) >= {4, 5, 6, 7, 8}
+    assert layout.body.ids[0] == 0
 
 
 def test_pictures_without_perspective_do_not_tell_inside_from_outside() -> None:

@@ -8,18 +8,20 @@ are adjusted together (`bundle`, `robust`), with the cameras if asked for.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines import progress
 from pipelines.errors import InputError
 from pipelines.vision.camera import Camera
-from pipelines.vision.layout.bundle import Array, free_cameras
+from pipelines.vision.layout.cameras import free_cameras
 from pipelines.vision.layout.covariance import covariance
 from pipelines.vision.layout.pictures import Gathered, Shots, gathered
 from pipelines.vision.layout.placing import joint
 from pipelines.vision.layout.robust import Fit, fitted
+from pipelines.vision.layout.sights import Array, Sights
 from pipelines.vision.layout.whole import adjusted_whole, flip_told
 from pipelines.vision.pose import TagBody, part
 
@@ -98,7 +100,8 @@ def estimate_layout(shots: Sequence[Shots], given: TagBody, refine_camera: bool 
             raise InputError(f"tag {given.ids[0]}, which defines the body's frame: {wrong[int(given.ids[0])]}")
         unplaced, body = unplaced | wrong, fit.bundle.body
     if refine_camera:
-        fit = fitted(fit.bundle, views.sights[fit.whole], 0, free_cameras(fit.bundle.cameras))
+        refined = fitted(fit.bundle, views.sights[fit.whole], 0, free_cameras(fit.bundle.cameras))
+        fit = replace(refined, whole=fit.whole)
     return _layout(views, fit, unplaced)
 
 
@@ -106,10 +109,7 @@ def _apart(views: Gathered, given: TagBody) -> dict[int, str]:
     """Tags that no chain of tags seen together ties to the first one."""
     n, sights = len(given.ids), views.sights
     times = np.bincount(sights.tag, minlength=n)
-    pictures = joint(sights, n) > 0
-    reached = np.arange(n) == 0
-    for _ in range(n):
-        reached = reached | (pictures & reached).any(axis=1)
+    reached = _reached(sights, n)
     if reached.sum() < 2:
         shown = "in no picture" if not times[0] else f"in {times[0]} pictures, never with another tag of the body"
         raise InputError(
@@ -124,30 +124,37 @@ def _apart(views: Gathered, given: TagBody) -> dict[int, str]:
     }
 
 
+def _reached(sights: Sights, tags: int) -> NDArray[np.bool_]:
+    """(n,) tags that a chain of pictures ties to the first one."""
+    pictures, reached = joint(sights, tags) > 0, np.arange(tags) == 0
+    for _ in range(tags):
+        reached = reached | (pictures & reached).any(axis=1)
+    return reached
+
+
 def _wrong(views: Gathered, fit: Fit) -> dict[int, str]:
     """Tags whose pose is not to be believed."""
     body, sights = fit.bundle.body, views.sights
     n = len(body.ids)
     shown, used = np.bincount(sights.tag, minlength=n), np.bincount(fit.sights.tag, minlength=n)
-    looked_at = np.bincount(sights.tag[fit.whole], minlength=n)
+    looked_at, reached = np.bincount(sights.tag[fit.whole], minlength=n), _reached(fit.sights, n)
     out = {}
     for k, tag in enumerate(body.ids.tolist()):
-        if not looked_at[k]:
-            out[tag] = (
-                f"in {shown[k]} pictures, none of which tells the planar flip of all that it shows; take pictures from "
-                "nearer, or that show more tags"
-            )
-        elif used[k] < (1.0 - _MOSTLY_FALSE) * looked_at[k]:
+        if looked_at[k] and used[k] < (1.0 - _MOSTLY_FALSE) * looked_at[k]:
             out[tag] = (
                 f"disagrees with the others in {looked_at[k] - used[k]} of {looked_at[k]} pictures; is its size right, "
                 "is it glued down, is there another tag of this id?"
+            )
+        elif not reached[k]:
+            out[tag] = (
+                f"in {shown[k]} pictures, but in none with placed tags that tells the flip of all it shows; take "
+                "pictures from nearer, or that show more tags"
             )
         elif not flip_told(fit, views.view, k):
             out[tag] = (
                 f"in {used[k]} pictures that fit its planar flip as well; take pictures of it with its neighbours from "
                 "nearer and from other sides"
             )
-    # Of tags that disagree each may spoil the next one's pose: the worst goes first.
     return out
 
 

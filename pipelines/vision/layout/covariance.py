@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.vision.layout.bundle import Array, Index, normal_equations, shared_rows
+from pipelines.vision.layout.normal import normal_equations, shared_rows
 from pipelines.vision.layout.robust import Fit
+from pipelines.vision.layout.sights import Array, Index
 
 # A correlation within this many of its sigmas of zero has died out; the first one is asked to be beyond more of them.
 _DIED_OUT, _COLOURED = 2.0, 4.0

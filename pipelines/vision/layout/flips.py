@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from factors import so3
-from pipelines.vision.layout.bundle import Array, Bundle, Index, Sights, linearized, loss, refined_pictures
+from pipelines.vision.layout.bundle import loss, refined_pictures
+from pipelines.vision.layout.sights import Array, Bundle, Index, Sights, linearized
 from pipelines.vision.pose import planar_solutions
 
 # Poses closer than this, rad, are one.

@@ -9,7 +9,7 @@ import numpy as np
 
 from factors import so3
 from pipelines.vision.camera import Camera
-from pipelines.vision.layout.bundle import Array, Bundle, Index, Sights
+from pipelines.vision.layout.sights import Array, Bundle, Index, Sights
 from pipelines.vision.pose import TagBody
 from pipelines.vision.tags import Detections
 

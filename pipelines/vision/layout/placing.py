@@ -14,17 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import so3
-from pipelines.vision.layout.bundle import (
-    Array,
-    Bundle,
-    Index,
-    Sights,
-    adjusted,
-    fixed_cameras,
-    linearized,
-    loss,
-)
+from pipelines.vision.layout.bundle import adjusted, loss
+from pipelines.vision.layout.cameras import fixed_cameras
 from pipelines.vision.layout.flips import Flips, Sides, pairs, sides
+from pipelines.vision.layout.sights import Array, Bundle, Index, Sights, linearized
 from pipelines.vision.pose import TagBody, part
 
 # Sum of squares of a tag in a picture, eight numbers in sigmas, beyond which it counts less and less.

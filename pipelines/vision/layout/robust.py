@@ -12,16 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.vision.layout.bundle import (
-    Array,
-    Bundle,
-    Cameras,
-    Index,
-    Rows,
-    Sights,
-    adjusted,
-    linearized,
-)
+from pipelines.vision.layout.bundle import adjusted
+from pipelines.vision.layout.cameras import Cameras
+from pipelines.vision.layout.sights import Array, Bundle, Index, Rows, Sights, linearized
 
 # Degrees of freedom of the t distribution.
 _NU = 4.0
@@ -42,7 +35,7 @@ class Fit:
         weight: (f,) of the pictures, about 1; the inverse of their variance over the common one.
         sigma: of a corner in a common picture, in the sigmas given.
         sigma_px: of a corner in a common picture, per axis.
-        whole: indices of the sights that were looked at, in a table of the caller's.
+        whole: indices of the sights that were looked at, used or not, in a table of the caller's.
         cameras: what was adjusted of the cameras.
     """
 

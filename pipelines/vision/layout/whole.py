@@ -8,11 +8,13 @@ import numpy as np
 
 from factors import so3
 from pipelines.errors import InputError
-from pipelines.vision.layout.bundle import Array, Bundle, Index, Sights, adjusted, fixed_cameras, loss
+from pipelines.vision.layout.bundle import adjusted, loss
+from pipelines.vision.layout.cameras import fixed_cameras
 from pipelines.vision.layout.flips import Flips, flips, lone_scale, pairs, sides
 from pipelines.vision.layout.pictures import Gathered
 from pipelines.vision.layout.placing import FAR, grown, joint, mirrored, together, vote, with_pictures
 from pipelines.vision.layout.robust import Fit, fitted
+from pipelines.vision.layout.sights import Array, Bundle, Index, Sights
 from pipelines.vision.pose import TagBody
 
 # Twice the logarithm of the odds, a thousand to one, from which a flip is told.
