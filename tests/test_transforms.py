@@ -87,6 +87,21 @@ def test_tf_and_urdf_say_the_same(read_back: SavedCalibration) -> None:
             np.testing.assert_allclose(so3.matrix(wxyz), so3.matrix(np.array(each.wxyz)), atol=1e-10)
 
 
+def test_a_cubes_mounts_are_those_of_its_config_corrected() -> None:
+    cube = method("cube")
+    simulated = cube.simulate(
+        cube.scenario.model_validate({"poses": 6, "static_s": 2.0, "camera": {"rate_hz": 4.0}}), 0
+    )
+    calibration = Session.of(cube, simulated).calibrate()
+    transforms = saved(calibration).transforms
+    assert (transforms["BRC"].parent, transforms["BRC"].child) == ("reference", "camera")
+    given = np.array(cube.stated(calibration.config)["camera_rotation"])
+    mount = np.array([calibration.parameters[f"camera_mount_{axis}"].value for axis in "xyz"])
+    expected = so3.matrix(so3.compose(given, so3.exp(mount)))
+    np.testing.assert_allclose(so3.matrix(np.array(transforms["BRC"].wxyz)), expected, atol=1e-10)
+    assert {f"bodyRtag_{tag}" for tag in range(16, 22)} < set(transforms)
+
+
 def test_angles_at_a_right_angle_of_pitch(read_back: SavedCalibration) -> None:
     each = next(iter(read_back.transforms.values()))
     axes = np.eye(3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +22,7 @@ from pipelines.methods import method
 from pipelines.methods.triads import triad_names, triad_of
 from pipelines.methods.tumble.recording import TumbleData, read_tumble, write_tumble
 from pipelines.methods.tumble.scenario import TumbledAccelerometer, TumbledMagnetometer, TumbleScenario
+from pipelines.planning import make_plan
 from pipelines.recording import series
 from pipelines.recording.checks import nanoseconds
 from pipelines.recording.reading import open_recording
@@ -255,6 +257,23 @@ def test_other_methods_go_first(tmp_path: Path) -> None:
     topics["/indexer/joint_states"] = series.JointSeries(t, zeros, ("outer_x", "inner_z"))
     write_session(tmp_path / "turns.mcap", topics, {})
     assert resolve_method(None, open_recording(tmp_path / "turns.mcap"), Config(latitude_deg=40.0)) == "indexer"
+
+
+def test_whoever_turns_it_is_told_where_to() -> None:
+    narrow = _simulated(replace_scenario(RESTING, tilt_deg=60.0), 0)
+    items = {item.what: item for item in TUMBLE.checklist(narrow.data, Config())}
+    # Up never came near -z.
+    assert re.match(r"rest it with this side up: -z", items["sides up"].wanted)
+    whole = _simulated(replace_scenario(BRIEF, attitudes=60), 0)
+    assert [item.wanted for item in TUMBLE.checklist(whole.data, Config())] == [""]
+
+
+def test_a_plan_that_falls_short_turns_it_upside_down(tmp_path: Path) -> None:
+    (tmp_path / "narrow.yaml").write_text("{attitudes: 20, tilt_deg: 25.0, magnetometer: {rate_hz: 10.0}}")
+    plan = make_plan("tumble", str(tmp_path / "narrow.yaml"), most_steps=1)
+    assert plan.now.missing
+    assert [step.change for step in plan.steps] == ["turned upside down too"]
+    assert not plan.best.missing
 
 
 def test_too_little_is_an_input_error(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from pipelines.errors import InputError, nearest_three
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from pipelines.graph.problem import Estimate, Findings, Problem
+    from pipelines.graph.problem import Array, Estimate, Findings, Problem
     from pipelines.judgement.checklist import ChecklistItem
     from pipelines.judgement.hypotheses import Hypotheses
     from pipelines.judgement.validation import Validation
@@ -156,6 +156,10 @@ class Method(ABC):
 
         Assumptions that the recording does not determine are not among them.
         """
+
+    def stated(self, config: Config) -> Mapping[str, Array]:  # noqa: ARG002
+        """What formulas ask to be measured that a config states, such as rotations of a drawing: name -> value."""
+        return {}
 
     def findings(self, data: Any, config: Config, estimate: Estimate) -> Findings:  # noqa: ARG002
         """What there is to tell beside the parameters."""

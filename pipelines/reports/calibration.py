@@ -181,13 +181,15 @@ def _transforms(calibration: Calibration) -> dict[str, SavedTransform]:
     """The formulas that are rotations and need nothing measured, by the frames in their meaning: "a to b, ..."."""
     estimate, covariance = calibration.estimate, calibration.covariance
     unknown = dict.fromkeys((q.name for q in calibration.problem.quantities), 0.0)
+    given = calibration.method.stated(calibration.config)
     formulas: list[Formula] = []
 
     def at(values: Array) -> dict[str, Array]:
-        return apply(formulas, {**unknown, **dict(zip(estimate.names, values.tolist(), strict=True))}, {})
+        needed = {name: given[name] for formula in formulas for name in formula.measured}
+        return apply(formulas, {**unknown, **dict(zip(estimate.names, values.tolist(), strict=True))}, needed)
 
     for formula in calibration.formulas:
-        if not formula.measured:
+        if given.keys() >= set(formula.measured):
             formulas.append(formula)
             try:
                 at(estimate.values)

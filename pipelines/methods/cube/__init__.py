@@ -10,7 +10,7 @@ from pipelines.methods import Method, Scenario
 from pipelines.methods.cube.topics import NEEDS, TOPICS, CubeConfig
 
 if TYPE_CHECKING:
-    from pipelines.graph.problem import Estimate, Findings, Problem
+    from pipelines.graph.problem import Array, Estimate, Findings, Problem
     from pipelines.judgement.checklist import ChecklistItem
     from pipelines.judgement.hypotheses import Hypotheses
     from pipelines.judgement.validation import Validation
@@ -98,6 +98,11 @@ class Cube(Method):
         from pipelines.methods.cube.formulas import formulas
 
         return formulas(parameters, config)
+
+    def stated(self, config: Config) -> Mapping[str, Array]:
+        from pipelines.methods.cube.formulas import stated
+
+        return stated(config)
 
     def figures(self, data: CubeData, calibration: Calibration) -> Sequence[Plot | Table]:
         from pipelines.methods.cube.figures import cube_plots

@@ -66,6 +66,13 @@ def formulas(parameters: Collection[str], config: Config) -> list[Formula]:
     return found
 
 
+def stated(config: Config) -> dict[str, so3.Array]:
+    """The camera's mount and the tags' rotations as the config gives them, by their names in the formulas."""
+    cube = config.section(CubeConfig)
+    tags = {f"rotation_{tag}": np.array(each.rotation) for tag, each in cube.tags.items()}
+    return tags if cube.camera_rotation is None else {**tags, "camera_rotation": np.array(cube.camera_rotation)}
+
+
 def _accelerometer(parameters: Collection[str], conversion: RawConversion | None) -> list[Formula]:
     """With its curvature taken off, in nominal units, if any of it is known."""
     if not any(name in parameters for each in (SQUARE, CUBE) for name in each.names):

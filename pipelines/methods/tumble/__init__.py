@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.methods import Method
+from pipelines.methods import Method, Scenario
 from pipelines.methods.tumble.topics import NEEDS, TOPICS
 
 if TYPE_CHECKING:
     from pipelines.graph.problem import Estimate, Findings, Problem
+    from pipelines.judgement.checklist import ChecklistItem
     from pipelines.judgement.hypotheses import Hypotheses
     from pipelines.judgement.validation import Validation
     from pipelines.methods.formula import Formula
@@ -71,6 +72,16 @@ class Tumble(Method):
         from pipelines.methods.tumble.recording import write_tumble
 
         write_tumble(path, simulated)
+
+    def candidates(self, scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
+        from pipelines.methods.tumble.candidates import candidates
+
+        return candidates(scenario)
+
+    def checklist(self, data: TumbleData, config: Config) -> Sequence[ChecklistItem]:
+        from pipelines.methods.tumble.guidance import checklist
+
+        return checklist(data, config)
 
     def hypotheses(self) -> Hypotheses:
         from pipelines.methods.tumble.hypotheses import HYPOTHESES
