@@ -17,6 +17,7 @@ from typer.core import TyperGroup
 
 from pipelines import exit_codes
 from pipelines.options import ConfigFile, Quiet, RecordingPath, RecordingPaths
+from pipelines.solvers.window import parse_window
 
 if TYPE_CHECKING:
     from pipelines.reports.result import Calibration
@@ -77,7 +78,7 @@ _NoCheck = Annotated[bool, typer.Option("--no-check", help="Do not hold an incre
 _Prior = Annotated[
     Path | None, typer.Option(help="An earlier calibration of the device to begin from: result.json, calibration.yaml.")
 ]
-_Window = Annotated[str, typer.Option(help="Of the incremental solver: seconds kept, or 'all'.")]
+_Window = Annotated[str, typer.Option(help="Of the incremental solver: seconds kept, keyframes (50kf), or 'all'.")]
 
 
 def _version(wanted: bool) -> None:
@@ -139,7 +140,7 @@ def calibrate(
                 [solver.value],
                 method,
                 config,
-                _seconds(window),
+                parse_window(window),
                 strict,
                 auto_topics,
                 not no_check,
@@ -172,7 +173,7 @@ def compare(
 
     solvers = ["published", "batch", "incremental"]
     with progress.shown(quiet or as_json):
-        calibrations = run(session, solvers, method, config, _seconds(window), strict, auto_topics)
+        calibrations = run(session, solvers, method, config, parse_window(window), strict, auto_topics)
     if as_json:
         terminal.show_json(calibrations)
     else:
@@ -209,7 +210,7 @@ def follow(
     from pipelines.follow.follower import Settings
     from pipelines.reports.write import write_results
 
-    settings = Settings(method, config, _seconds(window), patience, checkpoint, not no_check)
+    settings = Settings(method, config, parse_window(window), patience, checkpoint, not no_check)
     calibration = run(source, settings, port if serve else None, record, as_json)
     folder = out or _beside(Path(_file_name(source)), "incremental")
     written = write_results(folder, calibration)
@@ -395,7 +396,7 @@ def montecarlo(
     chosen = SOLVERS if solvers == "all" else tuple(solvers.split(","))
     seeds = range(seed, seed + runs)
     with progress.shown(quiet or as_json):
-        study = run_study(method, scenario, seeds, chosen, folder, scheduler, jobs, _seconds(window))
+        study = run_study(method, scenario, seeds, chosen, folder, scheduler, jobs, parse_window(window))
     written = write_study(folder, study)
     for line in () if as_json else study.summary:
         terminal.say(line)
@@ -429,7 +430,7 @@ def fleet(
     from pipelines.fleet.write import write_fleet
     from pipelines.reports.plain_json import fleet_json
 
-    settings = Settings.of(method, config, solver.value, _seconds(window))
+    settings = Settings.of(method, config, solver.value, parse_window(window))
     with progress.shown(quiet or as_json):
         outcome = calibrate_fleet(find(recordings), settings, out, scheduler, jobs, names)
     found = populations(outcome.results)
@@ -511,20 +512,6 @@ def _tell(calibration: Calibration, folder: Path, written: Sequence[Path], as_js
         terminal.show([calibration])
         terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
     raise typer.Exit(exit_codes.OF_STATUS[calibration.assessment.status])
-
-
-def _seconds(window: str) -> float | None:
-    from pipelines.errors import InputError
-
-    if window == "all":
-        return None
-    try:
-        seconds = float(window)
-    except ValueError:
-        seconds = 0.0
-    if not 0.0 < seconds < float("inf"):
-        raise InputError(f"--window {window}: seconds above zero are needed, or 'all'")
-    return seconds
 
 
 def _interrupted(error: BaseException | None) -> bool:

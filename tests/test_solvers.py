@@ -16,6 +16,7 @@ from pipelines.judgement.observability import assess
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.incremental import solve_incremental
 from pipelines.solvers.marginals import IndeterminateError, reported_covariance
+from pipelines.solvers.window import Keyframes
 from tests import chain
 from tests.chain import INTERVAL, PARAMETER, PRIOR, Walk
 
@@ -120,7 +121,7 @@ def test_undetermined_state_is_named() -> None:
         solve_batch(replace(walk.problem(), steps=steps))
 
 
-@pytest.mark.parametrize("window", [0.35, 1.0, None])
+@pytest.mark.parametrize("window", [0.35, 1.0, Keyframes(3), None])
 def test_incremental_is_batch(window: float | None) -> None:
     """A linear problem loses nothing when states are marginalised out of the window."""
     walk, _ = Walk.random(4)

@@ -274,7 +274,7 @@ class Follower:
             "recording": f"one that starts at {session.origin.epoch_ns} ns ({identity(self.source.parts[0])})",
             "method": session.method.name,
             "config": session.config.model_dump_json(exclude_defaults=True),
-            "window": f"{self.settings.window} s",
+            "window": str(self.settings.window),
             "version": f"alidade {metadata.version('alidade')} with gtsam {metadata.version('gtsam')}",
         }
 

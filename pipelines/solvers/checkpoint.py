@@ -23,6 +23,7 @@ from pipelines.solvers.incremental import Run
 from pipelines.solvers.innovations import Innovations
 from pipelines.solvers.rows import Rows
 from pipelines.solvers.state import State
+from pipelines.solvers.window import Keyframes
 
 _SCHEMA = "alidade.checkpoint/3"
 _INNOVATIONS = "innovations/"
@@ -98,7 +99,9 @@ def load_checkpoint(path: Path, problem: Problem, identity: Mapping[str, str]) -
         values.deserialize(head["values"])
         linear.deserialize(head["linear"])
         stamps = {int(key): float(stamp) for key, stamp in head["stamps"]}
-        run = Run.resumed(problem, head["window"], State(head["time"], values, linear, stamps), head["levels"])
+        # What is saved as a whole number is keyframes.
+        window = Keyframes(head["window"]) if isinstance(head["window"], int) else float(head["window"])
+        run = Run.resumed(problem, window, State(head["time"], values, linear, stamps), head["levels"])
         run.current_keys = {int(key): int(held) for key, held in head["current_keys"]}
         run.keyframes = head["keyframes"]
         run.history, run.attitudes = Rows(arrays.pop("history")), Rows(arrays.pop("attitudes"))

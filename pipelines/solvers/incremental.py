@@ -29,6 +29,7 @@ from pipelines.solvers.rows import Rows
 from pipelines.solvers.smoother import Smoother, linearized, unweighed, used_part
 from pipelines.solvers.spurious import information_of_noise
 from pipelines.solvers.state import State, explained, require_known, require_sound
+from pipelines.solvers.window import Keyframes, Window
 
 DEFAULT_WINDOW = 1.0
 
@@ -52,7 +53,7 @@ MARGINALIZE_EVERY = 20.0
 _HISTORY_RATE = 5.0
 
 
-def solve_incremental(problem: Problem, window: float | None = DEFAULT_WINDOW) -> Estimate:
+def solve_incremental(problem: Problem, window: Window = DEFAULT_WINDOW) -> Estimate:
     """The filtered estimate after the last step, with its history.
 
     Measurements whose innovation lies outside the gate, measured against the innovation's own covariance, are left
@@ -60,7 +61,7 @@ def solve_incremental(problem: Problem, window: float | None = DEFAULT_WINDOW) -
 
     Args:
         problem: the graph.
-        window: s, how long states are kept; None keeps all.
+        window: how long states are kept, s or Keyframes; None keeps all.
 
     Raises:
         InputError: a factor gives no finite numbers, or needs a state that has left the window.
@@ -94,7 +95,7 @@ class Run:
 
     Attributes:
         problem: the graph.
-        window: s, how long states are kept; None keeps all.
+        window: how long states are kept, s or Keyframes; None keeps all.
         base: what was known when the past was last marginalised out; None: never.
         past: the steps since then.
         current_keys: parameter key -> variable that holds its value now.
@@ -105,7 +106,7 @@ class Run:
         attitudes: rows of time and quaternion.
     """
 
-    def __init__(self, problem: Problem, window: float | None) -> None:
+    def __init__(self, problem: Problem, window: Window) -> None:
         self.problem = problem
         self.window = window
         self.base: State | None = None
@@ -117,7 +118,9 @@ class Run:
         self.history = Rows()
         self.attitudes = Rows()
         self._smoother: Smoother | None = None  # None before the first batch solution
-        self._stamps: dict[int, float] = {}  # of the variables held that age
+        self._stamps: dict[int, float] = {}  # of the variables held that age, in the window's unit
+        self._times: list[float] = []  # of the steps, where the window's unit is keyframes
+        self._before = 0.0  # so many steps were taken before these
         self._young = True
         self._solved: _Solved | None = None  # the last batch solution while young
         self._looked = 0.0  # from so many s on it is to be seen again whether the past may be folded
@@ -125,10 +128,11 @@ class Run:
         self._noise: Array | None = None  # information of a young run that is its states' noise
 
     @classmethod
-    def resumed(cls, problem: Problem, window: float, base: State, scales: Mapping[str, float]) -> Run:
+    def resumed(cls, problem: Problem, window: Keyframes | float, base: State, scales: Mapping[str, float]) -> Run:
         """A run that goes on from what another one knew, with its noise levels by name."""
         run = cls(problem, window)
         run._young = False
+        run._before = 1.0 + max(base.stamps.values(), default=-1.0)
         run.levels = tuple(replace(level, scale=scales[level.noise.name]) for level in run.levels)
         run._continue_from(base)
         return run
@@ -164,10 +168,12 @@ class Run:
         self.current_keys.update(step.current_keys)
         self.keyframes = max(self.keyframes, step.keyframes.stop)
         self.past.append(step)
+        if isinstance(self.window, Keyframes):
+            self._times.append(step.time)
         if self._smoother is not None:
             self._advance(self._smoother, step)
         else:
-            self._stamps.update(step.timestamps)
+            self._stamps.update(self._aged(step.timestamps))
         since = step.time - (self.past[0].time if self.base is None else self.base.time)
         if self._young:
             if self._due(since):
@@ -246,13 +252,14 @@ class Run:
                 point = smoother.point()
                 begins = step.initial if step.predict is None else step.predict(point)
                 point.insert(begins)
-            smoother.update(self._accepted(smoother, step, values, new, point), begins, step.timestamps)
+            stamps = self._aged(step.timestamps)
+            smoother.update(self._accepted(smoother, step, values, new, point), begins, stamps)
         except (RuntimeError, np.linalg.LinAlgError):
             # Singular, if only by rounding. The smoother is spoilt, but all it knew is in the base and the steps since.
             self._reinitialize()
             return
         values = smoother.estimate()
-        self._stamps = {k: t for k, t in {**self._stamps, **step.timestamps}.items() if values.exists(k)}
+        self._stamps = {k: t for k, t in {**self._stamps, **stamps}.items() if values.exists(k)}
         self._record(step.keyframes, values)
 
     def _accepted(
@@ -274,6 +281,13 @@ class Run:
             measurements = [linearized(f, point) for f in measurements]
         return processes + measurements
 
+    def _aged(self, timestamps: Mapping[int, float]) -> dict[int, float]:
+        """Times of last use, s, in the window's unit: the number of the step, one a keyframe, or as they are."""
+        if not isinstance(self.window, Keyframes):
+            return dict(timestamps)
+        number = self._before + np.searchsorted(self._times, list(timestamps.values()))
+        return dict(zip(timestamps, number.tolist(), strict=True))
+
     def _record(self, keyframes: Sequence[int], values: gtsam.Values) -> None:
         if self.problem.attitudes is not None:
             attitudes = self.problem.attitudes(keyframes, values)
@@ -287,6 +301,7 @@ class Run:
         """Solve everything since the base in batch and start the smoother from it, without the outliers."""
         from_start = self.base is None
         whole = Assembly.of(self._since_base())
+        whole.timestamps = self._aged(whole.timestamps)
         if self.base is not None:
             whole.factors.append(self.base.factor)
             whole.initial.insert(self.base.estimate)

@@ -1,0 +1,33 @@
+"""How long the incremental solver keeps states: seconds, keyframes, or for ever."""
+
+from __future__ import annotations
+
+from pipelines.errors import InputError
+
+# After a number of keyframes.
+_KEYFRAMES = "kf"
+
+
+class Keyframes(int):
+    """A window's length as a number of keyframes; a plain number is seconds."""
+
+    def __str__(self) -> str:
+        return f"{int(self)}{_KEYFRAMES}"
+
+
+Window = Keyframes | float | None
+
+
+def parse_window(text: str) -> Window:
+    """The window that `--window` names: seconds, keyframes ("50kf"), or None for "all". Raises InputError."""
+    if text == "all":
+        return None
+    try:
+        length: Keyframes | float = (
+            Keyframes(text.removesuffix(_KEYFRAMES)) if text.endswith(_KEYFRAMES) else float(text)
+        )
+    except ValueError:
+        length = 0.0
+    if not 0.0 < length < float("inf"):
+        raise InputError(f"--window {text}: seconds above zero are needed, keyframes such as 50kf, or 'all'")
+    return length

@@ -1,0 +1,67 @@
+"""The incremental solver's window, by time, by keyframes or none: all methods end where batch does."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from alidade import simulate
+from pipelines import methods
+from pipelines.config import load_config
+from pipelines.errors import InputError
+from pipelines.graph.problem import Problem
+from pipelines.solvers.batch import solve_batch
+from pipelines.solvers.incremental import Run, solve_incremental
+from pipelines.solvers.window import Keyframes, parse_window
+
+SMALL: dict[str, dict[str, Any]] = {
+    "los": {"duration_s": 8.0, "image_rate_hz": 10.0, "gyro_rate_hz": 100.0, "gimbal_rate_hz": 100.0},
+    "head": {"duration_s": 8.0, "vision_rate_hz": 10.0, "gyro_rate_hz": 100.0},
+    "indexer": {},
+    "cube": {},
+}
+
+
+def made(method: str, **changes: Any) -> Problem:
+    simulated = simulate(method, {**SMALL[method], "sensors": "ideal", **changes}, seed=1)
+    return methods.method(method).problem(simulated.data, load_config(simulated.config.encode()))
+
+
+@pytest.mark.parametrize("method", SMALL)
+@pytest.mark.parametrize("window", [Keyframes(20), None])
+def test_every_window_ends_where_batch_does(method: str, window: float | None) -> None:
+    problem = made(method)
+    batch, incremental = solve_batch(problem), solve_incremental(problem, window)
+    assert incremental.converged
+    free = batch.sigmas > 0.0
+    assert np.abs((incremental.values - batch.values)[free] / batch.sigmas[free]).max() < 0.1
+    np.testing.assert_allclose(incremental.sigmas[free], batch.sigmas[free], rtol=0.05)
+
+
+def test_so_many_keyframes_are_kept() -> None:
+    problem = made("head", duration_s=6.0)
+    run = Run(problem, Keyframes(7))
+    held = []
+    for step in problem.steps(1):
+        run.add_step(step)
+        if run.started:
+            held.append(len([key for key in run._stamps if chr(key >> 56) == "x"]))
+    assert max(held) == 8
+
+
+def test_what_the_option_takes() -> None:
+    assert parse_window("2.5") == 2.5
+    assert not isinstance(parse_window("2"), Keyframes)
+    window = parse_window("50kf")
+    assert isinstance(window, Keyframes)
+    assert window == 50
+    assert str(window) == "50kf"
+    assert parse_window("all") is None
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "nan", "0kf", "2.5kf", "kf", "many"])
+def test_what_it_does_not_take(text: str) -> None:
+    with pytest.raises(InputError, match="--window"):
+        parse_window(text)
