@@ -122,7 +122,7 @@ def test_sigmas_of_a_small_layout_hold() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("tags", "pictures"), [(18, 60), (30, 60)])
+@pytest.mark.parametrize(("tags", "pictures"), [(18, 80), (30, 80)])
 def test_sigmas_of_large_layouts_hold(tags: int, pictures: int) -> None:
     spread = 1.96 * (2 / (20 * 6 * (tags - 1))) ** 0.5
     assert abs(nees(tags, pictures, range(20)) - 1.0) < spread

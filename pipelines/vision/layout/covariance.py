@@ -21,6 +21,8 @@ from pipelines.vision.layout.sights import Array, Index
 _DIED_OUT, _COLOURED = 2.0, 4.0
 # Numbers seen again where nothing moved, from which on they tell what they have in common.
 _FEWEST = 100
+# A tag's variance beyond the common one by this many of its sigmas is its own.
+_CLEARLY = 2.0
 # Of a tag's sum of squares, what the adjustment leaves at least.
 _LEAST_LEFT = 0.1
 # Of the views, the longest lag.
@@ -139,7 +141,7 @@ def _spectrum(correlations: Array, views: int) -> Array:
 
 
 def _variances(fit: Fit, taken: Array) -> Array:
-    """(n,) variance of each tag's errors over what their pictures' sigmas say, at least 1.
+    """(n,) variance of each tag's errors over what their pictures' sigmas say; 1 where it is not clearly more.
 
     `taken` (n,) is what the adjustment of all that pictures share takes from a tag's sum of squares: of correlated
     errors more than of independent ones.
@@ -148,4 +150,5 @@ def _variances(fit: Fit, taken: Array) -> Array:
     shown = np.bincount(fit.sights.picture)[fit.sights.picture]
     free = np.bincount(fit.sights.tag, 8.0 - 6.0 / shown, tags)
     left = np.maximum(free - taken, _LEAST_LEFT * free)
-    return np.asarray(np.maximum(np.bincount(fit.sights.tag, fit.rows.squares, tags) / left, 1.0))
+    found = np.bincount(fit.sights.tag, fit.rows.squares, tags) / left
+    return np.asarray(np.where(found > 1.0 + _CLEARLY * np.sqrt(2.0 / left), found, 1.0))
