@@ -23,6 +23,11 @@ from pipelines.settings import Config
 DAY_S = 86_400.0
 
 
+def of_recording(method: Method, name: str) -> bool:
+    """Whether a parameter belongs to a recording, as the method says."""
+    return any(fnmatchcase(name, pattern) for pattern in method.of_recording)
+
+
 def walks(method: Method, config: Config, names: Sequence[str]) -> dict[str, float]:
     """Parameter of the device -> how far it walks in the root of a day, SI; 0: not at all. Those of recordings are not
     among them.
@@ -30,7 +35,7 @@ def walks(method: Method, config: Config, names: Sequence[str]) -> dict[str, flo
     Raises:
         InputError: the config's `share` names no parameter.
     """
-    rates = {name: 0.0 for name in names if not any(fnmatchcase(name, each) for each in method.of_recording)}
+    rates = {name: 0.0 for name in names if not of_recording(method, name)}
     for pattern, share in config.share.items():
         meant = [name for name in names if fnmatchcase(name, pattern)]
         if not meant:

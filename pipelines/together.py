@@ -42,6 +42,8 @@ from pipelines.solvers.joint import Joined, join, tell
 # The joint estimate stays when another linearisation moves it by less than this, in sigmas (what is left is about the
 # square); so many are tried.
 _STAYS, _MOST_PASSES = 1e-2, 6
+# Where chi-square between the recordings is so many times its freedoms the device is not one: no need to be exact.
+_FAR_APART = 10.0
 # So many recordings are named in a sentence.
 _MOST_NAMED = 3
 _ADVICE = "Calibrate those after the last change together, or let what changed walk: `share` in the config."
@@ -203,6 +205,9 @@ def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) 
     """The joint estimate, and by how much it moved last, in sigmas."""
     told, days = [each.told for each in alone], [each.day for each in alone]
     joined, step = join(told, rates, days), np.inf
+    value, dof = joined.disagreement
+    if value > _FAR_APART * max(dof, 1):
+        return joined, 0.0
     for _ in range(_MOST_PASSES if len(alone) > 1 else 0):
         told = [
             _again(method, each, joined.others(i), rates).with_priors_of(before)

@@ -137,6 +137,18 @@ def test_a_unit_that_drifts_slowly_is_found_by_first_and_last() -> None:
     assert b.repeatability == pytest.approx(0.1, rel=0.3)
 
 
+def test_what_belongs_to_a_recording_does_not_change() -> None:
+    """A turn-on bias of two sessions, too few to tell that they differ by nature."""
+    results = a_fleet(1, units=1, dates=2)
+    for result in results.values():
+        result["parameters"]["gyro_bias_x"] = result["parameters"].pop("b") | {"sigma": 1e-4}
+    results["0-1"]["parameters"]["a"]["value"] += 1.0
+    a, bias = populations(results)
+    assert [c.changed for c in a.changes] == [True]
+    assert abs(bias.changes[0].z) > 100.0
+    assert not bias.changes[0].changed
+
+
 def test_a_drift_of_the_whole_fleet_is_found() -> None:
     a, b = populations(a_fleet(6, units=60, slope=0.006))
     assert a.drift is not None

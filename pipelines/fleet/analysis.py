@@ -13,10 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines import methods
 from pipelines.fleet import statistics
 from pipelines.fleet.statistics import Array, Spread, Trend
 from pipelines.fleet.store import Result
 from pipelines.fleet.tables import Cell, Row
+from pipelines.sharing import of_recording
 
 DAY = 86400.0
 _COUNTED = {"calibrated", "weak"}
@@ -197,7 +199,8 @@ def _population(
         good = ~outlying
         scatter = np.hypot(spread.tau, sigmas)
         drift = statistics.trend(dates[good] / DAY, values[good], scatter[good])
-    changes, repeatability = _changes(_pairs(results, recordings), values, sigmas, comparisons)
+    own = of_recording(methods.method(method), name)
+    changes, repeatability = _changes(_pairs(results, recordings), values, sigmas, comparisons, own)
     return Population(
         method=method,
         name=name,
@@ -219,9 +222,9 @@ def _population(
 
 
 def _changes(
-    pairs: Sequence[tuple[str, int, int]], values: Array, sigmas: Array, comparisons: int
+    pairs: Sequence[tuple[str, int, int]], values: Array, sigmas: Array, comparisons: int, own: bool
 ) -> tuple[tuple[Change, ...], float | None]:
-    """The changes, and how much sessions of one unit differ by nature if they do."""
+    """The changes, and how much sessions of one unit differ by nature if they do; `own` numbers of a recording may."""
     if not pairs:
         return (), None
     before = np.array([pair[1] for pair in pairs])
@@ -234,6 +237,8 @@ def _changes(
         usual = statistics.spread(difference, sigma, centre=0.0)
         repeatability = usual.tau / 2.0**0.5
         changed &= np.abs(usual.z(difference, sigma)) > statistics.limit(comparisons, len(pairs))
+    if own:
+        changed[:] = False
     rows = zip(pairs, difference, sigma, z, changed, strict=True)
     return tuple(
         Change(unit, a, b, float(d), float(s), float(q), bool(flag)) for (unit, a, b), d, s, q, flag in rows
