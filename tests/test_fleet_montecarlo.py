@@ -132,7 +132,11 @@ def test_the_consistency_page_lists_every_solver(scheduler: str, scenario: Path,
 
 
 # Shorter than the nominal recordings: `python -m pipelines.fleet.consistency` has the whole study.
-BRIEF = {"los": "{duration_s: 30.0, sensors: {}}", "head": "{duration_s: 30.0, vision_rate_hz: 15.0, sensors: {}}"}
+BRIEF = {
+    "los": "{duration_s: 30.0, sensors: {}}",
+    "head": "{duration_s: 30.0, vision_rate_hz: 15.0, sensors: {}}",
+    "tumble": "{attitudes: 25, rest_s: 1.5, accelerometer: {rate_hz: 50.0}}",
+}
 
 
 @pytest.mark.slow
