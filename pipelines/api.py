@@ -5,6 +5,7 @@ from __future__ import annotations
 import typing
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, fields, is_dataclass
+from functools import partial
 from pathlib import Path
 from types import NoneType
 from typing import TYPE_CHECKING, Any
@@ -94,10 +95,18 @@ def calibrate(
 ) -> Calibration:
     """Open and calibrate in one go (arguments as `open` and `Session.calibrate` have them).
 
+    A list of sources is several recordings of one device, calibrated together by batch.
+
     Raises:
         InputError: source or config cannot be used, or there is no such solver.
         IndeterminateError: states other than the parameters are not determined.
     """
+    if isinstance(source, list | tuple):
+        if solver != "batch":
+            raise InputError(f"solver {solver!r}: several recordings are calibrated together by batch alone")
+        from pipelines.together import calibrate_together
+
+        return calibrate_together([partial(open, each, method, config, prior=prior) for each in source])
     return open(source, method, config, prior=prior).calibrate(solver, window)
 
 

@@ -26,6 +26,7 @@ from pipelines.session import Session
 from pipelines.sharing import walks
 from pipelines.solvers.joint import join
 from pipelines.together import calibrate_together
+from tests.broad_trials import TRIALS, converted
 from tests.one_graph import one_graph, solved
 
 EXACT = "noise_known: 0\nsensors: ideal\n"
@@ -189,6 +190,30 @@ def test_recordings_that_are_of_another_device_are_told() -> None:
     found = jointly(opened)
     assert found.status == "inconsistent"
     assert "The device is not the same in all recordings. theta_y changed by -" in found.headline
+
+
+def test_a_list_of_sources_is_calibrated_together() -> None:
+    simulated = [alidade.simulate("indexer", None, seed=seed) for seed in (1, 2)]
+    found = alidade.calibrate(simulated, config=load_config(EXACT.encode()))
+    assert len(found.recordings) == 2
+    assert found.status == "calibrated"
+    with pytest.raises(InputError, match="together by batch alone"):
+        alidade.calibrate(simulated, "incremental")
+
+
+@pytest.mark.slow
+def test_real_trials_agree_or_are_named(shared_data: Path, tmp_path: Path) -> None:
+    """Three trials of one helmet tracker's stand-in: the slow one saw another mount and scale, and is named for it."""
+    for name in TRIALS:
+        converted(shared_data / "broad" / f"{name}.mat", tmp_path / f"{name[:2]}.mcap")
+    paths = [tmp_path / f"{name[:2]}.mcap" for name in TRIALS]
+    both = alidade.calibrate(paths, config=load_config(b"share: {time_offset: device}"))
+    assert both.status == "inconsistent"
+    assert "helmet_mount" in both.headline
+    assert "between 01.mcap and 07.mcap" in both.headline
+    assert both.parameters["time_offset"].value == pytest.approx(4.2e-3, abs=0.1e-3)
+    agreeing = alidade.calibrate(paths[1:], config=load_config(b"share: {time_offset: device}"))
+    assert not [step for step in agreeing.changes.found if "mount" in step.name or step.name == "time_offset"]  # type: ignore[union-attr]
 
 
 def test_a_recording_that_does_not_fit_is_named() -> None:
