@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -199,6 +200,24 @@ def test_a_list_of_sources_is_calibrated_together() -> None:
     assert found.status == "calibrated"
     with pytest.raises(InputError, match="together by batch alone"):
         alidade.calibrate(simulated, "incremental")
+
+
+def test_what_walks_has_a_number_for_each_recording() -> None:
+    """A month apart, with a step between the first and the others that the walk allows for."""
+    walking = EXACT + "share: {'theta_*': 1.0e-6}\n"
+    opened = []
+    for month, arcsec in enumerate((0.0, 0.5, 0.5)):
+        simulated = alidade.simulate("indexer", {"mounting_deg": [0.5, -0.3 - arcsec / 3600.0, 0.4]}, seed=month)
+        later = replace(simulated.data, epoch_ns=simulated.data.epoch_ns + month * 30 * 86_400 * 10**9)
+        opened.append(alidade.open(later, method="indexer", config=load_config(walking.encode())))
+    found = jointly(opened)
+    assert found.status == "calibrated"
+    by_date = [{p.name: p for p in part.parameters}["theta_y"] for part in found.recordings]
+    truth = [np.deg2rad(-0.3 - arcsec / 3600.0) for arcsec in (0.0, 0.5, 0.5)]
+    for each, true in zip(by_date, truth, strict=True):
+        assert abs(each.value - true) < 4.0 * each.sigma
+    assert found.parameters["theta_y"].value == by_date[-1].value
+    assert not found.changes or "theta_y" not in {step.name for step in found.changes.steps}
 
 
 @pytest.mark.slow
