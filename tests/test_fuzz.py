@@ -130,7 +130,7 @@ def test_texts_as_definitions(trial: settings, tmp_path: Path) -> None:
     property_()
 
 
-@fuzzed(6, 300)
+@fuzzed(6, 150)
 def test_texts_as_idl(trial: settings, tmp_path: Path) -> None:
     kind = messages.IMU
     lines = forms.idl(kind)[1].decode().splitlines()
