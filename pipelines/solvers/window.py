@@ -22,10 +22,9 @@ def parse_window(text: str) -> Window:
     """The window that `--window` names: seconds, keyframes ("50kf"), or None for "all". Raises InputError."""
     if text == "all":
         return None
+    number, read = (text.removesuffix(_KEYFRAMES), Keyframes) if text.endswith(_KEYFRAMES) else (text, float)
     try:
-        length: Keyframes | float = (
-            Keyframes(text.removesuffix(_KEYFRAMES)) if text.endswith(_KEYFRAMES) else float(text)
-        )
+        length: Keyframes | float = read(number)
     except ValueError:
         length = 0.0
     if not 0.0 < length < float("inf"):
