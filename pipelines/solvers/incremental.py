@@ -279,6 +279,7 @@ class Run:
                     measurements.append(unweighed(used))
         if self._fixed or (self.window is not None and self.innovations.rejected_in_a_row == 0):
             measurements = [linearized(f, point) for f in measurements]
+            processes = [f if f.vectorized is None else linearized(f, point) for f in processes]
         return processes + measurements
 
     def _aged(self, timestamps: Mapping[int, float]) -> dict[int, float]:
