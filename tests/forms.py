@@ -365,3 +365,27 @@ def _fill(target: Any, message: Any) -> None:
             getattr(target, name).extend(list(value))
         else:
             setattr(target, name, int(value) if isinstance(value, bool) else value)
+
+
+MCAP, SQLITE = StoragePlugin.MCAP, StoragePlugin.SQLITE3
+
+# What writes a recording anew, from its path into a folder.
+FORMS: dict[str, Callable[[Path, Path], Path]] = {
+    "rosbag2 sqlite": lambda s, f: rosbag2(s, f / "bag", SQLITE),
+    "rosbag2 mcap": lambda s, f: rosbag2(s, f / "bag", MCAP),
+    "rosbag2 mcap, compressed by message": lambda s, f: rosbag2(s, f / "bag", MCAP, CompressionMode.MESSAGE),
+    "rosbag2 sqlite, compressed by message": lambda s, f: rosbag2(s, f / "bag", SQLITE, CompressionMode.MESSAGE),
+    "rosbag2 sqlite, compressed by file": lambda s, f: rosbag2(s, f / "bag", SQLITE, CompressionMode.FILE),
+    "rosbag2 split": lambda s, f: split(s, f / "bag"),
+    "db3": lambda s, f: rosbag2(s, f / "bag", SQLITE) / "bag.db3",
+    "db3.zstd": lambda s, f: zstd(rosbag2(s, f / "bag", SQLITE) / "bag.db3", f / "b.db3.zstd"),
+    "mcap.zstd": lambda s, f: zstd(s, f / "s.mcap.zstd"),
+    "pattern": lambda s, f: split(s, f / "bag") / "bag_*.mcap",
+    "ros 1": lambda s, f: rosbag1(s, f / "s.bag"),
+    "ros 1 lz4": lambda s, f: rosbag1(s, f / "s.bag", Ros1Writer.CompressionFormat.LZ4),
+    "ros 1 bz2": lambda s, f: rosbag1(s, f / "s.bag", Ros1Writer.CompressionFormat.BZ2),
+    "mcap ros 1": lambda s, f: mcap_ros1(s, f / "r.mcap"),
+    "mcap IDL": lambda s, f: mcap_idl(s, f / "i.mcap"),
+    "mcap json": lambda s, f: mcap_json(s, f / "j.mcap"),
+    "mcap protobuf": lambda s, f: mcap_protobuf(s, f / "p.mcap"),
+}

@@ -19,7 +19,6 @@ from pipelines.session import calibrate
 from pipelines.simulation.motion import EulerMotion, Swing
 from tests import forms
 from tests.broad_trials import TRIALS, converted
-from tests.test_recording_forms import FORMS
 from tests.turning import write_csv
 
 SWAY = EulerMotion(
@@ -73,19 +72,19 @@ def assert_same(ours: Any, theirs: Any, where: str) -> None:
         assert ours == theirs, where
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", forms.FORMS)
 @pytest.mark.parametrize("name", BRIEF)
 def test_every_method_reads_the_same_out_of_every_form(name: str, form: str, sources: Any, tmp_path: Path) -> None:
     source, config = sources(name)
-    made = FORMS[form](source, tmp_path)
+    made = forms.FORMS[form](source, tmp_path)
     assert_same(read(name, source, config), read(name, made, config), name)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", forms.FORMS)
 def test_the_same_calibration_out_of_every_form(form: str, sources: Any, tmp_path: Path) -> None:
     source, config = sources("head")
-    made = FORMS[form](source, tmp_path)
+    made = forms.FORMS[form](source, tmp_path)
     ours, theirs = (calibrate(path, ["batch"], "head", config)[0] for path in (source, made))
     assert ours.status == theirs.status
     np.testing.assert_equal(theirs.estimate.values, ours.estimate.values)
@@ -256,7 +255,7 @@ def test_real_recordings_in_other_forms(name: str, shared_data: Path, tmp_path: 
     made: dict[str, tuple[Path, str]] = {}
     for form in ("rosbag2 sqlite", "ros 1 lz4"):
         (tmp_path / form).mkdir()
-        made[form] = FORMS[form](source, tmp_path / form), ""
+        made[form] = forms.FORMS[form](source, tmp_path / form), ""
     for make in (foxglove, tables, euroc, px4):
         folder = tmp_path / make.__name__
         folder.mkdir()

@@ -114,7 +114,7 @@ def test_validate_on_another_recording_writes_a_page(tmp_path: Path) -> None:
     command = ["validate", "--calibration", str(tmp_path / "cal" / "calibration.yaml")]
     result = run.invoke(app, [*command, str(tmp_path / "b.mcap"), "--out", str(tmp_path / "v")])
     assert result.exit_code == 0
-    before, after = (float(x) for x in _line(result.output, "against the truth").split()[-5:-3])
+    before, after = (float(x) for x in _line(result.output, "against the truth").split()[-7:-5])
     assert after < 0.5 * before
     assert "calibrated on" not in result.output
     page = (tmp_path / "v" / "validation.html").read_text()
@@ -133,7 +133,7 @@ def test_calibration_of_another_method_is_refused(tmp_path: Path) -> None:
     write_head(tmp_path / "s.mcap", data, truth, head_config(settings))
     (tmp_path / "c.yaml").write_text(
         "schema: alidade.calibration/1\nmethod: los\nsolver: batch\nstatus: calibrated\n"
-        "recording: {file: x, sha256: x, start: x}\nparameters: {}\n"
+        "recording: {file: x, sha256: x, start: '2026-01-01T00:00:00+00:00'}\nparameters: {}\n"
     )
     command = ["validate", str(tmp_path / "s.mcap"), "--method", "head", "--calibration", str(tmp_path / "c.yaml")]
     result = CliRunner().invoke(app, command)

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from gtsam import Rot3
-from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import CompressionMode, StoragePlugin
+from rosbags.rosbag2 import StoragePlugin
 
 from pipelines.config import load_config
 from pipelines.errors import InputError
@@ -64,31 +63,10 @@ def read_topics(recording: Recording, names: Any) -> dict[str, Any]:
     return {name: readers[name](name) for name in names}
 
 
-FORMS: dict[str, Callable[[Path, Path], Path]] = {
-    "rosbag2 sqlite": lambda s, f: forms.rosbag2(s, f / "bag", SQLITE),
-    "rosbag2 mcap": lambda s, f: forms.rosbag2(s, f / "bag", MCAP),
-    "rosbag2 mcap, compressed by message": lambda s, f: forms.rosbag2(s, f / "bag", MCAP, CompressionMode.MESSAGE),
-    "rosbag2 sqlite, compressed by message": lambda s, f: forms.rosbag2(s, f / "bag", SQLITE, CompressionMode.MESSAGE),
-    "rosbag2 sqlite, compressed by file": lambda s, f: forms.rosbag2(s, f / "bag", SQLITE, CompressionMode.FILE),
-    "rosbag2 split": lambda s, f: forms.split(s, f / "bag"),
-    "db3": lambda s, f: forms.rosbag2(s, f / "bag", SQLITE) / "bag.db3",
-    "db3.zstd": lambda s, f: forms.zstd(forms.rosbag2(s, f / "bag", SQLITE) / "bag.db3", f / "b.db3.zstd"),
-    "mcap.zstd": lambda s, f: forms.zstd(s, f / "s.mcap.zstd"),
-    "pattern": lambda s, f: forms.split(s, f / "bag") / "bag_*.mcap",
-    "ros 1": lambda s, f: forms.rosbag1(s, f / "s.bag"),
-    "ros 1 lz4": lambda s, f: forms.rosbag1(s, f / "s.bag", Ros1Writer.CompressionFormat.LZ4),
-    "ros 1 bz2": lambda s, f: forms.rosbag1(s, f / "s.bag", Ros1Writer.CompressionFormat.BZ2),
-    "mcap ros 1": lambda s, f: forms.mcap_ros1(s, f / "r.mcap"),
-    "mcap IDL": lambda s, f: forms.mcap_idl(s, f / "i.mcap"),
-    "mcap json": lambda s, f: forms.mcap_json(s, f / "j.mcap"),
-    "mcap protobuf": lambda s, f: forms.mcap_protobuf(s, f / "p.mcap"),
-}
-
-
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", forms.FORMS)
 def test_the_same_arrays_out_of_every_form(form: str, source: Path, tmp_path: Path) -> None:
     made = session(600)
-    recording = open_recording(FORMS[form](source, tmp_path))
+    recording = open_recording(forms.FORMS[form](source, tmp_path))
     recording.read_together({"/imu": (), "/joints": ("azimuth", "elevation"), "/pose": ()})
     assert_same(read_topics(recording, made), made)
     assert recording.epoch_ns == T0
@@ -825,7 +803,7 @@ def test_the_same_calibration_of_every_method_out_of_other_forms(name: str, tmp_
     ours = calibrate(tmp_path / "s.mcap", ["batch"], name, config)[0]
     for form in ("rosbag2 sqlite", "ros 1 bz2", "mcap protobuf"):
         (tmp_path / form).mkdir()
-        theirs = calibrate(FORMS[form](tmp_path / "s.mcap", tmp_path / form), ["batch"], name, config)[0]
+        theirs = calibrate(forms.FORMS[form](tmp_path / "s.mcap", tmp_path / form), ["batch"], name, config)[0]
         assert theirs.assessment.status == ours.assessment.status
         np.testing.assert_equal(theirs.estimate.values, ours.estimate.values)
         np.testing.assert_array_equal(theirs.estimate.covariance, ours.estimate.covariance)

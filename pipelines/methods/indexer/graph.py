@@ -113,7 +113,8 @@ def _mean_rates(groups: Sequence[Group], gyro: Level, encoders: Level) -> tuple[
             window = float(np.median(np.concatenate(windows)))
             white = gyro.used / window**0.5
             sigma = float(np.hypot(white, 2.0**0.5 * encoders.used / window))
-            found.append(Level(Noise(f"{kind}_rate", sigma, source, known, (kind,), least=white / sigma)))
+            least = white / sigma if encoders.noise.source == "default" else 1.0
+            found.append(Level(Noise(f"{kind}_rate", sigma, source, known, (kind,), least=least)))
     return tuple(found)
 
 
