@@ -25,7 +25,8 @@ from pipelines.recording.reading import Recording, open_recording
 from pipelines.recording.sources import TopicSource, inverted
 from pipelines.recording.topics import IMU
 from pipelines.recording.writing import write_session
-from pipelines.session import calibrate
+from pipelines.session import calibrate, session_facts
+from pipelines.settings import Config
 from pipelines.simulation.motion import EulerMotion, Swing
 from tests import forms, live
 from tests.forms import header, ros2_recording
@@ -705,6 +706,38 @@ def test_messages_without_a_stamp_are_told_with_the_jitter_of_what_stands_in(tmp
     assert note.startswith("topic /v: 400 of 400 messages have no stamp; the log times stand in")
     assert 0.3 < float(note.split("jitter by ")[1].split(" ms")[0]) < 0.5
     assert recording.stamp_sigma_s == pytest.approx(np.hypot(0.01, 4e-4), rel=0.01)
+
+
+STEP, JITTER = 10_000_000, np.random.default_rng(5).normal(0.0, 400_000.0, 400).astype(int)
+LATE = STEP * np.arange(400) + 2_000_000 + JITTER
+FLOAT_S = np.rint((1.7e9 + 0.0099945 * np.arange(400)) * 1e9).astype(np.int64) - 1_700_000_000_000_000_000
+BUNCHES = 8 * STEP * (np.arange(400) // 8) + 30_000 * (np.arange(400) % 8) + JITTER[np.arange(400) // 8]
+
+
+@pytest.mark.parametrize(
+    ("stamps", "logged", "says"),
+    [
+        (STEP * np.arange(400), LATE, "100 % of the stamps are exactly 10 ms apart while log times jitter by 0."),
+        (FLOAT_S, LATE, "100 % of the stamps are exactly 9.99"),
+        (STEP * (np.arange(400) + (np.arange(400) > 200)), LATE, "100 % of the stamps are exactly 10 ms"),
+        (BUNCHES, BUNCHES, "88 % of the stamps are bunched"),
+        (STEP * np.arange(400), STEP * np.arange(400), ""),
+        (STEP * np.arange(400) + JITTER // 10, LATE, ""),
+        (STEP * np.arange(400) + JITTER // 10, BUNCHES, ""),
+        (LATE, LATE, ""),
+    ],
+)
+def test_stamps_that_were_not_measured_are_told(stamps: Any, logged: Any, says: str, tmp_path: Path) -> None:
+    """Counted ones where the log times beside them jitter, and those of arrival; a simulated recording has neither."""
+    types = forms.ROS2.types
+    vector = types["geometry_msgs/msg/Vector3"](1.0, 2.0, 3.0)
+    path = tmp_path / "v.mcap"
+    messages = zip((T0 + logged).tolist(), (T0 + stamps).tolist(), strict=True)
+    made = [(log, types["geometry_msgs/msg/Vector3Stamped"](header(t), vector)) for log, t in messages]
+    recording = open_recording(ros2_recording(path, {"/v": made}))
+    recording.vector("/v")
+    assert [note.partition(says)[0] for note in recording.notes] == (["topic /v: "] if says else [])
+    assert session_facts(open_recording(path), Config()).notes == recording.notes
 
 
 @pytest.mark.parametrize(

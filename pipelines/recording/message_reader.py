@@ -21,6 +21,7 @@ from pipelines.recording.clocks import check_clock
 from pipelines.recording.container import Container, Rows
 from pipelines.recording.decoding import Decoder, Times, header_stamps, logged_at
 from pipelines.recording.messages import Definition, MessageError
+from pipelines.recording.stamps import stamp_notes
 from pipelines.recording.topic_columns import NUMBERS, TopicColumns
 
 # Topics whose first stamp may start a session. Positions and intrinsics may be stamped long before it.
@@ -95,6 +96,12 @@ class MessageReader:
         """How much later than their stamps messages were logged, at least, in the topics read by now; ns."""
         delays = [int((log_ns - t_ns).min()) for t_ns, log_ns in self._times.values() if len(t_ns)]
         return min(delays, default=0)
+
+    @property
+    def stamp_notes(self) -> tuple[str, ...]:
+        """Sentences about how the stamps came about in the topics read by now."""
+        timed = [name for name in self.topics if name in self._times and self.topics[name].type in TIMED]
+        return tuple(note for name in timed for note in stamp_notes(name, *self._times[name]))
 
     @property
     def times(self) -> Mapping[str, Times]:

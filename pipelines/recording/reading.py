@@ -29,6 +29,7 @@ from pipelines.recording.message_reader import TIMED, MessageReader, Topic
 from pipelines.recording.netpbm import netpbm
 from pipelines.recording.opening import Where, open_container
 from pipelines.recording.sources import TopicSource, inverted, joined
+from pipelines.recording.stamps import jitter_ns
 from pipelines.recording.table_topics import TableTopic, described
 
 # Pairs of frames an error lists.
@@ -124,10 +125,10 @@ class Recording:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences about what is lost, and what was assumed."""
+        """Sentences about what is lost, what was assumed, and how stamps came about in the topics read by now."""
         container = self._container
         lost = container.notes(self.epoch_ns, self.duration_s) if container.losses or container.missing else ()
-        return (*container.remarks, *lost)
+        return (*container.remarks, *self._reader.stamp_notes, *lost)
 
     @property
     def epoch_ns(self) -> int:
@@ -386,8 +387,7 @@ class Recording:
         """Remark that log times stand in for stamps, and by how much they jitter."""
         if not by_log:
             return
-        steps = np.diff(t_ns)
-        jitter = 1.4826 / np.sqrt(2.0) * float(np.median(np.abs(steps - np.median(steps)))) if len(steps) else 0.0
+        jitter = jitter_ns(np.diff(t_ns))
         self.stamp_sigma_s = max(self.stamp_sigma_s, float(np.hypot(_LATE, jitter * 1e-9)))
         sentence = (
             f"topic {topic}: {by_log} of {len(t_ns)} messages have no stamp; the log times stand in, which are "
