@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from gtsam import Rot3
 from rosbags.rosbag2 import StoragePlugin
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipelines.config import load_config
 from pipelines.errors import InputError
@@ -249,6 +250,68 @@ def test_foxglove_types(tmp_path: Path) -> None:
     assert (camera.width, camera.height, camera.distortion_model) == (640, 480, "plumb_bob")
     fixes = recording.fixes("/fix")
     np.testing.assert_array_equal(fixes.latitude_deg, [47.0] * 5)
+
+
+# Fields of Foxglove's types in ROS, behind the stamp.
+FOXGLOVE_MSGS = {
+    "PoseInFrame": "string frame_id\ngeometry_msgs/Pose pose\n",
+    "FrameTransform": "string parent_frame_id\nstring child_frame_id\n"
+    "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n",
+    "RawImage": "string frame_id\nuint32 width\nuint32 height\nstring encoding\nuint32 step\nuint8[] data\n",
+    "CompressedVideo": "string frame_id\nuint8[] data\nstring format\n",
+    "CameraCalibration": "string frame_id\nuint32 width\nuint32 height\nstring distortion_model\n"
+    "float64[] d\nfloat64[9] k\nfloat64[9] r\nfloat64[12] p\n",
+}
+
+
+@pytest.mark.parametrize("ros", [2, 1])
+def test_foxglove_types_in_ros(ros: int, tmp_path: Path) -> None:
+    """As their equals in protobuf: the same arrays, from the definitions that the recording carries."""
+    store = get_typestore(Stores.ROS2_HUMBLE if ros == 2 else Stores.ROS1_NOETIC)
+    stamp_of = "builtin_interfaces/Time" if ros == 2 else "time"
+    for kind, fields in FOXGLOVE_MSGS.items():
+        store.register(get_types_from_msg(f"{stamp_of} timestamp\n{fields}", f"foxglove_msgs/msg/{kind}"))
+    types = store.types
+    position = types["geometry_msgs/msg/Vector3"](1.0, 2.0, 3.0)
+    rotation = types["geometry_msgs/msg/Quaternion"](0.1, 0.2, 0.3, 0.9)
+    pose = types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](1.0, 2.0, 3.0), rotation)
+    k, d = np.array([500.0, 0.0, 320.0, 0.0, 510.0, 240.0, 0.0, 0.0, 1.0]), np.full(5, 0.1)
+    pictures = np.random.default_rng(1).integers(0, 256, (6, 32, 48), dtype=np.uint8)
+    whole: list[forms.Message] = []
+    for i, packet in enumerate(forms.h264(pictures)):
+        stamp = T0 + 10_000_000 * i
+        made = {
+            "PoseInFrame": ("a", pose),
+            "FrameTransform": ("a", "b", position, rotation),
+            "RawImage": ("a", 2, 2, "mono8", 2, np.array([1, 2, 3, 4], np.uint8)),
+            "CompressedVideo": ("a", np.frombuffer(packet, np.uint8), "h264"),
+            "CameraCalibration": ("a", 640, 480, "plumb_bob", d, k, k, np.zeros(12)),
+        }
+        for kind, values in made.items():
+            name = f"foxglove_msgs/msg/{kind}"
+            message = types[name](types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), *values)
+            write = store.serialize_cdr if ros == 2 else store.serialize_ros1
+            whole.append((f"/{kind}", name, stamp + 5_000_000, bytes(write(message, name))))
+
+    def schema(name: str) -> tuple[str, bytes]:
+        text = store.generate_msgdef(name, ros_version=ros)[0].encode()
+        return (name if ros == 2 else name.replace("/msg/", "/")), text
+
+    encoding = {2: ("cdr", "ros2msg"), 1: ("ros1", "ros1msg")}[ros]
+    recording = open_recording(forms.mcap(whole, tmp_path / "f.mcap", lambda _, data: data, *encoding, schema))
+    t_ns = T0 + 10_000_000 * np.arange(6)
+    assert recording.epoch_ns == T0
+    for topic in ("/PoseInFrame", "/FrameTransform"):
+        poses = recording.poses(topic)
+        np.testing.assert_array_equal(poses.t_ns, t_ns)
+        np.testing.assert_array_equal(poses.wxyz, [[0.9, 0.1, 0.2, 0.3]] * 6)
+        np.testing.assert_array_equal(poses.position, [[1.0, 2.0, 3.0]] * 6)
+    assert list(recording.images("/RawImage")) == [(t, b"P5 2 2 255\n\x01\x02\x03\x04") for t in t_ns.tolist()]
+    assert [t for t, _ in recording.images("/CompressedVideo")] == t_ns.tolist()
+    camera = recording.camera_info("/CameraCalibration")
+    np.testing.assert_array_equal(camera.k.ravel(), k)
+    np.testing.assert_array_equal(camera.d, d)
+    assert (camera.width, camera.height, camera.distortion_model) == (640, 480, "plumb_bob")
 
 
 _MADE: dict[int, dict[str, Any]] = {}

@@ -1,4 +1,4 @@
-"""How the messages of a channel are read: as ROS 2 or ROS 1 lays them out, or translated from protobuf and JSON."""
+"""How the messages of a channel are read: as ROS lays them out, or translated from protobuf, JSON, Foxglove's types."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pipelines.recording import messages
 from pipelines.recording.container import Channel, Rows, Schema, rows_of
 from pipelines.recording.decoding import header_stamps, logged_at
 from pipelines.recording.messages import Definition, Language, MessageError, Wire
-from pipelines.recording.translation import Translation, ros_type
+from pipelines.recording.translation import Translation, is_foxglove, ros_type
 
 # Encoding of the messages and of what defines them -> layout, and what the definition is written in.
 _ROS: dict[str, tuple[Wire, Language]] = {
@@ -52,25 +52,32 @@ class ChannelFormat:
         self.is_readable = self._wire is not None
         if self._wire == "ros1":
             self.type = _ros2_name(self.type)
-        elif self.encoding in _TRANSLATED:
-            known = ros_type(self.type)
-            self.type, self.is_readable = known or self.type, known is not None
+        self._recorded_type = self.type
+        is_ros = self.encoding not in _TRANSLATED and not (self.is_readable and is_foxglove(self.type))
+        known = None if is_ros else ros_type(self.type)
+        self._is_translated = known is not None
+        self.type = known or self.type
+        self.is_readable |= self._is_translated
 
     @cached_property
     def definition(self) -> Definition:
         """Of the type. Raises MessageError where it cannot be used."""
+        return messages.known(self.type) if self._is_translated else self._recorded
+
+    @cached_property
+    def _recorded(self) -> Definition:
+        """As the recording has it, in ROS."""
         assert self._schema is not None
-        if self._wire is None:
-            return messages.known(self.type)
-        text = self._schema.data.decode(errors="replace") or messages.definition_text(self.type)
+        assert self._wire is not None
+        text = self._schema.data.decode(errors="replace") or messages.definition_text(self._recorded_type)
         language = self._language if self._schema.data else "msg"
-        found = messages.definition(self.type, text, self._wire, language)
+        found = messages.definition(self._recorded_type, text, self._wire, language)
         found.check()
         return found
 
     def rows(self, rows: Rows) -> Rows:
         """The messages as `definition` tells them. Raises MessageError at one that cannot be translated."""
-        if self._wire is not None:
+        if not self._is_translated:
             return rows
         translated = []
         for i, log_ns in enumerate(rows.log_ns.tolist()):
@@ -81,7 +88,7 @@ class ChannelFormat:
     def stamps(self, rows: Rows) -> NDArray[np.int64]:
         """Header stamps of messages as the container has them, ns; log times where there are none to be read."""
         stamps = rows.log_ns
-        if self._wire is not None and self._schema is not None and self._language == "msg":
+        if self._wire and not self._is_translated and self._schema is not None and self._language == "msg":
             has_header = messages.has_header(self._schema.data.decode(errors="replace"))
             stamps = header_stamps(has_header, rows, self._wire)
         elif self.is_readable:
@@ -94,7 +101,7 @@ class ChannelFormat:
     @cached_property
     def _translation(self) -> Translation:
         assert self._schema is not None
-        return Translation(self._schema, self.definition)
+        return Translation(self._schema if self._wire is None else self._recorded, self.definition)
 
 
 def _ros2_name(name: str) -> str:

@@ -1,4 +1,4 @@
-"""Messages of protobuf and JSON as ROS 2 messages.
+"""Messages of protobuf and JSON, and of Foxglove's types in ROS, as ROS 2 messages.
 
 Translated are messages whose fields have the names that they have in ROS, and Foxglove's own types, which differ from
 them in little: `timestamp` and `frame_id` instead of a header, a transform without a level of its own. What a message
@@ -38,16 +38,30 @@ _SECONDS, _NANOSECONDS = ("sec", "seconds", "secs"), ("nanosec", "nsec", "nanos"
 
 def ros_type(name: str) -> str | None:
     """The ROS 2 type that messages of a type are translated into, None if there is none."""
-    package, _, kind = name.replace(".", "/").rpartition("/")
-    return (_FOXGLOVE if package.startswith("foxglove") else _ROS).get(kind)
+    kind = name.replace(".", "/").rpartition("/")[2]
+    return (_FOXGLOVE if is_foxglove(name) else _ROS).get(kind)
+
+
+def is_foxglove(name: str) -> bool:
+    """Whether a type is one of Foxglove's: foxglove.X, in ROS foxglove_msgs/msg/X."""
+    return name.startswith("foxglove")
 
 
 class Translation:
-    """Translates messages defined by a schema into CDR of a ROS 2 type. Raises MessageError."""
+    """Translates messages into CDR of a ROS 2 type. Raises MessageError.
 
-    def __init__(self, schema: Schema, definition: Definition) -> None:
+    Args:
+        recorded: what the messages are defined by: a schema, or a definition in ROS.
+        definition: of the ROS 2 type.
+    """
+
+    def __init__(self, recorded: Schema | Definition, definition: Definition) -> None:
         self._definition = definition
-        self._parse = _protobuf(schema) if schema.encoding == "protobuf" else _json
+        self._parse: Callable[[bytes], Any]
+        if isinstance(recorded, Definition):
+            self._parse = recorded.decode
+        else:
+            self._parse = _protobuf(recorded) if recorded.encoding == "protobuf" else _json
 
     def __call__(self, data: bytes) -> bytes:
         """The CDR bytes of one message."""
@@ -111,6 +125,8 @@ def _get(tree: Any, name: str) -> Any:
     if isinstance(tree, Mapping):
         found = tree.get(name)
         return tree.get(name.upper()) if found is None else found
+    if hasattr(tree, "__msgtype__"):
+        return getattr(tree, name, None)
     fields = tree.DESCRIPTOR.fields_by_name
     field = fields.get(name) or fields.get(name.upper())
     if field is None or (field.has_presence and not tree.HasField(field.name)):
