@@ -26,6 +26,8 @@ _FEWEST = 100
 _DIED_OUT, _COLOURED = 2.0, 4.0
 # Of a recording's length, the longest lag.
 _LONGEST = 0.25
+# Of a variance in units of a prior's: less is rounding.
+_SMALLEST = 1e-18
 # Numbers whose rows of L are held at a time.
 _AT_A_TIME = 8
 
@@ -69,13 +71,13 @@ def _residuals(factor: Factor, values: gtsam.Values) -> Array:
     return np.where(factor.measurement.used(values)[:, None], factor.measurement.residuals(values), 0.0)
 
 
-def inflations_by_innovations(
+def inflated_by_innovations(
     problem: Problem, covariance: Array, innovations: Mapping[str, Residuals]
 ) -> tuple[Array, dict[str, float]]:
-    """(n,) by what a filter's sigmas grow as its innovations are correlated, and how many of a family count as one.
+    """(n, n) a filter's covariance as its innovations are correlated, and how many of a family count as one.
 
-    A filter does not tell what each measurement did: the family that is correlated most counts for all that does not
-    come from a number's own prior.
+    A filter does not tell what each measurement did: the family that is correlated most counts for all information
+    that does not come from priors.
 
     Args:
         problem: the graph's.
@@ -87,10 +89,18 @@ def inflations_by_innovations(
         lags = correlations(np.where(found.used[:, None], found.whitened, 0.0))
         if len(lags):
             lengths[family] = 1.0 + 2.0 * float(lags.sum())
-    variance = np.diag(covariance)
-    prior = np.array([np.inf if q.prior_sigma is None else q.prior_sigma or np.inf for q in problem.quantities])
-    told = np.clip(1.0 - variance / prior**2, 0.0, 1.0)
-    return np.sqrt(1.0 + (max(lengths.values(), default=1.0) - 1.0) * told), lengths
+    if not lengths:
+        return covariance, lengths
+    free = np.flatnonzero(np.diag(covariance) > 0.0)
+    scale, extra = np.array([(problem.quantities[i].scale, problem.quantities[i].extra_sigma) for i in free]).T
+    block = np.ix_(free, free)
+    variance, vectors = np.linalg.eigh((covariance[block] - np.diag(extra**2)) / np.outer(scale, scale))
+    prior = np.diag([0.0 if problem.quantities[i].prior_sigma is None else 1.0 for i in free])
+    told = (vectors / np.maximum(variance, _SMALLEST)) @ vectors.T - prior
+    information, vectors = np.linalg.eigh(prior + told / max(lengths.values()))
+    grown = covariance.copy()
+    grown[block] = (vectors / information) @ vectors.T * np.outer(scale, scale) + np.diag(extra**2)
+    return grown, lengths
 
 
 def added_variance(found: Influence, colours: Mapping[str, Array]) -> dict[str, Array]:

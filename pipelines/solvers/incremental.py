@@ -20,7 +20,7 @@ import numpy as np
 from pipelines.graph.problem import Array, Attitudes, ChiSquare, Estimate, Factor, History, Problem, Step
 from pipelines.solvers.assembly import Assembly
 from pipelines.solvers.batch import CHUNK, Solution, optimize, with_levels
-from pipelines.solvers.coloured import inflations_by_innovations
+from pipelines.solvers.coloured import inflated_by_innovations
 from pipelines.solvers.innovations import Innovations, Prediction
 from pipelines.solvers.linearity import is_linear
 from pipelines.solvers.marginals import IndeterminateError, reported, reported_covariance
@@ -211,13 +211,15 @@ class Run:
             raise IndeterminateError(f"the estimate at {self.time:.3f} s is not a finite number")
         history, n = self.history.array.copy(), len(values)
         innovations = self.innovations.residuals()
-        inflation, colours = inflations_by_innovations(self.problem, covariance, innovations)
+        grown, colours = inflated_by_innovations(self.problem, covariance, innovations)
+        variance = np.diag(covariance)
+        inflation = np.sqrt(np.divide(np.diag(grown), variance, out=np.ones(n), where=variance > 0.0))
         attitudes = self.attitudes.array.copy()
         return Estimate(
             solver="incremental",
             names=tuple(q.name for q in self.problem.quantities),
             values=values,
-            covariance=covariance * np.outer(inflation, inflation),
+            covariance=grown,
             inflation=inflation,
             colours=colours,
             converged=not self._trouble,
