@@ -20,7 +20,7 @@ _OFFSET = "time_offset"
 _DELAY_PRIOR = 0.05
 # Stamps are moved by this much first, s, and numbers scaled by this much; then so many times to the bottom of a
 # parabola.
-_FIRST_SHIFT, _FIRST_SCALING, _PARABOLAS = 0.01, 0.01, 4
+_FIRST_SHIFT, _FIRST_SCALING, _SECOND_SCALING, _PARABOLAS = 0.01, 0.01, 5e-3, 4
 
 # What it would be, data and config.
 Trial = tuple[str, Any, Config]
@@ -126,18 +126,24 @@ def scaled(method: Method, hypotheses: Hypotheses, data: Any, config: Config) ->
             assert found is not None
             return found
 
-        # Not chi-square, which levels off where most measurements are rejected.
-        more = _lowest(lambda more: quick_score(method, *changed(more)) ** 2, _FIRST_SCALING)
-        if more is not None:
+        def cost(more: float, changed: Callable[[float], tuple[Any, Config]] = changed) -> float:
+            found = outcome(method, *changed(more))
+            return found.cost if found else np.inf
+
+        # Not chi-square, which levels off where most measurements are rejected; near the bottom it tells best.
+        rough = _lowest(lambda more: quick_score(method, *changed(more)) ** 2, _FIRST_SCALING)
+        if rough:
+            more = _lowest(cost, _SECOND_SCALING, rough)
+            more = rough if more is None else more
             yield scaling.label.format(factor=1.0 + more), *changed(more)
 
 
-def _lowest(cost: Callable[[float], float], step: float) -> float | None:
-    """The size of a change that costs least; None when there is none.
+def _lowest(cost: Callable[[float], float], step: float, start: float = 0.0) -> float | None:
+    """The size of a change that costs least, searched for from `start` on; None when there is none.
 
     From the best so far a step to either side, and to the bottom of the parabola through the three.
     """
-    known, best = {0.0: cost(0.0)}, 0.0
+    known, best = {start: cost(start)}, start
     for _ in range(_PARABOLAS):
         sides = best - step, best + step
         known |= {size: cost(size) for size in sides if size not in known}
