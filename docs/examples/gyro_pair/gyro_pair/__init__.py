@@ -36,6 +36,7 @@ class GyroPair(Method):
     needs = NEEDS
     section = GyroPairConfig
     rotations: ClassVar[Mapping[str, str]] = {"rotation": "aRb"}
+    of_recording = ("bias_difference_*",)
     scenarios = Path(__file__).parent / "scenarios"
 
     @property
