@@ -389,3 +389,14 @@ FORMS: dict[str, Callable[[Path, Path], Path]] = {
     "mcap json": lambda s, f: mcap_json(s, f / "j.mcap"),
     "mcap protobuf": lambda s, f: mcap_protobuf(s, f / "p.mcap"),
 }
+
+
+def video_file(path: Path, count: int) -> None:
+    """MPEG-4 in .mp4 or motion JPEG in .avi: pictures of 48 x 32 that become brighter, 20, 50, 80, ..."""
+    import cv2
+
+    codec = {".mp4": "mp4v", ".avi": "MJPG"}[path.suffix]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 30.0, (48, 32))
+    for i in range(count):
+        writer.write(np.full((32, 48, 3), 30 * i + 20, np.uint8))
+    writer.release()

@@ -200,6 +200,25 @@ def test_damaged_videos(number: int) -> None:
     assert found["read"] > 0
 
 
+@pytest.mark.parametrize("number", [40, pytest.param(600, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("form", ["mp4", "avi"])
+def test_damaged_video_files(form: str, number: int, tmp_path: Path) -> None:
+    """As many pictures as stamps, or one line."""
+    path = tmp_path / f"v.{form}"
+    forms.video_file(path, 7)
+    data, rng, found = path.read_bytes(), np.random.default_rng(5), Counter[str]()
+    cut = (data[:at] for at in rng.integers(1, len(data), number // 2).tolist())
+    for copy in (*cut, *flips(data, number // 4, 3), *spoilt(data, number // 4, 4)):
+        path.write_bytes(copy)
+        try:
+            found["read"] += len(list(video.VideoFile(path, 7))) == 7
+        except InputError as error:
+            found["refused"] += "\n" not in str(error)
+    print(form, dict(found))
+    assert found["read"] + found["refused"] == number
+    assert found["read"] > 0
+
+
 # -- hostile
 
 

@@ -421,9 +421,12 @@ def test_csv_with_columns_from_the_config(tmp_path: Path) -> None:
         ("{file: imu.csv, time: t, gyro: [a, wy, wz]}", "imu.csv: no column a; the columns are t, wx"),
         ("{file: imu.csv, time: t, gyro: [note, wy, wz]}", "columns note, wy, wz: could not convert string"),
         ("{file: imu.csv, time: note, gyro: [wx, wy, wz]}", "imu.csv: a time that is no number in s"),
-        ("{file: imu.csv, time: t}", "exactly one of gyro, wxyz, field, vector, latitude_deg, joints is needed"),
+        ("{file: imu.csv, time: t}", "exactly one of gyro, wxyz, field, vector, latitude_deg, joints, video is needed"),
         ("{file: imu.csv, time: t, gyro: [a, b, c], units: {gyro: rpm}}", "units.gyro: rpm is not one of rad/s"),
         ("{file: imu.csv, time: t, gyro: [a, b]}", "columns./imu.gyro"),
+        ("{file: imu.csv, time: t, video: a.mp4, gyro: [a, b, c]}", "joints, video is needed, not gyro and video"),
+        ("{file: imu.csv, time: t, video: a.mp4}", r"a.mp4: cannot be opened \(No such file"),
+        ("{file: imu.csv, time: t, video: pose.csv}", "pose.csv: neither an MP4 nor an AVI file"),
     ],
 )
 def test_columns_that_do_not_fit_are_one_line(columns: str, message: str, tmp_path: Path) -> None:
@@ -754,6 +757,52 @@ def test_a_video_that_is_not_as_it_should_be_is_one_line(change: Any, form: str,
     recording = video(tmp_path / "v.mcap", np.full((3, 16, 16), 90, np.uint8), change, form)
     with pytest.raises(InputError, match=f"topic /video: .*{message}"):
         list(recording.images("/video"))
+
+
+def with_video(where: str | Path, name: str, time: str = "column 1") -> Recording:
+    recording = open_recording(where)
+    config = load_config(f"columns: {{/image: {{file: stamps.txt, time: {time}, video: {name}}}}}".encode())
+    recording.use(config.topics.values(), config.columns)
+    return recording
+
+
+@pytest.mark.parametrize("name", ["v.mp4", "v.avi"])
+@pytest.mark.parametrize("head", ["", "t\n"])
+def test_a_video_file_with_a_list_of_stamps(name: str, head: str, tmp_path: Path) -> None:
+    import cv2
+
+    forms.video_file(tmp_path / name, 7)
+    (tmp_path / "stamps.txt").write_text(head + "".join(f"1700000000.{i}00000001\n" for i in range(7)))
+    recording = with_video(tmp_path / "*", name, "t" if head else "column 1")
+    assert recording.topics["/image"].type == messages.COMPRESSED_IMAGE
+    found = list(recording.images("/image"))
+    assert [t_ns for t_ns, _ in found] == [1_700_000_000_000_000_001 + 100_000_000 * i for i in range(7)]
+    grey = np.array([cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_GRAYSCALE) for _, file in found], float)
+    np.testing.assert_allclose(grey.mean(axis=(1, 2)), 30.0 * np.arange(7) + 20.0, atol=3.0)
+    assert recording.notes == ()
+    digest = recording.sha256()
+    forms.video_file(tmp_path / name, 6)
+    assert with_video(tmp_path / "stamps.txt", name, "t" if head else "column 1").sha256() != digest
+
+
+@pytest.mark.parametrize(
+    ("count", "message"),
+    [(6, "only 6 of 7 pictures of the video can be decoded"), (8, "the video has more pictures than its 7 stamps")],
+)
+def test_a_video_file_with_another_number_of_pictures_is_one_line(count: int, message: str, tmp_path: Path) -> None:
+    forms.video_file(tmp_path / "v.mp4", count)
+    (tmp_path / "stamps.txt").write_text("".join(f"{i}.5\n" for i in range(7)))
+    with pytest.raises(InputError, match=f"v.mp4: {message}"):
+        list(with_video(tmp_path / "stamps.txt", "v.mp4").images("/image"))
+
+
+def test_a_video_file_alone_says_what_it_needs(tmp_path: Path) -> None:
+    forms.video_file(tmp_path / "v.avi", 7)
+    assert "`columns:` in the config says which table" in open_recording(tmp_path / "v.avi").notes[0]
+    (tmp_path / "v.mp4").write_bytes(b"\0\0\0\x20ftypisom" + bytes(100))
+    (tmp_path / "stamps.txt").write_text("1.5\n")
+    with pytest.raises(InputError, match=r"v.mp4: only 0 of 1 pictures"):
+        list(with_video(tmp_path / "stamps.txt", "v.mp4").images("/image"))
 
 
 def test_messages_without_a_stamp_are_told_with_the_jitter_of_what_stands_in(tmp_path: Path) -> None:

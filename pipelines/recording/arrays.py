@@ -15,7 +15,7 @@ from pipelines.recording.message_source import message_source
 from pipelines.recording.messages import definition_text
 
 # Messages at a time; those of any size may be pictures.
-_ALIKE, _VARIED = 1 << 14, 16
+_ALIKE, _VARIED = 1 << 14, 4
 
 
 class ArrayContainer(Container):

@@ -14,10 +14,12 @@ import zstandard
 
 from pipelines.errors import InputError
 from pipelines.recording import ros1_bag
+from pipelines.recording.arrays import ArrayContainer
 from pipelines.recording.container import Container
 from pipelines.recording.mcap_file import McapFile
 from pipelines.recording.mcap_records import MAGIC
 from pipelines.recording.parts import Parts
+from pipelines.recording.video import is_video
 
 _ZSTD, _SQLITE, _ULOG, _ARDUPILOT = b"\x28\xb5\x2f\xfd", b"SQLite format 3\0", b"ULog\x01\x12\x35", b"\xa3\x95"
 _TABLES = {".csv", ".tum", ".txt"}
@@ -126,6 +128,8 @@ def _by_content(path: Path, data: Path, strict: bool) -> Container:
         )
     if start.startswith(_ZSTD):
         raise InputError(f"{path}: compressed twice")
+    if is_video(start):
+        return ArrayContainer(path, {}, ["a video; `columns:` in the config says which table has its pictures' stamps"])
     if _TABLES & set(path.suffixes) and start:
         from pipelines.recording.tables import read_table
 

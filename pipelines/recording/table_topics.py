@@ -4,6 +4,7 @@ columns:
   /imu: {file: imu.csv, time: t, unit: s, gyro: [wx, wy, wz], accel: [ax, ay, az], units: {gyro: deg/s}}
   /vision/attitude: {file: vision.csv, time: t_ns, unit: ns, wxyz: [qw, qx, qy, qz]}
   /gimbal/joint_states: {time: t, joints: {azimuth: az, elevation: el}, units: {joints: deg}}
+  /camera/image: {file: stamps.csv, time: t_ns, unit: ns, video: camera.mp4}
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pipelines.errors import InputError, nearest
 from pipelines.recording import series
 from pipelines.recording.arrays import ArrayContainer
-from pipelines.recording.container import Container
+from pipelines.recording.container import Container, sha256_of, sha256_together
 from pipelines.recording.parts import Parts
 from pipelines.recording.tables import CsvFile, nanoseconds, numbers, read_columns
+from pipelines.recording.video import VideoFile
 
 _Three = Annotated[tuple[str, str, str], Field(strict=False)]
 _Four = Annotated[tuple[str, str, str, str], Field(strict=False)]
@@ -63,6 +65,7 @@ class TableTopic(BaseModel):
         time, unit: column of the stamps, and what they count.
         gyro, accel, wxyz, position, field, vector, latitude_deg, longitude_deg, height, joints: columns, by what they
             are in pipelines.recording.series.
+        video: name of a video beside the table, whose rows are the stamps of its pictures.
         units: of one of these, where it is not SI.
     """
 
@@ -81,14 +84,15 @@ class TableTopic(BaseModel):
     longitude_deg: str | None = None
     height: str | None = None
     joints: dict[str, str] | None = None
+    video: str | None = None
     units: dict[str, str] = {}
 
     @model_validator(mode="after")
     def _complete(self) -> TableTopic:
-        kinds = [name for name in (*_KINDS, "joints") if getattr(self, name) is not None]
+        kinds = [name for name in (*_KINDS, "joints", "video") if getattr(self, name) is not None]
         if len(kinds) != 1:
             found = " and ".join(kinds) or "none"
-            raise ValueError(f"exactly one of {', '.join(_KINDS)}, joints is needed, not {found}")
+            raise ValueError(f"exactly one of {', '.join(_KINDS)}, joints, video is needed, not {found}")
         for name, unit in self.units.items():
             if name not in TableTopic.model_fields or unit not in UNITS:
                 raise ValueError(f"units.{name}: {unit} is not one of {', '.join(UNITS)}")
@@ -96,6 +100,10 @@ class TableTopic(BaseModel):
 
     def read(self, path: Path, data: Path) -> series.Topic:
         """The topic. Rows without a number in any of its columns are left out. Raises InputError."""
+        if self.video is not None:
+            t_ns = nanoseconds(path, read_columns(path, data, [self.time])[self.time], self.unit)
+            pictures = VideoFile(path.with_name(Path(self.video).name), len(t_ns))
+            return series.ImageSeries(t_ns, pictures, "netpbm")
         given = {name: self._columns(name) for name in (*_NUMBERS, "joints") if getattr(self, name) is not None}
         columns = read_columns(path, data, list(dict.fromkeys([self.time, *(c for cs in given.values() for c in cs)])))
         values = {name: self._scale(name) * numbers(path, columns, names) for name, names in given.items()}
@@ -151,11 +159,29 @@ def _tables(container: Container) -> dict[str, CsvFile]:
 
 def _with_topics(container: Container, of: Mapping[str, Mapping[str, series.Topic]]) -> Container:
     if isinstance(container, CsvFile) and of.get(container.path.name):
-        found = ArrayContainer(container.path, of[container.path.name])
-        found.data = container.data
-        return found
+        return _Described(container, of[container.path.name])
     if isinstance(container, Parts):
-        whole = Parts(container.path, [_with_topics(part, of) for part in container.parts])
+        used = {video.path.resolve() for topics in of.values() for video in _videos(topics)}
+        there = [part for part in container.parts if part.path.resolve() not in used]
+        whole = Parts(container.path, [_with_topics(part, of) for part in there])
         whole.unpacked = container.unpacked
         return whole
     return container
+
+
+class _Described(ArrayContainer):
+    """A table whose columns are known, with the videos that it has the stamps of."""
+
+    def __init__(self, table: CsvFile, topics: Mapping[str, series.Topic]) -> None:
+        super().__init__(table.path, topics)
+        self.data, self._video_paths = table.data, [video.path for video in _videos(topics)]
+
+    def sha256(self) -> str:
+        """SHA-256 of the table; with videos, of its digest and theirs, in order."""
+        digest = super().sha256()
+        return sha256_together([digest, *map(sha256_of, self._video_paths)]) if self._video_paths else digest
+
+
+def _videos(topics: Mapping[str, series.Topic]) -> list[VideoFile]:
+    pictures = [topic.data for topic in topics.values() if isinstance(topic, series.ImageSeries)]
+    return [video for video in pictures if isinstance(video, VideoFile)]

@@ -48,8 +48,9 @@ class CsvFile(ArrayContainer):
 
 
 def column_names(path: Path, data: Path) -> list[str]:
-    """Names of the columns: the first line, without a leading `#`."""
-    return [name.strip() for name in next(csv.reader([_head(path, data).lstrip("#")]), [])]
+    """Names of the columns: the first line, without a leading `#`; `column 1` and so on where that is of numbers."""
+    names = [name.strip() for name in next(csv.reader([_head(path, data).lstrip("#")]), [])]
+    return [f"column {i}" for i in range(1, len(names) + 1)] if _are_numbers(names) else names
 
 
 def read_columns(path: Path, data: Path, names: Sequence[str]) -> dict[str, NDArray[np.str_]]:
@@ -60,9 +61,10 @@ def read_columns(path: Path, data: Path, names: Sequence[str]) -> dict[str, NDAr
         raise InputError(f"{path}: no column {lacking[0]}; the columns are {', '.join(there)}")
     wanted = [there.index(name) for name in names]
     rows: list[list[str]] = []
+    first = 0 if there[:1] == ["column 1"] else 1
     with data.open(encoding="utf-8", errors="replace", newline="") as stream:
         try:
-            for number, row in enumerate(itertools.islice(csv.reader(stream), 1, None), start=2):
+            for number, row in enumerate(itertools.islice(csv.reader(stream), first, None), start=first + 1):
                 if not row or row[0].startswith("#"):
                     continue
                 if len(row) < len(there):
@@ -99,6 +101,13 @@ def numbers(path: Path, columns: Mapping[str, NDArray[np.str_]], names: Sequence
         return np.where(table == "", "nan", table).astype(float)
     except ValueError as error:
         raise InputError(f"{path}: columns {', '.join(names)}: {error}") from error
+
+
+def _are_numbers(texts: Sequence[str]) -> bool:
+    try:
+        return len([float(text) for text in texts]) > 0
+    except ValueError:
+        return False
 
 
 def _trajectory(path: Path, data: Path) -> series.PoseSeries:
