@@ -273,3 +273,14 @@ def test_white_noise_of_a_sensor_in_motion() -> None:
     assert found is None or found[0] == pytest.approx(density, rel=0.2)
     # Steps of the readings hide it.
     assert white_density(time, np.round(samples / 0.1) * 0.1) is None
+
+
+def test_coloured_innovations_leave_what_goes_together_together() -> None:
+    # The scale of K and the field's strength are known together far better than either; seed 17 looks coloured.
+    simulated = simulate("tumble", {}, seed=17)
+    problem = methods.method("tumble").problem(simulated.data, load_config(simulated.config.encode()))
+    estimate = solve_incremental(problem)
+    assert estimate.inflations.max() > 1.2
+    error = estimate.values - np.array([simulated.truth[q.name] for q in problem.quantities])
+    free = estimate.sigmas > 0.0
+    assert error[free] @ np.linalg.solve(estimate.covariance[np.ix_(free, free)], error[free]) < 25.0
