@@ -16,7 +16,7 @@ import typer
 from typer.core import TyperGroup
 
 from pipelines import exit_codes
-from pipelines.options import ConfigFile, Quiet, RecordingPath, RecordingPaths
+from pipelines.options import ConfigFile, Json, Quiet, RecordingPath, RecordingPaths
 from pipelines.solvers.window import parse_window
 
 if TYPE_CHECKING:
@@ -73,7 +73,6 @@ _Jobs = Annotated[int | None, typer.Option(help="Local worker processes; default
 _PictureJobs = Annotated[int | None, typer.Option("--jobs", help="Processes for many pictures; default: one a core.")]
 _Strict = Annotated[bool, typer.Option("--strict", help="Refuse a recording of which anything is lost.")]
 _AutoTopics = Annotated[bool, typer.Option("--auto-topics", help="Take the topics that `info` suggests.")]
-_Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")]
 _NoCheck = Annotated[bool, typer.Option("--no-check", help="Do not hold an incremental result against batch.")]
 _Prior = Annotated[
     Path | None, typer.Option(help="An earlier calibration of the device to begin from: result.json, calibration.yaml.")
@@ -108,7 +107,7 @@ def calibrate(
     jobs: _PictureJobs = None,
     prior: _Prior = None,
     no_check: _NoCheck = False,
-    as_json: _Json = False,
+    as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """Calibrate a recording, or several of one device together.
@@ -162,7 +161,7 @@ def compare(
     out: Annotated[Path | None, typer.Option(help="Folder for compare.html, which also splits the recording.")] = None,
     strict: _Strict = False,
     auto_topics: _AutoTopics = False,
-    as_json: _Json = False,
+    as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """The published, batch and incremental solvers side by side, with errors where the truth is known."""
@@ -203,7 +202,7 @@ def follow(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: SOURCE-incremental.")] = None,
     no_check: _NoCheck = False,
-    as_json: _Json = False,
+    as_json: Json = False,
 ) -> None:
     """Calibrate a recording while it is being written, and say what is still missing. Ctrl-C ends it."""
     from pipelines.follow.follow import follow as run
@@ -225,7 +224,7 @@ def validate(
     config: ConfigFile = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the page; default: SESSION-validation.")] = None,
     strict: _Strict = False,
-    as_json: _Json = False,
+    as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """Whether a calibration made on another recording still holds, and errors before and after compensation with it.
@@ -278,7 +277,7 @@ def plan(
     config: ConfigFile = None,
     require: Annotated[list[str] | None, typer.Option(help="NAME=SIGMA wanted, SI; may be repeated.")] = None,
     out: Annotated[Path | None, typer.Option(help="File for the better motion, as a scenario.")] = None,
-    as_json: _Json = False,
+    as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """How well a planned motion would determine each parameter, and a better one. Exit code 3 if less than required."""
@@ -304,7 +303,7 @@ def info(
     session: RecordingPath,
     config: ConfigFile = None,
     strict: _Strict = False,
-    as_json: _Json = False,
+    as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """What can be calibrated from a recording, with which topics, what is missing, and what is in it."""
@@ -383,7 +382,7 @@ def montecarlo(
     scheduler: _Scheduler = None,
     jobs: _Jobs = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: METHOD-montecarlo.")] = None,
-    as_json: _Json = False,
+    as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """Simulate and solve many recordings: are the sigmas true? The same command goes on after an interruption."""
@@ -419,7 +418,7 @@ def fleet(
     scheduler: _Scheduler = None,
     jobs: _Jobs = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("alidade-fleet"),
-    as_json: _Json = False,
+    as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """Calibrate many recordings and compare units and dates. The same command goes on after an interruption."""
@@ -450,7 +449,7 @@ def export(
     calibration: Annotated[Path, typer.Argument(metavar="CALIBRATION.yaml", help="The calibration.")],
     form: Annotated[str, typer.Option("--format", help="px4, ardupilot, ros2, kalibr (sensors); tf, urdf (mounts).")],
     out: Annotated[Path | None, typer.Option(help="The file to write; default: printed.")] = None,
-    as_json: _Json = False,
+    as_json: Json = False,
 ) -> None:
     """A calibration as the parameters of another program, in its own conventions."""
     from pipelines import terminal

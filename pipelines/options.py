@@ -16,3 +16,4 @@ RecordingPaths = Annotated[
 ]
 ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML that overrides the recording's own config.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -112,3 +113,14 @@ def test_the_page_takes_no_name_from_the_config(alidade: Command, tmp_path: Path
     assert run.code == 2
     assert "call it .yaml" in run.err
     assert not (tmp_path / "cube.html").exists()
+
+
+def test_with_json_it_prints_the_tags_and_nothing_else(alidade: Command, tmp_path: Path) -> None:
+    _session(tmp_path / "5.mcap", 5, SCENARIO.model_copy(update={"cube": TagCube(hidden=(19,))}))
+    run = alidade("cube-layout", tmp_path / "5.mcap", "--out", tmp_path / "cube.yaml", "--json")
+    found = json.loads(run.out)
+    assert [tag["id"] for tag in found["tags"]] == [16, 17, 18, 20, 21]
+    assert found["unplaced"] == {"19": "in no picture"}
+    config = load_config(None, tmp_path / "cube.yaml").section(CubeConfig)
+    assert tuple(found["tags"][1]["position"]) == pytest.approx(config.tags[17].position)
+    assert found["tags"][0]["position_sigma"] == [0.0] * 3 < found["tags"][1]["position_sigma"]

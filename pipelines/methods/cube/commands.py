@@ -9,7 +9,7 @@ import typer
 
 from pipelines import terminal
 from pipelines.errors import InputError
-from pipelines.options import ConfigFile, Quiet
+from pipelines.options import ConfigFile, Json, Quiet
 
 if TYPE_CHECKING:
     from pipelines.vision.layout import Layout
@@ -22,6 +22,7 @@ def cube_layout(
     refine_camera: Annotated[
         bool, typer.Option("--refine-camera", help="Adjust focal length, centre and distortion too.")
     ] = False,
+    as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """Where the tags are on a cube, from pictures of it on all sides; the config gives their ids and sizes."""
@@ -29,7 +30,7 @@ def cube_layout(
     from pipelines.config import recorded_config
     from pipelines.methods.cube.layout import cube_layout as estimate
     from pipelines.methods.cube.layout import layout_yaml
-    from pipelines.methods.cube.layout_page import layout_html
+    from pipelines.methods.cube.layout_page import layout_html, layout_json
     from pipelines.recording.reading import open_recording
     from pipelines.reports.whole import write_file
 
@@ -41,6 +42,9 @@ def cube_layout(
         layout = estimate([(each, recorded_config(each, config)) for each in recordings], refine_camera)
     write_file(out, layout_yaml(layout))
     write_file(page, layout_html(layout, [session.name for session in sessions]))
+    if as_json:
+        print(layout_json(layout))
+        return
     _show(layout)
     terminal.say(f"Wrote {out} for calibrate --config, and {page}")
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from factors import so3
+from pipelines.reports.plain_json import plain_json
 from pipelines.reports.plots import COLORS, figure
 from pipelines.reports.templating import environment
 from pipelines.reports.units import to_digits_of
@@ -56,6 +57,35 @@ def rows(layout: Layout) -> list[tuple[str, ...]]:
         (str(tag), str(s.pictures), f"{s.rms_px:.2f}", *cell, str(s.rejected), f"{s.inflation:.1f}")
         for (tag, s), cell in zip(layout.seen.items(), cells, strict=True)
     ]
+
+
+def layout_json(layout: Layout) -> str:
+    """What the terminal tells, in SI and pixels: every tag placed with its sigmas, and why others are not."""
+    sigmas = np.sqrt(np.diag(layout.covariance)).reshape(-1, 6).tolist()
+    body = layout.body
+    return plain_json(
+        "layout",
+        {
+            "headline": headline(layout),
+            "pictures": layout.frames,
+            "rms_px": layout.rms_px,
+            "tags": [
+                {
+                    "id": tag,
+                    "pictures": seen.pictures,
+                    "rejected": seen.rejected,
+                    "rms_px": seen.rms_px,
+                    "rotation": body.bRt[i].tolist(),
+                    "position": body.position[i].tolist(),
+                    "rotation_sigma": [0.0] * 3 if i == 0 else sigmas[i - 1][:3],
+                    "position_sigma": [0.0] * 3 if i == 0 else sigmas[i - 1][3:],
+                }
+                for i, (tag, seen) in enumerate(layout.seen.items())
+            ],
+            "unplaced": {str(tag): why for tag, why in layout.unplaced.items()},
+            "advice": advice(layout),
+        },
+    )
 
 
 def camera_rows(layout: Layout) -> list[tuple[str, ...]]:
