@@ -47,12 +47,14 @@ class Trial:
     Attributes:
         t: (N,) s.
         gyro: (N, 3) rad/s.
+        force: (N, 3) m/s^2, specific force by the accelerometer.
         attitude: (N, 4) marker body to world; NaN where the cameras lost the markers.
         moving: (N,) whether the IMU was being moved.
     """
 
     t: Array
     gyro: Array
+    force: Array
     attitude: Array
     moving: NDArray[np.bool_]
 
@@ -71,11 +73,12 @@ def read_trial(path: Path) -> Trial:
         return Trial(
             t=np.arange(len(gyro)) / float(content["sampling_rate"].item()),
             gyro=gyro,
+            force=content["imu_acc"],
             attitude=content["opt_quat"],
             moving=content["movement"][:, 0].astype(bool),
         )
     except (OSError, ValueError, KeyError) as error:
-        needed = "a Matlab file with imu_gyr, opt_quat, movement and sampling_rate"
+        needed = "a Matlab file with imu_gyr, imu_acc, opt_quat, movement and sampling_rate"
         raise InputError(f"{path}: not a BROAD trial ({needed}): {error}") from error
 
 
@@ -100,6 +103,7 @@ def to_session(trial: Trial, seed: int) -> HeadData:
         epoch_ns=EPOCH_NS,
         head_t=trial.t,
         head_gyro=trial.gyro,
+        head_force=trial.force,
         platform_t=None,
         platform_gyro=None,
         vision_t=trial.t[vision],
@@ -119,7 +123,7 @@ class Score:
 
     Attributes:
         attitude_rms: rad, of the fused attitude against the undisturbed motion capture.
-        bias_error: (3,) rad/s, gyro bias less the mean gyro at rest.
+        bias_error: (3,) rad/s, gyro bias and what it is by gravity at rest, less the mean gyro at rest.
         time_offset: s.
     """
 
@@ -139,9 +143,12 @@ def score(trial: Trial, values: Mapping[str, float], attitude_t: Array, attitude
     inside = (stamps >= trial.t[seen][0]) & (stamps <= trial.t[seen][-1])
     truth = so3.interpolate(trial.t[seen], trial.attitude[seen], stamps[inside])
     error = so3.log(so3.multiply(so3.inverse(truth), so3.multiply(attitude_wxyz[inside], vRh)))
+    # At rest the gyro shows its bias and what gravity does to it.
+    G = np.array([[values.get(f"gyro_g_{row}{column}", 0.0) for column in "xyz"] for row in "xyz"])
+    at_rest = np.array([values[f"gyro_bias_{axis}"] for axis in "xyz"]) + G @ trial.force[~trial.moving].mean(axis=0)
     return Score(
         attitude_rms=float(np.sqrt((error**2).sum(axis=1).mean())),
-        bias_error=np.array([values[f"gyro_bias_{axis}"] for axis in "xyz"]) - gyro_bias_at_rest(trial),
+        bias_error=at_rest - gyro_bias_at_rest(trial),
         time_offset=values["time_offset"],
     )
 

@@ -28,6 +28,7 @@ def trial_file(tmp_path: Path) -> Path:
         path,
         {
             "imu_gyr": BIAS + np.outer(rate, [0.0, 0.0, 1.0]),
+            "imu_acc": np.tile([0.0, 0.0, 9.8], (n, 1)),
             "opt_quat": quat,
             "sampling_rate": np.array([[RATE_HZ]]),
             "movement": (rate > 0.0)[:, None].astype(np.uint8),
@@ -41,6 +42,7 @@ def test_trial_becomes_a_session(trial_file: Path, tmp_path: Path) -> None:
     trial = read_trial(trial_file)
     np.testing.assert_allclose(data.head_t, trial.t, atol=1e-9)
     np.testing.assert_array_equal(data.head_gyro, trial.gyro)
+    np.testing.assert_array_equal(data.head_force, trial.force)
     assert data.platform_t is None
     assert data.truth_t is not None
     assert data.truth_wxyz is not None
