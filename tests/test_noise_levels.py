@@ -108,6 +108,7 @@ def repeating(seed: int, size: float) -> tuple[Any, Config, Mapping[str, float]]
     return data, config.model_copy(update={"noise": noise}), truth
 
 
+@pytest.mark.slow
 def test_poses_that_repeat_worse_than_white_noise_says() -> None:
     size = 8e-3
     data, config, truth = repeating(1, size)

@@ -74,6 +74,7 @@ def test_it_is_one_big_graph(case: str, monkeypatch: pytest.MonkeyPatch) -> None
     assert found.keys() == {q.name for q in problems[0].quantities}
 
 
+@pytest.mark.slow
 def test_once_linearised_anew_it_is_as_good_as_that() -> None:
     opened = sessions("indexer", [1, 2, 3], "noise_known: 0")
     values, sigmas = solved(
@@ -97,6 +98,7 @@ def test_five_recordings_make_sigmas_smaller_by_their_root() -> None:
         assert five[f"gyro_bias_{axis}"].sigma == pytest.approx(one[f"gyro_bias_{axis}"].sigma, rel=0.05)
 
 
+@pytest.mark.slow
 def test_one_after_the_other_it_is_the_same(tmp_path: Path) -> None:
     """Each recording with the result of those before it as prior."""
     opened = sessions("indexer", range(4), EXACT)
@@ -235,6 +237,7 @@ def test_real_trials_agree_or_are_named(shared_data: Path, tmp_path: Path) -> No
     assert not [step for step in agreeing.changes.found if "mount" in step.name or step.name == "time_offset"]  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 def test_a_recording_that_does_not_fit_is_named() -> None:
     opened = sessions("indexer", [1, 2], EXACT)
     wrong = alidade.simulate("indexer", None, seed=3)

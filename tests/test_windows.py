@@ -29,7 +29,9 @@ def made(method: str, **changes: Any) -> Problem:
     return methods.method(method).problem(simulated.data, load_config(simulated.config.encode()))
 
 
-@pytest.mark.parametrize("method", SMALL)
+@pytest.mark.parametrize(
+    "method", [pytest.param(name, marks=[pytest.mark.slow] if name == "cube" else []) for name in SMALL]
+)
 @pytest.mark.parametrize("window", [Keyframes(20), None])
 def test_every_window_ends_where_batch_does(method: str, window: float | None) -> None:
     problem = made(method)

@@ -81,6 +81,7 @@ def test_a_mount_about_the_only_axis_of_motion_keeps_its_prior() -> None:
     assert _apart(incremental, batch) < 0.1
 
 
+@pytest.mark.slow
 def test_outliers_from_the_first_picture_on_are_judged_again_when_more_is_known() -> None:
     problem, _ = _made(3, duration_s=6.0, outlier_fraction=0.2)
     batch, incremental = solve_batch(problem), solve_incremental(problem)
