@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+# Of correlated numbers, the least variance of a combination that counts as known, in their own.
+_LEAST = 1e-14
+
 
 @dataclass(frozen=True, eq=False)
 class Belief:
@@ -43,3 +46,9 @@ class Belief:
 def independent(names: Sequence[str], mean: Sequence[float], sigmas: Sequence[float], source: str = "") -> Belief:
     """Numbers of which each is known by itself."""
     return Belief(tuple(names), np.array(mean, dtype=float), np.diag(np.square(np.array(sigmas, dtype=float))), source)
+
+
+def root_of_information(correlation: Array, sigmas: Array) -> Array:
+    """(n, n) R with R'R the information of numbers with these correlations and sigmas (n,)."""
+    eigenvalues, vectors = np.linalg.eigh(correlation)
+    return np.asarray((vectors / np.sqrt(np.maximum(eigenvalues, _LEAST))).T / sigmas)

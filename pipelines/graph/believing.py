@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.belief import Belief
+from pipelines.belief import Belief, root_of_information
 from pipelines.errors import InputError
 from pipelines.graph.priors import pinned
 from pipelines.graph.problem import Array, Factor, Parameter, Problem, Quantity, Step
@@ -22,8 +22,6 @@ from pipelines.graph.problem import Array, Factor, Parameter, Problem, Quantity,
 _ROUNDING = 1e-9
 # First values farther from what is believed than this, in sigmas, are moved there, in so many steps.
 _APART, _MOVES = 3.0, 5
-# Of correlated numbers, the least variance of a combination that counts as known, in their own.
-_LEAST = 1e-14
 
 
 def believing(problem: Problem, beliefs: Sequence[Belief]) -> Problem:
@@ -196,8 +194,7 @@ def _square_root(belief: Belief, quantities: Sequence[Quantity]) -> Array:
     np.fill_diagonal(correlation, 1.0)
     if not (correlation - np.eye(len(sigmas))).any():
         return np.diag(1.0 / sigmas)  # row by row about one number, as budgets tell priors
-    eigenvalues, vectors = np.linalg.eigh(correlation)
-    return np.asarray((vectors / np.sqrt(np.maximum(eigenvalues, _LEAST))).T / sigmas)
+    return root_of_information(correlation, sigmas)
 
 
 def _rows_of(factor: gtsam.NonlinearFactor, rows: NDArray[np.intp], at: gtsam.Values) -> gtsam.CustomFactor:

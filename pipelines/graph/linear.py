@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gtsam
@@ -29,9 +29,7 @@ def linear_factor(
     values = gtsam.Values()
     for key in blocks:
         values.insert(key, origin[key])
-    jacobian: Any = gtsam.JacobianFactor  # its stubs cannot be called with as many blocks as there are
-    linear = jacobian(*terms, np.zeros(rows), gtsam.noiseModel.Unit.Create(rows))
-    return gtsam.LinearContainerFactor(linear, values)
+    return _container(terms, np.zeros(rows), values)
 
 
 def rescaled(factor: gtsam.LinearContainerFactor, scale: float) -> gtsam.LinearContainerFactor:
@@ -44,5 +42,10 @@ def rescaled(factor: gtsam.LinearContainerFactor, scale: float) -> gtsam.LinearC
     linear: Any = factor.linearize(zero)
     A, b = linear.getA() / scale, linear.getb() / scale
     terms = [part for i, key in enumerate(keys) for part in (key, A[:, size * i : size * (i + 1)])]
-    jacobian: Any = gtsam.JacobianFactor
-    return gtsam.LinearContainerFactor(jacobian(*terms, b, gtsam.noiseModel.Unit.Create(len(b))), zero)
+    return _container(terms, b, zero)
+
+
+def _container(terms: Sequence[Any], b: Array, values: gtsam.Values) -> gtsam.LinearContainerFactor:
+    """Whitened rows about the values: keys and blocks by turns, and the right side."""
+    jacobian: Any = gtsam.JacobianFactor  # its stubs cannot be called with as many blocks as there are
+    return gtsam.LinearContainerFactor(jacobian(*terms, b, gtsam.noiseModel.Unit.Create(len(b))), values)

@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines.belief import Belief
+from pipelines.belief import Belief, root_of_information
 from pipelines.graph.problem import Quantity, Told
 from pipelines.judgement.changes import Change, Changes, changes
 from pipelines.solvers.joint import join
@@ -78,7 +78,6 @@ def _of_device(told: Told) -> Collection[str]:
 def _as_told(known: Belief, quantities: Mapping[str, Quantity]) -> Told:
     """A belief as rows of unit variance."""
     n, sigmas = len(known.names), known.sigmas
-    eigenvalues, vectors = np.linalg.eigh(known.covariance / np.outer(sigmas, sigmas))
-    R = (vectors / np.sqrt(np.maximum(eigenvalues, 1e-14))).T / sigmas
+    R = root_of_information(known.covariance / np.outer(sigmas, sigmas), sigmas)
     scales = np.array([quantities[name].prior_scale for name in known.names])
     return Told(known.names, known.mean, R, np.zeros(n), np.empty((0, n)), np.empty(0), scales)

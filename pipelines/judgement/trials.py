@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from itertools import combinations, product
 from typing import TYPE_CHECKING, Any
 
@@ -105,11 +106,7 @@ def offset(method: Method, hypotheses: Hypotheses, data: Any, config: Config) ->
     def moved(shift: float) -> tuple[Any, Config]:
         return replace(data, **{stamps: getattr(data, stamps) + shift}), config
 
-    def cost(shift: float) -> float:
-        found = outcome(method, *moved(shift))
-        return found.cost if found else np.inf
-
-    shift = _lowest(cost, _FIRST_SHIFT)
+    shift = _lowest(partial(_cost, method, moved), _FIRST_SHIFT)
     if shift is not None:
         side = "early" if shift > 0.0 else "late"
         yield f"the stamps of the {source} are {1e3 * abs(shift):.3g} ms too {side}", *moved(shift)
@@ -126,16 +123,18 @@ def scaled(method: Method, hypotheses: Hypotheses, data: Any, config: Config) ->
             assert found is not None
             return found
 
-        def cost(more: float, changed: Callable[[float], tuple[Any, Config]] = changed) -> float:
-            found = outcome(method, *changed(more))
-            return found.cost if found else np.inf
-
         # Not chi-square, which levels off where most measurements are rejected; near the bottom it tells best.
         rough = _lowest(lambda more: quick_score(method, *changed(more)) ** 2, _FIRST_SCALING)
         if rough:
-            more = _lowest(cost, _SECOND_SCALING, rough)
+            more = _lowest(partial(_cost, method, changed), _SECOND_SCALING, rough)
             more = rough if more is None else more
             yield scaling.label.format(factor=1.0 + more), *changed(more)
+
+
+def _cost(method: Method, changed: Callable[[float], tuple[Any, Config]], size: float) -> float:
+    """Of a solution with a change of some size; infinite where there is none."""
+    found = outcome(method, *changed(size))
+    return found.cost if found else np.inf
 
 
 def _lowest(cost: Callable[[float], float], step: float, start: float = 0.0) -> float | None:

@@ -147,4 +147,9 @@ def inflations(problem: Problem, covariance: Array, names: Sequence[str], added:
     more = dict(zip(names, np.sum(list(added.values()), axis=0), strict=True)) if added else {}
     variance = np.diag(covariance)
     grown = variance + np.array([more.get(q.name, 0.0) for q in problem.quantities])
+    return growth(variance, grown)
+
+
+def growth(variance: Array, grown: Array) -> Array:
+    """(n,) by what sigmas grow with their variances; 1 of what is exactly known."""
     return np.sqrt(np.divide(grown, variance, out=np.ones_like(variance), where=variance > 0.0))

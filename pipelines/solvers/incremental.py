@@ -20,7 +20,7 @@ import numpy as np
 from pipelines.graph.problem import Array, Attitudes, ChiSquare, Estimate, Factor, History, Problem, Step
 from pipelines.solvers.assembly import Assembly
 from pipelines.solvers.batch import CHUNK, Solution, optimize, with_levels
-from pipelines.solvers.coloured import inflated_by_innovations
+from pipelines.solvers.coloured import growth, inflated_by_innovations
 from pipelines.solvers.innovations import Innovations, Prediction
 from pipelines.solvers.linearity import is_linear
 from pipelines.solvers.marginals import IndeterminateError, reported, reported_covariance
@@ -212,8 +212,7 @@ class Run:
         history, n = self.history.array.copy(), len(values)
         innovations = self.innovations.residuals()
         grown, colours = inflated_by_innovations(self.problem, covariance, innovations)
-        variance = np.diag(covariance)
-        inflation = np.sqrt(np.divide(np.diag(grown), variance, out=np.ones(n), where=variance > 0.0))
+        inflation = growth(np.diag(covariance), np.diag(grown))
         attitudes = self.attitudes.array.copy()
         return Estimate(
             solver="incremental",

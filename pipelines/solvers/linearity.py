@@ -9,7 +9,7 @@ import numpy as np
 
 from pipelines.graph.problem import Problem
 from pipelines.solvers.batch import HELD, Solution, held
-from pipelines.solvers.marginals import coordinate_inverse, ordering_of
+from pipelines.solvers.marginals import IndeterminateError, coordinate_inverse, joint_information
 
 # So many points about the estimate are tried, in pairs.
 _PAIRS = 4
@@ -30,11 +30,9 @@ def is_linear(problem: Problem, solution: Solution, keys: Sequence[int]) -> bool
     values, system = solution.values, solution.system
     linear, error = system.linearize(values), system.error(values)
     ends = np.cumsum([values.dims()[key] for key in keys])
-    rest = [key for i in range(system.ordering.size()) if (key := system.ordering.at(i)) not in set(keys)]
     generator = np.random.default_rng(0)
     try:
-        remaining = linear.eliminatePartialMultifrontal(ordering_of(rest), gtsam.EliminateQR)[1] if rest else linear
-        information = remaining.hessian(ordering_of(keys))[0]
+        information = joint_information(linear, system.ordering, keys)
         free = np.flatnonzero([q.prior_sigma != 0.0 for q in problem.quantities])
         scale = np.array([q.scale for q in problem.quantities])[free]
         unit = coordinate_inverse(problem.parameters, values, keys)[:, free] * scale
@@ -47,6 +45,6 @@ def is_linear(problem: Problem, solution: Solution, keys: Sequence[int]) -> bool
                 foreseen = 0.5 * float(z @ z)
                 if not abs(system.error(values.retract(delta)) - error - foreseen) < _BENT * foreseen:
                     return False
-    except (RuntimeError, np.linalg.LinAlgError):
+    except (RuntimeError, IndeterminateError, np.linalg.LinAlgError):
         return False
     return True

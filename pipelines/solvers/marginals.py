@@ -129,17 +129,28 @@ def reported_covariance(
     `noise` is as joint_covariance has it.
     """
     quantities = [q for p in parameters for q in p.quantities]
-    # Fixed numbers are left out: their huge information would cost the others their digits.
-    free = np.flatnonzero([q.prior_sigma != 0.0 for q in quantities])
-    scale, extra = np.array([(q.prior_scale, q.extra_sigma) for q in quantities])[free].T
-    # Information in units of the prior scales, so that one threshold serves angles, rates and seconds.
-    unit = coordinate_inverse(parameters, values, keys)[:, free] * scale
+    free, scale, unit = prior_units(parameters, values, keys)
+    extra = np.array([quantities[i].extra_sigma for i in free])
     own = unit.T @ information @ unit
     eigenvalues, vectors = np.linalg.eigh(own if noise is None else own - noise)
     variance = 1.0 / np.maximum(eigenvalues, _UNKNOWN**-2)
     covariance = np.zeros((len(quantities), len(quantities)))
     covariance[np.ix_(free, free)] = (vectors * variance) @ vectors.T * np.outer(scale, scale) + np.diag(extra**2)
     return covariance
+
+
+def prior_units(
+    parameters: Sequence[Parameter], values: gtsam.Values, keys: Sequence[int]
+) -> tuple[NDArray[np.intp], Array, Array]:
+    """Which reported numbers are free, their prior scales, and by columns what one of these is of the tangents.
+
+    In these units one threshold serves angles, rates and seconds. Fixed numbers are left out: their huge information
+    would cost the others their digits.
+    """
+    quantities = [q for p in parameters for q in p.quantities]
+    free = np.flatnonzero([q.prior_sigma != 0.0 for q in quantities])
+    scale = np.array([quantities[i].prior_scale for i in free])
+    return free, scale, coordinate_inverse(parameters, values, keys)[:, free] * scale
 
 
 def coordinate_inverse(parameters: Sequence[Parameter], values: gtsam.Values, keys: Sequence[int]) -> Array:

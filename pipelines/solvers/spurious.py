@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from pipelines.graph.problem import Array, Problem
-from pipelines.solvers.marginals import IndeterminateError, coordinate_inverse, eliminated, joint_information
+from pipelines.solvers.marginals import IndeterminateError, eliminated, joint_information, prior_units
 
 # Directions in which sigma is beyond this share of the prior are looked at; in others noise adds next to nothing.
 _WEAK = 0.3
@@ -58,9 +58,7 @@ def information_of_noise(
     except (RuntimeError, IndeterminateError):
         return None
     noise = np.mean(drawn, axis=0) - own
-    free = [i for i, q in enumerate(problem.quantities) if q.prior_sigma != 0.0]
-    scale = np.array([problem.quantities[i].prior_scale for i in free])
-    unit = coordinate_inverse(problem.parameters, values, keys)[:, free] * scale
+    free, scale, unit = prior_units(problem.parameters, values, keys)
     own, noise = unit.T @ own @ unit, unit.T @ noise @ unit
     priors = [problem.quantities[i].prior_sigma for i in free]
     told = own - np.diag([(s / sigma) ** 2 if sigma else 0.0 for s, sigma in zip(scale, priors, strict=True)])
