@@ -51,11 +51,23 @@ def _of_methods() -> Mapping[str, Any]:
 app = typer.Typer(
     cls=_WithMethods,
     no_args_is_help=True,
-    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # boxes around the help would take three times as long to import as all else
     help="Calibrates how sensors are mounted and how wrong they are, from MCAP recordings, and says how sure it is.",
 )
+
+
+def _complete_method(incomplete: str) -> list[str]:
+    from pipelines import methods
+
+    return [name for name in methods.names() if name.startswith(incomplete)]
+
+
+def _complete_scenario(incomplete: str) -> list[str]:
+    from pipelines import methods
+
+    return [name for known in methods.scenarios().values() for name in known if name.startswith(incomplete)]
 
 
 class Solver(StrEnum):
@@ -67,7 +79,17 @@ class Solver(StrEnum):
 
 
 _METHODS = "los, indexer, head, cube, tumble or one installed"
-_MethodName = Annotated[str | None, typer.Option("--method", help=f"{_METHODS}; by default what fits.")]
+_MethodName = Annotated[
+    str | None,
+    typer.Option("--method", help=f"{_METHODS}; by default what fits.", autocompletion=_complete_method),
+]
+_OfMethod = Annotated[str, typer.Argument(help=f"{_METHODS}.", autocompletion=_complete_method)]
+_Scenario = Annotated[
+    str | None,
+    typer.Option(
+        help="YAML file, or a name that `scenarios` lists; default: the nominal one.", autocompletion=_complete_scenario
+    ),
+]
 _Scheduler = Annotated[str | None, typer.Option(help="Of a dask cluster, tcp://host:8786; default: this machine.")]
 _Jobs = Annotated[int | None, typer.Option(help="Local worker processes; default: one a core.")]
 _PictureJobs = Annotated[int | None, typer.Option("--jobs", help="Processes for many pictures; default: one a core.")]
@@ -88,10 +110,11 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
+_Version = Annotated[bool, typer.Option("--version", "-V", callback=_version, is_eager=True, help="Print it.")]
+
+
 @app.callback()
-def _options(
-    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print it.")] = False,
-) -> None: ...
+def _options(version: _Version = False) -> None: ...
 
 
 @app.command()
@@ -252,9 +275,9 @@ def validate(
 
 @app.command()
 def simulate(
-    method: Annotated[str, typer.Argument(help=f"{_METHODS}.")],
+    method: _OfMethod,
     out: Annotated[Path, typer.Option(help="The recording to write.")],
-    scenario: Annotated[str | None, typer.Option(help="YAML file or the name of a shipped one.")] = None,
+    scenario: _Scenario = None,
     seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
     images: Annotated[bool, typer.Option("--images", help="Pictures instead of what is measured in them.")] = False,
     quiet: Quiet = False,
@@ -269,11 +292,42 @@ def simulate(
 
 
 @app.command()
-def plan(
-    method: Annotated[str, typer.Argument(help=f"{_METHODS}.")],
-    scenario: Annotated[
-        str | None, typer.Option(help="The planned motion: YAML file or a name, as simulate has.")
+def scenarios(
+    name: Annotated[
+        str | None,
+        typer.Argument(help="Of a scenario, to print its file; or of a method.", autocompletion=_complete_scenario),
     ] = None,
+    as_json: Json = False,
+) -> None:
+    """The scenarios that `simulate`, `plan` and `montecarlo` find by name, or the YAML of one, to be changed."""
+    from pipelines import methods, terminal
+    from pipelines.errors import InputError, nearest_three
+    from pipelines.reports.plain_json import plain_json
+    from pipelines.simulation.scenario import summary
+
+    known = methods.scenarios()
+    files = {scenario: path for found in known.values() for scenario, path in found.items()}
+    if name in files and not as_json:
+        print(files[name].read_text(encoding="utf-8"), end="")
+        return
+    if name is not None and name not in (*files, *known):
+        raise InputError(f"no scenario or method {name}; {nearest_three(name, [*known, *files])}")
+    listed = [
+        {"name": scenario, "method": method, "summary": summary(path), "file": str(path)}
+        for method, found in known.items()
+        for scenario, path in found.items()
+        if name in (None, method, scenario)
+    ]
+    if as_json:
+        print(plain_json("scenarios", {"scenarios": listed}))
+    else:
+        terminal.show_scenarios(listed)
+
+
+@app.command()
+def plan(
+    method: _OfMethod,
+    scenario: _Scenario = None,
     config: ConfigFile = None,
     require: Annotated[list[str] | None, typer.Option(help="NAME=SIGMA wanted, SI; may be repeated.")] = None,
     out: Annotated[Path | None, typer.Option(help="File for the better motion, as a scenario.")] = None,
@@ -373,9 +427,9 @@ def demo(
 
 @app.command()
 def montecarlo(
-    method: Annotated[str, typer.Argument(help=f"{_METHODS}.")],
+    method: _OfMethod,
     runs: Annotated[int, typer.Option(help="How many recordings to simulate, one a seed.")] = 200,
-    scenario: Annotated[str | None, typer.Option(help="YAML file or name; default: the method's nominal one.")] = None,
+    scenario: _Scenario = None,
     seed: Annotated[int, typer.Option(help="Of the first run; the others follow.")] = 0,
     solvers: Annotated[str, typer.Option(help="'all', or some of published,batch,incremental.")] = "all",
     window: _Window = "1",
@@ -525,7 +579,7 @@ def main() -> None:
     # The matrices are small: threads that wait for each other cost more than they bring, most on a busy machine.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
-        app()
+        app(prog_name="alidade")
     except BaseException as error:
         if _interrupted(error):
             sys.exit(exit_codes.INTERRUPTED)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from rich.box import SIMPLE_HEAD
@@ -39,6 +39,16 @@ COLOURS = {
 def say(text: str) -> None:
     """One line, never broken."""
     console.print(escape(printable(text, _LONGEST)), soft_wrap=True)
+
+
+def show_scenarios(scenarios: Sequence[Mapping[str, str]]) -> None:
+    """A row a scenario: its name and what it says of itself."""
+    table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
+    table.add_column("scenario", no_wrap=True)
+    table.add_column("what it shows")
+    for scenario in scenarios:
+        table.add_row(scenario["name"], escape(scenario["summary"]))
+    console.print(table)
 
 
 def show(calibrations: Sequence[Calibration]) -> None:

@@ -215,8 +215,53 @@ def test_ctrl_c_is_silent_and_leaves_nothing(
     assert [p.name for p in tmp_path.iterdir()] == ["s.mcap"]
 
 
-def test_version(alidade: Command) -> None:
-    assert alidade("--version").out == f"{version('alidade')}\n"
+@pytest.mark.parametrize("option", ["--version", "-V"])
+def test_version(alidade: Command, option: str) -> None:
+    assert alidade(option).out == f"{version('alidade')}\n"
+
+
+def test_short_help(alidade: Command) -> None:
+    """Of the command, of its own commands and of those that methods bring."""
+    for words in ((), ("plan",), ("cube-print",)):
+        run = alidade(*words, "-h")
+        assert run.code == 0
+        assert run.out.startswith("Usage: ")
+
+
+def test_every_shipped_scenario_is_listed_and_says_what_it_shows(alidade: Command) -> None:
+    listed = json.loads(alidade("scenarios", "--json").out)["scenarios"]
+    folder = Path(__file__).parents[1] / "datasets" / "scenarios"
+    assert {s["name"] for s in listed} == {path.stem for path in folder.glob("*.yaml")}
+    assert all(len(s["summary"]) > 20 for s in listed), listed
+    for_people = " ".join(alidade("scenarios").out.split())
+    assert all(s["name"] in for_people for s in listed)
+
+
+def test_scenarios_of_one_method_and_the_file_of_one(alidade: Command, tmp_path: Path) -> None:
+    assert "los_nominal" not in (of_head := alidade("scenarios", "head").out)
+    assert "head_outages" in of_head
+    (tmp_path / "mine.yaml").write_text(alidade("scenarios", "head_mounts").out)
+    assert load_scenario(HeadScenario, tmp_path / "mine.yaml") == load_scenario(HeadScenario, "head_mounts")
+    unknown = alidade("scenarios", "head_mount")
+    assert unknown.code == 2
+    nearest = "the nearest are head_mounts, head_outages, head_turntable"
+    assert unknown.err == f"alidade: no scenario or method head_mount; {nearest}\n"
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"),
+    [
+        ("alidade simu", ["simulate"]),
+        ("alidade cube-", ["cube-layout", "cube-print"]),
+        ("alidade plan t", ["tumble"]),
+        ("alidade simulate head --scenario head_m", ["head_mounts"]),
+    ],
+)
+def test_the_shell_completes(alidade: Command, monkeypatch: pytest.MonkeyPatch, typed: str, offered: list[str]) -> None:
+    monkeypatch.setenv("_ALIDADE_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", typed)
+    monkeypatch.setenv("COMP_CWORD", str(typed.count(" ")))
+    assert alidade().out.split() == offered
 
 
 def test_help_imports_nothing_heavy() -> None:

@@ -223,6 +223,19 @@ def simulate(name: str, scenario: str | None, seed: int, out: Path, images: bool
     chosen.write(out, chosen.simulate(chosen.settings(scenario, images), seed, images))
 
 
+def scenarios() -> dict[str, dict[str, Path]]:
+    """Method -> name -> file of the scenarios that are found by name; the name begins with the method's.
+
+    Raises InputError when a method's distribution is broken.
+    """
+    from pipelines.simulation.scenario import shipped
+
+    return {
+        name: {stem: path for stem, path in shipped(method(name).scenarios).items() if stem.startswith(f"{name}_")}
+        for name in names()
+    }
+
+
 @cache
 def _brought() -> Mapping[str, EntryPoint]:
     """Methods of other distributions, by name."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import TypeVar
 
@@ -32,7 +32,7 @@ def load_scenario(model: type[Model], name_or_path: str | Path, folder: Path | N
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
-    path = _find(name_or_path, _FOLDERS if folder is None else (*_FOLDERS, folder))
+    path = _find(name_or_path, folder)
     try:
         content = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
         return model.model_validate({} if content is None else content)
@@ -42,14 +42,26 @@ def load_scenario(model: type[Model], name_or_path: str | Path, folder: Path | N
         raise InputError(f"{path}: {explain(error.errors()[0], model)}") from error
 
 
-def _find(name_or_path: str | Path, folders: Sequence[Path]) -> Path:
+def shipped(folder: Path | None = None) -> dict[str, Path]:
+    """Name -> file of the scenarios that come with the toolkit, and of those in a method's own folder."""
+    folders = _FOLDERS if folder is None else (*_FOLDERS, folder)
+    return {path.stem: path for folder in folders for path in sorted(folder.glob("*.yaml"))}
+
+
+def summary(path: Path) -> str:
+    """What a scenario file says of itself: the comment that it begins with, on one line."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return " ".join(line.lstrip("# ") for line in takewhile(lambda line: line.startswith("#"), lines))
+
+
+def _find(name_or_path: str | Path, folder: Path | None) -> Path:
     path = Path(name_or_path)
     if path.is_file():
         return path
-    shipped = {p.stem: p for folder in folders for p in sorted(folder.glob("*.yaml"))}
-    if str(name_or_path) in shipped:
-        return shipped[str(name_or_path)]
-    raise InputError(f"no scenario file {name_or_path}; {nearest_three(str(name_or_path), sorted(shipped))}")
+    known = shipped(folder)
+    if str(name_or_path) in known:
+        return known[str(name_or_path)]
+    raise InputError(f"no scenario file {name_or_path}; {nearest_three(str(name_or_path), sorted(known))}")
 
 
 def explain(error: ErrorDetails, model: type[BaseModel]) -> str:
