@@ -477,8 +477,10 @@ def fleet(
 ) -> None:
     """Calibrate many recordings and compare units and dates. The same command goes on after an interruption."""
     from pipelines import progress, terminal
-    from pipelines.fleet.analysis import populations
+    from pipelines.fleet.analysis import counting, populations
+    from pipelines.fleet.attention import sentence, units_of_interest
     from pipelines.fleet.fleet import Settings, calibrate_fleet
+    from pipelines.fleet.histories import histories
     from pipelines.fleet.recordings import find
     from pipelines.fleet.write import write_fleet
     from pipelines.reports.plain_json import fleet_json
@@ -486,13 +488,15 @@ def fleet(
     settings = Settings.of(method, config, solver.value, parse_window(window))
     with progress.shown(quiet or as_json):
         outcome = calibrate_fleet(find(recordings), settings, out, scheduler, jobs, names)
-    found = populations(outcome.results)
-    written = write_fleet(out, outcome, found)
-    for line in () if as_json else outcome.summary:
-        terminal.say(line)
+    several = histories(outcome.results, {name: counting(result) for name, result in outcome.results.items()})
+    found = populations(outcome.results, several)
+    written = write_fleet(out, outcome, found, several)
     if as_json:
-        print(fleet_json(outcome, found))
+        print(fleet_json(outcome, found, several))
     else:
+        for line in outcome.summary:
+            terminal.say(line)
+        terminal.say(sentence(units_of_interest(outcome.results, found, several)))
         terminal.say(f"Results in {out}: {', '.join(p.name for p in written)}")
     if outcome.interrupted:
         raise typer.Exit(exit_codes.INTERRUPTED)

@@ -61,8 +61,7 @@ def device_belief(known: Known, method: Method, config: Config, sha256: str, sta
         InputError: the calibration is another method's, has no sigmas worth the name, or is of this very recording.
     """
     source = known.belief.source
-    if known.method != method.name:
-        raise InputError(f"{source}: is a calibration of {known.method}, not of {method.name}")
+    known.of_method(method.name)
     if known.solver == "published":
         raise InputError(f"{source}: is of the published solver, whose sigmas make no prior; use batch's")
     if known.sha256 == sha256:

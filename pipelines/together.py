@@ -37,7 +37,7 @@ from pipelines.reports.over_time import recordings_shown, sentences
 from pipelines.reports.result import Calibration, PartParameter, PartResult
 from pipelines.session import Session
 from pipelines.sharing import DAY_S, walks
-from pipelines.solvers.joint import Joined, join, tell
+from pipelines.solvers.joint import Joined, grown, join, tell
 
 # The joint estimate stays when another linearisation moves it by less than this, in sigmas (what is left is about the
 # square); so many are tried.
@@ -289,11 +289,9 @@ def _with_others(problem: Problem, alone: Sequence[Alone], found: Mapping[str, f
 
 
 def _inflation(name: str, alone: Sequence[Alone]) -> float:
-    """By what a number's sigma grows: the recordings' own factors, each weighed by what it says of the number."""
-    found = [p for each in alone if (p := each.calibration.parameters.get(name)) is not None and p.sigma > 0.0]
-    if not found:
-        return 1.0
-    return float(np.average([p.inflation**2 for p in found], weights=[p.sigma**-2.0 for p in found]) ** 0.5)
+    """By what a number's sigma grows."""
+    found = [p for each in alone if (p := each.calibration.parameters.get(name)) is not None]
+    return grown([p.sigma for p in found], [p.inflation for p in found])
 
 
 def _judged(

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from pipelines import progress
 from pipelines.config import recorded_config
-from pipelines.errors import InputError
 from pipelines.judgement.changes import Change
 from pipelines.judgement.holding import Holding, Verdict, holding
 from pipelines.judgement.validation import Validation
@@ -106,8 +105,7 @@ def validate(
     recording = open_recording(path, strict)
     config = recorded_config(recording, config_file)
     name = resolve_method(method_name or calibration.method, recording, config)
-    if name != calibration.method:
-        raise InputError(f"{calibration_file}: is a calibration of {calibration.method}, not of {name}")
+    known.of_method(name)
     chosen = method(name)
     data = chosen.read(recording, config)
     values = {parameter: saved.value for parameter, saved in calibration.parameters.items()}

@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from pipelines.belief import independent
 from pipelines.fleet import statistics
-from pipelines.fleet.analysis import populations
+from pipelines.fleet.analysis import Population, counting, populations
+from pipelines.fleet.attention import units_of_interest
+from pipelines.fleet.histories import History, change_table, histories, packed
 from pipelines.fleet.store import Result
+from pipelines.solvers.told import told_of
 
 
 @pytest.mark.parametrize("dof", [3, 6, 36])
@@ -86,12 +90,6 @@ def test_trend_is_the_weighted_line() -> None:
     assert statistics.trend(np.zeros(5), values[:5], sigmas[:5]) is None
 
 
-def test_changes_are_steps_and_the_whole() -> None:
-    assert statistics.changes([5.0]) == []
-    assert statistics.changes([5.0, 1.0]) == [(1, 0)]
-    assert statistics.changes([5.0, 1.0, 9.0]) == [(1, 0), (0, 2), (1, 2)]
-
-
 def a_fleet(seed: int, units: int = 30, dates: int = 3, wander: float = 0.0, slope: float = 0.0) -> dict[str, Result]:
     """Results of units whose parameter a is steady and b another in every session; SI."""
     rng = np.random.default_rng(seed)
@@ -104,9 +102,13 @@ def a_fleet(seed: int, units: int = 30, dates: int = 3, wander: float = 0.0, slo
             b = 0.1 * rng.standard_normal()
             parameters = {
                 name: {"value": value, "sigma": sigma, "unit": "rad", "require": 1e-2, "verdict": "observable"}
+                | {"inflation": 1.0}
                 for name, value in (("a", a), ("b", b))
             }
+            says = independent(["a", "b"], [a, b], [sigma, sigma])
             results[f"{unit}-{date}"] = {
+                "device": {"a": 0.0},
+                "told": packed(told_of(says, [1.0, 1.0])),
                 "unit": f"U{unit}",
                 "date": 86400.0 * 30.0 * date,
                 "method": "head",
@@ -118,35 +120,87 @@ def a_fleet(seed: int, units: int = 30, dates: int = 3, wander: float = 0.0, slo
     return results
 
 
+def judged(results: dict[str, Result]) -> tuple[list[Population], list[History]]:
+    found = histories(results, {name: counting(result) for name, result in results.items()})
+    return populations(results, found), found
+
+
 def test_a_good_fleet_raises_no_alarm() -> None:
     """One page in a hundred may, by each of the three kinds of test."""
     alarms = 0
-    for seed in range(40):
-        fleet = populations(a_fleet(seed))
-        alarms += any(p.outlying.any() or p.drifts or any(c.changed for c in p.changes) for p in fleet)
-    assert alarms <= 4
+    for seed in range(12):
+        fleet, found = judged(a_fleet(seed))
+        alarms += any(p.outlying.any() or p.drifts for p in fleet)
+        alarms += any(h.found or h.together for h in found)
+    assert alarms <= 1
 
 
-def test_a_unit_that_drifts_slowly_is_found_by_first_and_last() -> None:
-    """Two sigmas a step, eight in all."""
-    a, b = populations(a_fleet(5, dates=6, wander=0.006))
-    flagged = [(c.unit, c.before % 6, c.after % 6) for c in a.changes if c.changed]
-    assert ("U4", 0, 5) in flagged
-    assert {unit for unit, *_ in flagged} == {"U4"}
-    assert a.repeatability is None
-    assert b.repeatability == pytest.approx(0.1, rel=0.3)
+def test_a_unit_that_drifts_slowly_is_found() -> None:
+    """Two sigmas a step, eight in all; what belongs to a recording is another one each time, by many sigmas."""
+    results = a_fleet(5, dates=6, wander=0.006)
+    (a, b), found = judged(results)
+    red = [(h.unit, step.name) for h in found for step in h.found]
+    assert set(red) == {("U4", "a")}
+    assert {row["parameter"] for row in change_table(found)} == {"a"}
+    (unit,) = units_of_interest(results, [a, b], found)
+    assert unit.name == "U4"
+    assert "a changed by" in unit.findings[0].text
 
 
-def test_what_belongs_to_a_recording_does_not_change() -> None:
-    """A turn-on bias of two sessions, too few to tell that they differ by nature."""
+def test_a_step_of_one_unit_is_found_and_where() -> None:
     results = a_fleet(1, units=1, dates=2)
+    results["0-1"]["told"] = packed(told_of(independent(["a", "b"], [1.0, 5.0], [1e-3, 1e-3]), [1.0, 1.0]))
+    _, (history,) = judged(results)
+    assert [(step.name, history.after(step)) for step in history.found] == [("a", ("0-1",))]
+
+
+def test_numbers_that_differ_in_every_unit_differ_by_nature() -> None:
+    """A device's number that no recording repeats is not a change of each unit, but a repeatability."""
+    results = a_fleet(2)
+    rng = np.random.default_rng(9)
     for result in results.values():
-        result["parameters"]["gyro_bias_x"] = result["parameters"].pop("b") | {"sigma": 1e-4}
-    results["0-1"]["parameters"]["a"]["value"] += 1.0
-    a, bias = populations(results)
-    assert [c.changed for c in a.changes] == [True]
-    assert abs(bias.changes[0].z) > 100.0
-    assert not bias.changes[0].changed
+        p = result["parameters"]["a"]
+        p["value"] += 0.05 * rng.standard_normal()
+        result["told"] = packed(told_of(independent(["a"], [p["value"]], [p["sigma"]]), [1.0]))
+    (a, _), found = judged(results)
+    assert not any(h.found for h in found)
+    assert a.repeatability is not None
+    assert a.repeatability.value == pytest.approx(0.05, abs=3.0 * a.repeatability.sigma)
+
+
+def test_variance_components_are_told_with_their_sigmas() -> None:
+    """Both standard deviations lie within one of their sigmas in two of three fleets, and of none there is a bound."""
+    rng = np.random.default_rng(11)
+    pulls, bounded = [], []
+    for _ in range(200):
+        units = np.repeat(np.arange(20), 3)
+        sigmas = rng.uniform(0.5, 1.5, 60)
+        noise = sigmas * rng.standard_normal(60)
+        values = 3.0 * rng.standard_normal(20)[units] + 2.0 * rng.standard_normal(60) + noise
+        population, repeatability = statistics.components(values, sigmas, units)
+        assert population is not None
+        assert repeatability is not None
+        pulls.append([(population.value - 3.0) / population.sigma, (repeatability.value - 2.0) / repeatability.sigma])
+        _, nothing = statistics.components(noise, sigmas, units)
+        assert nothing is not None
+        bounded.append((population.upper > 3.0, repeatability.upper > 2.0, nothing.upper < 1.0))
+    within = (np.abs(pulls) < 1.0).mean(axis=0)
+    assert (np.abs(within - 0.683) < 0.1).all()
+    assert np.abs(np.mean(pulls, axis=0)).max() < 0.5
+    assert (np.mean(bounded, axis=0) > 0.94).all()
+
+
+def test_components_of_equal_sigmas_are_those_of_analysis_of_variance() -> None:
+    """Balanced, and positive, the restricted likelihood has its maximum at the moments' estimates."""
+    rng = np.random.default_rng(12)
+    values = 3.0 * rng.standard_normal((8, 1)) + rng.standard_normal((8, 4))
+    within = values.var(axis=1, ddof=1).mean()
+    population, repeatability = statistics.components(values.ravel(), np.full(32, 1e-6), np.repeat(np.arange(8), 4))
+    assert population is not None
+    assert repeatability is not None
+    assert repeatability.value == pytest.approx(within**0.5, rel=1e-4)
+    assert population.value == pytest.approx((values.mean(axis=1).var(ddof=1) - within / 4.0) ** 0.5, rel=1e-3)
+    assert repeatability.sigma == pytest.approx((within / (2.0 * 24.0)) ** 0.5, rel=1e-3)
 
 
 def test_a_drift_of_the_whole_fleet_is_found() -> None:

@@ -15,16 +15,20 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from pipelines import exit_codes, methods, progress
+from pipelines.belief import Belief
 from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.fleet.engine import Killed, cluster, completed, source_version
+from pipelines.fleet.histories import packed
 from pipelines.fleet.isolated import failure, quarantined, run_isolated
 from pipelines.fleet.recordings import as_date, from_metadata, from_name, local
 from pipelines.fleet.store import Result, Store, settings_key
+from pipelines.sharing import walks
 
 if TYPE_CHECKING:
     from fsspec.core import OpenFile
 
+    from pipelines.graph.problem import Told
     from pipelines.reports.result import Calibration
 
 
@@ -162,10 +166,13 @@ def _calibrated(path: Path, settings: Settings) -> Result:
 
 def _summary(calibration: Calibration) -> Result:
     """The numbers of a calibration that a fleet is about; SI."""
+    names = [q.name for q in calibration.problem.quantities]
     return {
         "start_ns": calibration.facts.epoch_ns,
         "duration_s": calibration.facts.duration_s,
         "method": calibration.problem.method,
+        "device": walks(calibration.method, calibration.config, names),
+        "told": packed(_says(calibration)),
         "parameters": {
             p.name: {
                 "value": p.value,
@@ -173,10 +180,24 @@ def _summary(calibration: Calibration) -> Result:
                 "unit": p.unit,
                 "require": p.require,
                 "verdict": p.observability,
+                "inflation": p.inflation,
             }
             for p in calibration.parameters.values()
         },
     }
+
+
+def _says(calibration: Calibration) -> Told:
+    """What a calibration says of its numbers; of solvers that do not tell it, by their covariance."""
+    from pipelines.solvers.told import told_of
+
+    estimate = calibration.estimate
+    if estimate.told is not None:
+        return estimate.told
+    scales = {q.name: q.prior_scale for q in calibration.problem.quantities}
+    known = [name for name, sigma in zip(estimate.names, estimate.sigmas, strict=True) if sigma > 0.0]
+    belief = Belief(estimate.names, estimate.values, estimate.covariance).of(known)
+    return told_of(belief, [scales[name] for name in belief.names])
 
 
 def _placed(name: str, result: Result, told: Mapping[str, str]) -> Result:

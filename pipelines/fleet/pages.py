@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.fleet import analysis, statistics
-from pipelines.fleet.analysis import Change, Population, iso
+from pipelines.fleet import statistics
+from pipelines.fleet.analysis import Population, iso
+from pipelines.fleet.attention import readable, sentence, units_of_interest
+from pipelines.fleet.histories import History
+from pipelines.fleet.statistics import Component
 from pipelines.graph.problem import Array, Quantity
 from pipelines.reports.plots import COLORS, REJECTED, figure, thin
 from pipelines.reports.result import Plot
@@ -31,24 +33,11 @@ _MONTH = 30.0
 _MOST_BARS = 60
 
 
-@dataclass(frozen=True)
-class _Finding:
-    """Something that stands out, in words."""
-
-    unit: str
-    parameter: str
-    text: str
-    z: float
-
-
-def fleet_html(outcome: Outcome, fleet: Sequence[Population]) -> str:
+def fleet_html(outcome: Outcome, fleet: Sequence[Population], found: Sequence[History]) -> str:
     """The page of a fleet."""
     results = outcome.results
     failures = [(name, r) for name, r in results.items() if r["exit_code"] != 0]
-    outlying = sorted(
-        (_outlying(p, int(i)) for p in fleet for i in np.flatnonzero(p.outlying)), key=lambda f: -abs(f.z)
-    )
-    changed = sorted((_changed(p, c) for p, c in analysis.every_change(fleet) if c.changed), key=lambda f: -abs(f.z))
+    attention = units_of_interest(results, fleet, found)
     statuses = [r["status"] for r in results.values()]
     dates = [r["date"] for r in results.values() if r["date"] is not None]
     return _render(
@@ -58,10 +47,11 @@ def fleet_html(outcome: Outcome, fleet: Sequence[Population]) -> str:
         units=len({r["unit"] for r in results.values()}),
         first=iso(min(dates, default=None)),
         last=iso(max(dates, default=None)),
-        outlying=outlying[:_MOST_LISTED],
-        changed=changed[:_MOST_LISTED],
+        several=len(found),
+        sentence=sentence(attention),
+        attention=attention[:_MOST_LISTED],
         failures=failures[:_MOST_LISTED],
-        hidden={"outlying": len(outlying), "changed": len(changed), "failures": len(failures)},
+        hidden={"attention": len(attention), "failures": len(failures)},
         parameters=[_parameter_row(p) for p in fleet],
         plots=[_population_plot(p) for p in fleet],
     )
@@ -102,53 +92,42 @@ def _render(template: str, plots: Sequence[Plot], **context: Any) -> str:
 # -- fleets
 
 
-def _readable(p: Population) -> tuple[str, float]:
-    return human_unit(Quantity(p.name, p.unit, None, 1.0, p.require or math.inf))
-
-
-def _outlying(p: Population, i: int) -> _Finding:
-    assert p.spread is not None  # without one nothing is outlying
-    unit, factor = _readable(p)
-    off, scale = factor * (p.values[i] - p.spread.centre), factor * float(np.hypot(p.spread.tau, p.sigmas[i]))
-    text = f"{to_digits_of(off, scale)} {unit} off the fleet's centre ({p.recordings[i]}, {iso(p.dates[i])})"
-    return _Finding(p.units[i], p.name, text, float(p.z[i]))
-
-
-def _changed(p: Population, c: Change) -> _Finding:
-    unit, factor = _readable(p)
-    change = f"{to_digits_of(factor * c.difference, factor * c.sigma)} ± {factor * c.sigma:.2g} {unit}"
-    text = f"changed by {change} from {iso(p.dates[c.before])} to {iso(p.dates[c.after])}"
-    return _Finding(c.unit, p.name, text, c.z)
-
-
 def _parameter_row(p: Population) -> dict[str, Any]:
     """The cells of a parameter, in the unit people read."""
-    unit, factor = _readable(p)
+    unit, factor = readable(p)
     sigma = factor * float(np.median(p.sigmas))
     row: dict[str, Any] = {"name": p.name, "method": p.method, "unit": unit, "count": len(p.values), "sigma": sigma}
-    row |= {"centre": "", "tau": "", "low": "", "high": "", "beyond": "", "drift": "", "drifts": p.drifts}
-    row |= {"repeatability": "", "outlying": int(p.outlying.sum()), "changed": sum(c.changed for c in p.changes)}
+    row |= {"centre": "", "low": "", "high": "", "beyond": "", "drift": "", "drifts": p.drifts}
+    row |= {"outlying": int(p.outlying.sum()), "changed": len({p.units[i] for i in np.flatnonzero(p.changed)})}
+    row |= {"of": "device" if p.of_device else "recording"}
+    row |= {"population": _component(p.population, factor), "repeatability": _component(p.repeatability, factor)}
     if p.spread and p.control:
         scatter = float(np.hypot(factor * p.spread.tau, sigma))
-        row |= {"centre": to_digits_of(factor * p.spread.centre, scatter), "tau": f"{factor * p.spread.tau:.2g}"}
+        row["centre"] = to_digits_of(factor * p.spread.centre, scatter)
         low, high = (to_digits_of(factor * bound, scatter) for bound in p.control)
         row |= {"low": low, "high": high, "beyond": p.beyond}
     if p.drift:
         slope, slope_sigma = (_MONTH * factor * number for number in (p.drift.slope, p.drift.sigma))
         row["drift"] = f"{to_digits_of(slope, slope_sigma)} ± {slope_sigma:.2g}"
-    if p.repeatability is not None:
-        row["repeatability"] = f"{factor * p.repeatability:.2g}"
     return row
 
 
+def _component(component: Component | None, factor: float) -> str:
+    """A standard deviation with its sigma, or what it is not more than."""
+    if component is None:
+        return ""
+    if component.value == 0.0:
+        return f"< {factor * component.upper:.2g}"
+    return f"{to_digits_of(factor * component.value, factor * component.sigma)} ± {factor * component.sigma:.2g}"
+
+
 def _population_plot(p: Population) -> Plot:
-    unit, factor = _readable(p)
+    unit, factor = readable(p)
     out = figure(unit, x_title="date")
     out.update_layout(
         xaxis={"domain": [0.0, 0.8]}, xaxis2={"domain": [0.83, 1.0], "title": {"text": "recordings"}}, barmode="stack"
     )
-    flagged = p.outlying.copy()
-    flagged[[i for c in p.changes if c.changed for i in (c.before, c.after)]] = True
+    flagged = p.outlying | p.changed
     good = np.flatnonzero(~flagged)
     _add_recordings(out, p, good[thin(len(good))], factor, "recording", COLORS[0])
     edges = np.histogram_bin_edges(factor * p.values, bins=int(np.clip(2.0 * math.sqrt(len(p.values)), 10, _MOST_BARS)))

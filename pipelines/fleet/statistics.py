@@ -2,20 +2,20 @@
 
 Values x_i come with their own sigmas s_i. A fleet has a spread t of its own beside them, so that x_i scatters about the
 centre with variance t^2 + s_i^2; centre and t are told from medians, which up to half of the units cannot spoil.
+Of what does not stand out, t is taken apart into what units differ by and what recordings of one unit differ by.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factors.chi_square import quantile, student
+from pipelines.judgement.likelihood import likeliest
 
 Array = NDArray[np.float64]
 
@@ -150,14 +150,64 @@ def trend(time: Array, values: Array, sigmas: Array) -> Trend | None:
     return Trend(float((weights * centred * values).sum()) / information, information**-0.5)
 
 
-def changes(times: Sequence[float]) -> list[tuple[int, int]]:
-    """Pairs of measurements of one unit to compare: each with the one before, and the last with the first.
+@dataclass(frozen=True)
+class Component:
+    """A standard deviation of what values scatter by beyond their sigmas.
 
-    The first find a step, the last one a slow drift. Indices into times, earlier first.
+    Attributes:
+        value: of the largest likelihood; 0 where the sigmas suffice.
+        sigma: of that; NaN at 0, where `upper` says what is known.
+        upper: it is not larger than that (95 %).
     """
-    order = [int(i) for i in np.argsort(times, kind="stable")]
-    pairs = list(pairwise(order))
-    return [*pairs, (order[0], order[-1])] if len(order) > 2 else pairs
+
+    value: float
+    sigma: float
+    upper: float
+
+
+def components(values: Array, sigmas: Array, units: NDArray[np.intp]) -> tuple[Component | None, Component | None]:
+    """From unit to unit, and from recording to recording of one unit: x = centre + unit + recording + noise.
+
+    The second is told by what recordings differ from their unit's mean, the first by these means, each by its
+    restricted likelihood (Searle, Casella, McCulloch, Variance Components, 1992, 3.7 and 6.6).
+
+    Args:
+        values, sigmas: (n,).
+        units: (n,) which unit each shows.
+
+    Returns:
+        The first from five units on, the second where a unit has several recordings.
+    """
+    groups = np.unique(units, return_inverse=True)[1]
+    several = np.bincount(groups) > 1 if len(groups) else np.empty(0, dtype=bool)
+    some = several[groups]
+    recording = _component(values[some], sigmas[some], groups[some]) if several.any() else None
+    if len(several) < ENOUGH:
+        return None, recording
+    weights = 1.0 / (sigmas**2 + (recording.value if recording else 0.0) ** 2)
+    total = np.bincount(groups, weights)
+    means = np.bincount(groups, weights * values) / total
+    return _component(means, np.asarray(total**-0.5), np.zeros(len(means), dtype=np.intp)), recording
+
+
+def _component(values: Array, sigmas: Array, groups: NDArray[np.intp]) -> Component:
+    """Of values (n,) about the means of their groups (n,), each of which has two at least."""
+    groups = np.unique(groups, return_inverse=True)[1]
+
+    def sums(weights: Array) -> Array:
+        return np.asarray(np.bincount(groups, weights), dtype=float)
+
+    def doubled(tau: float) -> float:
+        w = 1.0 / (sigmas**2 + tau**2)
+        total = sums(w)
+        mean = sums(w * values) / total
+        return float(np.log(total).sum() - np.log(w).sum() + (w * (values - mean[groups]) ** 2).sum())
+
+    tau, upper = likeliest(doubled, float(np.median(sigmas)))
+    w = 1.0 / (sigmas**2 + tau**2)
+    one, two, three = sums(w), sums(w**2), sums(w**3)
+    information = 0.5 * float((two - 2.0 * three / one + (two / one) ** 2).sum())  # of tau squared
+    return Component(tau, 0.5 / tau * information**-0.5 if tau > 0.0 else math.nan, upper)
 
 
 def varies(z: Array) -> bool:

@@ -7,23 +7,24 @@ from functools import partial
 from pathlib import Path
 
 from pipelines.errors import InputError
-from pipelines.fleet.analysis import Population, change_table, table
+from pipelines.fleet.analysis import Population, table
 from pipelines.fleet.fleet import Outcome
+from pipelines.fleet.histories import History, change_table
 from pipelines.fleet.montecarlo import Study, run_table, summary_table
 from pipelines.fleet.pages import fleet_html, study_html
 from pipelines.fleet.tables import write_csv, write_parquet
 
 
-def write_fleet(out: Path, outcome: Outcome, fleet: Sequence[Population]) -> tuple[Path, ...]:
+def write_fleet(out: Path, outcome: Outcome, fleet: Sequence[Population], found: Sequence[History]) -> tuple[Path, ...]:
     """fleet.html, fleet.csv, fleet.parquet and changes.csv; returns their paths."""
     rows = table(outcome.results, fleet)
-    page = fleet_html(outcome, fleet)
+    page = fleet_html(outcome, fleet, found)
     return _write(
         {
             out / "fleet.html": partial(_write_text, text=page),
             out / "fleet.csv": partial(write_csv, rows=rows),
             out / "fleet.parquet": partial(write_parquet, rows=rows),
-            out / "changes.csv": partial(write_csv, rows=change_table(fleet)),
+            out / "changes.csv": partial(write_csv, rows=change_table(found)),
         }
     )
 

@@ -14,7 +14,7 @@ the recordings is white they are then independent, and the rate is that of the l
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,19 +22,18 @@ import numpy as np
 from factors.chi_square import quantile
 from pipelines.graph.assumptions import kind
 from pipelines.graph.problem import Array
+from pipelines.judgement.likelihood import likeliest
 from pipelines.solvers.joint import Joined
 
 # How often a history in which nothing changed is taken for one in which something did: by a number, by all at once.
 LEVEL, _JOINTLY = 0.05, 0.2
-# Histories drawn; beyond so many tests chance is bounded instead.
-_DRAWN, _MOST_TESTS = 4000, 1500
+# Histories drawn; beyond so many tests, or where fewer of them would be beyond the limit, chance is bounded instead.
+_DRAWN, _MOST_TESTS, _FEW = 4000, 1500, 40
 # A step of a number is asked for where its sigma is less than this of the prior's.
 _TOLD = 1.0
 _MOST_STEPS = 20
 # Eigenvalues below this share of the largest are rounding.
 _ROUNDING = 1e-10
-# Of a chi-square with one degree of freedom, the 95 % quantile: what a rate's bound costs in twice the log likelihood.
-_BOUND = 3.84
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,11 @@ class Changes:
 
 
 def changes(
-    joined: Joined, days: Sequence[float], inflations: Mapping[str, float], asked: Collection[str] | None = None
+    joined: Joined,
+    days: Sequence[float],
+    inflations: Mapping[str, float],
+    asked: Collection[str] | None = None,
+    level: float = LEVEL,
 ) -> Changes:
     """Of the device's numbers that are taken for the same in all recordings.
 
@@ -113,9 +116,10 @@ def changes(
         days: of these.
         inflations: by what sigmas of the numbers are larger because noise is coloured; 1 where not given.
         asked: the numbers whose steps are looked for; None: all.
+        level: how often chance alone may make any step in such a history.
     """
     if len(joined.parts) < 2:
-        return Changes(LEVEL)
+        return Changes(level)
     A, b = (np.concatenate(each) for each in zip(*joined.rows, strict=True))
     steady = [(name, k) for k, (name, recording) in enumerate(joined.unknowns) if recording is None]
     steady = [(name, k) for name, k in steady if asked is None or name in asked]
@@ -125,16 +129,16 @@ def changes(
     told = np.linalg.norm(left, axis=0) * joined.scales[[k for _, k, _ in questions]] > 1.0 / _TOLD
     questions = [question for question, yes in zip(questions, told, strict=True) if yes]
     if not questions:
-        return Changes(LEVEL)
+        return Changes(level)
     columns, left = columns[:, told], left[:, told]
     grown = np.array([inflations.get(name, 1.0) for name, _, _ in questions])
-    steps, limit = _steps(questions, left, residual, grown), _limit(left)
+    steps, limit = _steps(questions, left, residual, grown), _limit(left, level)
     return Changes(
-        LEVEL,
+        level,
         limit,
         tuple(_found(A * joined.scales, b, columns, questions, grown, limit)),
         tuple(steps),
-        tuple(_together(left, residual, questions, grown)),
+        tuple(_together(left, residual, questions, grown, level)),
         _rates(left, residual, questions, days, grown),
     )
 
@@ -189,19 +193,20 @@ def _found(
     return found
 
 
-def _limit(left: Array) -> float:
+def _limit(left: Array, level: float) -> float:
     """Size in sigmas that the largest of all steps has by chance in one history in so many."""
-    level = LEVEL * (1.0 - _JOINTLY)
-    tests = left.shape[1]
-    if tests > _MOST_TESTS:
-        return float(quantile(1.0 - level / tests, 1.0)) ** 0.5
+    singly, tests = level * (1.0 - _JOINTLY), left.shape[1]
+    if tests > _MOST_TESTS or singly * _DRAWN < _FEW:
+        return float(quantile(1.0 - singly / tests, 1.0)) ** 0.5
     unit = left / np.linalg.norm(left, axis=0)
     triangle = np.linalg.qr(unit).R
     drawn = np.random.default_rng(0).standard_normal((_DRAWN, len(triangle))) @ triangle
-    return float(np.quantile(np.abs(drawn).max(axis=1), 1.0 - level))
+    return float(np.quantile(np.abs(drawn).max(axis=1), 1.0 - singly))
 
 
-def _together(left: Array, residual: Array, questions: Sequence[tuple[str, int, int]], grown: Array) -> list[Together]:
+def _together(
+    left: Array, residual: Array, questions: Sequence[tuple[str, int, int]], grown: Array, level: float
+) -> list[Together]:
     dates = sorted({after for _, _, after in questions})
     found = []
     for date in dates:
@@ -210,7 +215,7 @@ def _together(left: Array, residual: Array, questions: Sequence[tuple[str, int, 
         u, s, _ = np.linalg.svd(some / np.linalg.norm(some, axis=0), full_matrices=False)
         kept = s > _ROUNDING**0.5 * s[0]
         square, dof = float(((u[:, kept].T @ residual) ** 2).sum() / grown[own].mean() ** 2), int(kept.sum())
-        bound = quantile(1.0 - LEVEL * _JOINTLY / len(dates), float(dof))
+        bound = quantile(1.0 - level * _JOINTLY / len(dates), float(dof))
         found.append(Together(date, square, dof, square > bound))
     return found
 
@@ -242,24 +247,4 @@ def _rate(squares: Array, information: Array) -> Rate:
         variance = 1.0 + rate**2 * information
         return float((np.log(variance) + squares / variance).sum())
 
-    typical = float(information.max()) ** -0.5
-    grid = typical * np.geomspace(1e-3, 1e6, 400)
-    costs = np.array([doubled(rate) for rate in grid])
-    best, nothing = int(costs.argmin()), doubled(0.0)
-    if nothing <= costs[best]:
-        rate, cost = 0.0, nothing
-    else:
-        rate, cost = _lowest(doubled, grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)])
-    beyond = np.flatnonzero((costs > cost + _BOUND) & (grid > rate))
-    return Rate(float(rate), float(grid[beyond[0]]) if len(beyond) else float("inf"))
-
-
-def _lowest(cost: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
-    """Where a function of one minimum between two numbers has it, by thirds."""
-    for _ in range(60):
-        third = (high - low) / 3.0
-        if cost(low + third) < cost(high - third):
-            high -= third
-        else:
-            low += third
-    return 0.5 * (low + high), cost(0.5 * (low + high))
+    return Rate(*likeliest(doubled, float(information.max()) ** -0.5))

@@ -11,12 +11,11 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
-from pipelines.belief import Belief, root_of_information
+from pipelines.belief import Belief
 from pipelines.graph.problem import Quantity, Told
 from pipelines.judgement.changes import Change, Changes, changes
 from pipelines.solvers.joint import join
+from pipelines.solvers.told import told_of
 
 Verdict = Literal["holds", "changed", "unknown", "same"]
 
@@ -64,7 +63,8 @@ def holding(known: Belief, told: Told, quantities: Sequence[Quantity], inflation
     by_name = {q.name: q for q in quantities}
     known = known.of(told.names)
     rates = dict.fromkeys([*known.names, *_of_device(told)], 0.0)
-    joined = join([_as_told(known, by_name), told], rates, [0.0, 1.0])
+    before = told_of(known, [by_name[name].prior_scale for name in known.names])
+    joined = join([before, told], rates, [0.0, 1.0])
     asked = {name for name in known.names if by_name[name].judged}
     return Holding(changes(joined, [0.0, 1.0], inflations, asked), by_name)
 
@@ -73,11 +73,3 @@ def _of_device(told: Told) -> Collection[str]:
     """The numbers whose priors are set apart."""
     about = (told.prior_R != 0.0).any(axis=0)
     return [name for name, yes in zip(told.names, about, strict=True) if yes]
-
-
-def _as_told(known: Belief, quantities: Mapping[str, Quantity]) -> Told:
-    """A belief as rows of unit variance."""
-    n, sigmas = len(known.names), known.sigmas
-    R = root_of_information(known.covariance / np.outer(sigmas, sigmas), sigmas)
-    scales = np.array([quantities[name].prior_scale for name in known.names])
-    return Told(known.names, known.mean, R, np.zeros(n), np.empty((0, n)), np.empty(0), scales)

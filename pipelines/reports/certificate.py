@@ -207,9 +207,7 @@ def _read_fields(path: Path | None) -> Fields:
 
 
 def _earlier(path: Path, method: str) -> dict[str, float]:
-    known = load_known(path)
-    if known.method != method:
-        raise InputError(f"{path}: is a calibration of {known.method}, not of {method}")
+    known = load_known(path).of_method(method)
     return dict(zip(known.belief.names, known.belief.mean.tolist(), strict=True))
 
 

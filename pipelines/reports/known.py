@@ -39,6 +39,12 @@ class Known:
     start_ns: int
     belief: Belief
 
+    def of_method(self, name: str) -> Known:
+        """Itself. Raises InputError when it is another method's calibration."""
+        if self.method != name:
+            raise InputError(f"{self.belief.source}: is a calibration of {self.method}, not of {name}")
+        return self
+
 
 def with_covariance(known: Known, path: Path) -> Known:
     """The same from the result.json beside a calibration.yaml, where it is of the same calibration."""

@@ -27,7 +27,7 @@ def sentences(changes: Changes, parts: Sequence[PartResult], quantities: Sequenc
     surest = sorted(changes.found, key=lambda step: -abs(step.z))
     if surest:
         said = [
-            f"{_what(step)} by {_shown(step.size, step.sigma, known[step.name])} {_between(step.after, parts)}."
+            f"{what(step)} by {_shown(step.size, step.sigma, known[step.name])} {_between(step.after, parts)}."
             for step in surest[:_MOST_TOLD]
         ]
         more = len(surest) - len(said)
@@ -84,7 +84,7 @@ def recordings_shown(calibration: Calibration) -> list[Plot | Table]:
     changes = calibration.changes
     found = [] if changes is None else sorted(changes.found, key=lambda step: step.after)
     steps = tuple(
-        (_what(s), _between(s.after, parts), _shown(s.size, s.sigma, known[s.name]), f"{s.z:+.1f}") for s in found
+        (what(s), _between(s.after, parts), _shown(s.size, s.sigma, known[s.name]), f"{s.z:+.1f}") for s in found
     )
     tables = [
         Table("Recordings", "In the order of their dates, each with its verdict by itself.", _RECORDINGS, rows),
@@ -142,7 +142,7 @@ def _add(out: object, calibration: Calibration, q: Quantity, factor: float, colo
             out.add_vline(x=parts[step.after + 1].start, line={"color": color, "dash": "dash", "width": 1})
 
 
-def _what(step: Change) -> str:
+def what(step: Change) -> str:
     """What moved: a turn about an axis, or a number."""
     which, _, axis = step.name.rpartition("_")
     return f"{which} about {axis} moved" if which.endswith("mount") and axis in "xyz" else f"{step.name} changed"

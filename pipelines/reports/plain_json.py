@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from pipelines.judgement.validation import peak, rms
@@ -12,7 +13,9 @@ from pipelines.judgement.validation import peak, rms
 if TYPE_CHECKING:
     from pipelines.fleet.analysis import Population
     from pipelines.fleet.fleet import Outcome
+    from pipelines.fleet.histories import History
     from pipelines.fleet.montecarlo import Study
+    from pipelines.fleet.statistics import Component
     from pipelines.planning import Plan
     from pipelines.validate import Validated
 
@@ -84,19 +87,31 @@ def plan_json(plan: Plan) -> str:
     )
 
 
-def fleet_json(outcome: Outcome, fleet: Sequence[Population]) -> str:
-    """Of `fleet`: the rows of fleet.csv and changes.csv."""
-    from pipelines.fleet.analysis import change_table, table
+def fleet_json(outcome: Outcome, fleet: Sequence[Population], found: Sequence[History]) -> str:
+    """Of `fleet`: the rows of fleet.csv and changes.csv, the components of every parameter, and who needs attention."""
+    from pipelines.fleet.analysis import table
+    from pipelines.fleet.attention import units_of_interest
+    from pipelines.fleet.histories import change_table
 
     return plain_json(
         "fleet",
         {
             "recordings": table(outcome.results, fleet),
-            "changes": change_table(fleet),
+            "changes": change_table(found),
+            "attention": [asdict(unit) for unit in units_of_interest(outcome.results, fleet, found)],
+            "parameters": [
+                {"name": p.name, "method": p.method, "of_device": p.of_device}
+                | {"population": _component(p.population), "repeatability": _component(p.repeatability)}
+                for p in fleet
+            ],
             "wanted": outcome.recordings,
             "interrupted": outcome.interrupted,
         },
     )
+
+
+def _component(component: Component | None) -> dict[str, float] | None:
+    return None if component is None else asdict(component)
 
 
 def study_json(study: Study) -> str:

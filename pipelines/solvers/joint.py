@@ -155,6 +155,15 @@ class Joined:
         return [places[name, None] if (name, None) in places else places[name, recording] for name in names]
 
 
+def grown(sigmas: Sequence[float], inflations: Sequence[float]) -> float:
+    """By what a number's sigma grows: the recordings' own factors, each weighed by what it says of the number."""
+    found = [(sigma, inflation) for sigma, inflation in zip(sigmas, inflations, strict=True) if sigma > 0.0]
+    if not found:
+        return 1.0
+    own, factors = np.array(found).T
+    return float(np.average(factors**2, weights=own**-2.0) ** 0.5)
+
+
 def tell(problem: Problem, levels: Sequence[Level], device: Collection[str]) -> Told:
     """What a problem says of its numbers, linear about its solution with noise levels that are known.
 

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 import gtsam
 import numpy as np
 
+from pipelines.belief import Belief, root_of_information
 from pipelines.graph.believing import about_alone
 from pipelines.graph.problem import Array, Factor, Problem, Told
 from pipelines.solvers.marginals import IndeterminateError, coordinate_inverse, explain, reported
@@ -71,6 +72,13 @@ def told(
         prior_d=prior_b[of_device],
         scales=scales,
     )
+
+
+def told_of(belief: Belief, scales: Sequence[float]) -> Told:
+    """A belief, none of whose numbers is exactly known, as rows of unit variance; `scales` (n,) of the usual priors."""
+    n, sigmas = len(belief.names), belief.sigmas
+    R = root_of_information(belief.covariance / np.outer(sigmas, sigmas), sigmas)
+    return Told(belief.names, belief.mean, R, np.zeros(n), np.empty((0, n)), np.empty(0), np.array(scales, dtype=float))
 
 
 def fewest(R: Array, d: Array, scales: Array) -> tuple[Array, Array]:
