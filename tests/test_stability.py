@@ -9,21 +9,38 @@ import pytest
 
 import alidade
 from factors import so3
-from pipelines.graph.problem import Estimate, History, Quantity
+from pipelines.follow.guidance import View, Watch
+from pipelines.graph.problem import Course, Estimate, Quantity
 from pipelines.judgement.halves import Halves
-from pipelines.judgement.stability import Moved, stability
+from pipelines.judgement.observability import assess
+from pipelines.judgement.stability import Moved, Stability, stability
+from pipelines.settings import Config
 from pipelines.solvers.batch import solve_batch
+from pipelines.solvers.incremental import DEFAULT_WINDOW, Run
 
+IDEAL = Config.model_validate({"sensors": "ideal"})
 HEAD = {"duration_s": 60.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 20.0}
 
 
-def session(seed: int, slip_deg: float) -> alidade.Session:
+def session(seed: int, slip_deg: float, config: Config | None = None, **scenario: float) -> alidade.Session:
     """A minute of head motion; half way the markers slip on the helmet."""
-    simulated = alidade.simulate("head", HEAD, seed)
+    simulated = alidade.simulate("head", HEAD | scenario, seed)
     wxyz = simulated.data.vision_wxyz.copy()
     late = simulated.data.vision_t > 30.0
     wxyz[late] = so3.multiply(wxyz[late], so3.exp(np.deg2rad([slip_deg, 0.0, 0.0])))
-    return alidade.open(replace(simulated, data=replace(simulated.data, vision_wxyz=wxyz)))
+    return alidade.open(replace(simulated, data=replace(simulated.data, vision_wxyz=wxyz)), config=config)
+
+
+def watched(session: alidade.Session) -> tuple[Run, list[tuple[float, float]]]:
+    """A run that is watched, and each time at which it was seen to have changed, with when it changed, s."""
+    problem = session.problem()
+    run, watch, alarms = Run(problem, DEFAULT_WINDOW), Watch(), []
+    for step in problem.steps(1):
+        run.add_step(step)
+        watch.look(run)
+        if watch.change is not None:
+            alarms.append((step.time, watch.change.time_s))
+    return run, alarms
 
 
 def walk(rng: np.random.Generator, change: float = 0.0, n: int = 40) -> tuple[Estimate, tuple[Quantity, ...]]:
@@ -33,9 +50,9 @@ def walk(rng: np.random.Generator, change: float = 0.0, n: int = 40) -> tuple[Es
     k = np.arange(1, n + 1)
     values = np.cumsum(z, axis=0) / k[:, None]
     P = np.eye(2) / k[:, None, None]
-    history = History(k.astype(float), values, np.sqrt(np.diagonal(P, axis1=1, axis2=2)), P, np.array([True, True]))
+    course = Course(k.astype(float), values, P, np.array([True, True]))
     quantities = tuple(Quantity(name, "rad", 10.0, 10.0, 1.0) for name in "ab")
-    return Estimate("batch", ("a", "b"), values[-1], P[-1], True, "", history=history), quantities
+    return Estimate("batch", ("a", "b"), values[-1], P[-1], True, "", course=course), quantities
 
 
 def test_the_level_is_what_it_says() -> None:
@@ -62,8 +79,8 @@ def test_a_value_far_beyond_its_prior_is_no_change() -> None:
     k = np.arange(1, n + 1)
     values = np.cumsum(rng.normal(10.0, 1.0, n)) / (k + 1)
     P = np.asarray(1.0 / (k + 1.0), dtype=float)
-    history = History(k.astype(float), values[:, None], np.sqrt(P)[:, None], P[:, None, None], np.array([True]))
-    estimate = Estimate("batch", ("a",), values[-1:], np.array([[P[-1]]]), True, "", history=history)
+    course = Course(k.astype(float), values[:, None], P[:, None, None], np.array([True]))
+    estimate = Estimate("batch", ("a",), values[-1:], np.array([[P[-1]]]), True, "", course=course)
     found = stability(estimate, [Quantity("a", "rad", 1.0, 1.0, 1.0)])
     assert found is not None
     assert not found.changed
@@ -74,14 +91,14 @@ def test_a_value_far_beyond_its_prior_is_no_change() -> None:
 
 def test_what_walks_or_is_fixed_may_change() -> None:
     estimate, quantities = walk(np.random.default_rng(1), change=3.0)
-    history = estimate.history
-    assert history is not None
-    walking = replace(estimate, history=replace(history, steady=np.array([False, True])))
+    course = estimate.course
+    assert course is not None
+    walking = replace(estimate, course=replace(course, steady=np.array([False, True])))
     found = stability(walking, quantities)
     assert found is not None
     assert not found.changed
     assert stability(estimate, [replace(q, prior_sigma=0.0) for q in quantities]) is None
-    assert stability(replace(estimate, history=None), quantities) is None
+    assert stability(replace(estimate, course=None), quantities) is None
 
 
 def test_a_mount_that_slips_is_inconsistent_with_the_time_and_the_step() -> None:
@@ -114,6 +131,46 @@ def test_a_mount_that_stays_is_calibrated() -> None:
     assert calibration.status == "calibrated"
     assert calibration.stability is not None
     assert not calibration.stability.changed
+
+
+def test_a_slip_is_seen_while_it_is_recorded() -> None:
+    """With the estimate still young, and the same when the run has gone on from a Gaussian."""
+    run, alarms = watched(session(0, 0.8, IDEAL, vision_rate_hz=4.0))
+    assert run.way.rows.array[-1, 0] > 55.0
+    assert alarms
+    told, when = alarms[0]
+    assert told < 46.0
+    assert when == pytest.approx(30.0, abs=6.0)
+    found = stability(run.finish(0.0), run.problem.quantities)
+    assert found is not None
+    assert found.changed
+    assert next(iter(found.departures)) == "helmet_mount_x"
+
+
+def test_the_person_is_told_what_moved_and_when() -> None:
+    change = Stability(7.0, 0.0, 31.0, {"helmet_mount_x": -8.0})
+    quantities = (Quantity("helmet_mount_x", "rad", 0.1, 0.1, 1e-3),)
+    assessment = assess(quantities, np.eye(1) * 1e-8, None, lambda _: "")
+    view = View(40.0, 43_200 * 10**9, quantities, np.zeros(1), assessment, (), change)
+    assert not view.done
+    assert view.headline.startswith("Something changed at about 31 s: helmet_mount_x")
+    assert "12:00:31 UTC" in view.headline
+    assert replace(view, change=None).done
+
+
+@pytest.mark.slow
+def test_the_incremental_solver_finds_slips_and_raises_no_false_alarms() -> None:
+    for seed in range(4):
+        calibration = session(seed, 0.5).calibrate("incremental")
+        assert calibration.status == "inconsistent"
+        assert calibration.stability is not None
+        assert calibration.stability.time_s == pytest.approx(30.0, abs=5.0)
+    for seed in range(12):
+        run, alarms = watched(session(seed, 0.0))
+        assert not alarms
+        found = stability(run.finish(0.0), run.problem.quantities)
+        assert found is not None
+        assert not found.changed
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines.errors import InputError
-from pipelines.follow.guidance import View, view_of
+from pipelines.follow.guidance import View, Watch, view_of
 from pipelines.follow.sources import Source
 from pipelines.graph.problem import Problem, Step
 from pipelines.judgement.checklist import ChecklistItem
@@ -89,6 +89,7 @@ class Follower:
         self.source = source
         self.settings, self._show, self._say, self._stopped = settings, show, say, stopped
         self._run: Run | None = None
+        self._watch = Watch()
         self._epoch_ns = 0
         self._identity: dict[str, str] = {}
         self._resumable = settings.checkpoint is not None and settings.checkpoint.exists()
@@ -247,7 +248,8 @@ class Follower:
 
     def _view(self) -> None:
         assert self._run is not None
-        self._show(view_of(self._epoch_ns, self._run, tuple(self._checklist.values())))
+        self._watch.look(self._run)
+        self._show(view_of(self._epoch_ns, self._run, tuple(self._checklist.values()), self._watch.change))
         self._shown = time.monotonic()
 
     # -- the checkpoint

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 import numpy as np
 
 from pipelines.graph.problem import Array, Quantity
 from pipelines.judgement.checklist import ChecklistItem
 from pipelines.judgement.observability import Assessment, assess
+from pipelines.judgement.stability import Stability, stability
 from pipelines.solvers.incremental import Run
 
 # Parameters a sentence names.
@@ -26,6 +28,7 @@ class View:
         values: (n,) of them, as estimated by now; None while there is too little.
         assessment: of that estimate.
         checklist: what there is of what the method needs.
+        change: in what is calibrated, since the recording began; None: none was found.
     """
 
     time: float
@@ -34,6 +37,7 @@ class View:
     values: Array | None
     assessment: Assessment | None
     checklist: tuple[ChecklistItem, ...]
+    change: Stability | None = None
 
     @property
     def sigmas(self) -> Array | None:
@@ -50,7 +54,7 @@ class View:
     @property
     def done(self) -> bool:
         """Whether every parameter is as accurate as required, by what was recorded and not by its prior alone."""
-        return self.assessment is not None and self.assessment.status == "calibrated"
+        return self.assessment is not None and self.assessment.status == "calibrated" and self.change is None
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -64,6 +68,9 @@ class View:
         """The state in one sentence."""
         if self.assessment is None:
             return "not enough yet for an estimate"
+        if self.change is not None:
+            when = datetime.fromtimestamp(self.epoch_ns * 1e-9 + self.change.time_s, UTC)
+            return f"{self.change.sentence} It was {when:%H:%M:%S} UTC: look what moved, and begin anew"
         if self.done:
             return "the accuracy wanted is reached: recording may end"
         if not self.short:
@@ -73,7 +80,28 @@ class View:
         return f"not yet as accurate as required: {names}"
 
 
-def view_of(epoch_ns: int, run: Run, checklist: tuple[ChecklistItem, ...]) -> View:
+class Watch:
+    """Whether what a run calibrates stays as it is.
+
+    Attributes:
+        change: as of the last look; None: none was found.
+    """
+
+    def __init__(self) -> None:
+        self._seen: tuple[Run, int] | None = None  # the run, and its moments at the last look
+        self.change: Stability | None = None
+
+    def look(self, run: Run) -> None:
+        """Look again if the run has come to another moment since."""
+        now = run, run.moments
+        if not run.started or now == self._seen:
+            return
+        self._seen = now
+        found = stability(run.estimate(), run.problem.quantities)
+        self.change = found if found is not None and found.changed else None
+
+
+def view_of(epoch_ns: int, run: Run, checklist: tuple[ChecklistItem, ...], change: Stability | None = None) -> View:
     """The view of a run so far."""
     quantities = run.problem.quantities
     values, assessment = None, None
@@ -81,4 +109,4 @@ def view_of(epoch_ns: int, run: Run, checklist: tuple[ChecklistItem, ...]) -> Vi
         values = run.values()
         assessment = assess(quantities, run.covariance(), run.chi_square(), run.problem.advice)
     time = run.time if np.isfinite(run.time) else 0.0
-    return View(time, epoch_ns, quantities, values, assessment, checklist)
+    return View(time, epoch_ns, quantities, values, assessment, checklist, change)

@@ -248,24 +248,37 @@ class ChiSquare:
 
 @dataclass(frozen=True)
 class History:
-    """Estimates over time: times (k,), values and sigmas (k, n) in the order of Estimate.names.
+    """Estimates over time: times (k,), values and sigmas (k, n) in the order of Estimate.names."""
+
+    time: Array
+    values: Array
+    sigmas: Array
+
+    def inflated(self, by: Array) -> History:
+        """With sigmas larger by factors (n,)."""
+        return replace(self, sigmas=self.sigmas * by)
+
+
+@dataclass(frozen=True)
+class Course:
+    """What was known jointly at some moments, each of them with all that came before, weighed alike at all moments.
 
     Attributes:
-        time, values, sigmas: as above.
-        covariance: (k, n, n) joint for white noise, where they are all linearised at the final estimate; None where
-            they are not.
+        time: (k,), s.
+        values: (k, n) in the order of Estimate.names.
+        covariance: (k, n, n) for white noise.
         steady: (n,) which quantities are the same number at all times; the others walk.
     """
 
     time: Array
     values: Array
-    sigmas: Array
-    covariance: Array | None = None
-    steady: NDArray[np.bool_] | None = None
+    covariance: Array
+    steady: NDArray[np.bool_]
 
-    def inflated(self, by: Array) -> History:
-        """With sigmas larger by factors (n,); the covariances stay those of white noise."""
-        return replace(self, sigmas=self.sigmas * by)
+    @property
+    def history(self) -> History:
+        """With sigmas alone."""
+        return History(self.time, self.values, np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)))
 
 
 @dataclass(frozen=True)
@@ -329,6 +342,7 @@ class Estimate:
         residuals: family -> residuals of measurements at the estimate (innovations for an incremental solver).
         chi_square: None for solvers that have none.
         history: values and sigmas from what was recorded until each moment.
+        course: the same at some moments, jointly; None where moments are not weighed alike.
         smoothed: values and sigmas at each moment from the whole recording, where parameters move along; the others
             are as they are at the end.
         attitudes: the trajectory, if the method has one.
@@ -352,6 +366,7 @@ class Estimate:
     residuals: Mapping[str, Residuals] = field(default_factory=dict)
     chi_square: ChiSquare | None = None
     history: History | None = None
+    course: Course | None = None
     smoothed: History | None = None
     attitudes: Attitudes | None = None
     budget: Mapping[str, Mapping[str, float]] | None = None

@@ -98,23 +98,23 @@ class Moved:
 
 
 def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability | None:
-    """Of a batch estimate; None without a history of joint covariances, or with nothing in it that could change.
+    """Of an estimate; None where its course is not known, or holds nothing that could change.
 
     Quantities that walk are left out: they may change.
 
     Args:
-        estimate: with its history.
+        estimate: with its course.
         quantities: of the estimate, in its order.
     """
-    history = estimate.history
-    if history is None or history.covariance is None or history.steady is None:
+    course = estimate.course
+    if course is None:
         return None
-    kept = np.flatnonzero(history.steady & np.array([q.prior_sigma != 0.0 for q in quantities], dtype=bool))
-    late = history.time >= _long_enough(estimate, len(kept))
+    kept = np.flatnonzero(course.steady & np.array([q.prior_sigma != 0.0 for q in quantities], dtype=bool))
+    late = course.time >= _long_enough(estimate, len(kept))
     if late.sum() < _FEWEST_MOMENTS or not len(kept):
         return None
-    time = history.time[late]
-    values, covariance = _with_priors_as_found(estimate, quantities, history.values[late], history.covariance[late])
+    time = course.time[late]
+    values, covariance = _with_priors_as_found(estimate, quantities, course.values[late], course.covariance[late])
     P = (covariance * np.outer(estimate.inflations, estimate.inflations))[:, kept[:, None], kept]
     difference = values[:-1, kept] - values[-1, kept]
     whitening = [_whitening(P[i], P[-1]) for i in range(len(P) - 1)]
@@ -142,7 +142,7 @@ def _long_enough(estimate: Estimate, numbers: int) -> float:
 def _with_priors_as_found(
     estimate: Estimate, quantities: Sequence[Quantity], values: Array, P: Array
 ) -> tuple[Array, Array]:
-    """The history (k, n), (k, n, n) as it is when no parameter lies far beyond its prior.
+    """The course (k, n), (k, n, n) as it is when no parameter lies far beyond its prior.
 
     Widening one prior changes the information by a number on the diagonal (Sherman, Morrison 1950).
     """

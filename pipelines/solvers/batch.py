@@ -198,8 +198,12 @@ def solve_batch(
     solved = time.perf_counter()
     values, system, ordering = solution.values, solution.system, solution.system.ordering
     linear, factors = about.graph, system.factors
-    past = sequential_history(problem, linear, ordering, values, whole.boundaries)
-    marginal = past[1] if past else joint_covariance(problem, linear, ordering, values, whole.current_keys)
+    course = sequential_history(problem, linear, ordering, values, whole.boundaries)
+    marginal = (
+        joint_covariance(problem, linear, ordering, values, whole.current_keys)
+        if course is None
+        else course.covariance[-1]
+    )
     noise = information_of_noise(problem, system.linearize, ordering, values, marginal, whole.current_keys)
     if noise is not None:
         marginal = joint_covariance(problem, linear, ordering, values, whole.current_keys, noise)
@@ -235,7 +239,8 @@ def solve_batch(
         message=solution.message,
         residuals=residuals,
         chi_square=summary,
-        history=past[0].inflated(inflation) if past else None,
+        history=None if course is None else course.history.inflated(inflation),
+        course=course,
         smoothed=smooth,
         attitudes=problem.attitudes(whole.keyframes, values) if problem.attitudes else None,
         budget=sources,

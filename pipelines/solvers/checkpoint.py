@@ -19,13 +19,14 @@ import numpy as np
 
 from pipelines.errors import InputError
 from pipelines.graph.problem import Problem
+from pipelines.solvers.course import Way
 from pipelines.solvers.incremental import Run
 from pipelines.solvers.innovations import Innovations
 from pipelines.solvers.rows import Rows
 from pipelines.solvers.state import State
 from pipelines.solvers.window import Keyframes
 
-_SCHEMA = "alidade.checkpoint/3"
+_SCHEMA = "alidade.checkpoint/4"
 _INNOVATIONS = "innovations/"
 
 
@@ -51,6 +52,7 @@ def save_checkpoint(path: Path, run: Run, identity: Mapping[str, str]) -> None:
         "stamps": list(state.stamps.items()),
         "current_keys": list(run.current_keys.items()),
         "keyframes": run.keyframes,
+        "walked": sorted(run.walked),
         "levels": {level.noise.name: level.scale for level in run.levels},
         "unusable": run.innovations.unusable,
         "rejected_in_a_row": run.innovations.rejected_in_a_row,
@@ -65,6 +67,7 @@ def save_checkpoint(path: Path, run: Run, identity: Mapping[str, str]) -> None:
                 stream,
                 head=np.array(json.dumps(head)),
                 history=run.history.array,
+                way=run.way.rows.array,
                 attitudes=run.attitudes.array,
                 **rows,
             )
@@ -103,8 +106,9 @@ def load_checkpoint(path: Path, problem: Problem, identity: Mapping[str, str]) -
         window = Keyframes(head["window"]) if isinstance(head["window"], int) else float(head["window"])
         run = Run.resumed(problem, window, State(head["time"], values, linear, stamps), head["levels"])
         run.current_keys = {int(key): int(held) for key, held in head["current_keys"]}
-        run.keyframes = head["keyframes"]
+        run.keyframes, run.walked = head["keyframes"], set(head["walked"])
         run.history, run.attitudes = Rows(arrays.pop("history")), Rows(arrays.pop("attitudes"))
+        run.way = Way(Rows(arrays.pop("way")))
         families = {name.removeprefix(_INNOVATIONS): Rows(array) for name, array in arrays.items()}
         run.innovations = Innovations(families, head["unusable"], head["rejected_in_a_row"])
     except OSError as error:

@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.graph.problem import Array, History, Problem
+from pipelines.graph.problem import Array, Course, Problem
 from pipelines.solvers.assembly import StepBoundary
 from pipelines.solvers.marginals import coordinate_inverse, ordering_of, reported, reported_covariance
 
@@ -26,8 +26,8 @@ def sequential_history(
     ordering: gtsam.Ordering,
     values: gtsam.Values,
     boundaries: Sequence[StepBoundary],
-) -> tuple[History, Array] | None:
-    """Values and sigmas from what was recorded until some of the boundaries; joint covariance (n, n) at the last.
+) -> Course | None:
+    """What was known at some of the boundaries, the last among them, all linearised at the values.
 
     Args:
         problem: the graph's.
@@ -64,8 +64,7 @@ def sequential_history(
         numbers, covariance = _solved(problem, now, values, boundary.current_keys, held)
         rows.append((boundary.time, numbers, covariance))
     time, numbers, covariances = (np.array(column) for column in zip(*rows, strict=True))
-    sigmas = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
-    return History(time, numbers, sigmas, covariances, steady), covariance
+    return Course(time, numbers, covariances, steady)
 
 
 def _moments(boundaries: Sequence[StepBoundary]) -> list[StepBoundary]:

@@ -11,16 +11,19 @@ see pipelines.solvers.checkpoint: both go on from the same numbers.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 
 import gtsam
 import numpy as np
 
-from pipelines.graph.problem import Array, Attitudes, ChiSquare, Estimate, Factor, History, Problem, Step
+from pipelines.graph.problem import Array, Attitudes, ChiSquare, Course, Estimate, Factor, History, Problem, Step
 from pipelines.solvers.assembly import Assembly
 from pipelines.solvers.batch import CHUNK, Solution, optimize, with_levels
 from pipelines.solvers.coloured import growth, inflated_by_innovations
+from pipelines.solvers.course import Way
+from pipelines.solvers.history import sequential_history
 from pipelines.solvers.innovations import Innovations, Prediction
 from pipelines.solvers.linearity import is_linear
 from pipelines.solvers.marginals import IndeterminateError, reported, reported_covariance
@@ -104,6 +107,9 @@ class Run:
         levels: of the noises, as the last batch solution has them.
         history: rows of time, values and sigmas.
         attitudes: rows of time and quaternion.
+        way: what was known jointly at some moments, of a run that is not young.
+        moments: how often another one has come to the course; of a young run, how often it was solved in batch.
+        walked: parameter keys whose values other variables held before.
     """
 
     def __init__(self, problem: Problem, window: Window) -> None:
@@ -117,6 +123,9 @@ class Run:
         self.levels = problem.noises
         self.history = Rows()
         self.attitudes = Rows()
+        self.way = Way()
+        self.moments = 0
+        self.walked: set[int] = set()
         self._smoother: Smoother | None = None  # None before the first batch solution
         self._stamps: dict[int, float] = {}  # of the variables held that age, in the window's unit
         self._times: list[float] = []  # of the steps, where the window's unit is keyframes
@@ -126,6 +135,7 @@ class Run:
         self._looked = 0.0  # from so many s on it is to be seen again whether the past may be folded
         self._trouble = ""
         self._noise: Array | None = None  # information of a young run that is its states' noise
+        self._course: Callable[[], Course | None] = cache(lambda: None)  # of the last batch solution while young
 
     @classmethod
     def resumed(cls, problem: Problem, window: Keyframes | float, base: State, scales: Mapping[str, float]) -> Run:
@@ -165,6 +175,7 @@ class Run:
 
     def add_step(self, step: Step) -> None:
         """One more step. Raises as solve_incremental does; the run is of no use any more then."""
+        self.walked.update(key for key, held in step.current_keys.items() if self.current_keys.get(key, held) != held)
         self.current_keys.update(step.current_keys)
         self.keyframes = max(self.keyframes, step.keyframes.stop)
         self.past.append(step)
@@ -198,6 +209,16 @@ class Run:
             raise IndeterminateError(f"the parameters' covariance at {self.time:.3f} s is not finite")
         return reported_covariance(self.problem.parameters, information, self._estimate(), self.keys, self._noise)
 
+    def course(self) -> Course | None:
+        """What was known at some moments, weighed as it is now; of a young run, until its last batch solution."""
+        if self._young:
+            return self._course()
+        steady = np.repeat(
+            [p.key not in self.walked for p in self.problem.parameters],
+            [len(p.quantities) for p in self.problem.parameters],
+        )
+        return self.way.until(self.time, self.values(), self.covariance(), steady)
+
     def chi_square(self) -> ChiSquare:
         """The sum of the squared innovations of the measurements used."""
         return self.innovations.chi_square()
@@ -206,6 +227,10 @@ class Run:
         """The estimate after the last step added. More steps may follow."""
         if self._young and self._solved is not None and len(self.past) > self._solved.steps:
             self._reinitialize()
+        return replace(self.estimate(), seconds={"solve": seconds})
+
+    def estimate(self) -> Estimate:
+        """The estimate now. Raises IndeterminateError when it is no finite number."""
         values, covariance = self.values(), self.covariance()
         if not (np.isfinite(values).all() and np.isfinite(covariance).all()):
             raise IndeterminateError(f"the estimate at {self.time:.3f} s is not a finite number")
@@ -226,10 +251,10 @@ class Run:
             residuals=innovations,
             chi_square=self.chi_square(),
             history=History(history[:, 0], history[:, 1 : 1 + n], history[:, 1 + n :]).inflated(inflation),
+            course=self.course(),
             attitudes=None if self.problem.attitudes is None else Attitudes(attitudes[:, 0], attitudes[:, 1:]),
             rejected=self.innovations.rejected(),
             levels=self.levels,
-            seconds={"solve": seconds},
         )
 
     def _estimate(self) -> gtsam.Values:
@@ -295,7 +320,11 @@ class Run:
             attitudes = self.problem.attitudes(keyframes, values)
             self.attitudes.add(np.column_stack([attitudes.time, attitudes.wxyz]))
         if not len(self.history) or self.time - self.history.array[-1, 0] >= 1.0 / _HISTORY_RATE:
-            self.history.add(np.concatenate([[self.time], self.values(), np.sqrt(np.diag(self.covariance()))])[None])
+            numbers, covariance = self.values(), self.covariance()
+            self.history.add(np.concatenate([[self.time], numbers, np.sqrt(np.diag(covariance))])[None])
+            if not self._young and self.way.due(self.time):
+                self.way.add(self.time, numbers, covariance)
+                self.moments += 1
 
     # -- batch re-initialisation, and marginalising out
 
@@ -327,12 +356,19 @@ class Run:
             self._young = not (foldable or is_linear(self.problem, solution, self.keys))
         self._restart(solution, whole.timestamps)
         self._noise = None
+        system, current = solution.system, self.current_keys
         if self._young:
-            system, current = solution.system, self.current_keys
             self._noise = information_of_noise(
                 self.problem, system.linearize, system.ordering, values, self.covariance(), current
             )
         if from_start:
+            self.moments += 1
+            linear = partial(system.linearize, values)
+            self._course = cache(
+                lambda: sequential_history(self.problem, linear(), system.ordering, values, whole.boundaries)
+            )
+            if not self._young:
+                self.way, self._course = Way.of(self._course()), cache(lambda: None)
             self.attitudes.clear()
         self._record(whole.keyframes if from_start else last, values)
         self._solved = _Solved(since, len(self.past), self.values(), np.sqrt(np.diag(self.covariance())))
