@@ -16,13 +16,15 @@ DESKTOP, PHONE = 1280, 390
 
 # Frames, since a browser without a screen has no window as narrow as a phone. The title tells what was drawn in each.
 _LOOK = """<!doctype html><title>not loaded</title>{frames}<script>
-addEventListener('load', () => {{
-  document.title = [...document.querySelectorAll('iframe')].map(frame => {{
-    const page = frame.contentDocument;
-    const fits = page.documentElement.scrollWidth <= frame.clientWidth ? 'fits' : 'too wide';
-    return `${{fits}} ${{page.querySelectorAll('.main-svg').length}}`;
+const look = () => {{
+  const pages = [...document.querySelectorAll('iframe')].map(frame => frame.contentDocument);
+  if (pages.some(page => page.querySelector('.plot:not([data-drawn])'))) return setTimeout(look, 100);
+  document.title = pages.map((page, i) => {{
+    const fits = page.documentElement.scrollWidth <= frames[i].innerWidth ? 'fits' : 'too wide';
+    return `${{fits}} ${{page.querySelectorAll('.plot').length}}`;
   }}).join(', ');
-}});
+}};
+addEventListener('load', look);
 </script>"""
 
 
@@ -35,7 +37,7 @@ def drawn(text: str, folder: Path) -> int:
         str(CHROMIUM),
         *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync"),
         *("--disable-background-networking", "--disable-component-update", f"--user-data-dir={folder / 'profile'}"),
-        *("--allow-file-access-from-files", "--enable-logging=stderr", "--virtual-time-budget=10000"),
+        *("--allow-file-access-from-files", "--enable-logging=stderr", "--virtual-time-budget=60000"),
         *("--window-size=1400,2000", "--dump-dom", (folder / "look.html").as_uri()),
     ]
     run = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)

@@ -117,9 +117,9 @@ def test_figures_and_tables(solved: Solved) -> None:
         "Attitudes covered",
     ]
     for name, least in (("Accelerometer", 50.0), ("Gyro", 30.0), ("Magnetometer", 50.0)):
-        before, after = (np.asarray(trace.y) for trace in plots[f"{name} before and after"].figure.data)
+        before, after = (mark.y for mark in plots[f"{name} before and after"].figure.marks)
         assert np.sqrt((before**2).mean()) > least * np.sqrt((after**2).mean())
-    raw, good = (t for t in plots["Sphere of the accelerometer"].figure.data if t.xaxis == "x3")
+    raw, good, _ = plots["Sphere of the accelerometer"].beside[1].marks
     assert np.abs(good.y).max() < 0.1 < 1.0 < np.abs(raw.y).max()
     table = plots["Sensors taken apart"]
     assert isinstance(table, Table)
@@ -127,7 +127,7 @@ def test_figures_and_tables(solved: Solved) -> None:
     assert [row[0] for row in table.rows][::3] == ["scale error x, %", "non-orthogonality xy, deg", "mounting x, deg"]
     covered = plots["Attitudes covered"]
     assert isinstance(covered, Plot)
-    (poses,) = (t for t in covered.figure.data if t.name == "poses")
+    (poses,) = covered.figure.named("poses")
     assert len(poses.x) == SCENARIO.poses
     assert "deg from every pose" in covered.caption
 

@@ -26,11 +26,12 @@ def _plots(scenario: IndexerScenario) -> dict[str, Plot]:
 def test_figures_of_a_whole_schedule() -> None:
     plots = _plots(IndexerScenario(attitude_noise_arcsec=1, gyro_rate_hz=100))
     assert list(plots) == ["Attitude output", "Half differences", "Misfit by turn", "What each position says"]
-    measured, compensated = plots["Half differences"].figure.data
-    assert list(measured.x) == ["1 yt", "1 zt", "2 yt", "2 zt", "3 xt", "3 yt", "4 xt", "4 yt"]
-    assert np.abs(compensated.y).max() < 1.0 < 500.0 < np.abs(measured.y).max()
-    shares = np.sum([bar.y for bar in plots["What each position says"].figure.data], axis=0)
-    np.testing.assert_allclose(shares, 100.0)
+    half = plots["Half differences"].figure
+    measured, compensated = (mark.columns["high"] for mark in half.marks)
+    assert list(half.x_labels) == ["1 yt", "1 zt", "2 yt", "2 zt", "3 xt", "3 yt", "4 xt", "4 yt"]
+    assert np.abs(compensated).max() < 1.0 < 500.0 < np.abs(measured).max()
+    *_, last = plots["What each position says"].figure.marks
+    np.testing.assert_allclose(last.columns["high"], 100.0)
 
 
 def test_figures_without_attitude_and_without_a_published_position() -> None:

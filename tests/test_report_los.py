@@ -28,11 +28,11 @@ def _plots(priors: str) -> list[Plot]:
 @pytest.mark.parametrize("priors", ["{}", "{time_offset: 0.01}"])
 def test_the_prediction_follows_the_measured_error(priors: str) -> None:
     both, left = _plots(priors)
-    measured, predicted = ({t.name.split()[0]: np.asarray(t.y) for t in both.figure.data[i::2]} for i in (0, 1))
+    measured, predicted = ({mark.name.split()[0]: mark.y for mark in both.figure.marks[i::2]} for i in (0, 1))
     for axis in ("phx", "phz"):
         assert np.abs(measured[axis]).max() > 1.0  # mrad
         # 30 urad/sqrt(s) of gyro over 20 s, and 20 urad of picture.
         np.testing.assert_allclose(predicted[axis], measured[axis], atol=0.5)
-    spread = {trace.name: np.std(trace.y) for trace in left.figure.data}
+    spread = {mark.name: np.std(mark.y) for mark in left.figure.marks}
     assert spread["phx, mounting angles found"] < 150.0 < 500.0 < spread["phx, mounting angles zero"]
     assert "urad" in left.caption

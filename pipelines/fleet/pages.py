@@ -8,6 +8,7 @@ from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.fleet import statistics
 from pipelines.fleet.analysis import Population, iso
@@ -15,14 +16,12 @@ from pipelines.fleet.attention import readable, sentence, units_of_interest
 from pipelines.fleet.histories import History
 from pipelines.fleet.statistics import Component
 from pipelines.graph.problem import Array, Quantity
-from pipelines.reports.plots import COLORS, REJECTED, figure, thin
+from pipelines.reports.figure import COLORS, REJECTED, Figure, Shape, milliseconds, thin
 from pipelines.reports.result import Plot
-from pipelines.reports.templating import environment
+from pipelines.reports.templating import page
 from pipelines.reports.units import human_unit, to_digits_of
 
 if TYPE_CHECKING:
-    import plotly.graph_objects as go
-
     from pipelines.fleet.fleet import Outcome
     from pipelines.fleet.montecarlo import Study
     from pipelines.fleet.store import Result
@@ -40,8 +39,10 @@ def fleet_html(outcome: Outcome, fleet: Sequence[Population], found: Sequence[Hi
     attention = units_of_interest(results, fleet, found)
     statuses = [r["status"] for r in results.values()]
     dates = [r["date"] for r in results.values() if r["date"] is not None]
-    return _render(
+    return page(
+        "pipelines.fleet",
         "fleet.html",
+        [_population_plot(p) for p in fleet],
         outcome=outcome,
         counts={status: statuses.count(status) for status in sorted(set(statuses))},
         units=len({r["unit"] for r in results.values()}),
@@ -53,39 +54,21 @@ def fleet_html(outcome: Outcome, fleet: Sequence[Population], found: Sequence[Hi
         failures=failures[:_MOST_LISTED],
         hidden={"attention": len(attention), "failures": len(failures)},
         parameters=[_parameter_row(p) for p in fleet],
-        plots=[_population_plot(p) for p in fleet],
     )
 
 
 def study_html(study: Study) -> str:
     """The page of a Monte Carlo study."""
     solvers = [solver for solver in study.solvers if study.estimates(solver)]
-    return _render(
+    return page(
+        "pipelines.fleet",
         "montecarlo.html",
+        [plot for solver in solvers for plot in (_nees_plot(study, solver), _errors_plot(study, solver))],
         study=study,
         finished=len(study.results),
         rows=[_consistency_row(study, solver) for solver in solvers],
         failures={solver: study.failures(solver) for solver in study.solvers},
         accuracies=[_accuracy_row(solver, *row) for solver in solvers for row in study.accuracies(solver).items()],
-        plots=[plot for solver in solvers for plot in (_nees_plot(study, solver), _errors_plot(study, solver))],
-    )
-
-
-def _render(template: str, plots: Sequence[Plot], **context: Any) -> str:
-    from plotly.offline import get_plotlyjs
-
-    divs = [
-        plot.figure.to_html(full_html=False, include_plotlyjs=False, config={"responsive": True, "displaylogo": False})
-        for plot in plots
-    ]
-    return (
-        environment("pipelines.fleet")
-        .get_template(template)
-        .render(
-            plots=[(plot.title, plot.caption, div) for plot, div in zip(plots, divs, strict=True)],
-            plotly_js=get_plotlyjs() if plots else "",
-            **context,
-        )
     )
 
 
@@ -123,54 +106,39 @@ def _component(component: Component | None, factor: float) -> str:
 
 def _population_plot(p: Population) -> Plot:
     unit, factor = readable(p)
-    out = figure(unit, x_title="date")
-    out.update_layout(
-        xaxis={"domain": [0.0, 0.8]}, xaxis2={"domain": [0.83, 1.0], "title": {"text": "recordings"}}, barmode="stack"
-    )
+    out = Figure(unit, "date", share=0.8, x_scale="datetime")
+    counts = Figure("", "recordings", share=0.2, y_shared=True)
     flagged = p.outlying | p.changed
     good = np.flatnonzero(~flagged)
     _add_recordings(out, p, good[thin(len(good))], factor, "recording", COLORS[0])
     edges = np.histogram_bin_edges(factor * p.values, bins=int(np.clip(2.0 * math.sqrt(len(p.values)), 10, _MOST_BARS)))
-    _add_counts(out, factor * p.values[good], edges, COLORS[0])
+    told = _add_counts(counts, factor * p.values[good], edges, "recording", COLORS[0])
     if flagged.any():
         _add_recordings(out, p, np.flatnonzero(flagged), factor, "outlying or changed", REJECTED)
-        _add_counts(out, factor * p.values[flagged], edges, REJECTED)
+        _add_counts(counts, factor * p.values[flagged], edges, "outlying or changed", REJECTED, told)
     if p.spread and p.control:
-        for bound, dash in ((p.spread.centre, "solid"), *((limit, "dash") for limit in p.control)):
-            out.add_hline(y=factor * bound, line={"color": "#888888", "width": 1, "dash": dash})
+        out.levels(factor * p.spread.centre, dash="solid")
+        out.levels(factor * np.array(p.control), dash="dashed")
     caption = f"{len(p.values)} recordings of {len(set(p.units))} units, {unit}, with one sigma each"
     limits = "; dashed are the control limits, three standard deviations about the centre" if p.spread else ""
-    return Plot(f"{p.name} ({p.method})", f"{caption}{limits}.", out)
+    return Plot(f"{p.name} ({p.method})", f"{caption}{limits}.", out, (counts,))
 
 
-def _add_recordings(out: go.Figure, p: Population, some: Any, factor: float, name: str, color: str) -> None:
-    out.add_scatter(
-        x=[iso(p.dates[i]) for i in some],
-        y=factor * p.values[some],
-        error_y={"array": factor * p.sigmas[some], "thickness": 1, "width": 0},
-        text=[f"{p.units[i]}<br>{_escaped(p.recordings[i])}" for i in some],
-        mode="markers",
-        name=name,
-        marker={"color": color, "size": 6},
-    )
+def _add_recordings(out: Figure, p: Population, some: Any, factor: float, name: str, color: str) -> None:
+    dates = milliseconds(iso(p.dates[i]) for i in some)
+    values, sigmas = factor * p.values[some], factor * p.sigmas[some]
+    out.segments(dates, values - sigmas, dates, values + sigmas, color, name)
+    shape: Shape = "x" if color == REJECTED else "circle"
+    out.points(dates, values, name, color, 6, shape=shape, texts=[f"{p.units[i]}, {p.recordings[i]}" for i in some])
 
 
-def _add_counts(out: go.Figure, values: Array, edges: Array, color: str) -> None:
-    """Bars that lie down beside the values, counted here: the page does not grow with the fleet."""
-    out.add_bar(
-        x=np.histogram(values, edges)[0],
-        y=0.5 * (edges[1:] + edges[:-1]),
-        width=np.diff(edges),
-        orientation="h",
-        xaxis="x2",
-        marker={"color": color},
-        showlegend=False,
-    )
-
-
-def _escaped(text: str) -> str:
-    """Plotly reads tags in what hovers; names of files are only text."""
-    return text.replace("&", "&amp;").replace("<", "&lt;")
+def _add_counts(
+    out: Figure, values: Array, edges: Array, name: str, color: str, below: NDArray[np.intp] | int = 0
+) -> NDArray[np.intp]:
+    """Bars that lie down beside the values, counted here: the page does not grow with the fleet. Returns their ends."""
+    ends = below + np.histogram(values, edges)[0]
+    out.boxes(np.broadcast_to(below, ends.shape), ends, edges[:-1], edges[1:], name, color)
+    return ends
 
 
 # -- studies
@@ -209,7 +177,7 @@ def _nees_plot(study: Study, solver: str) -> Plot:
     dof = study.nees(solver).dof
     # What lies far out is told by the table.
     top = 1.5 * max(float(np.quantile(values, 0.95)), dof + 3.0 * math.sqrt(2.0 * dof))
-    out = figure("runs", x_title="NEES")
+    out = Figure("runs", "NEES")
     _histogram(out, np.minimum(values, top), 0.0, top, lambda x: _chi_square_density(x, dof), f"chi-square of {dof:g}")
     return Plot(
         f"{solver}: NEES",
@@ -221,7 +189,7 @@ def _nees_plot(study: Study, solver: str) -> Plot:
 
 def _errors_plot(study: Study, solver: str) -> Plot:
     values = study.normalised(solver)
-    out = figure("errors", x_title="error, sigmas")
+    out = Figure("errors", "error, sigmas")
     _histogram(
         out,
         np.clip(values, -5.0, 5.0),
@@ -237,14 +205,13 @@ def _errors_plot(study: Study, solver: str) -> Plot:
     )
 
 
-def _histogram(out: go.Figure, values: Array, low: float, high: float, density: Any, name: str) -> None:
+def _histogram(out: Figure, values: Array, low: float, high: float, density: Any, name: str) -> None:
     bars = 30
     counts, edges = np.histogram(values, bins=bars, range=(low, high))
-    middles = 0.5 * (edges[1:] + edges[:-1])
-    out.add_bar(x=middles, y=counts, width=np.diff(edges), showlegend=False, marker={"color": COLORS[0]}, opacity=0.7)
+    out.boxes(edges[:-1], edges[1:], np.zeros(bars), counts, "runs" if low == 0.0 else "errors", COLORS[0], alpha=0.7)
     x = np.linspace(low, high, 300)[1:]
     expected = len(values) * (high - low) / bars * density(x)
-    out.add_scatter(x=x, y=expected, mode="lines", name=name, line={"color": COLORS[1]})
+    out.line(x, expected, name, COLORS[1], width=2.5)
 
 
 def _chi_square_density(x: Array, dof: float) -> Array:

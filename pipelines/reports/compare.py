@@ -10,15 +10,19 @@ import numpy as np
 
 from pipelines.graph.problem import Quantity
 from pipelines.judgement.halves import Halves
-from pipelines.reports.plots import COLORS, add_line, band, figure
+from pipelines.reports.figure import COLORS, Dash, Figure
 from pipelines.reports.result import Calibration, Plot, truth_errors
-from pipelines.reports.templating import environment
+from pipelines.reports.templating import page
 from pipelines.reports.units import human_unit, to_digits_of
 from pipelines.reports.whole import write_page
 
 FILE = "compare.html"
 # Lines of the solvers, the exact ones over the published.
-_STYLES = {"published": (COLORS[1], "dot"), "batch": (COLORS[6], "dash"), "incremental": (COLORS[0], None)}
+_STYLES: dict[str, tuple[str, Dash]] = {
+    "published": (COLORS[1], "dotted"),
+    "batch": (COLORS[2], "dashed"),
+    "incremental": (COLORS[0], "solid"),
+}
 
 
 @dataclass(frozen=True)
@@ -43,19 +47,17 @@ def compare_html(
 
     quantities = [q for q in calibrations[0].problem.quantities if q.prior_sigma != 0.0]
     plots = [*_differences(calibrations, quantities), *_convergence(calibrations, quantities)]
-    return (
-        environment("pipelines.reports")
-        .get_template("compare.html")
-        .render(
-            calibrations=calibrations,
-            recording=calibrations[0].recording,
-            method=calibrations[0].problem.method,
-            truth_known=calibrations[0].truth is not None,
-            rows=[(q.name, human_unit(q)[0], [_cell(c, calibrations, q) for c in calibrations]) for q in quantities],
-            halves=[_half(q, halves[q.name]) for q in quantities if q.name in halves],
-            predicted=predicted,
-            plots=[(plot.title, plot.caption, _div(plot, first=i == 0)) for i, plot in enumerate(plots)],
-        )
+    return page(
+        "pipelines.reports",
+        "compare.html",
+        plots,
+        calibrations=calibrations,
+        recording=calibrations[0].recording,
+        method=calibrations[0].problem.method,
+        truth_known=calibrations[0].truth is not None,
+        rows=[(q.name, human_unit(q)[0], [_cell(c, calibrations, q) for c in calibrations]) for q in quantities],
+        halves=[_half(q, halves[q.name]) for q in quantities if q.name in halves],
+        predicted=predicted,
     )
 
 
@@ -116,8 +118,9 @@ def _half(quantity: Quantity, halves: Halves) -> tuple[str, str, str, str, str]:
 def _differences(calibrations: Sequence[Calibration], quantities: Sequence[Quantity]) -> list[Plot]:
     """Errors, or differences from batch, in sigmas."""
     known = any(truth_errors(c) for c in calibrations)
-    out = figure("error, sigmas of each solver" if known else "less batch, sigmas of batch", x_title="")
-    for c in calibrations:
+    y_title = "error, sigmas of each solver" if known else "difference from batch, sigmas of batch"
+    out = Figure(y_title, "", 380, x_labels=tuple(q.name for q in quantities))
+    for k, c in enumerate(calibrations):
         errors = truth_errors(c)
         numbers = [
             (errors[q.name].error_sigmas if q.name in errors else None)
@@ -125,11 +128,10 @@ def _differences(calibrations: Sequence[Calibration], quantities: Sequence[Quant
             else _from_batch(c, calibrations, q.name)
             for q in quantities
         ]
-        color = _STYLES[c.estimate.solver][0]
-        out.add_bar(x=[q.name for q in quantities], y=numbers, name=c.estimate.solver, marker_color=color)
-    for bound in (-3.0, 3.0):
-        out.add_hline(y=bound, line={"color": "#888888", "width": 1, "dash": "dot"})
-    out.update_xaxes(tickangle=-60, automargin=True)
+        if any(number is not None for number in numbers):
+            heights = np.array([np.nan if number is None else number for number in numbers])
+            out.bars(heights, c.estimate.solver, _STYLES[c.estimate.solver][0], (k, len(calibrations)))
+    out.levels((-3.0, 3.0))
     what = (
         "Error of each solver in units of the sigma it states" if known else "Each solver less batch, sigmas of batch"
     )
@@ -141,7 +143,7 @@ def _convergence(calibrations: Sequence[Calibration], quantities: Sequence[Quant
     plots = []
     for q in quantities:
         unit, factor = human_unit(q)
-        out = figure(unit, height=260)
+        out = Figure(unit, height=260)
         reach: list[float] = []
         for c in calibrations:
             history, names = c.estimate.history, c.estimate.names
@@ -151,27 +153,21 @@ def _convergence(calibrations: Sequence[Calibration], quantities: Sequence[Quant
             i = names.index(q.name)
             if history is None:
                 value, sigma = (factor * float(x[i]) for x in (c.estimate.values, c.estimate.sigmas))
-                out.add_hline(y=value, line={"color": color, "width": 1, "dash": "dash"}, annotation_text="batch")
+                out.levels(value, color, dash, c.estimate.solver)
                 reach += [value - 4.0 * sigma, value + 4.0 * sigma]
                 continue
             values, sigmas = factor * history.values[:, i], factor * history.sigmas[:, i]
             if c.estimate.solver == "incremental":
-                band(out, history.time, values, sigmas, color)
-            add_line(out, history.time, values, c.estimate.solver, color, dash)
+                out.band(history.time, values - sigmas, values + sigmas, color, c.estimate.solver)
+            out.line(history.time, values, c.estimate.solver, color, dash)
             settled = history.time >= history.time[0] + 0.2 * np.ptp(history.time)
             reach += [float(values[settled].min()), float(values[settled].max())]
         truth = (calibrations[0].truth or {}).get(q.name)
         if isinstance(truth, int | float):
-            out.add_hline(y=factor * truth, line={"color": COLORS[2], "width": 1.5}, annotation_text="truth")
+            out.levels(factor * truth, COLORS[6], "solid", "truth")
             reach.append(factor * truth)
-        if reach and len(out.data):
+        if reach and out.marks:
             edge = 0.05 * (max(reach) - min(reach))
-            out.update_yaxes(range=[min(reach) - edge, max(reach) + edge])
+            out.y_range = (min(reach) - edge, max(reach) + edge)
             plots.append(Plot(f"{q.name} over time", f"{unit}; the band is one sigma of incremental.", out))
     return plots
-
-
-def _div(plot: Plot, first: bool) -> str:
-    return str(
-        plot.figure.to_html(full_html=False, include_plotlyjs=first, config={"responsive": True, "displaylogo": False})
-    )

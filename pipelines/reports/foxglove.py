@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from itertools import cycle
 from typing import Any
 
-from pipelines.reports.plots import COLORS, variables
+from pipelines.reports.figure import COLORS, PALETTE
+from pipelines.reports.plots import variables
 from pipelines.reports.result import Calibration
 
 _PLOT = {
@@ -31,7 +32,7 @@ def foxglove_layout(calibration: Calibration) -> str:
                 "value": f"/estimate/{q.name}.{field}",
                 "label": q.name if field == "value" else f"{q.name} {field}",
                 "enabled": True,
-                "color": color,
+                "color": PALETTE[color][0],
                 "lineSize": 2 if field == "value" else 0.5,
                 "timestampMethod": "headerStamp",
             }

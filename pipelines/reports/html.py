@@ -14,7 +14,7 @@ from pipelines.judgement.observability import by_advice
 from pipelines.reports.budget import Limit, limits
 from pipelines.reports.plots import common_plots
 from pipelines.reports.result import Calibration, Plot, Table, quantities_of, truth_errors
-from pipelines.reports.templating import environment
+from pipelines.reports.templating import environment, page
 from pipelines.reports.units import human_unit, to_digits_of
 
 # Beyond so many sigmas of its prior a number says nothing.
@@ -52,31 +52,26 @@ class _Exact:
 
 def report_html(calibration: Calibration) -> str:
     """The report as one HTML text."""
-    from plotly.offline import get_plotlyjs
-
     own = list(calibration.plots(calibration)) if calibration.plots else []
     plots = [*(each for each in own if isinstance(each, Plot)), *common_plots(calibration)]
     facts, rows = calibration.facts, _rows(calibration)
     found = limits(calibration.budget or {}, calibration.problem.quantities)
-    return (
-        environment("pipelines.reports")
-        .get_template("report.html")
-        .render(
-            c=calibration,
-            by_advice=by_advice,
-            method=calibration.method.title,
-            start=datetime.datetime.fromtimestamp(facts.epoch_ns // 1_000_000_000, datetime.UTC),
-            rows=[row for row in rows if not row.assumed],
-            assumptions=[row for row in rows if row.assumed],
-            noises=calibration.noises,
-            limits=found,
-            advised=_short_of(calibration, found),
-            exact=_exact(calibration),
-            formulas=[formula.text for formula in calibration.formulas],
-            tables=[each for each in own if isinstance(each, Table)],
-            plots=[(plot.title, plot.caption, _div(plot, i)) for i, plot in enumerate(plots)],
-            plotly_js=get_plotlyjs() if plots else "",
-        )
+    return page(
+        "pipelines.reports",
+        "report.html",
+        plots,
+        c=calibration,
+        by_advice=by_advice,
+        method=calibration.method.title,
+        start=datetime.datetime.fromtimestamp(facts.epoch_ns // 1_000_000_000, datetime.UTC),
+        rows=[row for row in rows if not row.assumed],
+        assumptions=[row for row in rows if row.assumed],
+        noises=calibration.noises,
+        limits=found,
+        advised=_short_of(calibration, found),
+        exact=_exact(calibration),
+        formulas=[formula.text for formula in calibration.formulas],
+        tables=[each for each in own if isinstance(each, Table)],
     )
 
 
@@ -142,13 +137,3 @@ def _rows(calibration: Calibration) -> list[_Row]:
             )
         )
     return rows
-
-
-def _div(plot: Plot, number: int) -> str:
-    """The figure as a part of a page that already has plotly.js."""
-    return plot.figure.to_html(
-        full_html=False,
-        include_plotlyjs=False,
-        div_id=f"plot{number}",
-        config={"responsive": True, "displaylogo": False, "modeBarButtonsToRemove": ["lasso2d", "select2d"]},
-    )

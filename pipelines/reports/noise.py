@@ -9,20 +9,17 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pipelines.judgement.allan import allan_variance
 from pipelines.judgement.noise_fit import Coefficient
 from pipelines.noise import NoiseStudy, SensorNoise
-from pipelines.reports.plots import COLORS, figure
-from pipelines.reports.result import software_versions
-from pipelines.reports.templating import environment
+from pipelines.reports.figure import COLORS, Figure
+from pipelines.reports.result import Plot, software_versions
+from pipelines.reports.templating import page
 from pipelines.reports.whole import write_whole
-
-if TYPE_CHECKING:
-    import plotly.graph_objects as go
 
 FILES = ("noise.html", "noise.json")
 
@@ -162,14 +159,14 @@ def noise_json(study: NoiseStudy) -> str:
 
 def noise_html(study: NoiseStudy) -> str:
     """The page as one HTML text that opens offline."""
-    sensors = [
-        (title(sensor), list(sensor.axes), rows(sensor), remarks(sensor), _div(sensor, first=i == 0))
-        for i, sensor in enumerate(study.sensors)
-    ]
-    return (
-        environment("pipelines.reports")
-        .get_template("noise.html")
-        .render(recording=study.recording, section=section(study)[1], sensors=sensors, notes=study.notes)
+    return page(
+        "pipelines.reports",
+        "noise.html",
+        [_plot(sensor) for sensor in study.sensors],
+        recording=study.recording,
+        section=section(study)[1],
+        sensors=[(list(sensor.axes), rows(sensor), remarks(sensor)) for sensor in study.sensors],
+        notes=study.notes,
     )
 
 
@@ -284,31 +281,16 @@ def _sensor_json(sensor: SensorNoise) -> dict[str, Any]:
     }
 
 
-def _plot(sensor: SensorNoise) -> go.Figure:
+def _plot(sensor: SensorNoise) -> Plot:
     """Allan deviation of each axis with its interval, and the model that was fitted, dotted."""
-    out = figure(f"Allan deviation, {sensor.unit}", height=420, x_title="averaging time, s")
+    out = Figure(f"Allan deviation, {sensor.unit}", "averaging time, s", 420, x_scale="log", y_scale="log")
     for (axis, noise), color in zip(sensor.axes.items(), cycle(COLORS)):
         tau = noise.curve.tau
         # On a logarithmic axis a bound at infinity has no place.
         high = np.where(np.isfinite(noise.high), noise.high, 10.0 * noise.curve.deviation)
-        out.add_scatter(
-            x=np.concatenate([tau, tau[::-1]]),
-            y=np.concatenate([noise.low, high[::-1]]),
-            fill="toself",
-            fillcolor=color,
-            opacity=0.18,
-            line={"width": 0},
-            hoverinfo="skip",
-            showlegend=False,
-        )
-        out.add_scatter(x=tau, y=noise.curve.deviation, mode="lines+markers", name=axis, line={"color": color})
-        model = np.sqrt(allan_variance(tau, noise.fit.squares))
-        out.add_scatter(x=tau, y=model, mode="lines", line={"color": color, "dash": "dot"}, showlegend=False)
-    out.update_xaxes(type="log", exponentformat="power")
-    out.update_yaxes(type="log", exponentformat="power")
-    return out
-
-
-def _div(sensor: SensorNoise, first: bool) -> str:
-    config = {"responsive": True, "displaylogo": False}
-    return str(_plot(sensor).to_html(full_html=False, include_plotlyjs=first, config=config))
+        out.band(tau, noise.low, high, color, axis)
+        out.line(tau, noise.curve.deviation, axis, color)
+        out.points(tau, noise.curve.deviation, axis, color)
+        out.line(tau, np.sqrt(allan_variance(tau, noise.fit.squares)), axis, color, "dotted", shown=False)
+    caption = "Overlapping Allan deviation with its 95 % interval; dotted what the coefficients give."
+    return Plot(title(sensor), caption, out)

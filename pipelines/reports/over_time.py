@@ -7,10 +7,12 @@ import math
 from collections.abc import Sequence
 from itertools import cycle
 
+import numpy as np
+
 from pipelines.graph.assumptions import kind
 from pipelines.graph.problem import Quantity
 from pipelines.judgement.changes import Change, Changes
-from pipelines.reports.plots import COLORS, figure
+from pipelines.reports.figure import COLORS, Figure, milliseconds
 from pipelines.reports.result import Calibration, PartResult, Plot, Table
 from pipelines.reports.units import human_unit, to_digits_of
 
@@ -110,7 +112,7 @@ def _figures(calibration: Calibration) -> list[Plot]:
     for which in dict.fromkeys(map(kind, known)):
         own = [q for name, q in known.items() if kind(name) == which]
         unit, factor = human_unit(own[0])
-        out = figure(f"{which}, {unit.removeprefix('1')}", x_title="date of the recording")
+        out = Figure(f"{which}, {unit.removeprefix('1')}", "date of the recording", x_scale="datetime")
         for q, color in zip(own, cycle(COLORS), strict=False):
             _add(out, calibration, q, factor, color)
         caption = (
@@ -121,25 +123,19 @@ def _figures(calibration: Calibration) -> list[Plot]:
     return plots
 
 
-def _add(out: object, calibration: Calibration, q: Quantity, factor: float, color: str) -> None:
-    import plotly.graph_objects as go
-
-    assert isinstance(out, go.Figure)
+def _add(out: Figure, calibration: Calibration, q: Quantity, factor: float, color: str) -> None:
     parts, joint = calibration.recordings, calibration.parameters[q.name]
     told = [(p.start, n) for p in parts for n in p.alone if n.name == q.name]
-    out.add_scatter(
-        x=[start for start, _ in told],
-        y=[factor * (n.value - joint.value) for _, n in told],
-        error_y={"type": "data", "array": [2.0 * factor * n.sigma for _, n in told], "thickness": 1},
-        mode="markers",
-        name=q.name,
-        marker={"color": color, "size": 7},
-    )
+    dates = milliseconds(start for start, _ in told)
+    values = factor * np.array([n.value - joint.value for _, n in told])
+    spread = 2.0 * factor * np.array([n.sigma for _, n in told])
+    out.segments(dates, values - spread, dates, values + spread, color, q.name)
+    out.points(dates, values, q.name, color, 7)
     band = 2.0 * factor * joint.sigma
-    out.add_hrect(y0=-band, y1=band, fillcolor=color, opacity=0.12, line_width=0)
-    for step in calibration.changes.found if calibration.changes else ():
-        if step.name == q.name:
-            out.add_vline(x=parts[step.after + 1].start, line={"color": color, "dash": "dash", "width": 1})
+    out.zone(-band, band, color, q.name)
+    steps = [step for step in (calibration.changes.found if calibration.changes else ()) if step.name == q.name]
+    if steps:
+        out.moments(milliseconds(parts[step.after + 1].start for step in steps), color, name=q.name)
 
 
 def what(step: Change) -> str:

@@ -4,104 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import cycle
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.graph.problem import Array, History, Quantity, Residuals
+from pipelines.reports.figure import COLORS, PALE, REJECTED, Figure
 from pipelines.reports.result import Calibration, Plot, quantities_of
 from pipelines.reports.units import human_unit
 
-if TYPE_CHECKING:
-    import plotly.graph_objects as go
-
-# Okabe, Ito: told apart by the colour-blind too. The last is kept for what was rejected.
-COLORS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#8a7300", "#555555", "#7f3fbf", "#a0522d")
-REJECTED = "#d11d1d"
-
-_MOST_POINTS = 3000
 # Numbers are written into the correlation map up to this many parameters.
 _MOST_LABELLED = 12
 # Ellipses are drawn of so many pairs that are correlated at least so much.
 _MOST_ELLIPSES, _STRONG = 5, 0.5
 # The estimates' axis shows what came after this part of the recording.
 _SETTLED = 0.1
-
-
-# A template of plotly's own is copied and checked in every figure, at 25 ms and 7 kB each; this is what is used of one.
-_AXIS = {
-    "gridcolor": "#ebf0f8",
-    "linecolor": "#ebf0f8",
-    "zerolinecolor": "#ebf0f8",
-    "zerolinewidth": 2,
-    "ticks": "",
-    "automargin": True,
-    "title": {"standoff": 15},
-}
-_SPACE = {"backgroundcolor": "white", "gridcolor": "#dfe8f3", "linecolor": "#ebf0f8", "zerolinecolor": "#ebf0f8"}
-_STYLE = {
-    "layout": {
-        "autotypenumbers": "strict",
-        "font": {"color": "#2a3f5f"},
-        "hoverlabel": {"align": "left"},
-        "hovermode": "closest",
-        "paper_bgcolor": "white",
-        "plot_bgcolor": "white",
-        "scene": {"xaxis": _SPACE, "yaxis": _SPACE, "zaxis": _SPACE},
-        "xaxis": _AXIS,
-        "yaxis": _AXIS,
-    }
-}
-
-
-def figure(y_title: str, height: int = 320, x_title: str = "time, s") -> go.Figure:
-    """An empty figure in the report's style."""
-    import plotly.graph_objects as go
-
-    return go.Figure(
-        layout={
-            "template": _STYLE,
-            "height": height,
-            "margin": {"l": 56, "r": 12, "t": 12, "b": 44},
-            "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0.0},
-            "font": {"family": "system-ui, sans-serif", "size": 13},
-            "xaxis": {"title": {"text": x_title}},
-            "yaxis": {"title": {"text": y_title}},
-        }
-    )
-
-
-def thin(count: int) -> slice:
-    """Every n-th of so many points, so that no trace has more than a few thousand."""
-    return slice(None, None, max(1, -(-count // _MOST_POINTS)))
-
-
-def add_points(out: go.Figure, time: Array, values: Array, name: str, color: str, size: int = 4) -> None:
-    """Scatter values (n,) over time, thinned."""
-    some = thin(len(time))
-    out.add_scatter(
-        x=np.round(time[some], 4),
-        y=values[some].astype(np.float32),
-        mode="markers",
-        name=name,
-        marker={"color": color, "size": size},
-    )
-
-
-def add_line(
-    out: go.Figure, time: Array, values: Array, name: str, color: str, dash: str | None = None, shown: bool = True
-) -> None:
-    """A line over time, thinned."""
-    some = thin(len(time))
-    out.add_scatter(
-        x=np.round(time[some], 4),
-        y=values[some].astype(np.float32),
-        mode="lines",
-        name=name,
-        showlegend=shown,
-        line={"color": color, "width": 1.5, "dash": dash},
-    )
 
 
 def common_plots(calibration: Calibration) -> list[Plot]:
@@ -122,18 +39,17 @@ def common_plots(calibration: Calibration) -> list[Plot]:
 
 def _residuals(family: str, residuals: Residuals, innovations: bool) -> Plot:
     what = "innovation" if innovations else "residual"
-    out = figure(f"{what}, sigmas")
+    out = Figure(f"{what}, sigmas")
     used = residuals.used
     width = residuals.whitened.shape[1]
     for i, color in zip(range(width), cycle(COLORS)):
-        add_points(out, residuals.time[used], residuals.whitened[used, i], f"component {i + 1}", color, 3)
+        out.points(residuals.time[used], residuals.whitened[used, i], f"component {i + 1}", color, 3)
     if not used.all():
         low, high = _view(residuals.whitened[used])
         far = np.minimum(np.linalg.norm(residuals.whitened[~used], axis=1), 0.97 * high)
-        add_points(out, residuals.time[~used], far, "rejected (length)", REJECTED, 5)
-        out.update_yaxes(range=[low, high])
-    for bound in (-3.0, 3.0):
-        out.add_hline(y=bound, line={"color": "#888888", "width": 1, "dash": "dot"})
+        out.points(residuals.time[~used], far, "rejected (length)", REJECTED, 6, shape="x")
+        out.y_range = (low, high)
+    out.levels((-3.0, 3.0))
     share = float((np.abs(residuals.whitened[used]) > 3.0).mean()) if used.any() else 0.0
     return Plot(
         f"{what.capitalize()}s of {family}",
@@ -155,10 +71,10 @@ def _squares(family: str, residuals: Residuals) -> Plot:
     square = (rows**2).sum(axis=1)
     width = max(1, min(100, len(square) // 10))
     mean = np.convolve(square, np.full(width, 1.0 / width), mode="valid")
-    out = figure("innovation squared (NIS)")
-    add_points(out, time, square, "NIS", "#9ab6cc", 3)
-    add_line(out, time[width - 1 :], mean, f"mean of {width}", COLORS[0])
-    out.add_hline(y=rows.shape[1], line={"color": "#888888", "width": 1, "dash": "dot"})
+    out = Figure("innovation squared (NIS)")
+    out.points(time, square, "NIS", PALE, 3)
+    out.line(time[width - 1 :], mean, f"mean of {width}", COLORS[0])
+    out.levels(rows.shape[1])
     return Plot(
         f"Innovations squared of {family}",
         f"The mean should stay at {rows.shape[1]} (dotted): above it noise is larger than reckoned with or the model "
@@ -183,17 +99,17 @@ def _histories(calibration: Calibration, history: History) -> list[Plot]:
     plots = []
     for title, _, members in variables(calibration):
         unit, factor = human_unit(members[0])
-        out = figure(unit)
+        out = Figure(unit)
         settled = history.time >= history.time[0] + _SETTLED * np.ptp(history.time)
         reach, shown = [], set()
         for q, color in zip(members, cycle(COLORS)):
             values = factor * history.values[:, column[q.name]]
             sigmas = factor * history.sigmas[:, column[q.name]]
-            band(out, history.time, values, sigmas, color)
-            add_line(out, history.time, values, q.name, color)
+            out.band(history.time, values - sigmas, values + sigmas, color, q.name)
+            out.line(history.time, values, q.name, color)
             shown |= _others(out, calibration, q.name, factor, color)
             reach += [(values - 2.0 * sigmas)[settled].min(), (values + 2.0 * sigmas)[settled].max()]
-        out.update_yaxes(range=[min(reach), max(reach)])
+        out.y_range = (min(reach), max(reach))
         plots.append(
             Plot(
                 f"{title} over time",
@@ -214,22 +130,22 @@ _OTHERS = (
 )
 
 
-def _others(out: go.Figure, calibration: Calibration, name: str, factor: float, color: str) -> set[str]:
+def _others(out: Figure, calibration: Calibration, name: str, factor: float, color: str) -> set[str]:
     """Draws what else is known of a parameter over time; returns which of _OTHERS that was."""
     estimate, beside = calibration.estimate, calibration.beside() if calibration.beside else None
     published, smooth, truth = _OTHERS
     shown = set()
     if beside is not None and beside.history is not None and name in beside.names:
         values = factor * beside.history.values[:, beside.names.index(name)]
-        add_line(out, beside.history.time, values, name, color, "dot", shown=False)
+        out.line(beside.history.time, values, name, color, "dotted", shown=False)
         shown.add(published)
     moving = estimate.smoothed
     if moving is not None and np.ptp(values := factor * moving.values[:, estimate.names.index(name)]) > 0.0:
-        add_line(out, moving.time, values, name, color, "dashdot", shown=False)
+        out.line(moving.time, values, name, color, "dotdash", shown=False)
         shown.add(smooth)
     known = (calibration.truth or {}).get(name)
     if isinstance(known, int | float):
-        out.add_hline(y=factor * known, line={"color": color, "width": 1, "dash": "dash"})
+        out.levels(factor * known, color, "dashed")
         shown.add(truth)
     return shown
 
@@ -237,34 +153,16 @@ def _others(out: go.Figure, calibration: Calibration, name: str, factor: float, 
 def _learning(calibration: Calibration, history: History) -> Plot:
     """Sigmas over what is required, as they fell."""
     column = {name: i for i, name in enumerate(calibration.estimate.names)}
-    out = figure("sigma / required")
+    out = Figure("sigma / required", y_scale="log")
     require = {q.name: q.require for q in calibration.problem.quantities}
     for name, color in zip(calibration.learning, cycle(COLORS)):
-        add_line(out, history.time, history.sigmas[:, column[name]] / require[name], name, color)
-    out.add_hline(y=1.0, line={"color": "#888888", "width": 1, "dash": "dot"})
-    out.update_yaxes(type="log", exponentformat="power")
+        out.line(history.time, history.sigmas[:, column[name]] / require[name], name, color)
+    out.levels(1.0)
     return Plot(
         "What was known when",
         "Sigma of each parameter over the one required, as the recording went on; below the dotted line it is as "
         "accurate as required. Where a line falls steeply the motion said much.",
         out,
-    )
-
-
-def band(out: go.Figure, time: Array, values: Array, sigmas: Array, color: str) -> None:
-    """A band of one sigma around values over time, thinned."""
-    some = thin(2 * len(time))
-    x = np.concatenate([time[some], time[some][::-1]])
-    y = np.concatenate([(values + sigmas)[some], (values - sigmas)[some][::-1]])
-    out.add_scatter(
-        x=np.round(x, 4),
-        y=y.astype(np.float32),
-        fill="toself",
-        fillcolor=color,
-        opacity=0.18,
-        line={"width": 0},
-        hoverinfo="skip",
-        showlegend=False,
     )
 
 
@@ -279,8 +177,6 @@ def _common_name(names: Sequence[str]) -> str:
 
 
 def _correlation(calibration: Calibration) -> Plot | None:
-    import plotly.graph_objects as go
-
     quantities = quantities_of(calibration.problem, calibration.estimate)
     sigmas = calibration.assessment.sigmas
     shown: NDArray[np.intp] = np.flatnonzero(sigmas > 0.0)
@@ -288,24 +184,11 @@ def _correlation(calibration: Calibration) -> Plot | None:
         return None
     covariance = calibration.assessment.covariance[np.ix_(shown, shown)]
     correlation = np.clip(covariance / np.outer(sigmas[shown], sigmas[shown]), -1.0, 1.0)
-    names = [quantities[i].name for i in shown]
-    out = figure("", height=max(320, 130 + 24 * len(names)), x_title="")
-    out.add_trace(
-        go.Heatmap(
-            z=correlation.astype(np.float32),
-            x=names,
-            y=names,
-            zmin=-1.0,
-            zmax=1.0,
-            colorscale="RdBu",
-            reversescale=True,
-            showscale=False,
-            texttemplate="%{z:.1f}" if len(names) <= _MOST_LABELLED else None,
-            hovertemplate="%{y}, %{x}: %{z:.3f}<extra></extra>",
-        )
-    )
-    out.update_xaxes(tickangle=-60, dtick=1, automargin=True, showgrid=False)
-    out.update_yaxes(autorange="reversed", dtick=1, automargin=True, showgrid=False)
+    names = tuple(quantities[i].name for i in shown)
+    ends = (-0.5, len(names) - 0.5)
+    out = Figure("", "", max(320, 130 + 24 * len(names)), x_labels=names, y_labels=names, x_range=ends)
+    out.y_range = ends[::-1]
+    out.heat(correlation, numbers=len(names) <= _MOST_LABELLED)
     return Plot(
         "Correlation of the parameters",
         "Red +1, blue -1. Near either two parameters trade against each other: their errors are not independent.",
@@ -326,20 +209,13 @@ def _ellipses(calibration: Calibration) -> Plot | None:
     strong = sorted((pair for pair in pairs if abs(pair[0]) > _STRONG), key=lambda pair: -abs(pair[0]))[:_MOST_ELLIPSES]
     if not strong:
         return None
-    out = figure("error of the second, sigmas", height=380, x_title="error of the first, sigmas")
+    out = Figure("error of the second, sigmas", "error of the first, sigmas", 380, square=True)
     angle = np.linspace(0.0, 2.0 * np.pi, 73)
     circle = np.stack([np.cos(angle), np.sin(angle)])
     for (correlation, i, j), color in zip(strong, cycle(COLORS)):
         correlation = float(np.clip(correlation, -1.0, 1.0))
         x, y = np.array([[1.0, 0.0], [correlation, np.sqrt(1.0 - correlation**2)]]) @ circle
-        out.add_scatter(
-            x=np.round(x, 4),
-            y=np.round(y, 4),
-            mode="lines",
-            name=f"{quantities[j].name}, {quantities[i].name}: {correlation:+.2f}",
-            line={"color": color, "width": 1.5},
-        )
-    out.update_yaxes(scaleanchor="x")
+        out.line(x, y, f"{quantities[j].name}, {quantities[i].name}: {correlation:+.2f}", color)
     return Plot(
         "Parameters that trade against each other",
         "One-sigma ellipses of the most correlated pairs: the thinner, the more the error of one is that of the other.",

@@ -27,11 +27,10 @@ from pipelines.judgement.self_check import SelfCheck
 from pipelines.judgement.stability import Stability
 from pipelines.recording.faults import CLIPPED
 from pipelines.recording.info import SessionFacts
+from pipelines.reports.figure import Figure
 from pipelines.settings import Config
 
 if TYPE_CHECKING:
-    import plotly.graph_objects
-
     from pipelines.methods import Method
     from pipelines.methods.formula import Formula
 
@@ -47,12 +46,14 @@ class Plot:
     Attributes:
         title: in a few words.
         caption: what is seen, units included.
-        figure: a plotly figure.
+        figure: it.
+        beside: figures that belong to it, beside it or below.
     """
 
     title: str
     caption: str
-    figure: plotly.graph_objects.Figure
+    figure: Figure
+    beside: tuple[Figure, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from pipelines.graph.problem import Array
-from pipelines.reports.plots import COLORS, figure
-
-if TYPE_CHECKING:
-    import plotly.graph_objects as go
+from pipelines.reports.figure import COLORS, FAINT, Figure
 
 # Directions farther than this from all there are, rad, are gaps; the second ones wide.
 _GAPS = np.deg2rad([30.0, 45.0])
-_GAP_COLORS = ("#f6dfae", "#e69f00")
+_GAP_COLORS = ("gap", COLORS[1])
 _DIRECTIONS = 1500
 
 
@@ -39,7 +34,7 @@ def share_near(directions: Array) -> float:
     return float(np.mean(_distances(directions) <= _GAPS[0]))
 
 
-def sphere_map(directions: Array, names: list[str], what: str) -> go.Figure:
+def sphere_map(directions: Array, names: list[str], what: str) -> Figure:
     """A map with unit vectors (n, 3) of the body.
 
     Args:
@@ -48,47 +43,20 @@ def sphere_map(directions: Array, names: list[str], what: str) -> go.Figure:
         what: they are, in a word.
     """
     away = _distances(directions)
-    out = figure("", height=420, x_title="")
+    out = Figure("", "", 420, square=True, bare=True)
     latitude = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 61)
     for longitude in (-np.pi, np.pi):
         at_edge = 0.999999 * longitude
         across = np.cos(latitude)
         edge = _map(np.stack([across * np.cos(at_edge), across * np.sin(at_edge), np.sin(latitude)], axis=1))
-        out.add_scatter(
-            x=edge[:, 0], y=edge[:, 1], mode="lines", line={"color": "#c3ccd4"}, hoverinfo="skip", showlegend=False
-        )
+        out.line(edge[:, 0], edge[:, 1], color=FAINT)
     for low, high, color in zip(_GAPS, (*_GAPS[1:], np.inf), _GAP_COLORS, strict=True):
         some = _map(_SPHERE[(away > low) & (away <= high)])
-        out.add_scatter(
-            x=some[:, 0],
-            y=some[:, 1],
-            mode="markers",
-            hoverinfo="skip",
-            name=f"no {what} within {np.rad2deg(low):.0f} deg",
-            marker={"color": color, "size": 6},
-        )
+        out.points(some[:, 0], some[:, 1], f"no {what} within {np.rad2deg(low):.0f} deg", color, 6)
     at = _map(directions)
-    out.add_scatter(
-        x=at[:, 0],
-        y=at[:, 1],
-        mode="markers",
-        name=f"{what}s",
-        text=names,
-        hoverinfo="text",
-        marker={"color": COLORS[0], "size": 9, "line": {"color": "white", "width": 1}},
-    )
+    out.points(at[:, 0], at[:, 1], f"{what}s", COLORS[0], 9, texts=names)
     where = _map(np.vstack([np.eye(3), -np.eye(3)]))
-    out.add_scatter(
-        x=where[:, 0],
-        y=where[:, 1],
-        mode="text",
-        text=["+x", "+y", "+z", "-x", "-y", "-z"],
-        textfont={"size": 14, "color": "#1b2530"},
-        hoverinfo="skip",
-        showlegend=False,
-    )
-    out.update_xaxes(visible=False, range=[-3.0, 3.0])
-    out.update_yaxes(visible=False, scaleanchor="x", range=[-1.6, 1.6])
+    out.words(where[:, 0], where[:, 1], ("+x", "+y", "+z", "-x", "-y", "-z"))
     return out
 
 

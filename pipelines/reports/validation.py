@@ -9,8 +9,9 @@ import numpy as np
 
 from pipelines.judgement.validation import Validation, peak, rms
 from pipelines.reports.calibration import SavedCalibration
-from pipelines.reports.plots import COLORS, add_points, figure
-from pipelines.reports.templating import environment
+from pipelines.reports.figure import BEFORE, COLORS, Figure
+from pipelines.reports.result import Plot
+from pipelines.reports.templating import page
 
 # Angles of less than this, rad, are read in arc seconds.
 _FINE = 2e-4
@@ -61,30 +62,30 @@ def validation_html(
         sentence: that in words.
         parameters: name, change, sigma, from what on it would be noticed, unit.
     """
-    return (
-        environment("pipelines.reports")
-        .get_template("validation.html")
-        .render(
-            c=calibration,
-            recording=recording,
-            verdict=verdict,
-            sentence=sentence,
-            parameters=parameters,
-            rows=rows,
-            plots=[(v.name, v.note, _plot(v, first=i == 0)) for i, v in enumerate(validations)],
-        )
+    return page(
+        "pipelines.reports",
+        "validation.html",
+        [_plot(v) for v in validations],
+        c=calibration,
+        recording=recording,
+        verdict=verdict,
+        sentence=sentence,
+        parameters=parameters,
+        rows=rows,
     )
 
 
-def _plot(validation: Validation, first: bool) -> str:
+def _plot(validation: Validation) -> Plot:
     unit, factor = _readable(validation)
-    out = figure(f"error, {unit}")
+    out = Figure(f"error, {unit}")
     for name, errors, color in (
-        ("before", validation.before, COLORS[1]),
+        ("before", validation.before, BEFORE),
         ("after", validation.after, COLORS[0]),
     ):
-        add_points(out, validation.time, factor * np.linalg.norm(errors, axis=1), name, color, 3)
-    return str(out.to_html(full_html=False, include_plotlyjs=first, config={"responsive": True, "displaylogo": False}))
+        out.points(validation.time, factor * np.linalg.norm(errors, axis=1), name, color, 3)
+    said = "Length of the error over time, before and after compensation."
+    note = f" {validation.note[:1].upper()}{validation.note[1:]}." if validation.note else ""
+    return Plot(f"{validation.name[:1].upper()}{validation.name[1:]}", said + note, out)
 
 
 def _readable(validation: Validation) -> tuple[str, float]:

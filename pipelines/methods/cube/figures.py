@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,16 +16,12 @@ from pipelines.methods.cube.data import CubeData, local_field, nominal
 from pipelines.methods.cube.poses import StaticPoses, static_poses, turn
 from pipelines.methods.cube.tables import NAMES, cube_tables
 from pipelines.methods.cube.topics import CubeConfig
-from pipelines.reports.plots import COLORS, add_points, figure, thin
+from pipelines.reports.figure import BEFORE, COLORS, FAINT, Figure, thin
 from pipelines.reports.result import Calibration, Plot, Table
 from pipelines.settings import Config
 
-if TYPE_CHECKING:
-    import plotly.graph_objects as go
-
 # Unit that people read an error in, and what to multiply its SI number by.
 _ERRORS = {"accel": ("mg", 1e3 / 9.80665), "gyro": ("deg", np.rad2deg(1.0)), "mag": ("nT", 1e9)}
-_BEFORE, _AFTER = "#8a949e", COLORS[0]
 
 
 def cube_plots(data: CubeData, calibration: Calibration) -> list[Plot | Table]:
@@ -95,10 +90,9 @@ def _turns(
 def _before_and_after(name: str, time: Array, before: Array, after: Array) -> Plot:
     unit, factor = _ERRORS[name]
     lengths = [factor * np.linalg.norm(errors, axis=1) for errors in (before, after)]
-    out = figure(f"error, {unit}")
-    for words, length, color in zip(("uncalibrated", "calibrated"), lengths, (_BEFORE, _AFTER), strict=True):
-        add_points(out, time, np.maximum(length, 1e-12), words, color, 7)
-    out.update_yaxes(type="log", exponentformat="power", dtick=1)
+    out = Figure(f"error, {unit}", y_scale="log")
+    for words, length, color in zip(("uncalibrated", "calibrated"), lengths, (BEFORE, COLORS[0]), strict=True):
+        out.points(time, np.maximum(length, 1e-12), words, color, 7)
     rms = [float(np.sqrt((length**2).mean())) for length in lengths]
     what = "Rotation over each turn, against the attitudes found" if name == "gyro" else "Mean of each static pose"
     against = "" if name == "gyro" else " against what it should say at the attitude found"
@@ -127,44 +121,33 @@ def _sphere(
     assert means is not None
     good = np.isfinite(means).all(axis=1)
     vectors = [v / strength for v in (means[good], calibrated(name, means[good], config, values))]
-    out = figure("", height=660)
-    out.set_subplots(2, 2, specs=[[{}, {}], [{"colspan": 2}, None]], row_heights=[0.68, 0.32], vertical_spacing=0.14)
     angle = np.linspace(0.0, 2.0 * np.pi, 91)
-    for column, (i, j) in enumerate(((0, 1), (0, 2)), start=1):
-        circle = {"mode": "lines", "line": {"color": "#c3ccd4", "width": 1}, "hoverinfo": "skip", "showlegend": False}
-        out.add_scatter(x=np.cos(angle), y=np.sin(angle), row=1, col=column, **circle)
+    views = []
+    for i, j in ((0, 1), (0, 2)):
+        view = Figure("xyz"[j], "xyz"[i], 400, 0.5, square=True)
+        view.line(np.cos(angle), np.sin(angle), color=FAINT)
         if name == "mag" and data.mag is not None:
             moving = calibrated(name, nominal(data.mag, config.section(CubeConfig).raw.mag), config, values) / strength
             some = moving[thin(3 * len(moving))]
-            cloud = {"mode": "markers", "marker": {"color": "#9cc3de", "size": 3}, "name": "calibrated, all samples"}
-            out.add_scatter(x=some[:, i], y=some[:, j], row=1, col=column, showlegend=column == 1, **cloud)
-        _add_both(out, [v[:, i] for v in vectors], [v[:, j] for v in vectors], 1, column)
-        square = {"range": [-1.35, 1.35], "dtick": 1, "zeroline": False}
-        out.update_xaxes(title_text="xyz"[i], constrain="domain", row=1, col=column, **square)
-        out.update_yaxes(title_text="xyz"[j], scaleanchor=f"x{column}", row=1, col=column, **square)
+            view.points(some[:, i], some[:, j], "calibrated, all samples", "series5", 3)
+        _add_both(view, [v[:, i] for v in vectors], [v[:, j] for v in vectors])
+        views.append(view)
     time = poses.span[good].mean(axis=1)
     misses = [100.0 * (np.linalg.norm(v, axis=1) - 1.0) for v in vectors]
-    _add_both(out, [time, time], misses, 2, 1, legend=False)
-    out.add_hline(y=0.0, line={"color": "#c3ccd4", "width": 1}, row=2, col=1)
-    out.update_xaxes(title_text="time, s", row=2, col=1)
-    out.update_yaxes(title_text="length, % off", row=2, col=1)
+    lengths = Figure("length, % off", height=240)
+    _add_both(lengths, [time, time], misses)
+    lengths.levels(0.0, FAINT, "solid")
     rms = [float(np.sqrt((miss**2).mean())) for miss in misses]
     return Plot(
         f"Sphere of the {NAMES[name]}",
         f"Means of the static poses over the strength they should have, seen along z and along y, and below how far "
         f"their lengths are off: {rms[0]:.2g} % RMS as recorded, {rms[1]:.2g} % calibrated.",
-        out,
+        views[0],
+        (views[1], lengths),
     )
 
 
-def _add_both(out: go.Figure, x: list[Array], y: list[Array], row: int, column: int, legend: bool = True) -> None:
+def _add_both(out: Figure, x: list[Array], y: list[Array]) -> None:
     """Uncalibrated as rings, calibrated as dots."""
-    looks = (
-        ("uncalibrated", {"color": _BEFORE, "size": 8, "symbol": "circle-open", "line": {"width": 1.5}}),
-        ("calibrated", {"color": _AFTER, "size": 5}),
-    )
-    for (name, marker), across, along in zip(looks, x, y, strict=True):
-        shown = legend and row == column == 1
-        out.add_scatter(
-            x=across, y=along, mode="markers", name=name, marker=marker, showlegend=shown, row=row, col=column
-        )
+    out.points(x[0], y[0], "uncalibrated", BEFORE, 8, shape="ring")
+    out.points(x[1], y[1], "calibrated", COLORS[0], 5)

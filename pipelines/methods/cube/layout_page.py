@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from factors import so3
+from pipelines.graph.problem import Array
+from pipelines.reports.figure import COLORS, Figure
 from pipelines.reports.plain_json import plain_json
-from pipelines.reports.plots import COLORS, figure
-from pipelines.reports.templating import environment
+from pipelines.reports.result import Plot
+from pipelines.reports.templating import page
 from pipelines.reports.units import to_digits_of
 
 if TYPE_CHECKING:
-    import plotly.graph_objects as go
-
     from pipelines.vision.layout import Layout
 
 COLUMNS = ("tag", "pictures", "px", "sigma, deg", "sigma, mm", "false", "correlation")
@@ -105,77 +105,52 @@ def camera_rows(layout: Layout) -> list[tuple[str, ...]]:
 
 def layout_html(layout: Layout, recordings: Sequence[str]) -> str:
     """The page as one HTML text that opens offline."""
-    plots = [
-        ("The tags", _CAPTION, _div(_picture(layout), first=True)),
-        ("Reprojection", "How far the corners of each tag are from where the layout has them.", _div(_bars(layout))),
-    ]
-    return (
-        environment("pipelines.methods.cube")
-        .get_template("layout.html")
-        .render(
-            recordings=", ".join(recordings),
-            headline=headline(layout) + ".",
-            unplaced=layout.unplaced,
-            plots=plots,
-            columns=COLUMNS,
-            rows=rows(layout),
-            cameras=camera_rows(layout),
-        )
+    return page(
+        "pipelines.methods.cube",
+        "layout.html",
+        [_picture(layout), _bars(layout)],
+        recordings=", ".join(recordings),
+        headline=headline(layout) + ".",
+        unplaced=layout.unplaced,
+        columns=COLUMNS,
+        rows=rows(layout),
+        cameras=camera_rows(layout),
     )
 
 
 _CAPTION = (
-    "Each square is a tag as it faces outward, with its bottom edge drawn thick; the darker, the larger its error in "
-    "the pictures. m, in the frame of the body."
+    "The body from two opposite sides, without what is hidden. Each square is a tag as it faces outward, with its "
+    "bottom edge drawn thick; the darker, the larger its error in the pictures. m, in the frame of the body."
 )
+# Where the two viewers stand, in the frame of the body.
+_VIEWERS = {"from +x +y +z": (1.0, 0.7, 0.6), "from -x -y -z": (-1.0, -0.7, -0.6)}
 
 
-def _picture(layout: Layout) -> go.Figure:
-    """Squares in space, with ids and the way they face."""
-    out = figure("", height=620)
-    body, corners = layout.body, layout.body.corners
-    errors = np.array([seen.rms_px for seen in layout.seen.values()])
-    shade = np.repeat(errors, 4)
-    i = (4 * np.arange(len(errors))[:, None] + [0, 0]).ravel()
-    out.add_mesh3d(
-        **_xyz(corners.reshape(-1, 3)),
-        i=i,
-        j=i + np.tile([1, 2], len(errors)),
-        k=i + np.tile([2, 3], len(errors)),
-        intensity=shade,
-        colorscale=[[0.0, "#dcebf5"], [1.0, COLORS[0]]],
-        colorbar={"title": {"text": "px"}, "thickness": 12},
-        flatshading=True,
-        hoverinfo="skip",
-    )
-    gap = np.full((len(corners), 1, 3), np.nan)
-    outline = np.concatenate([corners, corners[:, :1], gap], axis=1).reshape(-1, 3)
-    bottom = np.concatenate([corners[:, :2], gap], axis=1).reshape(-1, 3)
-    for line, width in ((outline, 2), (bottom, 7)):
-        style = {"color": "#33414e", "width": width}
-        out.add_scatter3d(**_xyz(line), mode="lines", line=style, hoverinfo="skip", showlegend=False)
-    above = body.position + so3.rotate(body.bRt, [0.0, 0.0, 1.0]) * 0.15 * body.size[:, None]
-    words = [f"tag {tag}: {seen.rms_px:.2f} px, {seen.pictures} pictures" for tag, seen in layout.seen.items()]
-    out.add_scatter3d(
-        **_xyz(above), mode="text", text=body.ids.astype(str), hovertext=words, hoverinfo="text", showlegend=False
-    )
-    out.update_layout(scene={"aspectmode": "data", **{f"{axis}axis": {"title": {"text": axis}} for axis in "xyz"}})
+def _picture(layout: Layout) -> Plot:
+    """Squares as seen from two sides, with ids; those that face away are hidden."""
+    views = [_view(layout, f"seen {words}", np.array(at)) for words, at in _VIEWERS.items()]
+    return Plot("The tags", _CAPTION, views[0], (views[1],))
+
+
+def _view(layout: Layout, words: str, viewer: Array) -> Figure:
+    """A parallel projection, up is the body's +z as far as it goes."""
+    out = Figure("", words, 420, 0.5, square=True)
+    body, towards = layout.body, viewer / np.linalg.norm(viewer)
+    right = np.cross([0.0, 0.0, 1.0], towards)
+    right /= np.linalg.norm(right)
+    onto = np.stack([right, np.cross(towards, right)], axis=1)
+    faces = so3.rotate(body.bRt, [0.0, 0.0, 1.0]) @ towards > 0.0
+    corners, middles = body.corners[faces] @ onto, body.position[faces] @ onto
+    seen = [seen for seen, shown in zip(layout.seen.items(), faces, strict=True) if shown]
+    texts = [f"tag {tag}: {each.rms_px:.2f} px, {each.pictures} pictures" for tag, each in seen]
+    out.patches(corners, np.array([each.rms_px for _, each in seen]), COLORS[0], texts)
+    bottom = np.concatenate([corners[:, :2], np.full((len(corners), 1, 2), np.nan)], axis=1).reshape(-1, 2)
+    out.line(bottom[:, 0], bottom[:, 1], color="ink", width=4.0)
+    out.words(middles[:, 0], middles[:, 1], [str(tag) for tag, _ in seen])
     return out
 
 
-def _xyz(points: np.ndarray) -> dict[str, np.ndarray]:
-    return dict(zip("xyz", points.T, strict=True))
-
-
-def _bars(layout: Layout) -> go.Figure:
-    out = figure("px RMS", height=300, x_title="tag")
-    names = [str(tag) for tag in layout.seen]
-    values = [seen.rms_px for seen in layout.seen.values()]
-    out.add_bar(x=names, y=values, marker={"color": COLORS[0]}, showlegend=False)
-    out.update_xaxes(type="category")
-    return out
-
-
-def _div(plot: go.Figure, first: bool = False) -> str:
-    config = {"responsive": True, "displaylogo": False}
-    return str(plot.to_html(full_html=False, include_plotlyjs=first, config=config))
+def _bars(layout: Layout) -> Plot:
+    out = Figure("px RMS", "tag", 300, x_labels=tuple(str(tag) for tag in layout.seen))
+    out.bars([seen.rms_px for seen in layout.seen.values()], "", COLORS[0])
+    return Plot("Reprojection", "How far the corners of each tag are from where the layout has them.", out)

@@ -9,7 +9,7 @@ from factors import so3
 from pipelines.graph.problem import Array, Attitudes
 from pipelines.graph.robust import robust_sigma
 from pipelines.methods.head.recording import HeadData
-from pipelines.reports.plots import COLORS, add_line, add_points, figure
+from pipelines.reports.figure import COLORS, PALE, Figure
 from pipelines.reports.result import Calibration, Plot
 
 _AXES = "xyz"
@@ -43,13 +43,12 @@ def _from_vision(data: HeadData, calibration: Calibration, attitudes: Attitudes)
 
 
 def _attitude(attitudes: Attitudes, seen: Attitudes) -> Plot:
-    out = figure("rotation vector of bRv, deg", height=360)
+    out = Figure("rotation vector of bRv, deg", height=360)
     fused, vision = _vectors(attitudes.wxyz), _vectors(seen.wxyz)
     for i, axis in enumerate(_AXES):
-        add_points(out, seen.time, vision[:, i], f"vision {axis}", COLORS[i], 3)
+        out.points(seen.time, vision[:, i], f"vision {axis}", COLORS[i], 3, alpha=0.45)
     for i, axis in enumerate(_AXES):
-        add_line(out, attitudes.time, fused[:, i], f"fused {axis}", COLORS[i])
-    out.update_traces(selector={"mode": "markers"}, opacity=0.45)
+        out.line(attitudes.time, fused[:, i], f"fused {axis}", COLORS[i])
     return Plot(
         "Attitude of the helmet on the platform",
         "Lines: attitude bRv from gyros and vision together. Points: from vision alone, turned by the mounts found.",
@@ -60,10 +59,10 @@ def _attitude(attitudes: Attitudes, seen: Attitudes) -> Plot:
 def _difference(attitudes: Attitudes, seen: Attitudes) -> Plot:
     delta = _delta(attitudes, seen)
     spread = robust_sigma(delta)
-    out = figure("vision minus fused, deg")
+    out = Figure("vision minus fused, deg")
     for i, axis in enumerate(_AXES):
-        add_points(out, seen.time, delta[:, i], axis, COLORS[i], 3)
-    out.update_yaxes(range=[-6.0 * max(spread, 1e-3), 6.0 * max(spread, 1e-3)])
+        out.points(seen.time, delta[:, i], axis, COLORS[i], 3)
+    out.y_range = (-6.0 * max(spread, 1e-3), 6.0 * max(spread, 1e-3))
     return Plot(
         "Vision against the fused attitude",
         f"Difference about the axes of the helmet IMU: {spread:.3g} deg per axis (standard deviation, from the "
@@ -82,9 +81,9 @@ def _against_truth(data: HeadData, calibration: Calibration, attitudes: Attitude
         seen, attitudes = (Attitudes(a.time, so3.multiply(turn, a.wxyz)) for a in (seen, attitudes))
         without = " less its constant part on the platform's side, which is the camera mount that is not known"
     errors = {"vision alone": _error(truth, seen), "fused": _error(truth, attitudes)}
-    out = figure("attitude error, deg")
-    for (name, (time, angle)), color in zip(errors.items(), ("#9ab6cc", COLORS[1]), strict=True):
-        add_points(out, time, angle, name, color, 3)
+    out = Figure("attitude error, deg")
+    for (name, (time, angle)), color in zip(errors.items(), (PALE, COLORS[1]), strict=True):
+        out.points(time, angle, name, color, 3)
     said = ", ".join(f"{name} {float(np.sqrt((angle**2).mean())):.3g} deg RMS" for name, (_, angle) in errors.items())
     return Plot("Attitude against the truth", f"Angle between attitude and truth{without}: {said}.", out)
 

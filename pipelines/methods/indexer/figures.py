@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import cycle
+
 import numpy as np
 
 from factors import so3
@@ -14,7 +16,7 @@ from pipelines.methods.indexer.published import half_differences
 from pipelines.methods.indexer.recording import IndexerData
 from pipelines.methods.indexer.runs import axis_motion
 from pipelines.methods.indexer.validation import misfit, validate
-from pipelines.reports.plots import COLORS, add_line, add_points, figure
+from pipelines.reports.figure import COLORS, Figure
 from pipelines.reports.result import Calibration, Plot
 from pipelines.settings import Config
 
@@ -46,8 +48,8 @@ def _half_differences(data: IndexerData, values: dict[str, float]) -> Plot | Non
         found = half_differences(data)
     except InputError:
         return None
-    out = figure("across the axis, arcsec", x_title="position")
-    rows = []
+    out = Figure("across the axis, arcsec", x_title="position")
+    rows: list[list[float]] = []
     for name, theta, color in (
         ("as measured", np.zeros(3), COLORS[6]),
         ("compensated", _angles(values), COLORS[0]),
@@ -58,7 +60,8 @@ def _half_differences(data: IndexerData, values: dict[str, float]) -> Plot | Non
             for axis in (1, 2) if half.axis == "outer" else (0, 1):
                 labels.append(f"{half.position} {_AXES[axis]}t")
                 across.append(float(in_t[axis]))
-        out.add_bar(x=labels, y=across, name=name, marker_color=color)
+        out.x_labels = tuple(labels)
+        out.bars(across, name, color, (len(rows), 2))
         rows.append(across)
     return Plot(
         "Half differences",
@@ -70,10 +73,10 @@ def _half_differences(data: IndexerData, values: dict[str, float]) -> Plot | Non
 
 def _misfit(turning: list[Group], values: dict[str, float]) -> Plot:
     """Mean gyro less prediction over each turn or move, as an angle of the axis."""
-    out = figure("gyro less encoders, arcsec")
+    out = Figure("gyro less encoders, arcsec")
     time, error = misfit(turning, values)
     for i, axis in enumerate(_AXES):
-        add_points(out, time, error[:, i] * _ARCSEC, f"{axis}t", COLORS[i], 6)
+        out.points(time, error[:, i] * _ARCSEC, f"{axis}t", COLORS[i], 6)
     return Plot(
         "Misfit by turn",
         "Mean rate of each turn or move less what encoders, earth and calibration say, over the rate: the angle by "
@@ -93,10 +96,12 @@ def _contributions(turning: list[Group], values: dict[str, float]) -> Plot:
         position = f"{group.run.axis}, other at {round(np.rad2deg(group.run.other)) % 360} deg"
         information[position] = information.get(position, np.zeros(3)) + (by_theta**2).sum(axis=0)
     total = np.sum(list(information.values()), axis=0)
-    out = figure("share, %", x_title="")
-    for (position, own), color in zip(information.items(), [*COLORS] * len(information), strict=False):
-        out.add_bar(x=list(THETA), y=100.0 * own / np.maximum(total, 1e-300), name=position, marker_color=color)
-    out.update_layout(barmode="stack")
+    out = Figure("share, %", x_title="", x_labels=THETA)
+    below, left = np.zeros(len(THETA)), np.arange(len(THETA)) - 0.4
+    for (position, own), color in zip(information.items(), cycle(COLORS)):
+        share = 100.0 * own / np.maximum(total, 1e-300)
+        out.boxes(left, left + 0.8, below, below + share, position, color)
+        below = below + share
     return Plot(
         "What each position says",
         "Share of the turns and moves about each axis, the other axis standing at an angle, in the information on the "
@@ -108,13 +113,12 @@ def _contributions(turning: list[Group], values: dict[str, float]) -> Plot:
 def _attitude(data: IndexerData, config: Config, values: dict[str, float]) -> Plot:
     """Error of the carrier's attitude put out, before and after compensation."""
     found = validate(data, config, values)[0]
-    out = figure("attitude error, deg")
+    out = Figure("attitude error, deg", y_scale="log")
     said = []
     for name, error, color in (("before", found.before, COLORS[6]), ("after", found.after, COLORS[0])):
         angle = np.rad2deg(np.linalg.norm(error, axis=1))
-        add_line(out, found.time, angle, name, color)
+        out.line(found.time, angle, name, color)
         rms = float(np.sqrt((angle**2).mean()))
         said.append(f"{name} compensation {rms:.4g} deg ({3600.0 * rms:.3g} arcsec) RMS")
-    out.add_hline(y=0.005, line_dash="dash", annotation_text="published claim")
-    out.update_yaxes(type="log")
+    out.levels(0.005, dash="dashed", name="published claim")
     return Plot("Attitude output", "Angle between nRb put out and the base's attitude: " + ", ".join(said) + ".", out)

@@ -18,7 +18,7 @@ from pipelines.methods.los.guess import camera, carried_errors
 from pipelines.methods.los.parameters import ANGLES, OFFSET
 from pipelines.methods.los.pictures import select_pictures
 from pipelines.methods.los.recording import LosData
-from pipelines.reports.plots import COLORS, add_line, add_points, figure
+from pipelines.reports.figure import COLORS, Figure
 from pipelines.reports.result import Calibration, Plot
 from pipelines.settings import DEFAULT_NOISE, first_given
 
@@ -61,14 +61,13 @@ def _predicted(data: LosData, gyro: GyroPath, time: Array, measured: Array, valu
 
 
 def _measured_and_predicted(time: Array, measured: Array, predicted: Array) -> Plot:
-    out = figure("LOS error, mrad")
+    out = Figure("LOS error, mrad")
     for i, axis in enumerate(_AXES):
-        add_points(out, time, _MRAD * measured[:, i], f"{axis} measured", COLORS[i], 3)
-        add_line(out, time, _MRAD * predicted[:, i], f"{axis} predicted", COLORS[i])
-    out.update_traces(selector={"mode": "markers"}, opacity=0.45)
+        out.points(time, _MRAD * measured[:, i], f"{axis} measured", COLORS[i], 3, alpha=0.45)
+        out.line(time, _MRAD * predicted[:, i], f"{axis} predicted", COLORS[i])
     reach = 1.2 * _MRAD * max(float(np.abs(predicted).max()), _SHOWN * float(robust_sigma(measured - predicted)))
     middle = _MRAD * float(np.median(measured))
-    out.update_yaxes(range=[middle - reach, middle + reach])
+    out.y_range = (middle - reach, middle + reach)
     return Plot(
         "LOS error measured and predicted",
         "Points: where the camera saw the target. Lines: where it should be by gyro, gimbal and calibration alone, "
@@ -78,14 +77,14 @@ def _measured_and_predicted(time: Array, measured: Array, predicted: Array) -> P
 
 
 def _left(time: Array, without: Array, compensated: Array) -> Plot:
-    out = figure("measured less predicted, urad")
+    out = Figure("measured less predicted, urad")
     for i, axis in enumerate(_AXES):
-        add_points(out, time, _URAD * without[:, i], f"{axis}, mounting angles zero", COLORS[4 + 2 * i], 3)
+        out.points(time, _URAD * without[:, i], f"{axis}, mounting angles zero", COLORS[4 + 2 * i], 3)
     for i, axis in enumerate(_AXES):
-        add_points(out, time, _URAD * compensated[:, i], f"{axis}, mounting angles found", COLORS[i], 3)
+        out.points(time, _URAD * compensated[:, i], f"{axis}, mounting angles found", COLORS[i], 3)
     spread = [_URAD * robust_sigma(errors) for errors in (without, compensated)]
     reach = _SHOWN * max(*spread, 1.0)
-    out.update_yaxes(range=[-reach, reach])
+    out.y_range = (-reach, reach)
     return Plot(
         "What gyro, gimbal and calibration leave of the LOS error",
         f"Per axis {spread[0]:.3g} urad with the mounting angles zero, {spread[1]:.3g} urad with those found (standard "

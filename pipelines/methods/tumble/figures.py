@@ -11,11 +11,9 @@ from pipelines.methods.triads import triad_of
 from pipelines.methods.tumble.findings import NAMES, directions
 from pipelines.methods.tumble.model import Sensor, prepare
 from pipelines.methods.tumble.recording import TumbleData
-from pipelines.reports.plots import COLORS, add_points, figure, thin
+from pipelines.reports.figure import BEFORE, COLORS, Figure, thin
 from pipelines.reports.result import Calibration, Plot, Table
 from pipelines.reports.sphere_map import described, sphere_map
-
-_BEFORE = "#8a949e"
 
 
 def figures(data: TumbleData, calibration: Calibration) -> list[Plot | Table]:
@@ -42,10 +40,10 @@ def _lengths(sensor: Sensor, values: Mapping[str, float]) -> Plot:
     raw = np.linalg.norm(sensor.raw, axis=1)
     lengths = [raw / raw.mean(), np.linalg.norm(sensor.raw @ K.T + b, axis=1) / sensor.strength]
     misses = [100.0 * (length - 1.0) for length in lengths]
-    out = figure("length, % off")
+    out = Figure("length, % off")
     some = thin(2 * len(raw))
-    for words, miss, color in zip(("uncalibrated", "calibrated"), misses, (_BEFORE, COLORS[0]), strict=True):
-        add_points(out, sensor.time[some], miss[some], words, color, 4)
+    for words, miss, color in zip(("uncalibrated", "calibrated"), misses, (BEFORE, COLORS[0]), strict=True):
+        out.points(sensor.time[some], miss[some], words, color, 4)
     rms = [float(np.sqrt((miss**2).mean())) for miss in misses]
     return Plot(
         f"Length of what the {NAMES[sensor.name]} reads",
@@ -60,27 +58,18 @@ def _sphere(sensor: Sensor, values: Mapping[str, float]) -> Plot:
     K, b = triad_of(sensor.name, values)
     clouds = (sensor.raw / sensor.radius, (sensor.raw @ K.T + b) / sensor.strength)
     some = thin(3 * len(sensor.raw))
-    out = figure("", height=420, x_title="")
-    out.set_subplots(1, 2)
-    for column, (i, j) in enumerate(((0, 1), (0, 2)), start=1):
-        for name, cloud, color in zip(("as recorded", "calibrated"), clouds, (_BEFORE, COLORS[0]), strict=True):
-            out.add_scatter(
-                x=cloud[some, i],
-                y=cloud[some, j],
-                mode="markers",
-                name=name,
-                marker={"color": color, "size": 3},
-                showlegend=column == 1,
-                row=1,
-                col=column,
-            )
-        out.update_xaxes(title_text="xyz"[i], constrain="domain", row=1, col=column)
-        out.update_yaxes(title_text="xyz"[j], scaleanchor=f"x{column}", row=1, col=column)
+    views = []
+    for i, j in ((0, 1), (0, 2)):
+        out = Figure("xyz"[j], "xyz"[i], 420, 0.5, square=True)
+        for name, cloud, color in zip(("as recorded", "calibrated"), clouds, (BEFORE, COLORS[0]), strict=True):
+            out.points(cloud[some, i], cloud[some, j], name, color, 3)
+        views.append(out)
     return Plot(
         f"Readings of the {NAMES[sensor.name]}",
         "Seen along z and along y, in units of what is measured: an ellipsoid about the offset as recorded, the unit "
         "sphere about zero calibrated.",
-        out,
+        views[0],
+        (views[1],),
     )
 
 

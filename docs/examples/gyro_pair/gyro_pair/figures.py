@@ -7,7 +7,7 @@ import numpy as np
 from gyro_pair.recording import GyroPairData
 from gyro_pair.validation import rates
 from pipelines.judgement.validation import rms
-from pipelines.reports.plots import COLORS, add_line, add_points, figure
+from pipelines.reports.figure import COLORS, Figure
 from pipelines.reports.result import Calibration, Plot
 
 
@@ -15,11 +15,11 @@ def figures(data: GyroPairData, calibration: Calibration) -> list[Plot]:
     """With the estimate applied."""
     estimate = calibration.estimate
     start, by_b, predicted = rates(data, dict(zip(estimate.names, estimate.values.tolist(), strict=True)))
-    both, left = figure("rate in b, deg/s"), figure("rate of b less a's, deg/s")
+    both, left = Figure("rate in b, deg/s"), Figure("rate of b less a's, deg/s")
     for i, axis in enumerate("xyz"):
-        add_points(both, start, np.rad2deg(by_b[:, i]), f"gyro b {axis}", COLORS[i], 3)
-        add_line(both, start, np.rad2deg(predicted[:, i]), f"from gyro a {axis}", COLORS[i])
-        add_points(left, start, np.rad2deg(by_b - predicted)[:, i], axis, COLORS[i], 3)
+        both.points(start, np.rad2deg(by_b[:, i]), f"gyro b {axis}", COLORS[i], 3)
+        both.line(start, np.rad2deg(predicted[:, i]), f"from gyro a {axis}", COLORS[i])
+        left.points(start, np.rad2deg(by_b - predicted)[:, i], axis, COLORS[i], 3)
     said = "Gyro b less gyro a, turned, shifted in time and by the bias difference"
     return [
         Plot("Both gyros in one frame", "Mean rates over windows: points by gyro b, lines by gyro a, turned.", both),
