@@ -156,11 +156,12 @@ def follow(
     config: str | Path | None = None,
     window: float | None = 1.0,
     patience: float = 30.0,
+    prior: str | Path | None = None,
 ) -> Calibration:
     """Calibrate a recording while it is being made; returns when it is finished, or nothing is new for `patience` s.
 
     `path` is a file or a folder that is being written, `ws://host:port` of a Foxglove bridge, or `-` for standard
-    input; `show` is given what is known whenever that changes.
+    input; `show` is given what is known whenever that changes; `prior` is as `open` has it.
 
     Raises:
         InputError: the file does not appear, is no recording, or cannot be used in the end.
@@ -170,7 +171,8 @@ def follow(
     from pipelines.follow.follower import Settings as Following
     from pipelines.follow.sources import source_of
 
-    settings = Following(method, None if config is None else Path(config), window, patience)
+    earlier = None if prior is None else Path(prior)
+    settings = Following(method, None if config is None else Path(config), window, patience, prior=earlier)
     with source_of(str(path), say=lambda _: None) as source:
         return Follower(source, settings, show or (lambda _: None), lambda _: None, lambda: False).follow()
 

@@ -181,6 +181,7 @@ def compare(
     method: _MethodName = None,
     config: ConfigFile = None,
     window: _Window = "1",
+    prior: _Prior = None,
     out: Annotated[Path | None, typer.Option(help="Folder for compare.html, which also splits the recording.")] = None,
     strict: _Strict = False,
     auto_topics: _AutoTopics = False,
@@ -195,7 +196,7 @@ def compare(
 
     solvers = ["published", "batch", "incremental"]
     with progress.shown(quiet or as_json):
-        calibrations = run(session, solvers, method, config, parse_window(window), strict, auto_topics)
+        calibrations = run(session, solvers, method, config, parse_window(window), strict, auto_topics, prior=prior)
     if as_json:
         terminal.show_json(calibrations)
     else:
@@ -217,6 +218,7 @@ def follow(
     config: ConfigFile = None,
     window: _Window = "1",
     patience: Annotated[float, typer.Option(help="Seconds without anything new that end an unfinished file.")] = 30.0,
+    prior: _Prior = None,
     checkpoint: Annotated[Path | None, typer.Option(help="File to save the run in, and to go on from.")] = None,
     serve: Annotated[bool, typer.Option("--serve", help="Estimates live over Foxglove's WebSocket.")] = False,
     port: Annotated[int, typer.Option(help="Of --serve, on this machine alone.")] = 8765,
@@ -232,7 +234,7 @@ def follow(
     from pipelines.follow.follower import Settings
     from pipelines.reports.write import write_results
 
-    settings = Settings(method, config, parse_window(window), patience, checkpoint, not no_check)
+    settings = Settings(method, config, parse_window(window), patience, checkpoint, not no_check, prior)
     calibration = run(source, settings, port if serve else None, record, as_json)
     folder = out or _beside(Path(_file_name(source)), "incremental")
     written = write_results(folder, calibration)
@@ -469,6 +471,9 @@ def fleet(
     solver: Annotated[Solver, typer.Option(help="How to solve.")] = Solver.batch,
     window: _Window = "1",
     names: Annotated[str | None, typer.Option(help="What file names tell: '{unit}_{date}*'.")] = None,
+    prior: Annotated[
+        str | None, typer.Option(help="Earlier calibrations to begin from: 'last/{unit}/result.json'.")
+    ] = None,
     scheduler: _Scheduler = None,
     jobs: _Jobs = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("alidade-fleet"),
@@ -485,7 +490,7 @@ def fleet(
     from pipelines.fleet.write import write_fleet
     from pipelines.reports.plain_json import fleet_json
 
-    settings = Settings.of(method, config, solver.value, parse_window(window))
+    settings = Settings.of(method, config, solver.value, parse_window(window), prior)
     with progress.shown(quiet or as_json):
         outcome = calibrate_fleet(find(recordings), settings, out, scheduler, jobs, names)
     several = histories(outcome.results, {name: counting(result) for name, result in outcome.results.items()})

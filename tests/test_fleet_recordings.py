@@ -142,7 +142,7 @@ def test_planted_faults_are_told_apart(calibrated: Path) -> None:
     assert [(row["unit"], row["parameter"]) for row in changed] == [("U33", "helmet_mount_z")]
     assert float(changed[0]["difference"]) == pytest.approx(np.deg2rad(4.0), abs=5.0 * float(changed[0]["sigma"]))
     text = page_text(calibrated / "fleet.html")
-    attention = text.split("Which units need attention?")[1].split("Recordings without")[0]
+    attention = text.split("Which units need attention?")[1].split("Parameters")[0]
     assert set(re.findall(r"U\d\d(?= )", attention)) >= {"U07", "U33", "U20", "U12"}
     assert "4 units need attention: U33, U07" in attention
     assert "helmet_mount about z moved by 4.0" in attention
@@ -256,6 +256,35 @@ def test_unit_and_date_come_from_metadata(
         ("007", "2026-02-03T00:00:00Z"),
         ("c", "2026-11-20T12:00:00Z"),
     ]
+
+
+def test_each_unit_begins_from_its_own_calibration(
+    forty: Path, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A recording is done again when that has changed; one whose unit has none is told."""
+    for path in sorted(forty.glob("U3[012]_20260401*.mcap")):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    for unit in ("U30", "U31"):
+        before = forty / f"{unit}_{DATES[0]}.mcap"
+        assert alidade(monkeypatch, "calibrate", before, "--quiet", "--out", tmp_path / "last" / unit) == 0
+
+    def run() -> dict[str, dict[str, str]]:
+        command = ("fleet", tmp_path / "*.mcap", *NAMES, "--scheduler", scheduler, "--out", tmp_path / "out")
+        assert alidade(monkeypatch, *command, "--prior", tmp_path / "last" / "{unit}" / "result.json") == 0
+        return {row["unit"]: row for row in rows_of(tmp_path / "out" / "fleet.csv")}
+
+    rows = run()
+    assert [rows[unit]["exit_code"] for unit in ("U30", "U31", "U32")] == ["0", "0", "2"]
+    assert "cannot be opened" in rows["U32"]["reason"]
+    first = json.loads((tmp_path / "last" / "U30" / "result.json").read_text())
+    alone = {p["name"]: p["sigma"] for p in first["parameters"]}
+    # About as much as the first recording again.
+    ratio = float(rows["U30"]["helmet_mount_x_sigma"]) / alone["helmet_mount_x"]
+    assert ratio == pytest.approx(0.5**0.5, abs=0.1)
+    (tmp_path / "last" / "U31" / "result.json").write_bytes((tmp_path / "last" / "U30" / "result.json").read_bytes())
+    again = run()
+    assert again["U30"] == rows["U30"]
+    assert again["U31"]["helmet_mount_x"] != rows["U31"]["helmet_mount_x"]
 
 
 def with_metadata(source: Path, target: Path, name: str, content: dict[str, str]) -> None:

@@ -226,3 +226,30 @@ def test_methods_say_what_belongs_to_a_recording() -> None:
     }
     with pytest.raises(InputError, match=r"unknown key share\.gyro_bia; the nearest known key is gyro_bias"):
         walks(method("head"), load_config(b"share: {gyro_bia: device}"), names)
+
+
+def test_compare_and_follow_begin_from_an_earlier_calibration(tmp_path: Path) -> None:
+    (tmp_path / "short.yaml").write_text("duration_s: 6.0\n")
+    for seed, name in enumerate(("before", "today")):
+        scenario = ["--scenario", str(tmp_path / "short.yaml"), "--out", str(tmp_path / f"{name}.mcap")]
+        CliRunner().invoke(app, ["simulate", "head", "--seed", str(seed), *scenario])
+    CliRunner().invoke(app, ["calibrate", str(tmp_path / "before.mcap"), "--out", str(tmp_path / "before")])
+    prior = tmp_path / "before" / "result.json"
+    earlier = {p["name"]: p for p in json.loads(prior.read_text())["parameters"]}["helmet_mount_x"]
+
+    def found(*arguments: object) -> list[dict[str, float]]:
+        ended = CliRunner().invoke(app, [*map(str, arguments), "--prior", str(prior), "--json"])
+        said = json.loads(ended.stdout)
+        return [
+            next(p for p in each["parameters"] if p["name"] == "helmet_mount_x")
+            for each in (said if isinstance(said, list) else [said])
+            if each["solver"] != "published"
+        ]
+
+    today = tmp_path / "today.mcap"
+    followed = found("follow", today, "--no-check", "--out", tmp_path / "out")
+    for p in [*found("compare", today), *followed]:
+        assert p["prior_mean"] == pytest.approx(earlier["value"], rel=1e-11)
+        assert p["sigma"] < 0.9 * earlier["sigma"]
+    ended = CliRunner().invoke(app, ["follow", str(today), "--prior", str(tmp_path / "none.json")])
+    assert "none.json: cannot be opened" in str(ended.exception)

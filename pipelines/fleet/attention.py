@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -54,7 +55,8 @@ def units_of_interest(
             units.setdefault(p.units[i], []).append(_outlying(p, i))
     for recording, result in results.items():
         if result["exit_code"] != exit_codes.OF_STATUS["calibrated"]:
-            text = f"{recording}: {result['reason'] or result['status']}"
+            reason = result["reason"].removeprefix(f"{recording}: ") or result["status"]
+            text = f"{Path(recording).name}, exit code {result['exit_code']}: {reason}"
             units.setdefault(result["unit"], []).append(Finding(result["status"], text))
     sorted_ = [Unit(name, tuple(sorted(each, key=_order))) for name, each in units.items() if each]
     return sorted(sorted_, key=lambda unit: _order(unit.findings[0]))

@@ -23,6 +23,7 @@ from pipelines.fleet.histories import packed
 from pipelines.fleet.isolated import failure, quarantined, run_isolated
 from pipelines.fleet.recordings import as_date, from_metadata, from_name, local
 from pipelines.fleet.store import Result, Store, settings_key
+from pipelines.reports.known import load_known
 from pipelines.sharing import walks
 
 if TYPE_CHECKING:
@@ -30,6 +31,10 @@ if TYPE_CHECKING:
 
     from pipelines.graph.problem import Told
     from pipelines.reports.result import Calibration
+
+
+# In the path of earlier calibrations.
+_UNIT = "{unit}"
 
 
 @dataclass(frozen=True)
@@ -41,22 +46,30 @@ class Settings:
         config: text of a YAML file that overrides the recordings' own config key by key.
         solver: batch, incremental or published.
         window: s, of the incremental solver; None keeps the whole history.
+        prior: path of the earlier calibration that each begins from, `{unit}` in place of the unit; None: of none.
     """
 
     method: str | None = None
     config: str | None = None
     solver: str = "batch"
     window: float | None = 1.0
+    prior: str | None = None
 
     @classmethod
-    def of(cls, method: str | None, config: Path | None, solver: str, window: float | None) -> Settings:
-        """With the text of a config file. Raises InputError when there is no such method or the config is wrong."""
+    def of(
+        cls, method: str | None, config: Path | None, solver: str, window: float | None, prior: str | None = None
+    ) -> Settings:
+        """With the text of a config file. Raises InputError when there is no such method, or a file cannot be used."""
         if method is not None:
             methods.method(method)  # there is one of that name
+        if prior is not None:
+            prior = str(Path(prior).absolute())
+            if _UNIT not in prior:
+                load_known(Path(prior))
         if config is None:
-            return cls(method, None, solver, window)
+            return cls(method, None, solver, window, prior)
         load_config(None, config)
-        return cls(method, config.read_text(encoding="utf-8"), solver, window)
+        return cls(method, config.read_text(encoding="utf-8"), solver, window, prior)
 
 
 @dataclass(frozen=True)
@@ -112,7 +125,8 @@ def calibrate_fleet(
         if "date" in fields:
             as_date(fields["date"])
     store = Store(out, settings_key(source_version(), asdict(settings)))
-    tasks = {name: (file, settings, store.results.get(name, {}).get("sha256")) for name, file in recordings.items()}
+    kept_inputs = {name: _inputs(result) for name, result in store.results.items()}
+    tasks = {name: (file, settings, told[name].get("unit"), kept_inputs.get(name)) for name, file in recordings.items()}
     fresh: dict[str, Result] = {}
     kept, interrupted = [], False
     with cluster(scheduler, jobs) as client:
@@ -135,19 +149,37 @@ def calibrate_fleet(
     return Outcome(results, len(recordings), len(kept), interrupted)
 
 
-def calibrate_recording(file: OpenFile, settings: Settings, known_sha256: str | None) -> Result | None:
-    """On the worker: the result of one recording, None when its hash is the one known.
+def calibrate_recording(
+    file: OpenFile, settings: Settings, unit: str | None = None, known: tuple[str, str | None] | None = None
+) -> Result | None:
+    """On the worker: the result of one recording, None when it was made of the very same.
 
     A result without `sha256` is of a file that could not be read at all; the next run tries again.
+
+    Args:
+        file: the recording.
+        settings: how.
+        unit: as the file's name has it.
+        known: SHA-256 of the recording and of the earlier calibration that the result known was made of.
     """
     try:
         with local(file) as path:
-            sha256 = _sha256(path)
-            if sha256 == known_sha256:
+            told = _told(path)
+            prior = None
+            if settings.prior is not None:
+                prior = Path(settings.prior.replace(_UNIT, unit or told.get("unit") or Path(file.path).stem))
+                load_known(prior)
+            result = {"sha256": _sha256(path), "prior_sha256": prior and _sha256(prior), **told}
+            if _inputs(result) == known:
                 return None
-            return {"sha256": sha256, **_told(path), **_calibrated(path, settings)}
+            return {**result, **_calibrated(path, settings, prior)}
     except (OSError, InputError) as error:
         return failure(exit_codes.BAD_INPUT, str(error))
+
+
+def _inputs(result: Result) -> tuple[str, str | None]:
+    """What a result was made of."""
+    return result["sha256"], result["prior_sha256"]
 
 
 def _told(path: Path) -> Result:
@@ -155,13 +187,13 @@ def _told(path: Path) -> Result:
     return {key: value for key, value in from_metadata(path).items() if key != "date" or as_date(value)}
 
 
-def _calibrated(path: Path, settings: Settings) -> Result:
+def _calibrated(path: Path, settings: Settings, prior: Path | None) -> Result:
     with TemporaryDirectory(prefix="alidade.") as folder:
         config = None
         if settings.config is not None:
             config = Path(folder) / "config.yaml"
             config.write_text(settings.config, encoding="utf-8")
-        return run_isolated(_summary, path, settings.solver, settings.method, config, settings.window)
+        return run_isolated(_summary, path, settings.solver, settings.method, config, settings.window, prior)
 
 
 def _summary(calibration: Calibration) -> Result:

@@ -21,6 +21,7 @@ def run_isolated(
     method: str | None,
     config: Path | None,
     window: float | None,
+    prior: Path | None = None,
 ) -> Result:
     """Status, exit code, reason, seconds of wall time, and what `summarise` takes from the calibration.
 
@@ -30,7 +31,7 @@ def run_isolated(
     from pipelines.solvers.marginals import IndeterminateError
 
     try:
-        (calibration,) = calibrate(path, [solver], method, config, window)
+        (calibration,) = calibrate(path, [solver], method, config, window, prior=prior)
         assessment = calibration.assessment
         return {
             "status": assessment.status,

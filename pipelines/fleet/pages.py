@@ -35,7 +35,6 @@ _MOST_BARS = 60
 def fleet_html(outcome: Outcome, fleet: Sequence[Population], found: Sequence[History]) -> str:
     """The page of a fleet."""
     results = outcome.results
-    failures = [(name, r) for name, r in results.items() if r["exit_code"] != 0]
     attention = units_of_interest(results, fleet, found)
     statuses = [r["status"] for r in results.values()]
     dates = [r["date"] for r in results.values() if r["date"] is not None]
@@ -51,8 +50,7 @@ def fleet_html(outcome: Outcome, fleet: Sequence[Population], found: Sequence[Hi
         several=len(found),
         sentence=sentence(attention),
         attention=attention[:_MOST_LISTED],
-        failures=failures[:_MOST_LISTED],
-        hidden={"attention": len(attention), "failures": len(failures)},
+        hidden=max(len(attention) - _MOST_LISTED, 0),
         parameters=[_parameter_row(p) for p in fleet],
     )
 
@@ -101,7 +99,8 @@ def _component(component: Component | None, factor: float) -> str:
         return ""
     if component.value == 0.0:
         return f"< {factor * component.upper:.2g}"
-    return f"{to_digits_of(factor * component.value, factor * component.sigma)} ± {factor * component.sigma:.2g}"
+    value, sigma = (to_digits_of(factor * x, factor * component.sigma) for x in (component.value, component.sigma))
+    return f"{value} ± {sigma}"
 
 
 def _population_plot(p: Population) -> Plot:

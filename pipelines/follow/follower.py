@@ -22,9 +22,11 @@ from pipelines.follow.guidance import View, Watch, view_of
 from pipelines.follow.sources import Source
 from pipelines.graph.problem import Problem, Step
 from pipelines.judgement.checklist import ChecklistItem
+from pipelines.recording.container import sha256_of
 from pipelines.recording.growing import Growing
 from pipelines.recording.opening import identity
 from pipelines.recording.reading import Recording, open_recording
+from pipelines.reports.known import load_known
 from pipelines.reports.result import Calibration
 from pipelines.session import Session
 from pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
@@ -57,6 +59,7 @@ class Settings:
         patience: s, without anything new, after which what is there is taken as all there will be.
         checkpoint: file the run is saved in from time to time, and resumed from.
         check: hold the result against batch.
+        prior: an earlier calibration of the device to begin from.
     """
 
     method: str | None = None
@@ -65,6 +68,7 @@ class Settings:
     patience: float = 30.0
     checkpoint: Path | None = None
     check: bool = False
+    prior: Path | None = None
 
 
 class Follower:
@@ -103,6 +107,8 @@ class Follower:
         self._held: Step | None = None  # the first step that is not settled
         if settings.checkpoint is not None and settings.window is None:
             raise InputError("--window all has no checkpoints: it forgets nothing; give seconds")
+        if settings.prior is not None:
+            load_known(settings.prior)  # told now, not when the recording has begun
 
     def follow(self) -> Calibration:
         """Until the recording is finished, stops growing, or `stopped`; then the calibration by all there is.
@@ -163,13 +169,17 @@ class Follower:
     def _whole(self) -> tuple[Problem, Iterator[Step]]:
         """The graph of all there is, and its steps that were not taken yet."""
         recording = Recording(self._growing.look(self.source.parts, None))
-        session = Session.read(recording, self.settings.method, self.settings.config)
+        session = self._read(recording)
         problem = self._guessed_before(session) or _that_grows(session.problem(), session)
         steps = self._new_steps(session, problem)
         self._session, self._checklist = session, {}
         self._delay_ns, self._attachments = recording.delay_ns, len(self._growing.attachments)
         self._collect(session)
         return problem, steps
+
+    def _read(self, recording: Recording) -> Session:
+        settings = self.settings
+        return Session.read(recording, settings.method, settings.config, prior=settings.prior)
 
     def _guessed_before(self, session: Session) -> Problem | None:
         """The graph from the first guesses of a look before, where that is not long ago: they take most of the time."""
@@ -277,6 +287,7 @@ class Follower:
             "method": session.method.name,
             "config": session.config.model_dump_json(exclude_defaults=True),
             "window": str(self.settings.window),
+            "prior": "none" if self.settings.prior is None else sha256_of(self.settings.prior),
             "version": f"alidade {metadata.version('alidade')} with gtsam {metadata.version('gtsam')}",
         }
 
@@ -291,7 +302,7 @@ class Follower:
             why = "stopped" if self._stopped() else f"nothing new for {self.settings.patience:g} s"
             self._say(f"{why}: the recording is not finished, the result is that of what is there")
         started = time.perf_counter()
-        session = Session.read(open_recording(self.source.where), self.settings.method, self.settings.config)
+        session = self._read(open_recording(self.source.where))
         problem = session.problem()
         read = time.perf_counter() - started
         started = time.perf_counter()
