@@ -229,7 +229,7 @@ def test_methods_say_what_belongs_to_a_recording() -> None:
 
 
 def test_compare_and_follow_begin_from_an_earlier_calibration(tmp_path: Path) -> None:
-    (tmp_path / "short.yaml").write_text("duration_s: 6.0\n")
+    (tmp_path / "short.yaml").write_text("duration_s: 3.0\nsensors: ideal\n")
     for seed, name in enumerate(("before", "today")):
         scenario = ["--scenario", str(tmp_path / "short.yaml"), "--out", str(tmp_path / f"{name}.mcap")]
         CliRunner().invoke(app, ["simulate", "head", "--seed", str(seed), *scenario])
