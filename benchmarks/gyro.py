@@ -28,14 +28,14 @@ def run() -> Iterator[Ratio]:
     windows = edges[:-1], edges[1:]
     chain, plain = costs(
         [
-            lambda: GyroPath(t, rate, specific_force=force).increments(*windows, scale=True),
+            lambda: GyroPath(t, rate, drivers=force).increments(*windows, scale=True),
             lambda: GyroPath(t, rate).increments(*windows),
         ]
     )
     compared = "increments with derivatives by scale and g-sensitivity over those with a bias only, 300,000 samples"
     yield Ratio("gyro.integration", compared, chain.seconds / plain.seconds, wanted=2.0, ours=chain, theirs=plain)
 
-    path = GyroPath(t, rate, specific_force=force)
+    path = GyroPath(t, rate, drivers=force)
     turns = path.increments(*windows, scale=True)
     values = gtsam.Values()
     for k, attitude in enumerate(path.attitude(edges)):

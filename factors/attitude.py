@@ -60,7 +60,7 @@ class VisionAttitudeFactor(Model):
     Predicted: cRh = cRb bRv(at) vRh with bRv(at) = dB(anchor, at)^T bRv(anchor) dV(anchor, at), the gyros' own samples
     carrying the attitude from the time of the variable to that of the picture. Blocks: bRv at the anchors (rotations),
     gyro bias (3), cRb, vRh (rotations), the pictures' errors (1 or 3) and, unless the gyros are perfect, the helmet
-    gyro's errors (6 or 15) and those of the platform's gyro (9), see factors.gyro. The pictures' errors are
+    gyro's errors (6 to 18) and those of the platform's gyro (9), see factors.gyro. The pictures' errors are
     time offset, s, positive when a picture was taken later than its stamp says; clock skew, at = stamp + time offset -
     skew * elapsed; angle scale, Log(first^T cRh) is measured 1 + scale times as large.
 
@@ -70,7 +70,7 @@ class VisionAttitudeFactor(Model):
         sqrt_information: (n, 3, 3); the error is cRh * Exp(delta), delta in frame h.
         helmet: the helmet's gyro.
         platform: the platform's gyro, None for a platform at rest.
-        errors: numbers of the helmet gyro's errors: 6, 15, or 0 for a perfect gyro.
+        errors: numbers of the helmet gyro's errors, 0 for a perfect gyro.
         platform_errors: whether the platform's gyro has errors too.
         anchor: (n,) times of the variables, s; None: the stamps.
         elapsed, first: (n,) s since the recording's first stamp, (n, 4) cRh of its first picture; with both, skew and
@@ -101,7 +101,7 @@ class VisionAttitudeFactor(Model):
 
     def __call__(self, bRv: Array, bias: Array, cRb: Array, vRh: Array, picture: Array, *of_gyros: Array) -> Residuals:
         """Residual sqrt_information * Log(predicted^T measured), (n, 3)."""
-        errors, platform = parted(of_gyros, self._error_blocks)
+        errors, platform = parted(of_gyros, self.errors > 0)
         at, by_at = self._times(picture)
         anchor = self.time if self.anchor is None else self.anchor
         middle = 0.5 * (anchor + self.time)

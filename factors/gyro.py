@@ -1,11 +1,13 @@
-"""A gyro with the errors of its data sheet: measured = (I + S) w + G f + bias + noise.
+"""A gyro with the errors of its data sheet: measured = (I + S) w + D f + bias + noise.
 
 S is symmetric, scale errors on its diagonal and half the angle errors between two axes off it; what else a 3x3 matrix
-could hold is a rotation, which is the mounting's. G is the g-sensitivity, rad/s per m/s^2, f the specific force that
-the accelerometer of the same IMU measures, in the same frame. As a variable, `errors`, they are 6 numbers of S, xx yy
-zz xy xz yz, and, where there is a specific force, 9 of G by rows: row for the gyro's axis, column for the force's.
+could hold is a rotation, which is the mounting's. f are the drivers: the specific force that the accelerometer of the
+same IMU measures, in the same frame, where D holds the g-sensitivity G, rad/s per m/s^2; the temperature above that at
+which the bias is the bias, where D holds the slope c, rad/s/K; or one after the other, D = [G c]. As a variable,
+`errors`, they are 6 numbers of S, xx yy zz xy xz yz, then 9 of G by rows, row for the gyro's axis, column for the
+force's, then 3 of c, as far as there are such drivers: 6, 9, 15 or 18 numbers.
 
-The rate from a reading m is w = N (m - G f - bias) with N = (I + S)^-1, linear in N, N G and N bias. So is the rotation
+The rate from a reading m is w = N (m - D f - bias) with N = (I + S)^-1, linear in N, N D and N bias. So is the rotation
 vector by which an increment, once integrated, has to be turned further, but for a twelfth of its square times the angle
 by which its direction turns over the window. Against integrating again, with swings of 2 rad/s about three axes, a bias
 off by 0.02 rad/s and a scale off by 1e-2 (5e-2), that is 5e-9 (6e-8) rad over 1/60 s, 8e-7 (1.3e-5) over 0.1 s, 6e-6
@@ -24,11 +26,13 @@ from factors import so3
 from factors.model import ROT3, Array, Block, Model, Residuals
 from factors.preintegration import GyroPath, Increments
 
-# Derivatives by bias (n, 3, 3) and, where they are variables, by errors (n, 3, 6 or 15).
+# Derivatives by bias (n, 3, 3) and, where they are variables, by errors (n, 3, 6 to 18).
 Derivatives = Callable[[], tuple[Array, ...]]
 
-# Numbers of S, of S and G, and of a platform's gyro: its bias and S.
-SCALE, SCALE_AND_G, PLATFORM = 6, 15, 9
+# Numbers of S, and of a platform's gyro: its bias and S.
+SCALE, PLATFORM = 6, 9
+# Where the numbers of G and then of c are among those of [G c] by rows.
+_G_THEN_C = np.array([0, 1, 2, 4, 5, 6, 8, 9, 10, 3, 7, 11])
 _ROW, _COLUMN = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
 
 
@@ -44,9 +48,9 @@ def corrected(turns: Increments, bias_error: Array, errors: Array | None) -> tup
     """Increments (n, 4) with the errors of their gyro taken off, and how these turn them further (on the right).
 
     Args:
-        turns: n increments, with their scale_jacobian if there are errors and their g_jacobian if G is among them.
+        turns: n increments, with their scale_jacobian if there are errors and their driver_jacobian if D is among them.
         bias_error: (n, 3), the bias beyond what was taken off the rates.
-        errors: (n, 6 or 15); None for a perfect gyro.
+        errors: (n, 6 to 18); None for a perfect gyro.
     """
     if errors is None:
         phi = _apply(turns.bias_jacobian, bias_error)
@@ -54,22 +58,22 @@ def corrected(turns: Increments, bias_error: Array, errors: Array | None) -> tup
     _, N, off = _inverse(errors)
     bias_off = _apply(N, bias_error)
     phi = _apply(turns.bias_jacobian, bias_off) + _apply(needed(turns.scale_jacobian), off.reshape(-1, 9))
-    G = _sensitivity(errors)
-    g_off = None if G is None else N @ G
-    if g_off is not None:
-        phi = phi + _apply(needed(turns.g_jacobian), g_off.reshape(-1, 9))
+    D = _driven(errors)
+    d_off = None if D is None else N @ D
+    if d_off is not None:
+        phi = phi + _apply(needed(turns.driver_jacobian), d_off.reshape(len(d_off), -1))
 
     def derivatives() -> tuple[Array, ...]:
-        # dN = -N dS N, so dS acts on all three of bias_off, off = I - N and g_off.
+        # dN = -N dS N, so dS acts on all three of bias_off, off = I - N and d_off.
         to_end = so3.right_jacobian(phi)
         by_bias = to_end @ turns.bias_jacobian @ N
         by_scale = N[:, None] @ (to_end @ needed(turns.scale_jacobian)).reshape(-1, 3, 3, 3) @ N[:, None]
         by_scale -= by_bias[..., None] * bias_off[:, None, None]
-        if g_off is None:
+        if d_off is None:
             return by_bias, by_symmetric(by_scale)
-        by_g = N[:, None] @ (to_end @ needed(turns.g_jacobian)).reshape(-1, 3, 3, 3)
-        by_scale -= by_g @ np.swapaxes(g_off, 1, 2)[:, None]
-        return by_bias, np.concatenate([by_symmetric(by_scale), by_g.reshape(-1, 3, 9)], axis=2)
+        by_d = N[:, None] @ (to_end @ needed(turns.driver_jacobian)).reshape(len(by_bias), 3, 3, -1)
+        by_scale -= by_d @ np.swapaxes(d_off, 1, 2)[:, None]
+        return by_bias, np.concatenate([by_symmetric(by_scale), _by_driven(by_d)], axis=2)
 
     return so3.multiply(turns.wxyz, so3.exp(phi)), derivatives
 
@@ -78,14 +82,14 @@ def errors_block(turns: Increments) -> int:
     """Numbers of the errors that increments have derivatives by; 0 for a perfect gyro."""
     if turns.scale_jacobian is None:
         return 0
-    return SCALE if turns.g_jacobian is None else SCALE_AND_G
+    return SCALE if turns.driver_jacobian is None else SCALE + turns.driver_jacobian.shape[2]
 
 
-def parted(blocks: Sequence[Array], sizes: Sequence[int]) -> tuple[Array | None, Array | None]:
-    """A gyro's errors and those of a platform's gyro, None for a perfect one, from blocks of these sizes."""
-    by_size = dict(zip(sizes, blocks, strict=True))
-    platform = by_size.pop(PLATFORM, None)
-    return next(iter(by_size.values()), None), platform
+def parted(blocks: Sequence[Array], own: bool) -> tuple[Array | None, Array | None]:
+    """A gyro's errors, if it has its own, and those of a platform's gyro, None for a perfect one, from their blocks."""
+    rest = list(blocks)
+    errors = rest.pop(0) if own else None
+    return errors, rest[0] if rest else None
 
 
 def platform_errors(gyro: GyroPath, variable: Array | None, n: int) -> tuple[Array, Array | None]:
@@ -110,7 +114,7 @@ def carried(
         start, stop: (n,) the windows' ends, s.
         middle: (n,) s, where the errors are evaluated; does not move with the windows' ends.
         bias: (n, 3) rad/s.
-        errors: (n, 6 or 15); None for a perfect gyro.
+        errors: (n, 6 to 18); None for a perfect gyro.
 
     Returns:
         The increments (n, 4), the true rate at their ends (n, 3) in the turned frame, and how bias and errors turn
@@ -118,8 +122,8 @@ def carried(
     """
     turns = gyro.increments(start, stop)
     rate = turns.rate if errors is None else gyro.rate(middle)
-    force = None if errors is None or errors.shape[1] == SCALE else gyro.specific_force(middle)
-    excess, by_excess = rate_error(bias - gyro.bias_hat, errors, rate, force)
+    drivers = None if errors is None or errors.shape[1] == SCALE else gyro.drivers(middle)
+    excess, by_excess = rate_error(bias - gyro.bias_hat, errors, rate, drivers)
     phi = _apply(turns.bias_jacobian, excess)
     to_end = so3.right_jacobian(phi)
     # The gyro's rate seen through the correction, and the correction's own growth.
@@ -139,7 +143,7 @@ class GyroIncrementFactor(Model):
 
     Equal to gtsam's AHRSFactor where the errors are zero. On a platform that turns and has a gyro of its own the
     attitudes are those on the platform: bRm_j = dB(platform)^T bRm_i dV. Blocks: attitudes i and j (rotations), gyro
-    bias (3, rad/s); unless all are perfect, errors (6 or 15) and, on a platform, its gyro's bias and S (3 + 6).
+    bias (3, rad/s); unless all are perfect, errors (6 to 18) and, on a platform, its gyro's bias and S (3 + 6).
 
     Attributes:
         time: (n,) ends of the windows, s.
@@ -171,7 +175,7 @@ class GyroIncrementFactor(Model):
 
     def __call__(self, i: Array, j: Array, bias: Array, *of_gyros: Array) -> Residuals:
         """Residual Log(predicted_j^T j) / sigma, (n, 3)."""
-        errors, platform = parted(of_gyros, self._error_blocks)
+        errors, platform = parted(of_gyros, errors_block(self.turns) > 0)
         dV, by_gyro = corrected(self.turns, bias - self.gyro.bias_hat, errors)
         predicted = so3.multiply(i, dV)
         by_dB: Derivatives = tuple
@@ -196,29 +200,31 @@ class GyroIncrementFactor(Model):
         return error * weight, jacobians
 
 
-def rate_error(bias_error: Array, errors: Array | None, rate: Array, force: Array | None) -> tuple[Array, Derivatives]:
-    """What a gyro reads too much (n, 3), rad/s, given what it reads and the specific force, and its derivatives.
+def rate_error(
+    bias_error: Array, errors: Array | None, rate: Array, drivers: Array | None
+) -> tuple[Array, Derivatives]:
+    """What a gyro reads too much (n, 3), rad/s, given what it reads and its drivers, and its derivatives.
 
     Args:
         bias_error: (n, 3), the bias beyond what was taken off the rates.
-        errors: (n, 6 or 15); None for a perfect gyro.
+        errors: (n, 6 to 18); None for a perfect gyro.
         rate: (n, 3) as read.
-        force: (n, 3), needed where G is among the errors.
+        drivers: (n, d), needed where D is among the errors.
     """
     if errors is None:
         return bias_error, lambda: (np.eye(3),)
     S, N, _ = _inverse(errors)
     excess = bias_error + _apply(S, rate)
-    G = _sensitivity(errors)
-    if G is not None:
-        excess = excess + _apply(G, needed(force))
+    D = _driven(errors)
+    if D is not None:
+        excess = excess + _apply(D, needed(drivers))
     excess = _apply(N, excess)
 
     def derivatives() -> tuple[Array, ...]:
         by_errors = by_symmetric(N[..., None] * (rate - excess)[:, None, None])
-        if G is None:
+        if D is None:
             return N, by_errors
-        return N, np.concatenate([by_errors, (N[..., None] * needed(force)[:, None, None]).reshape(-1, 3, 9)], axis=2)
+        return N, np.concatenate([by_errors, _by_driven(N[..., None] * needed(drivers)[:, None, None])], axis=2)
 
     return excess, derivatives
 
@@ -230,9 +236,20 @@ def _inverse(errors: Array) -> tuple[Array, Array, Array]:
     return S, N, N @ S
 
 
-def _sensitivity(errors: Array) -> Array | None:
-    """G, (n or 1, 3, 3), if it is among the errors."""
-    return _distinct(errors)[:, SCALE:].reshape(-1, 3, 3) if errors.shape[1] > SCALE else None
+def _driven(errors: Array) -> Array | None:
+    """D, (n or 1, 3, d), if it is among the errors."""
+    numbers = _distinct(errors)[:, SCALE:]
+    if not numbers.shape[1]:
+        return None
+    if numbers.shape[1] == len(_G_THEN_C):
+        numbers = numbers[:, np.argsort(_G_THEN_C)]
+    return numbers.reshape(len(numbers), 3, -1)
+
+
+def _by_driven(by_entry: Array) -> Array:
+    """Derivatives by the entries of D, (n, 3, 3, d), to those by its numbers, (n, 3, 3 d)."""
+    flat = by_entry.reshape(len(by_entry), 3, -1)
+    return flat[..., _G_THEN_C] if flat.shape[2] == len(_G_THEN_C) else flat
 
 
 def _distinct(rows: Array) -> Array:
@@ -244,8 +261,8 @@ def needed(given: Array | None) -> Array:
     """What variables were told to depend on. Raises ValueError when it was not given."""
     if given is None:
         raise ValueError(
-            "errors of a gyro need increments with scale=True and, for G, a specific force; skew and scale of pictures "
-            "need elapsed and first"
+            "errors of a gyro need increments with scale=True and, for D, drivers; skew and scale of pictures need "
+            "elapsed and first"
         )
     return given
 

@@ -39,7 +39,7 @@ class Increments:
             straight line between the rates on either side.
         scale_jacobian: (n, 3, 9), None unless asked for; for a gyro that reads D w too much the rotation is
             wxyz * Exp(J vec(D)), to first order, w the rate with bias_hat taken off, vec by rows: xx, xy, xz, yx ...
-        g_jacobian: (n, 3, 9), likewise for a gyro that reads D f too much, f the specific force; None without it.
+        driver_jacobian: (n, 3, 3 d), likewise for a gyro that reads D f too much, D (3, d), f its drivers, or None.
     """
 
     duration: Array
@@ -48,8 +48,8 @@ class Increments:
     rate: Array
     unseen: Array
     scale_jacobian: Array | None = None
-    g_jacobian: Array | None = None
-    stacked: ClassVar = ("duration", "wxyz", "bias_jacobian", "rate", "unseen", "scale_jacobian", "g_jacobian")
+    driver_jacobian: Array | None = None
+    stacked: ClassVar = ("duration", "wxyz", "bias_jacobian", "rate", "unseen", "scale_jacobian", "driver_jacobian")
 
     def __getitem__(self, rows: Any) -> Increments:
         """Those over some of the windows."""
@@ -67,7 +67,8 @@ class GyroPath:
         t: (N,) stamps, s, increasing, N >= 2.
         rate: (N, 3) angular rate, rad/s.
         bias_hat: (3,) taken off all rates.
-        specific_force: (N, 3) by the accelerometer of the same IMU, at the same stamps and in the same frame, m/s^2.
+        drivers: (N, d) what else than the rate moves what it reads, at the same stamps: the specific force by the
+            accelerometer of the same IMU, in the same frame, m/s^2, its temperature above some other, K, or both.
     """
 
     def __init__(
@@ -75,19 +76,19 @@ class GyroPath:
         t: ArrayLike,
         rate: ArrayLike,
         bias_hat: ArrayLike = (0.0, 0.0, 0.0),
-        specific_force: ArrayLike | None = None,
+        drivers: ArrayLike | None = None,
     ) -> None:
         self.t = np.asarray(t, dtype=float)
         self.bias_hat = np.asarray(bias_hat, dtype=float)
         mean = np.asarray(rate, dtype=float)
         if len(self.t) < 2 or mean.shape != (len(self.t), 3):
             raise ValueError(f"needs stamps (N,) and rates (N, 3), N >= 2; got {self.t.shape} and {mean.shape}")
-        self._force: Array | None = None
-        if specific_force is not None:
-            force = np.asarray(specific_force, dtype=float)
-            if force.shape != mean.shape:
-                raise ValueError(f"needs a specific force for each rate; got {force.shape} and {mean.shape}")
-            self._force = force - _trapezoid_excess(self.t, force)
+        self._drivers: Array | None = None
+        if drivers is not None:
+            driving = np.asarray(drivers, dtype=float)
+            if driving.ndim != 2 or len(driving) != len(mean):
+                raise ValueError(f"needs drivers for each rate; got {driving.shape} and {mean.shape}")
+            self._drivers = driving - _trapezoid_excess(self.t, driving)
         self._rate = mean - self.bias_hat - _trapezoid_excess(self.t, mean)
         self._slope = np.diff(self._rate, axis=0) / np.diff(self.t)[:, None]
         self._arcs = _arc(self._rate[:-1], self._slope, np.diff(self.t)[:, None])
@@ -110,12 +111,13 @@ class GyroPath:
         i, s = self._place(np.asarray(at, dtype=float))
         return self._rate[i] + self._slope[i] * s
 
-    def specific_force(self, at: ArrayLike) -> Array | None:
-        """Specific force (n, 3) at the times, m/s^2; None where it is not known."""
-        if self._force is None:
+    def drivers(self, at: ArrayLike) -> Array | None:
+        """The drivers (n, d) at the times; None without."""
+        if self._drivers is None:
             return None
         i, s = self._place(np.asarray(at, dtype=float))
-        return self._force[i] + (self._force[i + 1] - self._force[i]) * (s / (self.t[i + 1] - self.t[i])[:, None])
+        before, after = self._drivers[i], self._drivers[i + 1]
+        return np.asarray(before + (after - before) * (s / (self.t[i + 1] - self.t[i])[:, None]))
 
     def increments(self, start: ArrayLike, stop: ArrayLike, scale: bool = False) -> Increments:
         """Rotations over the windows [start, stop], (n,) each, s; a window may be empty or run backwards.
@@ -124,8 +126,8 @@ class GyroPath:
 
         Args:
             start, stop: the windows' ends.
-            scale: also the derivatives by the gyro's scale and, with a specific force, by its g-sensitivity. They cost
-                as much as the rest and one pass over the whole stream.
+            scale: also the derivatives by the gyro's scale and, with drivers, by what they add to it. They cost as much
+                as the rest and one pass over the whole stream.
         """
         start, stop = np.asarray(start, dtype=float), np.asarray(stop, dtype=float)
         # Both ends in one call: what a few windows cost is calls.
@@ -148,11 +150,11 @@ class GyroPath:
         )
         if not scale:
             return turned
-        by = [to_end @ self._moments(i, s, begun, v) for v in (self._rate, self._force) if v is not None]
-        return replace(turned, scale_jacobian=by[0], g_jacobian=by[1] if len(by) == 2 else None)
+        by = [to_end @ self._moments(i, s, begun, v) for v in (self._rate, self._drivers) if v is not None]
+        return replace(turned, scale_jacobian=by[0], driver_jacobian=by[1] if len(by) == 2 else None)
 
     def _moments(self, i: NDArray[np.intp], s: Array, begun: Array, vector: Array) -> Array:
-        """Integral over windows of the attitude matrix times each component of a vector, (n, 3, 9): [i, 3 a + b].
+        """Integral over windows of the attitude matrix times each component of a vector, (n, 3, 3 d): [i, d a + b].
 
         Within a sample interval the attitude's integral is taken with the vector's mean, which leaves out a twelfth of
         how both change in it. Column by column: all at once would take 27 times the stream's memory.
@@ -160,18 +162,19 @@ class GyroPath:
         Args:
             i, s: (2 n,), (2 n, 1) the samples before the windows' starts, then before their ends, and the times since.
             begun: (2 n, 3, 3) integral of the attitude matrix from the sample before each end.
-            vector: (N, 3) at the stamps, linear in between.
+            vector: (N, d) at the stamps, linear in between.
         """
+        d = vector.shape[1]
         slope = (vector[i + 1] - vector[i]) / (self.t[i + 1] - self.t[i])[:, None]
-        at_ends = np.einsum("nia,nb->niab", begun, vector[i] + 0.5 * s * slope).reshape(-1, 3, 9)
+        at_ends = np.einsum("nia,nb->niab", begun, vector[i] + 0.5 * s * slope).reshape(-1, 3, 3 * d)
         start, stop = np.split(i, 2)
         attitude = np.ascontiguousarray(np.diff(self._integral, axis=0).reshape(-1, 9).T)
         mean = np.ascontiguousarray(0.5 * (vector[1:] + vector[:-1]).T)
         out = at_ends[len(start) :] - at_ends[: len(start)]
         until = np.zeros(len(self.t))
-        for row, column in np.ndindex(9, 3):
+        for row, column in np.ndindex(9, d):
             np.cumsum(attitude[row] * mean[column], out=until[1:])
-            out[:, row // 3, 3 * (row % 3) + column] += until[stop] - until[start]
+            out[:, row // 3, d * (row % 3) + column] += until[stop] - until[start]
         return out
 
     def _place(self, at: Array) -> tuple[NDArray[np.intp], Array]:

@@ -115,7 +115,7 @@ class Turn:
         accel_K = np.asarray(np.linalg.inv(accel_A), dtype=float)
         force, G = (accel - accel_c) @ accel_K.T, sensitivity.reshape(3, 3)
         rate = (raw - c - force @ G.T) @ K.T
-        return cls(GyroPath(t, rate, specific_force=force), rate, K, force, G, accel_K)
+        return cls(GyroPath(t, rate, drivers=force), rate, K, force, G, accel_K)
 
     @property
     def rotation(self) -> Array:
@@ -134,7 +134,7 @@ class Turn:
         by_offset = -_by_rate(self.path, points) @ self.K
         if self.force is None or self.G is None or self.accel_K is None:
             return (_by_numbers(by_offset, points),)
-        forces = self.path.specific_force(self.path.t)
+        forces = self.path.drivers(self.path.t)
         assert forces is not None
         by_accel_offset = -by_offset @ self.G @ self.accel_K
         return (

@@ -117,12 +117,14 @@ class Sheet(Section):
 class GyroSheet(Sheet):
     """Of a gyro.
 
-    scale, no unit; skew, rad: half the angle error between two axes; g_sensitivity, rad/s per m/s^2.
+    scale, no unit; skew, rad: half the angle error between two axes; g_sensitivity, rad/s per m/s^2; temperature: slope
+    of the bias, rad/s/K.
     """
 
     scale: SigmaOrZero | None = None
     skew: SigmaOrZero | None = None
     g_sensitivity: SigmaOrZero | None = None
+    temperature: SigmaOrZero | None = None
 
 
 class PlatformGyroSheet(Sheet):
@@ -161,10 +163,14 @@ class ClockSheet(Sheet):
 
 
 class AccelSheet(Sheet):
-    """Of an accelerometer that reads u + square u^2 + cube u^3: square, s^2/m, and cube, (s^2/m)^2."""
+    """Of an accelerometer that reads u + square u^2 + cube u^3: square, s^2/m, and cube, (s^2/m)^2.
+
+    temperature: slope of its offset, m/s^2/K.
+    """
 
     square: SigmaOrZero | None = None
     cube: SigmaOrZero | None = None
+    temperature: SigmaOrZero | None = None
 
 
 class ReferenceSheet(Sheet):

@@ -108,7 +108,7 @@ def validate(
     known.of_method(name)
     chosen = method(name)
     data = chosen.read(recording, config)
-    values = {parameter: saved.value for parameter, saved in calibration.parameters.items()}
+    values = calibration.values
     validations = chosen.validate(data, config, values)
     if known.sha256 == recording.sha256():
         return Validated(calibration, path.name, validations, True, recording.notes)

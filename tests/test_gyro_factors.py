@@ -1,4 +1,4 @@
-"""The gyro chain, measured = (I + S) w + G f + bias: against integrating again, numerically, and against gtsam."""
+"""The gyro chain, measured = (I + S) w + G f + c (T - T0) + bias: against integrating again, differences, and gtsam."""
 
 from __future__ import annotations
 
@@ -20,6 +20,10 @@ N = 15
 T = np.arange(0.0, 20.0, 0.0025)
 RATE = 2.0 * np.sin(2.0 * np.pi * np.array([0.5, 0.8, 0.6]) * T[:, None] + np.array([0.3, 1.9, 4.0]))
 FORCE = np.stack([3.0 * np.sin(T), 2.0 * np.cos(1.3 * T), 9.8 + np.sin(2.0 * T)], axis=1)
+# K above the first.
+WARMTH = 5.0 * (1.0 - np.exp(-T / 8.0)) + 0.3 * np.sin(0.9 * T)
+# What moves the gyro's readings, by how many numbers its errors are.
+DRIVERS = {0: None, 6: None, 9: WARMTH[:, None], 15: FORCE, 18: np.column_stack([FORCE, WARMTH])}
 BIAS, BIAS_HAT = np.array([0.01, -0.02, 0.015]), np.array([0.005, -0.01, 0.0])
 SCALE = np.array([1.0, -0.7, 0.4, -0.5, 0.8, 0.3])
 G = np.array([0.2, -0.9, 0.5, 1.0, 0.3, -0.6, 0.1, 0.7, -0.4])
@@ -67,17 +71,17 @@ def test_windows_between_stamps_and_backwards() -> None:
 
 
 def test_jacobians_of_increments_against_differences() -> None:
-    """Each entry of S and G, by integrating the changed samples."""
+    """Each entry of S, G and c, by integrating the changed samples."""
     start = np.linspace(0.5, 15.0, N)
     stop = start + np.linspace(0.001, 1.5, N)
-    path = GyroPath(T, RATE, BIAS_HAT, FORCE)
+    path = GyroPath(T, RATE, BIAS_HAT, DRIVERS[18])
     turns = path.increments(start, stop, scale=True)
     assert turns.scale_jacobian is not None
-    assert turns.g_jacobian is not None
+    assert turns.driver_jacobian is not None
     h = 1e-5
-    for jacobian, vector in [(turns.scale_jacobian, RATE - BIAS_HAT), (turns.g_jacobian, FORCE)]:
-        for entry in range(9):
-            D = h * np.eye(9)[entry].reshape(3, 3)
+    for jacobian, vector in [(turns.scale_jacobian, RATE - BIAS_HAT), (turns.driver_jacobian, DRIVERS[18])]:
+        for entry in range(3 * vector.shape[1]):
+            D = h * np.eye(3 * vector.shape[1])[entry].reshape(3, -1)
             less, more = (
                 GyroPath(T, RATE - sign * vector @ D.T, BIAS_HAT).increments(start, stop).wxyz for sign in (-1, 1)
             )
@@ -85,18 +89,18 @@ def test_jacobians_of_increments_against_differences() -> None:
             np.testing.assert_allclose(jacobian[..., entry], numeric, atol=2e-5 * np.abs(numeric).max())
 
 
-def test_without_specific_force_there_is_no_g_jacobian() -> None:
+def test_without_drivers_there_is_no_driver_jacobian() -> None:
     path = GyroPath(T, RATE)
-    assert path.increments([1.0], [2.0], scale=True).g_jacobian is None
+    assert path.increments([1.0], [2.0], scale=True).driver_jacobian is None
     assert path.increments([1.0], [2.0]).scale_jacobian is None
-    assert path.specific_force([1.0]) is None
-    with pytest.raises(ValueError, match="a specific force for each rate"):
-        GyroPath(T, RATE, specific_force=FORCE[1:])
+    assert path.drivers([1.0]) is None
+    with pytest.raises(ValueError, match="drivers for each rate"):
+        GyroPath(T, RATE, drivers=FORCE[1:])
 
 
-def test_specific_force_between_stamps() -> None:
+def test_drivers_between_stamps() -> None:
     at = np.array([1.0, 1.001, 7.77])
-    got = GyroPath(T, RATE, specific_force=FORCE).specific_force(at)
+    got = GyroPath(T, RATE, drivers=FORCE).drivers(at)
     assert got is not None
     exact = np.stack([3.0 * np.sin(at), 2.0 * np.cos(1.3 * at), 9.8 + np.sin(2.0 * at)], axis=1)
     np.testing.assert_allclose(got, exact, atol=1e-5)
@@ -106,13 +110,13 @@ def _blocks(angle: float, size: float, errors: int, platform: bool = False) -> l
     """Random values for the factor's blocks, with `errors` numbers of S and G, of the given size."""
     rng = np.random.default_rng(4)
     attitudes = [so3.exp(angle * rng.normal(size=(N, 3))) for _ in range(2)]
-    gyro = [BIAS_HAT + 0.02 * rng.normal(size=(N, 3)), size * rng.normal(size=(N, 15)) * ([1.0] * 6 + [0.03] * 9)]
+    gyro = [BIAS_HAT + 0.02 * rng.normal(size=(N, 3)), size * rng.normal(size=(N, 18)) * ([1.0] * 6 + [0.03] * 12)]
     base = [size * rng.normal(size=(N, 9))] if platform else []
     return [*attitudes, gyro[0], *([gyro[1][:, :errors]] if errors else []), *base]
 
 
 def _factor(rows: NDArray[np.intp], errors: int, platform: bool = False) -> GyroIncrementFactor:
-    path = GyroPath(T, RATE, BIAS_HAT, FORCE if errors == 15 else None)
+    path = GyroPath(T, RATE, BIAS_HAT, DRIVERS[errors])
     base = GyroPath(T, 0.3 * np.roll(RATE, 1, axis=1), 0.5 * BIAS_HAT)
     start = np.linspace(0.5, 15.0, N)
     stop = start + np.linspace(0.01, 0.9, N)
@@ -123,7 +127,7 @@ def _factor(rows: NDArray[np.intp], errors: int, platform: bool = False) -> Gyro
     return GyroIncrementFactor(stop[rows], turns, path, sigma)
 
 
-CASES = [(0, False), (6, False), (15, False), (6, True), (15, True)]
+CASES = [(errors, platform) for errors in (0, 6, 9, 15, 18) for platform in (False, True) if errors or not platform]
 
 
 @pytest.mark.parametrize(("errors", "platform"), CASES)
@@ -173,12 +177,35 @@ def test_carried_over_short_windows() -> None:
     np.testing.assert_allclose(rate, true.rate, atol=3e-3)
 
 
+@pytest.mark.parametrize("errors", [9, 18])
+def test_a_gyro_that_warms_up(errors: int) -> None:
+    """Corrected for its slope, and for scale and force where those are known too, it tells the true rate."""
+    scale, g, slope = 1e-2 * SCALE, 1e-4 * G, np.array([1e-3, -2e-3, 5e-4])
+    numbers = np.array([*scale, *g, *slope]) if errors == 18 else np.array([*scale, *slope])
+    felt = FORCE @ g.reshape(3, 3).T if errors == 18 else 0.0
+    measured = RATE @ (np.eye(3) + symmetric(scale)).T + felt + np.outer(WARMTH, slope) + BIAS
+    path = GyroPath(T, measured, BIAS_HAT, DRIVERS[errors])
+    start = np.linspace(0.5, 15.0, N)
+    stop = start + 0.05
+    bias, known = np.tile(BIAS, (N, 1)), np.tile(numbers, (N, 1))
+    true = GyroPath(T, RATE).increments(start, stop).wxyz
+    ways = (
+        corrected(path.increments(start, stop, scale=True), bias - BIAS_HAT, known)[0],
+        carried(path, start, start + 0.025, stop, bias, known)[0],
+    )
+    for got, limit in zip(ways, (3e-7, 4e-6), strict=True):
+        np.testing.assert_allclose(so3.log(so3.multiply(so3.inverse(true), got)), 0.0, atol=limit)
+    without = np.tile([*numbers[:-3], 0.0, 0.0, 0.0], (N, 1))
+    cold, _ = corrected(path.increments(start, stop, scale=True), bias - BIAS_HAT, without)
+    assert np.abs(so3.log(so3.multiply(so3.inverse(true), cold))).max() > 1e-4
+
+
 def test_errors_as_variables_need_derivatives_by_them() -> None:
     path = GyroPath(T, RATE)
     turns = path.increments([1.0], [2.0])
     with pytest.raises(ValueError, match="scale=True"):
         corrected(turns, np.zeros((1, 3)), np.zeros((1, 6)))
-    with pytest.raises(ValueError, match="specific force"):
+    with pytest.raises(ValueError, match="drivers"):
         corrected(path.increments([1.0], [2.0], scale=True), np.zeros((1, 3)), np.zeros((1, 15)))
 
 

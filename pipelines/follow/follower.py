@@ -220,6 +220,9 @@ class Follower:
     def _new_steps(self, session: Session, problem: Problem) -> Iterator[Step]:
         """The steps not taken yet, for a run that is the one to take them: a new one if the past has changed."""
         belongs = self._identify(session)
+        # A sensor whose first message comes late may bring variables of its own.
+        if self._run is not None and _names(self._run.problem) != _names(problem):
+            self._run = None
         if problem.steps_after is None or belongs != self._identity or session.origin.epoch_ns != self._epoch_ns:
             self._run = None
         self._identity, self._epoch_ns = belongs, session.origin.epoch_ns
@@ -322,6 +325,11 @@ def _first(steps: Iterable[Step]) -> Iterator[Step]:
     for step in steps:
         yield step
         return
+
+
+def _names(problem: Problem) -> list[str]:
+    """Of all numbers that are estimated."""
+    return [quantity.name for quantity in problem.quantities]
 
 
 def _that_grows(problem: Problem, session: Session) -> Problem:

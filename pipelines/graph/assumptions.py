@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from pipelines.graph.problem import Findings, Parameter, Quantity
+import numpy as np
+
+from pipelines.graph.problem import Array, Findings, Parameter, Quantity
 from pipelines.settings import Config
 
 # What is left free has a prior so many times the one in force.
@@ -59,6 +61,12 @@ def sensitivity_assumption(sensor: str, sheet: str, sigma: float) -> Assumption:
     return Assumption(names, "rad/s/(m/s^2)", sheet, "g_sensitivity", sigma)
 
 
+def temperature_assumption(sensor: str, unit: str, sigma: float) -> Assumption:
+    """The three slopes of a sensor's bias over its temperature, `unit`/K."""
+    names = tuple(f"{sensor}_temperature_{axis}" for axis in "xyz")
+    return Assumption(names, f"{unit}/K", sensor, "temperature", sigma)
+
+
 def encoder_assumptions(joints: Sequence[str], once_per_turn: float, delay: float) -> tuple[Assumption, Assumption]:
     """Sine and cosine of each encoder's error once a turn, rad, and the delay of their readings, s; one sigma."""
     names = tuple(f"encoder_{joint}_{part}" for joint in joints for part in ("sin", "cos"))
@@ -93,6 +101,20 @@ def parameter(key: int, assumptions: Sequence[Assumption], config: Config) -> Pa
     """One variable of several assumptions; None if all are fixed, so that the graph can do without."""
     all_of_them = tuple(q for assumption in assumptions for q in quantities(assumption, config))
     return Parameter(key, all_of_them) if any(q.prior_sigma for q in all_of_them) else None
+
+
+def gyro_errors(
+    key: int, scale: Sequence[Assumption], drivers: Sequence[Assumption], config: Config
+) -> Parameter | None:
+    """One variable of a gyro's errors, see factors.gyro: S and, in this order, what of its drivers is not all fixed."""
+    return parameter(key, (*scale, *(each for each in drivers if parameter(key, (each,), config))), config)
+
+
+def acting(errors: Parameter | None, drivers: Mapping[Assumption, Array | None]) -> Array | None:
+    """Those of a gyro's drivers that its errors act on, side by side, (N, d): of (N, 3) and (N,); None: none."""
+    names = {q.name for q in errors.quantities} if errors else set()
+    found = [driver for each, driver in drivers.items() if driver is not None and each.names[0] in names]
+    return np.column_stack(found) if found else None
 
 
 def stamped(parameter: Parameter | None, name: str, sigma: float) -> Parameter | None:

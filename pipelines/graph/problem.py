@@ -195,6 +195,7 @@ class Problem:
             `unsettled` s. None if there is no such keyframe. Not every graph can be built from the end alone.
         unsettled: see `onward`, s.
         noises: that are in force, with what sensors' own samples say of them.
+        constants: numbers of the recording that formulas need beside the parameters, by name.
     """
 
     method: str
@@ -210,6 +211,7 @@ class Problem:
     onward: Callable[[Any, float], Problem | None] | None = None
     unsettled: float = 1.0
     noises: tuple[Level, ...] = ()
+    constants: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:

@@ -74,28 +74,43 @@ def numbers_of(space: Any, names: Sequence[str]) -> Array:
 
 
 def gyro_rate(
-    known: Collection[str], s: Sequence[str], g: Sequence[str]
+    known: Collection[str], s: Sequence[str], g: Sequence[str], c: Sequence[str] = ()
 ) -> tuple[str, tuple[str, ...], Callable[[Any], Array]]:
-    """The true rate w from what a gyro reads, (I + S) w + G f + gyro_bias: text, what it measures, the same as code.
+    """The true rate w from what a gyro reads, (I + S) w + G f + c (temperature - first_temperature) + gyro_bias.
+
+    Text, what it measures, and the same as code.
 
     Args:
         known: parameters that are applied.
-        s, g: names of the numbers of S, xx yy zz xy xz yz, and of those of G by rows.
+        s, g, c: names of the numbers of S, xx yy zz xy xz yz, of those of G by rows, and of c.
     """
-    feels, scaled = (any(name in known for name in names) for names in (g, s))
+    scaled, feels, drifts = (any(name in known for name in names) for names in (s, g, c))
 
     def compute(v: Any) -> Array:
         rate = v.gyro - v.gyro_bias
         if feels:
             rate = rate - v.accel @ numbers_of(v, g).reshape(3, 3).T
+        if drifts:
+            rate = rate - over_temperature(v, c)
         return np.asarray(rate @ np.linalg.inv(np.eye(3) + symmetric(numbers_of(v, s))))
 
-    text = f"gyro - {matrix_text([g[:3], g[3:6], g[6:]], known)} * accel - gyro_bias" if feels else "gyro - gyro_bias"
+    force = f" - {matrix_text([g[:3], g[3:6], g[6:]], known)} * accel" if feels else ""
+    text = f"gyro{force}{f' - {temperature_text(c, known)}' if drifts else ''} - gyro_bias"
     return (
         f"inverse({symmetric_text(s, known)}) * ({text})" if scaled else text,
-        ("gyro", "accel") if feels else ("gyro",),
+        ("gyro", *(["accel"] if feels else []), *(["temperature"] if drifts else [])),
         compute,
     )
+
+
+def temperature_text(names: Sequence[str], known: Collection[str]) -> str:
+    """What a sensor reads too much at a temperature, by its slopes."""
+    return f"{vector_text(names, known)} * (temperature - first_temperature)"
+
+
+def over_temperature(v: Any, names: Sequence[str]) -> Array:
+    """The same as code, (..., 3)."""
+    return np.asarray((v.temperature - v.first_temperature)[..., None] * numbers_of(v, names))
 
 
 def axis_angles(axes: Sequence[str], once_per_turn: Sequence[str], delay: str, known: Collection[str]) -> list[Formula]:

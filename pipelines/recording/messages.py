@@ -40,6 +40,7 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 TWIST = "geometry_msgs/msg/TwistStamped"
 ACCEL = "geometry_msgs/msg/AccelStamped"
 TF = "tf2_msgs/msg/TFMessage"
+TEMPERATURE = "sensor_msgs/msg/Temperature"
 TAG_DETECTIONS = "apriltag_msgs/msg/AprilTagDetectionArray"
 
 # What an attitude is taken from; of an Imu its orientation. A TFMessage besides needs the pair of frames.
@@ -52,7 +53,7 @@ PICTURES = (COMPRESSED_IMAGE, IMAGE)
 # All types that anything is taken from.
 SENSORS = (
     *(IMU, MAGNETIC_FIELD, JOINT_STATE, NAV_SAT_FIX, CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, VECTOR, QUATERNION, POSE),
-    *(PLAIN_POSE, TRANSFORM, ODOMETRY, TWIST, ACCEL, TF, TAG_DETECTIONS),
+    *(PLAIN_POSE, TRANSFORM, ODOMETRY, TWIST, ACCEL, TF, TAG_DETECTIONS, TEMPERATURE),
 )
 
 # Not among the types rosbags brings along.

@@ -227,6 +227,10 @@ class Recording:
         """A sensor_msgs/msg/NavSatFix topic."""
         return self._series(series.FixSeries, topic)
 
+    def temperature(self, topic: str) -> series.TemperatureSeries:
+        """A sensor_msgs/msg/Temperature topic."""
+        return self._series(series.TemperatureSeries, topic)
+
     def joints(self, topic: str, names: Sequence[str]) -> series.JointSeries:
         """Positions of the named joints on a sensor_msgs/msg/JointState topic, whatever order the messages have."""
         self._reader.require(topic, messages.JOINT_STATE)

@@ -172,6 +172,16 @@ class FixSeries(Series):
 
 
 @dataclass(frozen=True, eq=False)
+class TemperatureSeries(Series):
+    """Temperatures (N,), degrees Celsius."""
+
+    TYPE: ClassVar[str] = messages.TEMPERATURE
+    COLUMNS: ClassVar[dict[str, Column]] = {"celsius": Column("temperature", ())}
+
+    celsius: Array
+
+
+@dataclass(frozen=True, eq=False)
 class JointSeries:
     """Positions (N, len(names)) rad of the named joints; `without` counts messages that lack one of them."""
 

@@ -54,6 +54,7 @@ _KINDS: dict[str, type[series.Series]] = {
     "field": series.MagneticSeries,
     "vector": series.VectorSeries,
     "latitude_deg": series.FixSeries,
+    "celsius": series.TemperatureSeries,
 }
 
 
@@ -63,8 +64,8 @@ class TableTopic(BaseModel):
     Attributes:
         file: name of the file; needed where there are several tables.
         time, unit: column of the stamps, and what they count.
-        gyro, accel, wxyz, position, field, vector, latitude_deg, longitude_deg, height, joints: columns, by what they
-            are in pipelines.recording.series.
+        gyro, accel, wxyz, position, field, vector, latitude_deg, longitude_deg, height, celsius, joints: columns, by
+            what they are in pipelines.recording.series.
         video: name of a video beside the table, whose rows are the stamps of its pictures.
         units: of one of these, where it is not SI.
     """
@@ -83,6 +84,7 @@ class TableTopic(BaseModel):
     latitude_deg: str | None = None
     longitude_deg: str | None = None
     height: str | None = None
+    celsius: str | None = None
     joints: dict[str, str] | None = None
     video: str | None = None
     units: dict[str, str] = {}
@@ -130,7 +132,9 @@ class TableTopic(BaseModel):
         return UNITS[self.units[name]] if name in self.units else 1.0
 
 
-_NUMBERS = ("gyro", "accel", "wxyz", "position", "field", "vector", "latitude_deg", "longitude_deg", "height")
+_NUMBERS = (
+    *("gyro", "accel", "wxyz", "position", "field", "vector", "latitude_deg", "longitude_deg", "height", "celsius"),
+)
 
 
 def described(container: Container, columns: Mapping[str, TableTopic]) -> Container:

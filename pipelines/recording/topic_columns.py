@@ -18,6 +18,7 @@ _COLUMNS: Mapping[str, Mapping[str, series.Column]] = {
         series.QuaternionSeries,
         series.PoseSeries,
         series.FixSeries,
+        series.TemperatureSeries,
     )
     for name, columns in ({kind.TYPE: kind.COLUMNS} | kind.OTHERS).items()
 }

@@ -37,6 +37,7 @@ Need = Sequence[Sequence[Topic | Setting]]
 IMU = Topic("imu", "/imu", (messages.IMU,))
 MAG = Topic("mag", "/mag", (messages.MAGNETIC_FIELD,))
 FIX = Topic("fix", "/fix", (messages.NAV_SAT_FIX,))
+TEMPERATURE = Topic("temperature", "/temperature", (messages.TEMPERATURE,))
 IMAGE = Topic("image", "/camera/image/compressed", messages.PICTURES)
 CAMERA_INFO = Topic("camera_info", "/camera/camera_info", (messages.CAMERA_INFO,))
 

@@ -88,6 +88,12 @@ class SavedCalibration(_Record):
     transforms: dict[str, SavedTransform] = {}
     findings: dict[str, list[dict[str, object]]] = {}
     formulas: list[str] = []
+    constants: dict[str, float] = {}
+
+    @property
+    def values(self) -> dict[str, float]:
+        """What formulas are computed with: parameters and constants by name."""
+        return {**self.constants, **{name: parameter.value for name, parameter in self.parameters.items()}}
 
     def value(self, name: str) -> float:
         """Value of a parameter. Raises InputError if the calibration has none of that name."""
@@ -115,6 +121,8 @@ def calibration_yaml(calibration: Calibration) -> str:
     for section in ("parameters", "rotations", "transforms"):
         content[section] = {name: one_line(entry) for name, entry in content[section].items()}
     content["findings"] = {name: [one_line(row) for row in rows] for name, rows in content["findings"].items()}
+    if not content["constants"]:
+        del content["constants"]
     yaml = YAML()
     yaml.Representer = Representer
     yaml.width = 200
@@ -140,6 +148,7 @@ def saved(calibration: Calibration) -> SavedCalibration:
         transforms=_transforms(calibration),
         findings={name: [_plain(row) for row in rows] for name, rows in calibration.findings.items()},
         formulas=[formula.text for formula in calibration.formulas],
+        constants=dict(calibration.problem.constants),
     )
 
 

@@ -70,9 +70,14 @@ def report_html(calibration: Calibration) -> str:
         limits=found,
         advised=_short_of(calibration, found),
         exact=_exact(calibration),
-        formulas=[formula.text for formula in calibration.formulas],
+        formulas=[*(formula.text for formula in calibration.formulas), *_constants(calibration)],
         tables=[each for each in own if isinstance(each, Table)],
-    )
+
+
+def _constants(calibration: Calibration) -> list[str]:
+    """The numbers of the recording that formulas need, as formulas; those that are in none left out."""
+    needed = " ".join(formula.expression for formula in calibration.formulas)
+    return [f"{name} = {value:.6g}" for name, value in calibration.problem.constants.items() if name in needed]
 
 
 def _short_of(calibration: Calibration, found: list[Limit]) -> list[str]:

@@ -5,7 +5,8 @@ calibration.yaml, whose numbers count as independent.
 from __future__ import annotations
 
 import datetime
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -30,6 +31,7 @@ class Known:
         sha256: of its recording.
         start_ns: of its recording, Unix ns.
         belief: about its parameters.
+        constants: that its formulas need beside them.
     """
 
     method: str
@@ -38,6 +40,7 @@ class Known:
     sha256: str
     start_ns: int
     belief: Belief
+    constants: Mapping[str, float] = field(default_factory=dict)
 
     def of_method(self, name: str) -> Known:
         """Itself. Raises InputError when it is another method's calibration."""
@@ -72,7 +75,12 @@ def saved_of(known: Known, path: Path) -> SavedCalibration:
     start = datetime.datetime.fromtimestamp(known.start_ns // 1_000_000_000, datetime.UTC).isoformat()
     recording = SavedRecording(file=path.name, sha256=known.sha256, start=start)
     return SavedCalibration(
-        method=known.method, solver=known.solver, status=known.status, recording=recording, parameters=parameters
+        method=known.method,
+        solver=known.solver,
+        status=known.status,
+        recording=recording,
+        parameters=parameters,
+        constants=dict(known.constants),
     )
 
 
@@ -103,6 +111,7 @@ class _Result(_Record):
     parameters: list[_Parameter]
     covariance: _Covariance
     session: _Session
+    constants: dict[str, float] = {}
 
 
 def load_known(path: Path) -> Known:
@@ -134,7 +143,15 @@ def _of_result(path: Path, text: str) -> Known:
         raise InputError(f"{path}: not a result.json: its covariance is none")
     belief = Belief(names, np.array([p.value for p in result.parameters]), covariance, str(path))
     session = result.session
-    return Known(result.method, result.solver, result.status, session.sha256, _nanoseconds(session.start), belief)
+    return Known(
+        result.method,
+        result.solver,
+        result.status,
+        session.sha256,
+        _nanoseconds(session.start),
+        belief,
+        result.constants,
+    )
 
 
 def _of_calibration(path: Path) -> Known:

@@ -255,7 +255,7 @@ class Calibration:
             for formulas in (self.formulas, self.method.formulas(list(unknown), self.config))
         )
         given = {name: value for name, value in measured.items() if name in needed or name not in possible}
-        return apply(self.formulas, {**unknown, **values}, given)
+        return apply(self.formulas, {**self.problem.constants, **unknown, **values}, given)
 
     def __repr__(self) -> str:
         """One line."""
@@ -591,6 +591,7 @@ class Result(_Record):
     sensitivity: dict[str, SensitivityResult] | None
     measurements: list[MeasurementResult] | None
     findings: dict[str, list[dict[str, object]]]
+    constants: dict[str, float] | None = None
     recordings: list[PartResult] | None = None
     changes: ChangesResult | None = None
     truth: dict[str, TruthResult] | None = None
@@ -626,6 +627,7 @@ def result(calibration: Calibration) -> Result:
         sensitivity=c.sensitivity,
         measurements=c.measurements,
         findings={name: [dict(row) for row in rows] for name, rows in c.findings.items()},
+        constants=dict(c.problem.constants) or None,
         recordings=list(c.recordings) or None,
         changes=_changes(c),
         truth=truth_errors(c) if c.truth is not None else None,
@@ -633,9 +635,9 @@ def result(calibration: Calibration) -> Result:
 
 
 def result_json(calibration: Calibration) -> str:
-    """The text of result.json; without truth it has no key `truth`, of one recording none of several."""
+    """The text of result.json; keys that only some calibrations have are left out of the others."""
     model = result(calibration)
-    left_out = {name for name in ("truth", "recordings", "changes") if getattr(model, name) is None}
+    left_out = {name for name in ("truth", "constants", "recordings", "changes") if getattr(model, name) is None}
     return model.model_dump_json(by_alias=True, indent=1, exclude=left_out) + "\n"
 
 

@@ -10,9 +10,10 @@ import numpy as np
 from factors import so3
 from factors.gyro import symmetric
 from pipelines.methods.formula import Formula, gyro_rate, numbers_of, symmetric_text, vector_text
-from pipelines.methods.head.parameters import CLOCK_SKEW, PLATFORM_BIAS, PLATFORM_SCALE, SCALE, SENSITIVITY
+from pipelines.methods.head.parameters import CLOCK_SKEW, PLATFORM_BIAS, PLATFORM_SCALE, SCALE, SENSITIVITY, TEMPERATURE
 
 _S, _PLATFORM_S = (tuple(name for each in scale for name in each.names) for scale in (SCALE, PLATFORM_SCALE))
+_DRIVERS = SENSITIVITY.names, TEMPERATURE.names
 
 
 def formulas(parameters: Collection[str]) -> list[Formula]:
@@ -20,7 +21,7 @@ def formulas(parameters: Collection[str]) -> list[Formula]:
     return [
         Formula("markers to helmet IMU", "vRh", "Exp(helmet_mount)", (), lambda v: so3.exp(v.helmet_mount)),
         Formula("platform to camera", "cRb", "Exp(camera_mount)", (), lambda v: so3.exp(v.camera_mount)),
-        Formula("rate of the helmet, rad/s in v", "w_iv", *gyro_rate(parameters, _S, SENSITIVITY.names)),
+        Formula("rate of the helmet, rad/s in v", "w_iv", *gyro_rate(parameters, _S, *_DRIVERS)),
         *_platform_rate(parameters),
         Formula(
             "attitude of the helmet on the platform from a camera measurement cRh",

@@ -18,15 +18,16 @@ from numpy.typing import NDArray
 from factors import so3
 from factors.attitude import VisionAttitudeFactor
 from factors.chi_square import gate
-from factors.gyro import SCALE
 from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
 from pipelines.errors import InputError
+from pipelines.graph.assumptions import acting
 from pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk
 from pipelines.graph.noise import Level
 from pipelines.graph.priors import rotation_prior, vector_prior
 from pipelines.graph.problem import Array, Attitudes, Factor, Problem, Step
-from pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, HeadParameters
+from pipelines.methods import temperature
+from pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, SENSITIVITY, TEMPERATURE, HeadParameters
 from pipelines.methods.head.recording import HeadData
 from pipelines.methods.noise import sampled, stated, typical, walking
 from pipelines.settings import DEFAULT_NOISE, Config, first_given
@@ -60,6 +61,7 @@ class _Model:
     loss: TruncatedLoss
     parameters: HeadParameters
     helmet_guess: Array  # vRh
+    reference: float | None  # degrees Celsius, the temperature at which the bias is the bias; None: nobody measures it
     noises: dict[str, Level]  # by name
 
 
@@ -85,8 +87,9 @@ def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
         dropped=data.dropped,
         premises=() if data.platform_t is not None else (_AT_REST,),
         onward=partial(_onward, config, model),
-        unsettled=0.0,
+        unsettled=0.0 if data.temperature is None else data.temperature.longest_interval,
         noises=tuple(model.noises.values()),
+        constants={} if model.reference is None else {temperature.FIRST: model.reference},
     )
 
 
@@ -107,6 +110,8 @@ def _onward(config: Config, model: _Model, data: HeadData, time: float) -> Probl
     """The graph of the end of a growing recording; see Problem.onward."""
     trunk = ROOT if time == -np.inf else model.chain.trunk(time)
     if trunk is None or (trunk is not ROOT and time < data.vision_t[0]):
+        return None
+    if (data.temperature is None) != (model.reference is None):
         return None
     grown = _prepare(data, config, model, trunk, time)
     return _problem(config, data, grown) if trunk is ROOT or grown.chain.time[0] == time else None
@@ -132,7 +137,11 @@ def _prepare(
     if data.platform_t is not None and data.platform_gyro is not None:
         platform = GyroPath(data.platform_t, data.platform_gyro)
         platform_density = noises["platform_gyro_density"].used
-    parameters = HeadParameters.of(config, platform is not None, data.head_force is not None, data.stamp_sigma)
+    reference = temperature.reference(data.temperature) if before is None else before.reference
+    warmth = temperature.above(data.temperature, reference, data.head_t)
+    drivers = {SENSITIVITY: data.head_force, TEMPERATURE: warmth}
+    caused = [each for each, driver in drivers.items() if driver is not None]
+    parameters = HeadParameters.of(config, platform is not None, caused, data.stamp_sigma)
     sqrt_information = _sqrt_information(data.vision_cov, inside, config)
 
     sigma = float(1.0 / np.median(np.linalg.norm(sqrt_information, axis=(1, 2)) / np.sqrt(3.0)))
@@ -148,12 +157,11 @@ def _prepare(
     time, pictures = time[late:], pictures[late:] - pictures[late]
     frames = slice(len(vision_t) - pictures[-1], None)
     vision_t, measured, sqrt_information = vision_t[frames], measured[frames], sqrt_information[frames]
-    sensitive = parameters.gyro is not None and len(parameters.gyro.quantities) > SCALE
     chain = GyroChain.over(
         time,
         np.arange(len(time)) == 0,
         so3.interpolate(vision_t, so3.multiply(measured, so3.inverse(vRh)), time),
-        GyroPath(data.head_t, data.head_gyro, bias_hat, data.head_force if sensitive else None),
+        GyroPath(data.head_t, data.head_gyro, bias_hat, acting(parameters.gyro, drivers)),
         density=density,
         other_density=platform_density,
         walk=noises["gyro_bias_walk"].used,
@@ -174,6 +182,7 @@ def _prepare(
         loss=TruncatedLoss(gate(3)),
         parameters=parameters,
         helmet_guess=vRh,
+        reference=reference,
         noises=noises,
     )
 

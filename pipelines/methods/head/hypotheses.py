@@ -25,7 +25,7 @@ def _inverted(data: HeadData, config: Config) -> tuple[HeadData, Config]:
 
 
 def _swapped(data: HeadData, config: Config) -> tuple[HeadData, Config] | None:
-    """Helmet and platform the other way round; nobody has read the force in the platform."""
+    """Helmet and platform the other way round; nobody has read force and temperature in the platform."""
     if data.platform_t is None or data.platform_gyro is None:
         return None
     swapped = replace(
@@ -34,6 +34,7 @@ def _swapped(data: HeadData, config: Config) -> tuple[HeadData, Config] | None:
         head_gyro=data.platform_gyro,
         gyro_density=data.platform_gyro_density,
         head_force=None,
+        temperature=None,
         platform_t=data.head_t,
         platform_gyro=data.head_gyro,
         platform_gyro_density=data.gyro_density,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
 
@@ -11,10 +12,12 @@ from factors.earth import EARTH_RATE
 from pipelines.errors import InputError
 from pipelines.graph.assumptions import (
     Assumption,
+    gyro_errors,
     parameter,
     quantities,
     scale_assumptions,
     sensitivity_assumption,
+    temperature_assumption,
 )
 from pipelines.graph.problem import Parameter, Quantity, rotation_vector_coordinates
 from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
@@ -25,11 +28,12 @@ BIAS, HELMET, CAMERA, OFFSET = "gyro_bias", "helmet_mount", "camera_mount", "tim
 # The grades of real-sensor data sheets, one sigma: MEMS gyros, uncalibrated, and a platform's of 10 deg/h.
 SCALE = scale_assumptions("gyro", "gyro", 1e-2)
 SENSITIVITY = sensitivity_assumption("gyro", "gyro", 1e-4)
+TEMPERATURE = temperature_assumption("gyro", "rad/s", 1e-4)
 PLATFORM_BIAS = Assumption(tuple(f"platform_bias_{axis}" for axis in "xyz"), "rad/s", "platform_gyro", "bias", 5e-5)
 PLATFORM_SCALE = scale_assumptions("platform", "platform_gyro", 1e-2)
 CLOCK_SKEW = Assumption(("clock_skew",), "", "clock", "skew", 1e-4)
 VISION_SCALE = Assumption(("vision_scale",), "", "camera", "scale", 3e-3)
-ASSUMPTIONS = (*SCALE, SENSITIVITY, PLATFORM_BIAS, *PLATFORM_SCALE, CLOCK_SKEW, VISION_SCALE)
+ASSUMPTIONS = (*SCALE, SENSITIVITY, PLATFORM_BIAS, *PLATFORM_SCALE, CLOCK_SKEW, VISION_SCALE, TEMPERATURE)
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class HeadParameters:
         bias: the helmet gyro's (3), rad/s, its first node.
         helmet, camera: vRh, cRb.
         picture: time offset alone, or with clock skew and vision scale.
-        gyro: S of the helmet's gyro (6), or S and G (15); None for a perfect one.
+        gyro: S of the helmet's gyro and what its drivers do, see factors.gyro; None for a perfect one.
         platform: bias and S of the platform's gyro (9); None for a perfect one, or none.
     """
 
@@ -52,13 +56,15 @@ class HeadParameters:
     platform: Parameter | None
 
     @classmethod
-    def of(cls, config: Config, platform: bool, accelerometer: bool, stamp_sigma: float = 0.0) -> HeadParameters:
+    def of(
+        cls, config: Config, platform: bool, drivers: Sequence[Assumption], stamp_sigma: float = 0.0
+    ) -> HeadParameters:
         """With the priors in force; a camera without a moving platform is fixed by default.
 
         Args:
             config: priors, data sheets, accuracies wanted.
             platform: whether there is a platform gyro.
-            accelerometer: whether the helmet's IMU measures specific force.
+            drivers: SENSITIVITY and TEMPERATURE, in this order, where the helmet's IMU measures their causes.
             stamp_sigma: s, how well the stamps are known.
         """
         if config.noise.gyro_scale:
@@ -86,13 +92,12 @@ class HeadParameters:
         check_names(config.require, known, "require")
 
         clock = parameter(_key("T"), (CLOCK_SKEW, VISION_SCALE), config)
-        sensitive = accelerometer and parameter(_key("G"), (SENSITIVITY,), config) is not None
         return cls(
             bias=Parameter(FIRST_BIAS, bias),
             helmet=Parameter(_key("H"), mounts[0], rotation_vector_coordinates),
             camera=Parameter(_key("C"), mounts[1], rotation_vector_coordinates),
             picture=Parameter(_key("T"), (offset, *(clock.quantities if clock else ()))),
-            gyro=parameter(_key("G"), (*SCALE, SENSITIVITY) if sensitive else SCALE, config),
+            gyro=gyro_errors(_key("G"), SCALE, drivers, config),
             platform=parameter(_key("P"), (PLATFORM_BIAS, *PLATFORM_SCALE), config) if platform else None,
         )
 

@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import InputError
+from pipelines.methods import temperature
+from pipelines.methods.head import parameters
 from pipelines.methods.head.topics import HEAD_IMU, PLATFORM_IMU, TRUTH_ATTITUDE, VISION_ATTITUDE, HeadConfig
 from pipelines.recording import series
 from pipelines.recording.checks import (
@@ -22,6 +24,7 @@ from pipelines.recording.checks import (
 )
 from pipelines.recording.gyro import read_gyro, read_imu
 from pipelines.recording.reading import Recording
+from pipelines.recording.temperature import Temperature
 from pipelines.recording.topics import CAMERA_INFO, IMAGE, wanted
 from pipelines.recording.writing import attached, write_session
 from pipelines.settings import Config
@@ -45,7 +48,7 @@ class HeadData:
     truth_wxyz (T, 4): bRv, for scoring only, or None. gyro_density, platform_gyro_density, rad/s/sqrt(Hz): from the
     covariances of the messages, None if they say nothing. head_force (N, 3) m/s^2: specific force by the helmet's
     accelerometer in v, at head_t; None if it has none. dropped: reason -> messages. stamp_sigma, s: how well the stamps
-    are known, 0 where they are those of the sensors.
+    are known, 0 where they are those of the sensors. temperature: of the helmet's IMU, None where nobody measures it.
     """
 
     epoch_ns: int
@@ -63,6 +66,7 @@ class HeadData:
     head_force: Array | None = None
     dropped: dict[str, int] = field(default_factory=dict)
     stamp_sigma: float = 0.0
+    temperature: Temperature | None = None
 
 
 def read_head(recording: Recording, config: Config) -> HeadData:
@@ -112,6 +116,7 @@ def read_head(recording: Recording, config: Config) -> HeadData:
         head_force,
         dropped,
         recording.stamp_sigma_s,
+        temperature.read(recording, config, (parameters.TEMPERATURE,), head_t, dropped),
     )
 
 
@@ -150,6 +155,7 @@ def write_head(
     if data.truth_t is not None and data.truth_wxyz is not None:
         t_ns = nanoseconds(data.truth_t, data.epoch_ns)
         topics[TRUTH_ATTITUDE.name] = series.QuaternionSeries(t_ns, data.truth_wxyz, frame_id="platform")
+    topics |= temperature.topics(data.temperature, data.epoch_ns)
     write_session(path, topics, attached(truth, config_yaml))
 
 

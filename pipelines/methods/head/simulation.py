@@ -28,6 +28,7 @@ from pipelines.settings import SensorSheets
 from pipelines.simulation.motion import EulerMotion, Swing, sample_times
 from pipelines.simulation.sensors import read_by, true_values
 from pipelines.simulation.simulated import Simulated
+from pipelines.simulation.temperature import Warming, drift, known, measured
 
 Array = NDArray[np.float64]
 
@@ -79,6 +80,7 @@ class HeadScenario(BaseModel):
     vision_outages_s: list[tuple[float, float]] = []  # [start, end) of each gap
     outlier_fraction: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     outlier_deg: NotNegative = 20.0  # an outlier is turned this far about a random axis
+    temperature: Warming | None = None  # of the helmet's IMU; null: nobody measures it
     pictures: HeadPictures = HeadPictures()  # when pictures are asked for: they take the place of vision's attitudes
     # Data sheets that errors of the sensors are drawn from, passed on to the config; ideal: there are none; null: none
     # either, but the config does not know.
@@ -98,11 +100,12 @@ def simulate_head(scenario: HeadScenario, seed: int) -> tuple[HeadData, dict[str
     # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
     rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     noise = scenario.noise
-    effects = true_values(ASSUMPTIONS, scenario.sensors, scenario.effects, rng_of_sensors)
+    effects = true_values(known(ASSUMPTIONS, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
     head_t, head_rate = _gyro(scenario, scenario.gyro_rate_hz, scenario.gyro_phase, helmet=True)
     force = _specific_force(scenario, head_t)
     bias = _walking_bias(scenario, len(head_t), rng)
     head_gyro = read_by(head_rate, "gyro", effects, force) + bias
+    head_gyro += drift(scenario.temperature, "gyro", effects, head_t)
     head_gyro = head_gyro + _white(noise.gyro_density, scenario.gyro_rate_hz, len(head_t), rng)
     platform_t = platform_gyro = None
     if scenario.platform is not None:
@@ -129,6 +132,7 @@ def simulate_head(scenario: HeadScenario, seed: int) -> tuple[HeadData, dict[str
         gyro_density=noise.gyro_density or None,
         platform_gyro_density=(noise.platform_gyro_density or None) if scenario.platform else None,
         head_force=force + _white(noise.accel_density, scenario.gyro_rate_hz, len(head_t), rng_of_sensors),
+        temperature=measured(scenario.temperature, scenario.duration_s),
     )
     return data, {**_truth(scenario, bias), **effects}
 
@@ -141,7 +145,8 @@ def simulate_pictures(scenario: HeadScenario, seed: int) -> tuple[series.CameraI
     """
     if scenario.outlier_fraction > 0.0:
         raise InputError("outlier_fraction: pictures are simulated without outliers; leave out --images")
-    effects = true_values(ASSUMPTIONS, scenario.sensors, scenario.effects, np.random.default_rng([seed, 1]))
+    rng_of_sensors = np.random.default_rng([seed, 1])
+    effects = true_values(known(ASSUMPTIONS, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
     t, at, cRh = _sights(scenario, effects)
     rng = np.random.default_rng(seed)
     return draw(scenario.pictures, at, nanoseconds(t, EPOCH_NS), cRh, rng)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from pipelines.recording import messages
-from pipelines.recording.topics import CAMERA_INFO, IMAGE, Need, Setting, Topic
+from pipelines.recording.topics import CAMERA_INFO, IMAGE, TEMPERATURE, Need, Setting, Topic
 from pipelines.settings import Board, MethodSection
 
 HEAD_IMU = Topic("head_imu", "/head/imu", messages.RATES)
@@ -22,6 +22,6 @@ class HeadConfig(MethodSection):
     board: Board | None = None
 
 
-TOPICS = (HEAD_IMU, PLATFORM_IMU, VISION_ATTITUDE, TRUTH_ATTITUDE, IMAGE, CAMERA_INFO)
+TOPICS = (HEAD_IMU, PLATFORM_IMU, VISION_ATTITUDE, TRUTH_ATTITUDE, IMAGE, CAMERA_INFO, TEMPERATURE)
 _BOARD = Setting("head.board in the config", lambda config: config.section(HeadConfig).board is not None)
 NEEDS: tuple[Need, ...] = (((HEAD_IMU,),), ((VISION_ATTITUDE,), (IMAGE, CAMERA_INFO, _BOARD)))

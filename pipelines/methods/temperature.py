@@ -1,0 +1,47 @@
+"""The temperature of sensors whose biases follow it, as methods have it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from pipelines.graph.assumptions import Assumption, parameter
+from pipelines.graph.problem import Array
+from pipelines.recording import series
+from pipelines.recording.checks import nanoseconds
+from pipelines.recording.reading import Recording
+from pipelines.recording.temperature import Temperature, read_temperature
+from pipelines.recording.topics import TEMPERATURE, wanted
+from pipelines.settings import Config
+
+# What formulas call the temperature at which a bias is the bias, degrees Celsius.
+FIRST = "first_temperature"
+
+
+def read(
+    recording: Recording, config: Config, slopes: Sequence[Assumption], sensor_t: Array, dropped: dict[str, int]
+) -> Temperature | None:
+    """That of a recording; None without the topic, and where the config fixes all slopes over it.
+
+    Raises InputError as pipelines.recording.temperature does.
+    """
+    if not wanted(recording, config, TEMPERATURE) or parameter(0, slopes, config) is None:
+        return None
+    return read_temperature(recording, config.topic(TEMPERATURE), sensor_t, dropped)
+
+
+def reference(temperature: Temperature | None) -> float | None:
+    """The temperature at which a bias is the bias, degrees Celsius: the first."""
+    return None if temperature is None else temperature.first
+
+
+def above(temperature: Temperature | None, reference: float | None, at: Array) -> Array | None:
+    """By how much (n,), K, it is above the reference, degrees Celsius, at times (n,), s; None where nobody measures."""
+    return None if temperature is None or reference is None else temperature.above(reference, at)
+
+
+def topics(temperature: Temperature | None, epoch_ns: int) -> dict[str, series.Topic]:
+    """The topic to be written, if there is a temperature."""
+    if temperature is None:
+        return {}
+    t_ns = nanoseconds(temperature.t, epoch_ns)
+    return {TEMPERATURE.name: series.TemperatureSeries(t_ns, temperature.celsius, frame_id="imu")}
