@@ -72,6 +72,7 @@ def report_html(calibration: Calibration) -> str:
         exact=_exact(calibration),
         formulas=[*(formula.text for formula in calibration.formulas), *_constants(calibration)],
         tables=[each for each in own if isinstance(each, Table)],
+    )
 
 
 def _constants(calibration: Calibration) -> list[str]:
