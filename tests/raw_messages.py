@@ -21,6 +21,7 @@ FLAT = [
     messages.QUATERNION,
     messages.POSE,
     messages.NAV_SAT_FIX,
+    messages.TEMPERATURE,
 ]
 
 
@@ -101,5 +102,6 @@ def read_any(path: Path, kind: str) -> dict[str, Any]:
         messages.QUATERNION: recording.quaternion,
         messages.POSE: recording.poses,
         messages.NAV_SAT_FIX: recording.fixes,
+        messages.TEMPERATURE: recording.temperature,
     }.get(kind, lambda topic: recording.joints(topic, ["defgh", "ab"]))
     return vars(method("/x"))
