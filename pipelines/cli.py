@@ -222,6 +222,13 @@ def follow(
     checkpoint: Annotated[Path | None, typer.Option(help="File to save the run in, and to go on from.")] = None,
     serve: Annotated[bool, typer.Option("--serve", help="Estimates live over Foxglove's WebSocket.")] = False,
     port: Annotated[int, typer.Option(help="Of --serve, on this machine alone.")] = 8765,
+    page: Annotated[
+        bool, typer.Option("--page", help="A page that says what to do, for a browser or a phone.")
+    ] = False,
+    host: Annotated[
+        str, typer.Option(help="Of --page: 0.0.0.0 opens it to the network, by a token in its address.")
+    ] = "127.0.0.1",
+    page_port: Annotated[int, typer.Option(help="Of --page.")] = 8766,
     record: Annotated[
         Path | None, typer.Option(help="Folder to keep what comes by ws:// or -; a later run goes on in it.")
     ] = None,
@@ -235,7 +242,7 @@ def follow(
     from pipelines.reports.write import write_results
 
     settings = Settings(method, config, parse_window(window), patience, checkpoint, not no_check, prior)
-    calibration = run(source, settings, port if serve else None, record, as_json)
+    calibration = run(source, settings, port if serve else None, record, as_json, (host, page_port) if page else None)
     folder = out or _beside(Path(_file_name(source)), "incremental")
     written = write_results(folder, calibration)
     _tell(calibration, folder, written, as_json)

@@ -11,6 +11,7 @@ from rich.console import Console
 from pipelines.config import load_config
 from pipelines.follow.guidance import View
 from pipelines.follow.screen import Screen
+from pipelines.graph.motion import Motion
 from pipelines.graph.problem import Quantity
 from pipelines.judgement.checklist import ChecklistItem
 from pipelines.judgement.observability import assess
@@ -93,18 +94,24 @@ def test_cube_counts_poses_and_faces(cube: tuple[ChecklistItem, ...]) -> None:
     poses = int(found["poses"].have.split(" ")[0])
     assert poses == sum(map(int, count.values()))
     assert bool(found["poses"].wanted) == (poses < 4)
-    assert found["next"].wanted.startswith("rest it with ")
+    assert found["next"].wanted.startswith("rest the cube with ")
 
 
 def test_the_next_best_pose_shows_the_axis_that_was_not_up() -> None:
     y, z = np.eye(3)[1:]
-    assert next_pose(np.array([y, -y, z, -z, y, z]), None) in ("rest it with +x up", "rest it with -x up")
-    assert next_pose(np.array([[1.0, 0.0, 0.0], -z, -y, z]), None) in ("rest it with -x up", "rest it with +y up")
+    assert next_pose(np.array([y, -y, z, -z, y, z]), None).words in (
+        "rest the cube with +x up",
+        "rest the cube with -x up",
+    )
+    assert next_pose(np.array([[1.0, 0.0, 0.0], -z, -y, z]), None).words in (
+        "rest the cube with -x up",
+        "rest the cube with +y up",
+    )
 
 
 def _view(sigma: float) -> View:
     quantities = (Quantity("delta_px", "rad", 0.1, 0.1, 1e-3),)
-    assessment = assess(quantities, np.eye(1) * sigma**2, None, lambda _: "sway it more")
+    assessment = assess(quantities, np.eye(1) * sigma**2, None, lambda _: Motion("sway it more"))
     wanted = ChecklistItem("sway", "1.0 deg", "turn it")
     return View(3.0, 0, quantities, np.array([0.02]), assessment, (wanted,))
 

@@ -91,7 +91,7 @@ def test_two_positions_without_the_move_leave_theta_x_weak_and_named() -> None:
     assert max(sigma["theta_y"], sigma["theta_z"]) < 5e-5
     assert abs(estimate.values[0] - truth["theta_x"]) < 3.0 * sigma["theta_x"]
     assert graph.advice is not None
-    assert "inner axis" in graph.advice({"theta_x": 0.99, "theta_y": 0.02})
+    assert "inner axis" in graph.advice({"theta_x": 0.99, "theta_y": 0.02}).advice
     assert thin_shell(data).flat[0]
 
 

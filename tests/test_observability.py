@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from pipelines.graph.motion import Motion
 from pipelines.graph.problem import ChiSquare, History, Quantity, Residuals
 from pipelines.judgement.observability import Assessment, Cause, Innovations, assess, learning
 
@@ -146,9 +147,9 @@ def test_nothing_to_judge() -> None:
 def test_advice_is_the_methods_own_and_gets_the_weights() -> None:
     seen = []
 
-    def advice(weights: object) -> str:
+    def advice(weights: object) -> Motion:
         seen.append(weights)
-        return "nod"
+        return Motion("nod")
 
     found = assess([quantity("a")], np.eye(1), GOOD_FIT, advice)
     assert found.directions[0].advice == "nod"

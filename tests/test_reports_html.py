@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from factors import so3
+from pipelines.graph.motion import Motion
 from pipelines.graph.problem import Attitudes, Quantity, Residuals
 from pipelines.graph.robust import robust_sigma
 from pipelines.judgement.observability import assess
@@ -48,7 +49,7 @@ def test_the_verdict_comes_first_and_numbers_are_for_people() -> None:
 def test_weak_directions_come_with_advice_and_no_formula_to_apply() -> None:
     covariance = np.diag([1e-6, 1e-6, 0.35**2, 1e-8, 1e-8, 0.0])
     calibration = make_calibration(covariance=covariance)
-    judged = assess(calibration.problem.quantities, covariance, None, lambda _: "nod and shake the head")
+    judged = assess(calibration.problem.quantities, covariance, None, lambda _: Motion("nod and shake the head"))
     page = Page(report_html(replace(calibration, assessment=judged)))
     assert page.text.count("od and shake the head") == 2
     assert "How to apply it" not in page.text

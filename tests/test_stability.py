@@ -10,6 +10,7 @@ import pytest
 import alidade
 from factors import so3
 from pipelines.follow.guidance import View, Watch
+from pipelines.graph.motion import Motion
 from pipelines.graph.problem import Course, Estimate, Quantity
 from pipelines.judgement.halves import Halves
 from pipelines.judgement.observability import assess
@@ -150,7 +151,7 @@ def test_a_slip_is_seen_while_it_is_recorded() -> None:
 def test_the_person_is_told_what_moved_and_when() -> None:
     change = Stability(7.0, 0.0, 31.0, {"helmet_mount_x": -8.0})
     quantities = (Quantity("helmet_mount_x", "rad", 0.1, 0.1, 1e-3),)
-    assessment = assess(quantities, np.eye(1) * 1e-8, None, lambda _: "")
+    assessment = assess(quantities, np.eye(1) * 1e-8, None, lambda _: Motion(""))
     view = View(40.0, 43_200 * 10**9, quantities, np.zeros(1), assessment, (), change)
     assert not view.done
     assert view.headline.startswith("Something changed at about 31 s: helmet_mount_x")

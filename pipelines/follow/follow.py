@@ -1,4 +1,4 @@
-"""`alidade follow`: the follower, its screen and its server put together."""
+"""`alidade follow`: the follower, its screen, its server and its page put together."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from rich.console import Console
 
 from pipelines.follow.follower import Follower, Settings
 from pipelines.follow.guidance import View
+from pipelines.follow.page import LivePage
 from pipelines.follow.screen import Screen
 from pipelines.follow.serve import LiveServer
 from pipelines.follow.sources import source_of
@@ -21,9 +22,14 @@ from pipelines.terminal import console
 
 
 def follow(
-    what: str, settings: Settings, port: int | None, record: Path | None = None, on_stderr: bool = False
+    what: str,
+    settings: Settings,
+    port: int | None,
+    record: Path | None = None,
+    on_stderr: bool = False,
+    page_at: tuple[str, int] | None = None,
 ) -> Calibration:
-    """Follow a recording until it ends, shown in the terminal and, with a port, served on it.
+    """Follow a recording until it ends, shown in the terminal, with a port served on it, and on a page.
 
     The first Ctrl-C ends it with what is there, the second at once. Raises as `source_of` and `Follower.follow` do.
 
@@ -33,6 +39,7 @@ def follow(
         port: of the server.
         record: folder where streams are kept.
         on_stderr: show it there, for standard output is a program's.
+        page_at: host and port of the page; None: there is none.
     """
     with ExitStack() as stack:
         server = None if port is None else stack.enter_context(LiveServer(port))
@@ -41,13 +48,26 @@ def follow(
         if server is not None:
             screen.say(f"estimates live at {server.url} (Foxglove: open connection)")
 
+        page = None if page_at is None else stack.enter_context(LivePage(screen.say, *page_at, name=what))
+        if page is not None:
+            screen.say(f"page at {page.url}")
+
         def show(view: View) -> None:
             screen.show(view)
-            if server is not None:
-                server.show(view)
+            for each in (server, page):
+                if each is not None:
+                    each.show(view)
 
-        source = stack.enter_context(source_of(what, record, screen.say))
-        return Follower(source, settings, show, screen.say, stopped.is_set).follow()
+        def say(sentence: str) -> None:
+            screen.say(sentence)
+            if page is not None:
+                page.say(sentence)
+
+        source = stack.enter_context(source_of(what, record, say))
+        calibration = Follower(source, settings, show, say, stopped.is_set).follow()
+        if page is not None:
+            page.end(calibration)
+        return calibration
 
 
 @contextmanager

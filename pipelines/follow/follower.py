@@ -242,10 +242,10 @@ class Follower:
 
     def _collect(self, session: Session) -> None:
         """What there is by now; what was enough once stays so."""
+        before, self._checklist = self._checklist, {}
         for item in session.method.checklist(session.data, session.config):
-            before = self._checklist.get(item.what)
-            if before is None or before.wanted or not item.wanted:
-                self._checklist[item.what] = item
+            earlier = before.get(item.what, item)
+            self._checklist[item.what] = earlier if item.wanted and not earlier.wanted else item
 
     def _take(self, problem: Problem, steps: Iterable[Step]) -> None:
         run = self._run

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import chain
+from typing import Any
 
 import numpy as np
 
+from pipelines.graph.motion import Motion
 from pipelines.graph.problem import Array, Quantity
 from pipelines.judgement.checklist import ChecklistItem
 from pipelines.judgement.observability import Assessment, assess
@@ -15,6 +18,9 @@ from pipelines.solvers.incremental import Run
 
 # Parameters a sentence names.
 _MOST_NAMED = 6
+# Of many parameters so many are shown, the least accurate ones.
+_MOST_SHOWN = 14
+_BEGIN_ANEW = Motion("look what moved, and begin anew")
 
 
 @dataclass(frozen=True)
@@ -64,13 +70,58 @@ class View:
         return tuple(dict.fromkeys((*advice, *wanted)))
 
     @property
+    def motion(self) -> Motion | None:
+        """What to do now: to collect what is missing, then to determine the worst direction; None: go on as now."""
+        if self.change is not None:
+            return _BEGIN_ANEW
+        if self.done:
+            return None
+        wanted = (c.motion for c in self.checklist if c.wanted and c.motion is not None)
+        weak = () if self.assessment is None else (d.motion for d in self.assessment.directions)
+        return next(chain(wanted, weak), None)
+
+    @property
+    def alarms(self) -> tuple[str, ...]:
+        """What is wrong with the recording rather than missing in it, sentences."""
+        if self.change is not None:
+            return (self.headline,)
+        if self.assessment is not None and self.assessment.status == "inconsistent":
+            return (self.assessment.headline,)
+        return ()
+
+    @property
+    def shown(self) -> tuple[int, ...]:
+        """Rows of the parameters to be shown: all that are estimated, or those furthest from what is required."""
+        rows = [i for i, q in enumerate(self.quantities) if _is_estimated(q)]
+        if self.sigmas is None:
+            return tuple(rows[:_MOST_SHOWN])
+        ratio = self.sigmas / np.array([q.require for q in self.quantities])
+        return tuple(sorted(sorted(rows, key=lambda i: -ratio[i])[:_MOST_SHOWN]))
+
+    @property
+    def estimated(self) -> tuple[str, ...]:
+        """The parameters that are to be determined."""
+        return tuple(q.name for q in self.quantities if _is_estimated(q))
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """The state in words, as clients are told it."""
+        return {
+            "time_s": self.time,
+            "status": "" if self.assessment is None else self.assessment.status,
+            "headline": self.headline,
+            "missing": list(self.missing),
+            "collected": [{"what": c.what, "have": c.have, "wanted": c.wanted} for c in self.checklist],
+        }
+
+    @property
     def headline(self) -> str:
         """The state in one sentence."""
         if self.assessment is None:
             return "not enough yet for an estimate"
         if self.change is not None:
             when = datetime.fromtimestamp(self.epoch_ns * 1e-9 + self.change.time_s, UTC)
-            return f"{self.change.sentence} It was {when:%H:%M:%S} UTC: look what moved, and begin anew"
+            return f"{self.change.sentence} It was {when:%H:%M:%S} UTC: {_BEGIN_ANEW.words}"
         if self.done:
             return "the accuracy wanted is reached: recording may end"
         if not self.short:
@@ -99,6 +150,10 @@ class Watch:
         self._seen = now
         found = stability(run.estimate(), run.problem.quantities)
         self.change = found if found is not None and found.changed else None
+
+
+def _is_estimated(q: Quantity) -> bool:
+    return q.judged and q.prior_sigma != 0.0
 
 
 def view_of(epoch_ns: int, run: Run, checklist: tuple[ChecklistItem, ...], change: Stability | None = None) -> View:

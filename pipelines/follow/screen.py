@@ -18,8 +18,6 @@ from pipelines.terminal import COLOURS
 
 # A line at most this often where there is no terminal, s.
 _LINE = 5.0
-# Of many parameters so many are shown, the least accurate ones.
-_MOST_ROWS = 14
 
 
 class Screen:
@@ -72,7 +70,7 @@ def _parameters(view: View) -> Table:
     for column in ("value", "sigma", "required"):
         table.add_column(column, justify="right", no_wrap=True)
     table.add_column("verdict", no_wrap=True)
-    for i in _shown(view):
+    for i in view.shown:
         q = view.quantities[i]
         unit, factor = human_unit(q)
         required = f"{factor * q.require:.2g}"
@@ -82,19 +80,9 @@ def _parameters(view: View) -> Table:
         sigma, verdict = float(view.sigmas[i]), view.assessment.verdicts[q.name]
         value = to_digits_of(factor * float(view.values[i]), factor * sigma)
         table.add_row(q.name, unit, value, f"{factor * sigma:.2g}", required, f"[{COLOURS[verdict]}]{verdict}[/]")
-    judged = sum(q.judged for q in view.quantities)
-    if judged > _MOST_ROWS:
-        table.caption = f"the least accurate of {judged} parameters"
+    if len(view.shown) < len(view.estimated):
+        table.caption = f"the least accurate of {len(view.estimated)} parameters"
     return table
-
-
-def _shown(view: View) -> list[int]:
-    """The parameters shown: all, or those furthest from what is required, in their order."""
-    indexes = [i for i, q in enumerate(view.quantities) if q.judged]
-    if view.sigmas is None:
-        return indexes[:_MOST_ROWS]
-    ratio = [sigma / q.require for q, sigma in zip(view.quantities, view.sigmas.tolist(), strict=True)]
-    return sorted(sorted(indexes, key=lambda i: -ratio[i])[:_MOST_ROWS])
 
 
 def _collected(view: View) -> Table:

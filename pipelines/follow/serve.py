@@ -94,14 +94,7 @@ class LiveServer:
                 if q.judged:
                     message |= {"require": q.require, "verdict": view.assessment.verdicts[q.name]}
                 self._log(f"/estimate/{q.name}", _ESTIMATE, {"unit": q.unit}, message, at)
-        status = {
-            "time_s": view.time,
-            "status": "" if view.assessment is None else view.assessment.status,
-            "headline": view.headline,
-            "missing": list(view.missing),
-            "collected": [{"what": c.what, "have": c.have, "wanted": c.wanted} for c in view.checklist],
-        }
-        self._log("/status", _STATUS, {}, status, at)
+        self._log("/status", _STATUS, {}, view.summary, at)
 
     def _advertise(self, topic: str, schema: dict[str, Any], metadata: dict[str, str]) -> int:
         """The number of a topic's channel; a new one is told to everybody."""

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from factors import so3
 from factors.loss import TruncatedLoss
 from factors.vectorized import VectorizedFactor
+from pipelines.graph.motion import Motion
 from pipelines.graph.noise import Level
 
 if TYPE_CHECKING:
@@ -184,7 +185,7 @@ class Problem:
         loss: shared by all measurements that may be outliers; the batch solver anneals it. None: no outliers expected.
         attitudes: the trajectory at some keyframes, given values that hold them; None when the method has none.
         attitude_name: what the trajectory is, e.g. "bRv".
-        advice: sentence for a weak direction, given its weights by parameter name.
+        advice: what to do about a weak direction, given its weights by parameter name.
         dropped: measurements left out before solving, reason -> count.
         premises: what is taken for granted and a reader has to know, sentences.
         steps_after: the steps of one measurement each that are later than a time, s, for graphs whose steps stay
@@ -204,7 +205,7 @@ class Problem:
     loss: TruncatedLoss | None = None
     attitudes: Callable[[Sequence[int], gtsam.Values], Attitudes] | None = None
     attitude_name: str = ""
-    advice: Callable[[Mapping[str, float]], str] | None = None
+    advice: Callable[[Mapping[str, float]], Motion] | None = None
     dropped: Mapping[str, int] = field(default_factory=dict)
     premises: tuple[str, ...] = ()
     steps_after: Callable[[float], Iterator[Step]] | None = None

@@ -9,7 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipelines.graph.motion import Motion
 from pipelines.graph.problem import Array
+from pipelines.judgement.pictures import swaying
 
 # A turn within this time, s, counts as motion about an axis.
 _STRETCH = 5.0
@@ -24,23 +26,38 @@ class ChecklistItem:
         what: its name.
         have: how much there is, in words.
         wanted: what is still to be done, empty when it is enough.
+        share: how much there is of what is enough, 0 to 1; None where that is no matter of more or less.
+        motion: that gives what is wanted, for who holds the device; None where no single motion does.
+        chart: of what there is, SVG as `pipelines.judgement.pictures` draws it; empty: none.
     """
 
     what: str
     have: str
     wanted: str = ""
+    share: float | None = None
+    motion: Motion | None = None
+    chart: str = ""
 
 
-def motion(name: str, turned: Array, enough: float, what: str) -> list[ChecklistItem]:
-    """An item an axis: how far it turned (3,) rad, of which `enough` is wanted; `what` to do comes before the axis."""
-    return [
-        ChecklistItem(
-            f"{name} about {axis}",
-            f"{np.rad2deg(angle):.1f} deg",
-            "" if angle >= enough else f"{what} {axis} by {np.rad2deg(enough):.0f} deg and more",
+def swayed(name: str, turned: Array, enough: float, what: str, who: str) -> list[ChecklistItem]:
+    """An item an axis: how far it turned (3,) rad, of which `enough` is wanted.
+
+    `what` to do comes before the axis; `who` is to be turned, in a word.
+    """
+    found = []
+    for axis, angle in zip(_AXES, turned, strict=True):
+        wanted = f"{what} {axis} by {np.rad2deg(enough):.0f} deg and more"
+        short = bool(angle < enough)
+        found.append(
+            ChecklistItem(
+                f"{name} about {axis}",
+                f"{np.rad2deg(angle):.1f} deg",
+                wanted if short else "",
+                min(float(angle / enough), 1.0),
+                Motion(wanted, swaying(axis, who)) if short else None,
+            )
         )
-        for axis, angle in zip(_AXES, turned, strict=True)
-    ]
+    return found
 
 
 def turned(t: Array, gyro: Array) -> Array:

@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.chi_square import quantile
+from pipelines.graph.motion import Motion
 from pipelines.graph.problem import Array, ChiSquare, History, Quantity, Residuals
 from pipelines.judgement.assumptions import costs
 
 Verdict = Literal["fixed", "observable", "prior", "weak", "unobservable"]
 Status = Literal["calibrated", "weak", "inconsistent", "unobservable"]
-Advice = Callable[[Mapping[str, float]], str]
+Advice = Callable[[Mapping[str, float]], Motion]
 
 # A sigma of this fraction of its prior says that the recording added next to nothing.
 _UNCHANGED = 0.9
@@ -40,7 +41,7 @@ _LAGS, _FEWEST_INNOVATIONS = 5, 20
 # Parts of a recording whose information is compared, and from how many moments on.
 _TENTHS, _FEWEST_MOMENTS = 10, 20
 
-_DEFAULT_ADVICE = "vary the motion while recording, record longer, or give these parameters a tighter prior"
+_DEFAULT_ADVICE = Motion("vary the motion while recording, record longer, or give these parameters a tighter prior")
 
 
 @dataclass(frozen=True)
@@ -52,13 +53,18 @@ class Direction:
         sigma_ratio: its sigma over that of its prior.
         weights: parameter -> component of the unit vector, in units of the priors' sigmas; strongest first, small ones
             dropped.
-        advice: what to do about it.
+        motion: what to do about it.
     """
 
     verdict: Verdict
     sigma_ratio: float
     weights: Mapping[str, float]
-    advice: str
+    motion: Motion
+
+    @property
+    def advice(self) -> str:
+        """What to do about it, in words."""
+        return self.motion.advice
 
     @property
     def label(self) -> str:
@@ -317,7 +323,7 @@ def assess(
             wanted have no verdict.
         covariance: of the reported numbers, rows and columns as the quantities.
         chi_square: of the residuals, if the solver has one.
-        advice: the method's sentence for a direction, given its weights by parameter name.
+        advice: what the method asks for to determine a direction, given its weights by parameter name.
         decides: whether chi-square beyond its bound makes it inconsistent; not where noise levels are estimated.
     """
     covariance = _finite(quantities, covariance)

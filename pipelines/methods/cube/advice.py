@@ -4,25 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from pipelines.graph.motion import Motion
+from pipelines.judgement.pictures import swaying
+from pipelines.methods.cube.faces import Side
+from pipelines.methods.cube.picture import rested
 
-def advice(weights: Mapping[str, float]) -> str:
+_UP: dict[str, Side] = {"x": "+x", "y": "+y", "z": "+z"}
+
+
+def advice(weights: Mapping[str, float]) -> Motion:
     """The motion that would make a weak direction observable."""
     strongest = [name for name, w in weights.items() if abs(w) > 0.3] or list(weights)
     if all(name.startswith("field") for name in strongest):
-        return (
-            "the magnetometer's scale follows the field model's strength: tighter priors on field_e, field_n, field_u"
+        return Motion(
+            "give tighter priors on field_e, field_n, field_u",
+            why="the magnetometer's scale follows the field model's strength",
         )
-    gyro = sorted({"xyz"[int(name[-1]) - 1] for name in strongest if name.startswith("gyro_k")})
+    gyro = "".join(sorted({"xyz"[int(name[-1]) - 1] for name in strongest if name.startswith("gyro_k")}))
     if gyro:
-        return f"turn the cube between poses about its {' and '.join(gyro)} axis, by a quarter turn or more, both ways"
+        words = f"turn the cube between poses about its {' and '.join(gyro)} axis, by a quarter turn or more, both ways"
+        return Motion(words, swaying(gyro, "cube", (0.8, 0.8, 0.8)))
     still = {name.split("_")[0] for name in strongest if name.startswith(("accel", "mag"))}
     if still:
         axes = sorted({"xyz"[int(name[-1]) - 1] for name in strongest if name.startswith(("accel_k", "mag_k"))})
         about = f", its {' and '.join(axes)} axis up, down and level" if axes else ""
-        return f"{' and '.join(sorted(still))}: add static poses in other attitudes{about}"
+        picture = rested(_UP[axes[0] if axes else "x"])
+        return Motion(f"add static poses in other attitudes{about}", picture, " and ".join(sorted(still)))
     if any(name.startswith("gyro_b") for name in strongest):
-        return "let the cube stand still longer"
+        return Motion("let the cube stand still longer")
     if any(name.startswith("tag_") for name in strongest):
         tags = sorted({name.split("_")[1] for name in strongest if name.startswith("tag_")})
-        return f"show tag {' and '.join(tags)} to the camera together with its neighbours"
-    return "heading, camera mount and field trade against each other: turn the cube through more attitudes"
+        return Motion(f"show tag {' and '.join(tags)} to the camera together with its neighbours")
+    return Motion(
+        "turn the cube through more attitudes", why="heading, camera mount and field trade against each other"
+    )

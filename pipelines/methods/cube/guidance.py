@@ -7,44 +7,49 @@ from itertools import permutations
 
 import numpy as np
 
+from pipelines.graph.motion import Motion
 from pipelines.graph.problem import Array
 from pipelines.judgement.checklist import ChecklistItem
+from pipelines.judgement.pictures import covered
 from pipelines.methods.cube.data import CubeData
+from pipelines.methods.cube.faces import SIDES, Side
+from pipelines.methods.cube.picture import rested
 from pipelines.methods.cube.poses import static_poses
 from pipelines.settings import Config
 
 # Poses that determine the twelve numbers of a triad, and those of published practice: each of six faces thrice.
 _FEWEST_POSES, _POSES_A_FACE = 4, 3
-_AXES = "xyz"
-_FACES = tuple(f"{sign}{axis}" for axis in _AXES for sign in "+-")
+_FACES: tuple[Side, ...] = tuple(SIDES)
 
 
 def checklist(data: CubeData, config: Config) -> Sequence[ChecklistItem]:
     """Poses and the faces that were up, tags seen, and the next best pose."""
     poses = static_poses(data, config)
     up = poses.accel / np.linalg.norm(poses.accel, axis=1, keepdims=True)
-    axis = np.argmax(np.abs(up), axis=1)
-    faces = [f"{'+' if row[k] > 0.0 else '-'}{_AXES[k]}" for row, k in zip(up, axis, strict=True)]
-    count = {face: faces.count(face) for face in _FACES}
+    faces = np.argmax(up @ np.array(list(SIDES.values())).T, axis=1)
+    count = {face: int((faces == k).sum()) for k, face in enumerate(_FACES)}
     few = [face for face, n in count.items() if n < _POSES_A_FACE]
     tags = sorted({int(tag) for seen in poses.tags if seen is not None for tag in seen.ids})
     wanted = f"at least {_FEWEST_POSES}" if len(up) < _FEWEST_POSES else ""
     found = [
-        ChecklistItem("poses", f"{len(up)} at rest", wanted),
+        ChecklistItem("poses", f"{len(up)} at rest", wanted, min(len(up) / _FEWEST_POSES, 1.0)),
         ChecklistItem(
             "faces up",
             ", ".join(f"{face} {n}" for face, n in count.items()),
             f"{_POSES_A_FACE} poses each recommended, too few of {', '.join(few)}" if few else "",
+            sum(min(n, _POSES_A_FACE) for n in count.values()) / (_POSES_A_FACE * len(count)),
+            chart=covered(up, "sides up") if len(up) else "",
         ),
     ]
     if data.camera is not None:
         found.append(ChecklistItem("tags seen", ", ".join(map(str, tags)) or "none", "" if tags else "show the cube"))
     if few:
-        found.append(ChecklistItem("next", f"{len(up) + 1}. pose", next_pose(up, poses.mag)))
+        pose = next_pose(up, poses.mag)
+        found.append(ChecklistItem("next", f"{len(up) + 1}. pose", pose.words, motion=pose))
     return found
 
 
-def next_pose(up: Array, mag: Array | None) -> str:
+def next_pose(up: Array, mag: Array | None) -> Motion:
     """The one of 24 attitudes along the axes that says most about accelerometer and magnetometer.
 
     What a pose with nominal vector n adds to what a triad's twelve numbers are known by is x'N^-1x, x = (n, 1), N the
@@ -57,7 +62,7 @@ def next_pose(up: Array, mag: Array | None) -> str:
         dip = float(np.median((field * up[seen]).sum(axis=1)))
     known = _information(up)
     known_field = None if field is None else _information(field)
-    best, most = "", -1.0
+    best, most = Motion(""), -1.0
     axes = [sign * unit for unit in np.eye(3) for sign in (1.0, -1.0)]
     for (i, above), (k, north) in permutations(enumerate(axes), 2):
         if i // 2 == k // 2:
@@ -67,7 +72,8 @@ def next_pose(up: Array, mag: Array | None) -> str:
             gain += _gain(known_field, dip * above + np.sqrt(max(1.0 - dip**2, 0.0)) * north)
         if gain > most * (1.0 + 1e-9):
             ahead = f" and {_FACES[k]} to the north" if known_field is not None else ""
-            best, most = f"rest it with {_FACES[i]} up{ahead}", gain
+            picture = rested(_FACES[i], None if known_field is None else _FACES[k])
+            best, most = Motion(f"rest the cube with {_FACES[i]} up{ahead}", picture), gain
     return best
 
 

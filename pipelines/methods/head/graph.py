@@ -23,9 +23,11 @@ from factors.preintegration import GyroPath
 from pipelines.errors import InputError
 from pipelines.graph.assumptions import acting
 from pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk
+from pipelines.graph.motion import Motion
 from pipelines.graph.noise import Level
 from pipelines.graph.priors import rotation_prior, vector_prior
 from pipelines.graph.problem import Array, Attitudes, Factor, Problem, Step
+from pipelines.judgement.pictures import swaying
 from pipelines.methods import temperature
 from pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, SENSITIVITY, TEMPERATURE, HeadParameters
 from pipelines.methods.head.recording import HeadData
@@ -320,15 +322,28 @@ def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) ->
     return Attitudes(at, model.chain.attitudes(of, model.stamps[rows], at, values))
 
 
-def _advice(weights: Mapping[str, float]) -> str:
+def _advice(weights: Mapping[str, float]) -> Motion:
     """The motion that would make a weak direction observable."""
     strongest = {name.rsplit("_", 1)[0] if name != OFFSET else name for name, w in weights.items() if abs(w) > 0.3}
+    platform = swaying("xy", "platform")
     if {CAMERA, HELMET} <= strongest:
-        return "camera and helmet mounts trade against each other: turn the platform about two axes while recording"
+        return Motion(
+            "turn the platform about two axes while recording",
+            platform,
+            "camera and helmet mounts trade against each other",
+        )
     if CAMERA in strongest:
-        return "the camera mount needs platform motion: turn the platform about two axes while recording"
+        return Motion(
+            "turn the platform about two axes while recording", platform, "the camera mount needs platform motion"
+        )
     if HELMET in strongest:
-        return "the helmet mount needs head motion about two axes: nod and shake the head"
+        return Motion(
+            "nod and shake the head", swaying("yz", "helmet"), "the helmet mount needs head motion about two axes"
+        )
     if OFFSET in strongest:
-        return "the time offset needs faster head motion: turn the head back and forth within a second"
-    return "the gyro bias needs a longer recording with vision"
+        return Motion(
+            "turn the head back and forth within a second",
+            swaying("xyz", "helmet"),
+            "the time offset needs faster head motion",
+        )
+    return Motion("record longer with the markers in sight", why="the gyro bias is not determined yet")

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipelines.judgement.checklist import ChecklistItem, motion, turned
+from pipelines.judgement.checklist import ChecklistItem, swayed, turned
 from pipelines.methods.head.recording import HeadData
 from pipelines.settings import Config
 
@@ -17,9 +17,8 @@ _NOD, _MANOEUVRE = np.deg2rad(10.0), np.deg2rad(5.0)
 def checklist(data: HeadData, _: Config) -> Sequence[ChecklistItem]:
     """Motion of the head, and of the platform where there is one."""
     found = [ChecklistItem("vision", f"{1.0 / np.median(np.diff(data.vision_t)):.3g} attitudes/s")]
-    found += motion("head", turned(data.head_t, data.head_gyro), _NOD, "turn the head about its")
+    found += swayed("head", turned(data.head_t, data.head_gyro), _NOD, "turn the head about its", "helmet")
     if data.platform_t is not None and data.platform_gyro is not None:
-        found += motion(
-            "platform", turned(data.platform_t, data.platform_gyro), _MANOEUVRE, "turn the platform about its"
-        )
+        platform = turned(data.platform_t, data.platform_gyro)
+        found += swayed("platform", platform, _MANOEUVRE, "turn the platform about its", "platform")
     return found

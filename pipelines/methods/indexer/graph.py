@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from factors.earth import EARTH_RATE
 from factors.indexer import ENCODER_ERRORS, IndexerAverageFactor, Option
 from pipelines.errors import InputError
+from pipelines.graph.motion import Motion
 from pipelines.graph.noise import Level, Noise
 from pipelines.graph.priors import prior_sigmas, vector_prior
 from pipelines.graph.problem import Array, Attitudes, Factor, Parameter, Problem, Step
@@ -39,6 +40,7 @@ from pipelines.methods.indexer.parameters import (
     indexer_parameters,
     theta_coordinates,
 )
+from pipelines.methods.indexer.picture import turning
 from pipelines.methods.indexer.recording import IndexerData
 from pipelines.methods.indexer.runs import AxisMotion, axis_motion, cut_turns, encoder_scatter
 from pipelines.methods.noise import sampled, stated, walking
@@ -246,21 +248,38 @@ def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) ->
     return Attitudes(model.data.gyro_t[rows], carrier(model.data, model.motion, rows, theta, epsilon, encoder))
 
 
-def _advice(weights: Mapping[str, float]) -> str:
+def _advice(weights: Mapping[str, float]) -> Motion:
     """The motion that would make a weak direction observable."""
     strongest = {name for name, w in weights.items() if abs(w) > 0.3}
+    outer = turning("outer", 0.0)
     if strongest & set(EPSILON):
-        return "the axes' right angle needs turns about both axes, the outer one with the inner at 0 and at 180 degrees"
+        return Motion(
+            "make turns about both axes, about the outer one with the inner at 0 and at 180 degrees",
+            turning("outer", 180.0),
+            "the axes' right angle is not determined",
+        )
     if strongest & set(SKEW.names):
-        return "the gyro's skew needs turns about the outer axis with the inner at 90 and at -90 degrees"
+        return Motion(
+            "make turns about the outer axis with the inner at 90 and at -90 degrees",
+            turning("outer", 90.0),
+            "the gyro's skew is not determined",
+        )
     if strongest & set(SCALE.names):
-        return (
-            "the gyro's scale needs turns about each of its axes: the outer axis with the inner at 0 and at 90 degrees"
+        return Motion(
+            "make turns about the outer axis with the inner at 0 and at 90 degrees",
+            turning("outer", 90.0),
+            "the gyro's scale needs turns about each of its axes",
         )
     if "theta_x" in strongest:
-        return "theta_x needs turns about the inner axis, forward and back (positions 3 and 4), or the moves recorded"
+        return Motion(
+            "make turns about the inner axis, forward and back (positions 3 and 4), or record the moves",
+            turning("inner", 0.0),
+            "theta_x is not determined",
+        )
     if "theta_z" in strongest:
-        return "theta_z needs turns about the outer axis, forward and back (positions 1 and 2)"
+        return Motion(
+            "make turns about the outer axis, forward and back (positions 1 and 2)", outer, "theta_z is not determined"
+        )
     if "theta_y" in strongest:
-        return "theta_y needs whole turns about either axis, forward and back"
-    return "the gyro bias needs turns forward and back, or longer dwells"
+        return Motion("make whole turns about either axis, forward and back", outer, "theta_y is not determined")
+    return Motion("make turns forward and back, or dwell longer", outer, "the gyro bias is not determined")

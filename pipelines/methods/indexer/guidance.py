@@ -6,10 +6,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pipelines.graph.motion import Motion
 from pipelines.judgement.checklist import ChecklistItem
+from pipelines.methods.indexer.picture import Axis, turning
 from pipelines.methods.indexer.recording import IndexerData
 from pipelines.methods.indexer.runs import axis_motion
 from pipelines.settings import Config
+
+_AXES: tuple[tuple[Axis, Axis], ...] = (("outer", "inner"), ("inner", "outer"))
+# Whole turns each way that are wanted in a position.
+_TURNS = 3
 
 
 def checklist(data: IndexerData, _: Config) -> Sequence[ChecklistItem]:
@@ -21,11 +27,21 @@ def checklist(data: IndexerData, _: Config) -> Sequence[ChecklistItem]:
             position = (run.axis, round(np.rad2deg(run.other) / 180.0) % 2 * 180)
             turns.setdefault(position, [0, 0])[0 if run.direction > 0 else 1] += run.whole_turns
     found = []
-    for axis, other in (("outer", "inner"), ("inner", "outer")):
+    for axis, other in _AXES:
         for angle in (0, 180):
             forward, back = turns.get((axis, angle), [0, 0])
-            lacking = [word for word, n in (("forward", forward), ("back", back)) if n < 3]
+            lacking = [word for word, n in (("forward", forward), ("back", back)) if n < _TURNS]
             wanted = f"three whole turns {' and '.join(lacking)}" if lacking else ""
             what = f"{axis} axis, {other} one at {angle} deg"
-            found.append(ChecklistItem(what, f"{forward} turns forward, {back} back", wanted))
+            words = f"turn the {axis} axis by {wanted}, the {other} one at {angle} deg"
+            ways = " ".join({"forward": "end", "back": "start"}[word] for word in lacking)
+            found.append(
+                ChecklistItem(
+                    what,
+                    f"{forward} turns forward, {back} back",
+                    wanted,
+                    (min(forward, _TURNS) + min(back, _TURNS)) / (2 * _TURNS),
+                    Motion(words, turning(axis, float(angle), ways)) if lacking else None,
+                )
+            )
     return found

@@ -23,9 +23,11 @@ from factors.los import LosDirectionFactor, Surroundings
 from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
 from pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk
+from pipelines.graph.motion import Motion
 from pipelines.graph.noise import Level
 from pipelines.graph.priors import vector_prior
 from pipelines.graph.problem import Array, Factor, Problem, Step
+from pipelines.judgement.pictures import swaying
 from pipelines.methods.los.guess import camera, foreseen, guess, initial_attitudes, seen
 from pipelines.methods.los.parameters import BIAS, OFFSET, SPLIT, LosParameters
 from pipelines.methods.los.pictures import select_pictures
@@ -264,25 +266,45 @@ def _picture_factor(model: _Model, k: NDArray[np.intp], rows: int, family: str) 
     return Factor.of(family, rows_model.on(*columns, loss=model.loss))
 
 
-def _advice(weights: Mapping[str, float]) -> str:
+def _advice(weights: Mapping[str, float]) -> Motion:
     """What would make a weak direction observable."""
     strong = {name for name, weight in weights.items() if abs(weight) > 0.3}
     if set(SPLIT) <= strong:
-        return (
-            "delta_pz and delta_gz can never be told apart, turning the carrier's frame about the azimuth axis changes "
-            "both alike: ask for delta_z = delta_pz - delta_gz instead"
+        return Motion(
+            "ask for delta_z = delta_pz - delta_gz instead",
+            why="delta_pz and delta_gz can never be told apart, turning the carrier's frame about the azimuth axis "
+            "changes both alike",
         )
     if OFFSET in strong:
-        return "the time offset needs faster sway: turn the carrier back and forth within a second or two"
+        return Motion(
+            "turn the carrier back and forth within a second or two",
+            swaying("xyz", "carrier"),
+            "the time offset needs faster sway",
+        )
     if "camera_roll" in strong:
-        return "the camera's roll needs the target to move across the picture: offset the gimbal while recording"
+        return Motion(
+            "offset the gimbal while recording",
+            why="the camera's roll needs the target to move across the picture",
+        )
     if {"collimation", "axis_nonperpendicularity"} & strong:
-        return "errors of the gimbal's axes need changing elevation: record targets at low and at high elevation"
+        return Motion(
+            "record targets at low and at high elevation",
+            why="errors of the gimbal's axes need changing elevation",
+        )
     if "delta_px" in strong:
-        return (
-            "delta_px trades against delta_gx and delta_gy: sway the carrier in azimuth too, or record targets at "
-            "other azimuths and elevations"
+        return Motion(
+            "sway the carrier in azimuth too, or record targets at other azimuths and elevations",
+            swaying("z", "carrier"),
+            "delta_px trades against delta_gx and delta_gy",
         )
     if set(BIAS) & strong and not strong - set(BIAS):
-        return "the gyro bias needs a longer recording with the target in sight, and sway across the line of sight"
-    return "the mounting angles need sway of the carrier about all three axes while the target is in sight"
+        return Motion(
+            "record longer with the target in sight, and sway across the line of sight",
+            swaying("xz", "carrier"),
+            "the gyro bias is not determined yet",
+        )
+    return Motion(
+        "sway the carrier about all three axes while the target is in sight",
+        swaying("xyz", "carrier"),
+        "the mounting angles need it",
+    )

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipelines.judgement.checklist import ChecklistItem, motion, turned
+from pipelines.judgement.checklist import ChecklistItem, swayed, turned
 from pipelines.methods.los.recording import LosData
 from pipelines.settings import Config
 
@@ -21,6 +21,6 @@ def checklist(data: LosData, _: Config) -> Sequence[ChecklistItem]:
     spread = np.rad2deg(np.ptp(data.gimbal, axis=0))
     return (
         ChecklistItem("target", seen),
-        *motion("sway", sway, _SWAY, "sway the carrier about its"),
+        *swayed("sway", sway, _SWAY, "sway the carrier about its", "carrier"),
         ChecklistItem("gimbal", f"azimuth over {spread[0]:.0f}, elevation over {spread[1]:.0f} deg"),
     )

@@ -17,8 +17,10 @@ import numpy as np
 from factors.chi_square import gate
 from factors.ellipsoid import DipFactor, StrengthFactor
 from factors.loss import TruncatedLoss
+from pipelines.graph.motion import Motion
 from pipelines.graph.noise import Level
 from pipelines.graph.problem import Array, Factor, Problem, Step
+from pipelines.judgement.pictures import swaying
 from pipelines.methods.tumble.model import Dip, Model, Sensor, prepare
 from pipelines.methods.tumble.parameters import DIP_KEY, STRENGTH_KEYS, TRIAD_KEYS, Variable, variables
 from pipelines.methods.tumble.recording import TumbleData
@@ -98,9 +100,12 @@ def _dips(dip: Dip, rows: slice, symmetric: tuple[bool, bool], loss: TruncatedLo
     return [Factor.of("dip", factor.on(TRIAD_KEYS["accel"], TRIAD_KEYS["mag"], DIP_KEY, loss=loss))]
 
 
-def _advice(weights: Mapping[str, float]) -> str:
+def _advice(weights: Mapping[str, float]) -> Motion:
     """The motion that would make a weak direction observable."""
     strong = [name for name, weight in weights.items() if abs(weight) > 0.3] or list(weights)
     if any(name.startswith("accel") for name in strong):
-        return "rest the device for a second or two in each of twenty and more attitudes, every side up"
-    return "turn the device through more attitudes, each end of each axis up, down, north and south, away from iron"
+        return Motion("rest the device for a second or two in each of twenty and more attitudes, every side up")
+    return Motion(
+        "turn the device through more attitudes, each end of each axis up, down, north and south, away from iron",
+        swaying("xyz", "device"),
+    )

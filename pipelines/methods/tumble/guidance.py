@@ -6,7 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from factors import so3
+from pipelines.graph.motion import Motion
+from pipelines.graph.problem import Array
 from pipelines.judgement.checklist import ChecklistItem
+from pipelines.judgement.pictures import along, covered, resting
 from pipelines.methods.tumble.model import prepare
 from pipelines.methods.tumble.recording import TumbleData
 from pipelines.reports.sphere_map import described, share_near, widest_gap
@@ -14,6 +18,8 @@ from pipelines.settings import Config
 
 # Part of all directions that a vector has to have come near, and the widest gap that is none, rad.
 _ENOUGH, _GAP = 0.9, np.deg2rad(45.0)
+# Less than this, rad, from the vertical is upright.
+_UPRIGHT = 1e-6
 _WHAT = {"mag": "directions of the field", "accel": "sides up"}
 _TURN = {"mag": "turn the device so that the field goes along", "accel": "rest it with this side up:"}
 
@@ -25,5 +31,18 @@ def checklist(data: TumbleData, config: Config) -> Sequence[ChecklistItem]:
         share, (gap, where) = share_near(sensor.directions), widest_gap(sensor.directions)
         wanted = f"{_TURN[sensor.name]} {described(where)}" if share < _ENOUGH or gap > _GAP else ""
         have = f"{100.0 * share:.0f} % within 30 deg, {len(sensor.raw)} readings"
-        found.append(ChecklistItem(_WHAT[sensor.name], have, wanted))
+        motion = Motion(wanted, _picture(sensor.name, where)) if wanted else None
+        chart = covered(sensor.directions, _WHAT[sensor.name])
+        found.append(ChecklistItem(_WHAT[sensor.name], have, wanted, min(share / _ENOUGH, 1.0), motion, chart))
     return found
+
+
+def _picture(sensor: str, where: Array) -> str:
+    """Of the device with a direction (3,) in it along the field, or up."""
+    if sensor == "mag":
+        return along(where, "field")
+    axis = np.cross(where, [0.0, 0.0, 1.0])
+    sine = np.linalg.norm(axis)
+    if sine < _UPRIGHT:  # half a turn about x where it points down
+        return resting(so3.exp([0.0 if where[2] > 0.0 else np.pi, 0.0, 0.0]), lit=where)
+    return resting(so3.exp(axis / sine * np.arctan2(sine, where[2])), lit=where)

@@ -19,9 +19,11 @@ from gyro_pair.factor import GyroPairFactor
 from gyro_pair.published import FARTHEST, align
 from gyro_pair.recording import GyroPairData, densities
 from pipelines.errors import InputError
+from pipelines.graph.motion import Motion
 from pipelines.graph.noise import Level
 from pipelines.graph.priors import rotation_prior, vector_prior
 from pipelines.graph.problem import Array, Factor, Parameter, Problem, Quantity, Step, rotation_vector_coordinates
+from pipelines.judgement.pictures import swaying
 from pipelines.methods.noise import stated
 from pipelines.settings import DEFAULT_NOISE, Config, check_names, first_given
 
@@ -130,11 +132,15 @@ def _factor(measured: GyroPairFactor, rows: slice) -> Factor:
     return Factor.of("increment", replace(measured, **some).on(_ROTATION_KEY, _OFFSET_KEY, _DIFFERENCE_KEY))
 
 
-def _advice(weights: Mapping[str, float]) -> str:
+def _advice(weights: Mapping[str, float]) -> Motion:
     """The motion that would make a weak direction observable."""
     strong = [name for name, weight in weights.items() if abs(weight) > 0.3]
     if any(name.startswith(_ROTATION) for name in strong):
-        return "the rotation needs motion about two axes: turn the body about one axis, then about another"
+        return Motion(
+            "turn the body about one axis, then about another",
+            swaying("xy", "body"),
+            "the rotation needs motion about two axes",
+        )
     if _OFFSET in strong:
-        return "the time offset needs changing rates: turn the body back and forth within a second"
-    return "the bias difference needs a longer recording"
+        return Motion("turn the body back and forth within a second", why="the time offset needs changing rates")
+    return Motion("record longer", why="the bias difference is not determined yet")
