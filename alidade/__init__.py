@@ -7,6 +7,7 @@
     print(calibration)                                  # a table; in a notebook it shows itself
     calibration.parameters["time_offset"].sigma
     calibration.write("results/")
+    alidade.load("results/calibration.yaml").apply(...)
 
 Names are imported when they are first used, so that `import alidade` costs next to nothing.
 """
@@ -17,7 +18,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pipelines.api import Config, calibrate, follow, open, plan, simulate
+    from pipelines.api import Config, calibrate, follow, load, open, plan, simulate
     from pipelines.errors import InputError
     from pipelines.methods import Method
     from pipelines.methods import names as methods
@@ -37,6 +38,7 @@ __all__ = [
     "__version__",
     "calibrate",
     "follow",
+    "load",
     "methods",
     "open",
     "plan",
@@ -53,6 +55,7 @@ _MODULES = {
     "Simulated": "pipelines.simulation.simulated",
     "calibrate": "pipelines.api",
     "follow": "pipelines.api",
+    "load": "pipelines.api",
     "open": "pipelines.api",
     "plan": "pipelines.api",
     "simulate": "pipelines.api",

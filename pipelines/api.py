@@ -26,6 +26,7 @@ from pipelines.simulation.simulated import Simulated
 if TYPE_CHECKING:
     from pipelines.follow.guidance import View
     from pipelines.planning import Plan
+    from pipelines.reports.calibration import SavedCalibration
     from pipelines.reports.result import Calibration
 
     Config = _BaseConfig
@@ -108,6 +109,21 @@ def calibrate(
 
         return calibrate_together([partial(open, each, method, config, prior=prior) for each in source])
     return open(source, method, config, prior=prior).calibrate(solver, window)
+
+
+def load(path: str | Path, config: Settings = None) -> SavedCalibration:
+    """A calibration.yaml, to be applied: `.parameters`, `.rotations`, `.transforms`, `.apply(...)`.
+
+    Args:
+        path: of the file.
+        config: that it was made with, where its formulas depend on one: a cube's conversions of counts.
+
+    Raises:
+        InputError: file or config cannot be used.
+    """
+    from pipelines.reports.calibration import load_calibration
+
+    return load_calibration(Path(path), load_config(None, Path(config) if isinstance(config, str) else config))
 
 
 def simulate(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.methods import method
 from pipelines.methods.formula import apply
+from pipelines.reports.calibration import calibration_yaml
 from pipelines.settings import Config
 
 Array = so3.Array
@@ -228,3 +230,41 @@ def test_what_the_published_solver_does_not_know_counts_as_zero() -> None:
     gyro = np.array([0.1, -0.2, 0.3])
     M = calibration.apply()["M"]
     np.testing.assert_allclose(calibration.apply(gyro=gyro)["w_b"], so3.rotate(M, gyro))
+
+
+@pytest.mark.parametrize(
+    ("name", "scenario"),
+    [
+        ("los", {"duration_s": 10.0}),
+        ("indexer", None),
+        ("head", {"duration_s": 10.0}),
+        ("cube", {"poses": 8}),
+        ("tumble", None),
+    ],
+)
+def test_a_saved_calibration_applies_as_the_one_it_is_of(
+    name: str, scenario: Mapping[str, Any] | None, tmp_path: Path
+) -> None:
+    calibration = alidade.open(alidade.simulate(name, scenario, seed=1)).calibrate()
+    (tmp_path / "calibration.yaml").write_text(calibration_yaml(calibration))
+    loaded = alidade.load(tmp_path / "calibration.yaml")
+    rng = np.random.default_rng(0)
+    numbers = ("azimuth", "elevation", "outer", "inner", "stamp")
+    names = dict.fromkeys(name for formula in calibration.formulas for name in formula.measured)
+    vectors = {name: rng.normal(size=3) for name in names}
+    measured = {
+        name: vector[0] if name in numbers else so3.exp(vector) if re.search("R|rotation", name) else vector
+        for name, vector in vectors.items()
+    }
+    wanted, found = calibration.apply(**measured), loaded.apply(**measured)
+    assert list(wanted) == list(found)
+    for key, value in wanted.items():
+        np.testing.assert_allclose(found[key], value, rtol=1e-9, atol=1e-12)
+
+
+def test_formulas_of_another_config_are_refused(tmp_path: Path) -> None:
+    calibration = alidade.open(alidade.simulate("tumble", seed=1)).calibrate("published")
+    file = tmp_path / "calibration.yaml"
+    file.write_text(calibration_yaml(calibration).replace("mag_k11, mag_k12", "mag_k12, mag_k11"))
+    with pytest.raises(InputError, match="not those of its parameters and this config"):
+        alidade.load(file).apply(mag=[0.0, 0.0, 1.0])

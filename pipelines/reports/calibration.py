@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
 
 from factors import so3
 from pipelines.errors import InputError
@@ -21,6 +21,7 @@ from pipelines.graph.problem import Array, rotation_vector_coordinates
 from pipelines.judgement.observability import Status, Verdict
 from pipelines.methods.formula import Formula, apply
 from pipelines.reports.result import Calibration
+from pipelines.settings import Config
 
 _HEAD = """\
 # Calibration by alidade. Units are SI and radians, quaternions w x y z. aRb maps coordinates in b to coordinates in a,
@@ -89,6 +90,7 @@ class SavedCalibration(_Record):
     findings: dict[str, list[dict[str, object]]] = {}
     formulas: list[str] = []
     constants: dict[str, float] = {}
+    _config: Config = PrivateAttr(default_factory=Config)
 
     @property
     def values(self) -> dict[str, float]:
@@ -100,6 +102,30 @@ class SavedCalibration(_Record):
         if name not in self.parameters:
             raise InputError(f"the calibration has no parameter {name}; it has {', '.join(self.parameters)}")
         return self.parameters[name].value
+
+    def apply(self, **measured: Any) -> dict[str, Array]:
+        """The formulas, computed: everything that follows from what is measured.
+
+            alidade.load("results/calibration.yaml").apply(gyro=w)["w_iv"]
+
+        Args:
+            measured: by the names in the formulas: numbers, vectors (..., 3), quaternions w, x, y, z (..., 4); SI.
+
+        Raises:
+            InputError: something is given that no formula measures, or the formulas of the file are not those of its
+                parameters and config: it was made with another config, or by the published solver, which does not know
+                all of them.
+        """
+        from pipelines.methods import method
+
+        told = "\n".join(self.formulas)
+        # A formula names a parameter, or the vector that it is a component of.
+        applied = [name for name in self.parameters if re.search(rf"\b({name}|{name[:-2]})\b", told)]
+        formulas = method(self.method).formulas(applied, self._config)
+        if [formula.text for formula in formulas] != self.formulas:
+            raise InputError("apply: the formulas in the calibration are not those of its parameters and this config")
+        values = {name: value for name, value in self.values.items() if name in applied or name in self.constants}
+        return apply(formulas, values, measured)
 
 
 def calibration_yaml(calibration: Calibration) -> str:
@@ -152,14 +178,16 @@ def saved(calibration: Calibration) -> SavedCalibration:
     )
 
 
-def load_calibration(path: Path) -> SavedCalibration:
-    """Read calibration.yaml. Raises InputError when the file cannot be used."""
+def load_calibration(path: Path, config: Config | None = None) -> SavedCalibration:
+    """Read calibration.yaml, with the config that its formulas are for. Raises InputError when it cannot be used."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
     try:
         content: Any = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
-        return SavedCalibration.model_validate(content)
+        read = SavedCalibration.model_validate(content)
+        read._config = config or Config()
+        return read
     except OSError as error:
         raise InputError(f"{path}: cannot be opened ({error.strerror})") from error
     except (UnicodeDecodeError, YAMLError, RecursionError) as error:
