@@ -22,25 +22,29 @@ lint: $(VENV)/dev
 	$(BIN)/lint-imports
 
 types: $(VENV)/dev
-	$(BIN)/mypy alidade factors pipelines datasets benchmarks tests docs/examples/gyro_pair
+	$(BIN)/mypy alidade factors pipelines datasets benchmarks tests docs/examples/gyro_pair docs/_site
 
 bench: $(VENV)/dev
 	$(BIN)/python -m benchmarks
 
-# Wheel and sdist, each installed into an environment of its own, away from the checkout.
+# Wheel and sdist, each installed into an environment of its own, away from the checkout; then a new user's path through
+# README and tutorials, typed there.
 dist: $(VENV)/dev
-	rm -rf build dist
+	rm -rf build/smoke dist
 	$(BIN)/python -m build --outdir dist > build.log 2>&1 || { cat build.log; exit 1; }
 	rm build.log
 	$(BIN)/python -m twine check --strict dist/*
 	for made in dist/*.whl dist/*.tar.gz; do \
 	  rm -rf build/smoke && $(PYTHON) -m venv build/smoke && \
 	  build/smoke/bin/python -m pip install --quiet --disable-pip-version-check $$made -c constraints.txt && \
-	  cp tests/smoke.py build/smoke/ && (cd build/smoke && bin/python smoke.py) || exit 1; \
+	  cp tests/smoke.py tests/walk.py build/smoke/ && (cd build/smoke && bin/python smoke.py) || exit 1; \
 	done
+	cd build/smoke && bin/python walk.py $(CURDIR)/README.md $(CURDIR)/docs/tutorials/*.md
 
+# The site; tests/test_docs.py runs what its pages show.
 docs: $(VENV)/dev
-	$(BIN)/python -m pytest -q tests/test_docs.py
+	$(BIN)/python -m sphinx -q -W --keep-going -d build/doctrees docs build/docs
+	@echo "The site: build/docs/index.html"
 
 # Two stamps: people who try the command need none of what tests need.
 $(VENV)/run: pyproject.toml constraints.txt

@@ -62,28 +62,23 @@ class Section(BaseModel):
 
 
 class Noise(Section):
-    """Noise of the sensors: densities per sqrt(Hz), walks per sqrt(s), the others per sample; None where not given.
+    """Noise of the sensors, one sigma each; null where not given."""
 
-    gyro_scale (no unit) is what scale and alignment errors of the gyro add: a fraction of the angle turned. What the
-    mean over a rest repeats to beside white noise: gyro_, accel_, mag_repeatability, in the sensor's unit; the
-    angle turned from rest to rest: turn_repeatability, a fraction of it.
-    """
-
-    gyro_density: Sigma | None = None
-    gyro_bias_walk: SigmaOrZero | None = None
-    gyro_scale: SigmaOrZero | None = None
-    platform_gyro_density: SigmaOrZero | None = None
-    accel_density: Sigma | None = None
-    mag_density: Sigma | None = None
-    los_error: Sigma | None = None
-    los_roll: Sigma | None = None
-    encoder: SigmaOrZero | None = None
-    vision_attitude: Sigma | None = None
-    corner_px: Sigma | None = None
-    gyro_repeatability: SigmaOrZero | None = None
-    turn_repeatability: SigmaOrZero | None = None
-    accel_repeatability: SigmaOrZero | None = None
-    mag_repeatability: SigmaOrZero | None = None
+    gyro_density: Sigma | None = None  # rad/s/sqrt(Hz), white noise
+    gyro_bias_walk: SigmaOrZero | None = None  # rad/s/sqrt(s)
+    gyro_scale: SigmaOrZero | None = None  # fraction of the angle turned that errors not estimated add
+    platform_gyro_density: SigmaOrZero | None = None  # rad/s/sqrt(Hz)
+    accel_density: Sigma | None = None  # m/s^2/sqrt(Hz)
+    mag_density: Sigma | None = None  # T/sqrt(Hz)
+    los_error: Sigma | None = None  # rad per measurement
+    los_roll: Sigma | None = None  # rad per measurement
+    encoder: SigmaOrZero | None = None  # rad per sample
+    vision_attitude: Sigma | None = None  # rad per axis and frame
+    corner_px: Sigma | None = None  # px per axis
+    gyro_repeatability: SigmaOrZero | None = None  # rad/s, of means over a rest, beside white noise
+    turn_repeatability: SigmaOrZero | None = None  # fraction of the angle turned from rest to rest
+    accel_repeatability: SigmaOrZero | None = None  # m/s^2, of means over a rest
+    mag_repeatability: SigmaOrZero | None = None  # T, of means over a rest
 
 
 # Where neither the config nor a message says anything.
@@ -115,87 +110,76 @@ class Sheet(Section):
 
 
 class GyroSheet(Sheet):
-    """Of a gyro.
+    """Of a gyro."""
 
-    scale, no unit; skew, rad: half the angle error between two axes; g_sensitivity, rad/s per m/s^2; temperature: slope
-    of the bias, rad/s/K.
-    """
-
-    scale: SigmaOrZero | None = None
-    skew: SigmaOrZero | None = None
-    g_sensitivity: SigmaOrZero | None = None
-    temperature: SigmaOrZero | None = None
+    scale: SigmaOrZero | None = None  # no unit
+    skew: SigmaOrZero | None = None  # rad: half the angle error between two axes
+    g_sensitivity: SigmaOrZero | None = None  # rad/s per m/s^2
+    temperature: SigmaOrZero | None = None  # rad/s/K, slope of the bias
 
 
 class PlatformGyroSheet(Sheet):
-    """The same of a platform's gyro, with its bias, rad/s."""
+    """Of a platform's gyro."""
 
-    bias: SigmaOrZero | None = None
-    scale: SigmaOrZero | None = None
-    skew: SigmaOrZero | None = None
+    bias: SigmaOrZero | None = None  # rad/s
+    scale: SigmaOrZero | None = None  # no unit
+    skew: SigmaOrZero | None = None  # rad: half the angle error between two axes
 
 
 class CameraSheet(Sheet):
-    """Of a camera, or of what makes angles of its pictures.
+    """Of a camera, or of what makes angles of its pictures."""
 
-    scale of the angles, no unit; roll, rad: about its line of sight as it is mounted; focal, a share of CameraInfo's
-    focal length, and centre, px: what these are off by.
-    """
-
-    scale: SigmaOrZero | None = None
-    roll: SigmaOrZero | None = None
-    focal: SigmaOrZero | None = None
-    centre: SigmaOrZero | None = None
+    scale: SigmaOrZero | None = None  # of the angles, no unit
+    roll: SigmaOrZero | None = None  # rad, about its line of sight as it is mounted
+    focal: SigmaOrZero | None = None  # a share of CameraInfo's focal length that this is off by
+    centre: SigmaOrZero | None = None  # px that CameraInfo's centre is off by
 
 
 class EncoderSheet(Sheet):
-    """Of encoders: amplitude of the error that comes once a turn, sine and cosine each, rad; delay of a reading, s."""
+    """Of encoders."""
 
-    once_per_turn: SigmaOrZero | None = None
-    delay: SigmaOrZero | None = None
+    once_per_turn: SigmaOrZero | None = None  # rad: amplitude of the error that comes once a turn, sine and cosine each
+    delay: SigmaOrZero | None = None  # s: how late a reading was taken
 
 
 class ClockSheet(Sheet):
-    """Of the pictures' clock against the gyro's: offset, s, of a tracker that was not calibrated; skew, s/s."""
+    """Of the pictures' clock against the gyro's."""
 
-    offset: SigmaOrZero | None = None
-    skew: SigmaOrZero | None = None
+    offset: SigmaOrZero | None = None  # s, of a tracker that was not calibrated
+    skew: SigmaOrZero | None = None  # s/s
 
 
 class AccelSheet(Sheet):
-    """Of an accelerometer that reads u + square u^2 + cube u^3: square, s^2/m, and cube, (s^2/m)^2.
+    """Of an accelerometer that reads u + square u^2 + cube u^3."""
 
-    temperature: slope of its offset, m/s^2/K.
-    """
-
-    square: SigmaOrZero | None = None
-    cube: SigmaOrZero | None = None
-    temperature: SigmaOrZero | None = None
+    square: SigmaOrZero | None = None  # s^2/m
+    cube: SigmaOrZero | None = None  # (s^2/m)^2
+    temperature: SigmaOrZero | None = None  # m/s^2/K, slope of the offset
 
 
 class ReferenceSheet(Sheet):
-    """Of an attitude reference: tilt of its level, rad."""
+    """Of an attitude reference."""
 
-    tilt: SigmaOrZero | None = None
+    tilt: SigmaOrZero | None = None  # rad, of its level
 
 
 class FieldSheet(Sheet):
-    """Of the earth's magnetic field where the recording is made: model_error, T, of its model there."""
+    """Of the earth's magnetic field where the recording is made."""
 
-    model_error: Sigma | None = None
+    model_error: Sigma | None = None  # T, of its model there
 
 
 class GimbalSheet(Sheet):
-    """Of a gimbal: collimation, the optical axis against the elevation axis, and its axes not perpendicular, rad."""
+    """Of a gimbal."""
 
-    collimation: SigmaOrZero | None = None
-    nonperpendicularity: SigmaOrZero | None = None
+    collimation: SigmaOrZero | None = None  # rad: optical axis against elevation axis
+    nonperpendicularity: SigmaOrZero | None = None  # rad: elevation axis against azimuth axis
 
 
 class TargetSheet(Sheet):
-    """Of a target: rate at which the direction to it turns, rad/s."""
+    """Of a target."""
 
-    rate: SigmaOrZero | None = None
+    rate: SigmaOrZero | None = None  # rad/s: turn of the direction to it
 
 
 class Sensors(Section):
@@ -227,25 +211,25 @@ SensorSheets = Annotated[Sensors, BeforeValidator(_ideal)]
 
 
 class Tag(Section):
-    """A tag: edge of the black square m, rotation bodyRtag (w, x, y, z), position in the body m."""
+    """A tag on a body."""
 
-    size: Sigma
-    rotation: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    position: Vector = (0.0, 0.0, 0.0)
+    size: Sigma  # m: edge of the black square
+    rotation: Quaternion = (1.0, 0.0, 0.0, 0.0)  # bodyRtag as w, x, y, z
+    position: Vector = (0.0, 0.0, 0.0)  # in the body, m
 
 
 class Board(Section):
     """Tags on one rigid body, by id."""
 
-    tag_family: str = "36h11"
-    tags: dict[int, Tag] = {}
+    tag_family: str = "36h11"  # of AprilTag
+    tags: dict[int, Tag] = {}  # by id
 
 
 class KnownPrior(Section):
     """A prior with a mean; sigma 0 fixes the parameter there."""
 
-    mean: float
-    sigma: SigmaOrZero
+    mean: float  # SI, as the result reports the parameter
+    sigma: SigmaOrZero  # one sigma, SI
 
 
 # A sigma, null, or mean and sigma; the names of cases are left out of messages.
@@ -278,19 +262,19 @@ _Own = TypeVar("_Own", bound=MethodSection)
 class Config(Section):
     """A whole config; every key optional. Sections of methods are added where it is read, see pipelines.config."""
 
-    method: str | None = None
-    topics: dict[str, TopicSource] = {}
-    columns: dict[str, TableTopic] = {}
-    noise: Noise = Noise()
-    noise_known: SigmaOrZero = 0.1
-    priors: dict[str, PriorEntry] = {}
-    share: dict[str, Share] = {}
-    require: dict[str, Sigma] = {}
-    sensors: SensorSheets = Sensors()
-    latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None
-    longitude_deg: Annotated[float, Field(ge=-180.0, le=360.0)] | None = None
-    height: float | None = None
-    date: Date | None = None
+    method: str | None = None  # that is meant; by default what fits
+    topics: dict[str, TopicSource] = {}  # key of a topic: its name, or what it is made of
+    columns: dict[str, TableTopic] = {}  # topic: the columns of a table that make it
+    noise: Noise = Noise()  # of the sensors
+    noise_known: SigmaOrZero = 0.1  # how well figures under noise are known: sigma of the logarithm; 0: exactly
+    priors: dict[str, PriorEntry] = {}  # parameter: sigma, or mean and sigma; 0 fixes it, null leaves it free
+    share: dict[str, Share] = {}  # parameter or pattern: device, recording, or how far it walks in the root of a day
+    require: dict[str, Sigma] = {}  # parameter: sigma wanted
+    sensors: SensorSheets = Sensors()  # data sheets; ideal: all figures 0
+    latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None  # deg north; wins over fixes
+    longitude_deg: Annotated[float, Field(ge=-180.0, le=360.0)] | None = None  # deg east
+    height: float | None = None  # m above the ellipsoid
+    date: Date | None = None  # of the field model; default: the stamps
     _belief: Belief | None = PrivateAttr(None)
 
     def prior(self, name: str, default: float | None) -> float | None:

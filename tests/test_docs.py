@@ -1,95 +1,106 @@
-"""The commands in README and docs are run as they stand, block after block, in one folder."""
+"""README and docs are walked as they stand; their links lead somewhere; figures in them are the code's."""
 
 from __future__ import annotations
 
 import os
 import re
-import shlex
 import subprocess
 import sys
 import textwrap
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from pipelines.config import load_config
+from pipelines.settings import DEFAULT_NOISE
+from tests.command import Command, Run
+from tests.walk import Step, difference, steps
 
 ROOT = Path(__file__).parents[1]
-EXAMPLE = ROOT / "docs" / "examples" / "gyro_pair"
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-_BLOCK = re.compile(r"^```(sh|yaml file=(\S+))\n(.*?)^```", re.MULTILINE | re.DOTALL)
-_PYTHON = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+DOCS = ROOT / "docs"
+EXAMPLE = DOCS / "examples" / "gyro_pair"
+PAGES = [ROOT / "README.md", *sorted(p for p in DOCS.rglob("*.md") if EXAMPLE not in p.parents)]
 _CODE = re.compile(r"^```python file=(\S+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
-# What a command whose verdict is not "calibrated" says of itself on the page.
-_EXIT_CODE = re.compile(r"#.* exit code (\d+)")
 _LINK = re.compile(r"\]\((?!https?://)([^)#]+)")
 
-
-# Their Python needs the scheduler of a cluster.
-_CLUSTER = ("fleet.md",)
-# Their commands are those of other tests, on longer recordings.
-_LONG = ("cube.md", "fleet.md", "trust.md", "write-your-own-method.md")
-
-
-def _text(page: Path) -> str:
-    return page.read_text(encoding="utf-8")
+# Its Python needs the scheduler of a cluster.
+_CLUSTER = "docs/fleet.md"
+# Their commands need a process of their own.
+_APART = ("docs/fleet.md", "docs/write-your-own-method.md")
+# Their commands are those of other tests, on longer recordings; `make dist` walks all tutorials.
+_LONG = (*_APART, "docs/cube.md", "docs/trust.md", "docs/tutorials/cube.md", "docs/tutorials/los.md")
 
 
 def _name(page: Path) -> str:
-    return page.name
+    return str(page.relative_to(ROOT))
 
 
 @pytest.mark.parametrize(
-    "page", [pytest.param(p, marks=[pytest.mark.slow] * (p.name in _LONG), id=p.name) for p in PAGES]
+    "page",
+    [pytest.param(p, marks=[pytest.mark.slow] * (_name(p) in _LONG), id=_name(p)) for p in PAGES if steps(p)],
 )
-def test_commands_work(page: Path, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+def test_page_works(
+    page: Path,
+    tmp_path: Path,
+    alidade: Command,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
+) -> None:
+    """The commands run in this process, which imports once, wherever they can."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
     path = [str(ROOT)]
     if page.name == "write-your-own-method.md":
         path.append(str(request.getfixturevalue("example_site")))
-    for kind, file, text in _BLOCK.findall(page.read_text(encoding="utf-8")):
-        if kind != "sh":
-            (tmp_path / file).write_text(text, encoding="utf-8")
-            load_config(None, tmp_path / file)
-            continue
-        for line in text.splitlines():
-            words = shlex.split(line, comments=True)
-            command = [sys.executable, "-m", "pipelines.cli", *words[1:]] if words[:1] == ["alidade"] else words
-            run = subprocess.run(
-                command,
-                cwd=tmp_path,
-                env={"PYTHONPATH": os.pathsep.join(path), "PATH": "/usr/bin:/bin"},
-                capture_output=True,
-                text=True,
-            )
-            told = _EXIT_CODE.search(line)
-            assert run.returncode == (int(told[1]) if told else 0), f"{line}\n{run.stdout}{run.stderr}"
+    program: dict[str, Any] = {"__name__": "__main__"}
+    for step in steps(page):
+        if step.kind == "yaml":
+            Path(step.file).write_text(step.text, encoding="utf-8")
+            load_config(None, Path(step.file))
+        elif step.kind == "python" and _name(page) != _CLUSTER:
+            capsys.readouterr()
+            exec(compile(step.text, page.name, "exec"), program)
+            assert not difference(step.output or "", capsys.readouterr().out)
+        elif step.kind == "sh":
+            here = step.words[0] == "alidade" and _name(page) not in _APART
+            run = alidade(*step.words[1:]) if here else _apart(step, path)
+            assert run.code == step.exit_code, f"{step.text}\n{run.out}{run.err}"
+            assert not (wrong := difference(step.output or "", run.out)), f"{step.text}\n{wrong}"
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if p.name not in _CLUSTER and _PYTHON.search(_text(p))], ids=_name)
-def test_python_works(page: Path, tmp_path: Path) -> None:
-    """Block after block, as one program."""
-    program = "\n".join(_PYTHON.findall(_text(page)))
-    run = subprocess.run(
-        [sys.executable, "-"],
-        input=program,
-        cwd=tmp_path,
-        env={"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-    )
-    assert run.returncode == 0, run.stderr
+def _apart(step: Step, path: list[str]) -> Run:
+    words = step.words
+    command = [sys.executable, "-m", "pipelines.cli", *words[1:]] if words[0] == "alidade" else words
+    environment = {"PYTHONPATH": os.pathsep.join(path), "PATH": "/usr/bin:/bin", "COLUMNS": "100"}
+    run = subprocess.run(command, env=environment, capture_output=True, text=True)
+    return Run(run.returncode, run.stdout, run.stderr)
 
 
 @pytest.mark.parametrize(
-    "page", [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "datasets" / "README.md"], ids=lambda p: p.name
+    ("documented", "printed", "agree"),
+    [
+        ("a 1.00 b\n...\nd 2", "a 1.01 b c\nd  2.03", True),
+        ("theta  12 ±3\n", " theta │ 12 ±3 ", True),
+        ("a 1.00", "a 1.03", False),
+        ("a 1", "b 1", False),
+        ("b\n...\na", "a b", False),
+        ("-0.5 deg", "0.5 deg", False),
+    ],
 )
+def test_outputs_are_compared(documented: str, printed: str, agree: bool) -> None:
+    assert (difference(documented, printed) == "") is agree
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "datasets" / "README.md"], ids=_name)
 def test_links_lead_somewhere(page: Path) -> None:
     for target in _LINK.findall(page.read_text(encoding="utf-8")):
         assert (page.parent / target).exists(), target
 
 
 def test_code_of_the_example_is_that_of_its_files() -> None:
-    page = (ROOT / "docs" / "write-your-own-method.md").read_text(encoding="utf-8")
+    page = (DOCS / "write-your-own-method.md").read_text(encoding="utf-8")
     blocks = _CODE.findall(page)
     assert blocks
     for file, text in blocks:
@@ -98,11 +109,22 @@ def test_code_of_the_example_is_that_of_its_files() -> None:
         assert any(textwrap.indent(text, " " * depth) in source for depth in (0, 4, 8)), f"{file}:\n{text}"
 
 
-def test_readme_names_no_dependency_that_is_not_there() -> None:
+def test_defaults_of_the_noise_are_those_of_the_program() -> None:
+    table = (DOCS / "config.md").read_text(encoding="utf-8").split("## Noise")[1].split("## Priors")[0]
+    rows = re.findall(r"^\| (`\w+`(?:, `\w+`)*) \| .* \| ([-\d., e]+) \|", table, re.MULTILINE)
+    told = {
+        key.strip("`"): float(value)
+        for keys, values in rows
+        for key, value in zip(keys.split(", "), values.split(", "), strict=True)
+    }
+    assert told == DEFAULT_NOISE.model_dump()
+
+
+def test_every_dependency_is_named() -> None:
     """The Dependencies section and pyproject.toml say the same."""
     import tomllib
 
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    section = (ROOT / "README.md").read_text(encoding="utf-8").split("## Dependencies")[1]
+    section = (DOCS / "limits.md").read_text(encoding="utf-8").split("## Dependencies")[1]
     for requirement in project["dependencies"]:
         assert re.split(r"[\[<>=]", requirement)[0] in section

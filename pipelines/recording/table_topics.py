@@ -63,9 +63,15 @@ class TableTopic(BaseModel):
 
     Attributes:
         file: name of the file; needed where there are several tables.
-        time, unit: column of the stamps, and what they count.
-        gyro, accel, wxyz, position, field, vector, latitude_deg, longitude_deg, height, celsius, joints: columns, by
-            what they are in pipelines.recording.series.
+        time: column of the stamps.
+        unit: what they count.
+        gyro, accel: columns of an IMU's rates and accelerations.
+        wxyz, position: columns of a pose.
+        field: columns of a magnetometer.
+        vector: columns of a LOS error.
+        latitude_deg, longitude_deg, height: columns of a fix.
+        celsius: column of a temperature.
+        joints: name of a joint and its column.
         video: name of a video beside the table, whose rows are the stamps of its pictures.
         units: of one of these, where it is not SI.
     """

@@ -24,8 +24,8 @@ TAG_DETECTIONS = Topic("tag_detections", "/tag_detections", (messages.TAG_DETECT
 class RawConversion(Section):
     """Nominal conversion of counts: (raw - offset) * scale."""
 
-    scale: Sigma
-    offset: float = 0.0
+    scale: Sigma  # SI per count
+    offset: float = 0.0  # counts
 
 
 class Raw(Section):
@@ -37,13 +37,10 @@ class Raw(Section):
 
 
 class LayoutCovariance(Section):
-    """What cube-layout knows of its tags: the covariance of rotation (rad) and position (m) of each, six numbers a tag.
+    """What cube-layout knows of its tags: covariance of rotation (rad) and position (m) of each, six numbers a tag."""
 
-    tags: ids in order; rows: the lower triangle, each row its numbers with blanks between them.
-    """
-
-    tags: list[int]
-    rows: list[str]
+    tags: list[int]  # ids in order
+    rows: list[str]  # the lower triangle, each row its numbers with blanks between them
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
@@ -73,10 +70,10 @@ class CubeConfig(Board, MethodSection):
 
     key: ClassVar[str] = "cube"
 
-    camera_rotation: Quaternion | None = None
-    raw: Raw = Raw()
-    date: Date | None = None
-    covariance: LayoutCovariance | None = None
+    camera_rotation: Quaternion | None = None  # BRC, camera on the reference: w, x, y, z
+    raw: Raw = Raw()  # of sensors that record counts
+    date: Date | None = None  # of the field model, as at the top level
+    covariance: LayoutCovariance | None = None  # as cube-layout writes it
 
 
 def field_date(config: Config) -> datetime.date | None:

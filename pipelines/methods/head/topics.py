@@ -15,11 +15,11 @@ TRUTH_ATTITUDE = Topic("truth_attitude", "/truth/attitude", messages.ATTITUDES)
 
 
 class HeadConfig(MethodSection):
-    """The helmet: the tag board on it."""
+    """The helmet."""
 
     key: ClassVar[str] = "head"
 
-    board: Board | None = None
+    board: Board | None = None  # tags on the helmet
 
 
 TOPICS = (HEAD_IMU, PLATFORM_IMU, VISION_ATTITUDE, TRUTH_ATTITUDE, IMAGE, CAMERA_INFO, TEMPERATURE)

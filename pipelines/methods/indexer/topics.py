@@ -16,8 +16,8 @@ NEEDS: tuple[Need, ...] = (((IMU,),), ((INDEXER,),), ((FIX,), (_LATITUDE,)))
 
 
 class IndexerConfig(MethodSection):
-    """The indexer: attitude nRbase (w, x, y, z) of its base."""
+    """The indexer."""
 
     key: ClassVar[str] = "indexer"
 
-    base_attitude: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    base_attitude: Quaternion = (1.0, 0.0, 0.0, 0.0)  # nRbase: w, x, y, z
