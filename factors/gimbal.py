@@ -57,7 +57,7 @@ class LocalMotion:
     Attributes:
         rate, acceleration: (n, 3) of the gyro, rad/s and rad/s^2.
         gimbal, gimbal_rate, gimbal_acceleration: (n, 2) of azimuth and elevation, rad, rad/s and rad/s^2.
-        force: (n, 3) specific force in the gyro's frame, m/s^2; None where it is not known.
+        drivers: (n, d) of the gyro, see factors.gyro; None where it has none.
     """
 
     rate: Array
@@ -65,16 +65,16 @@ class LocalMotion:
     gimbal: Array
     gimbal_rate: Array
     gimbal_acceleration: Array
-    force: Array | None = None
-    stacked: ClassVar = ("rate", "acceleration", "gimbal", "gimbal_rate", "gimbal_acceleration", "force")
+    drivers: Array | None = None
+    stacked: ClassVar = ("rate", "acceleration", "gimbal", "gimbal_rate", "gimbal_acceleration", "drivers")
 
     @classmethod
     def around(
-        cls, at: Array, gyro_t: Array, gyro: Array, gimbal: GimbalPath, force: Array | None = None
+        cls, at: Array, gyro_t: Array, gyro: Array, gimbal: GimbalPath, drivers: Array | None = None
     ) -> LocalMotion:
         """From polynomials fitted to the samples within about SMOOTHING s: of degree 2 to rates, 3 to angles."""
         rates = _local_polynomials(at, gyro_t, gyro, 2)
-        forces = None if force is None else _local_polynomials(at, gyro_t, force, 2)[:, 0]
+        driving = None if drivers is None else _local_polynomials(at, gyro_t, drivers, 2)[:, 0]
         steps = 0.5 * np.diff(gyro_t)[:, None] * _pairs(command(gyro, gimbal.at(gyro_t)))
         commanded = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
         on_the_way, reached = (
@@ -87,7 +87,7 @@ class LocalMotion:
         ahead = command(rate + _STEP * acceleration, angles + _STEP * gimbal_rate)
         back = command(rate - _STEP * acceleration, angles - _STEP * gimbal_rate)
         gimbal_acceleration = (ahead - back) / (2.0 * _STEP) + 2.0 * rest[:, 2]
-        return cls(rate, acceleration, reached + rest[:, 0], gimbal_rate, gimbal_acceleration, forces)
+        return cls(rate, acceleration, reached + rest[:, 0], gimbal_rate, gimbal_acceleration, driving)
 
     def __getitem__(self, rows: Any) -> LocalMotion:
         """The motion around some of the pictures."""
@@ -97,7 +97,7 @@ class LocalMotion:
             self.gimbal[rows],
             self.gimbal_rate[rows],
             self.gimbal_acceleration[rows],
-            None if self.force is None else self.force[rows],
+            None if self.drivers is None else self.drivers[rows],
         )
 
 

@@ -85,7 +85,7 @@ class LosDirectionFactor(Model):
     Predicted: phz = atan2(dx, dy), phx = -atan2(dz, dy) with d = cRm tRm^T ey and, as a third row, the camera's roll
     about its line of sight, the twist about y that takes the target's texture to its picture: the rotation part of the
     picture's local similarity. Blocks: tRm at the stamps (rotations), the mounting angles `names` (rad), and with
-    `around` the gyro bias (3, rad/s), SIGHT_ERRORS and, unless the gyro is perfect, its errors (6 or 15), see
+    `around` the gyro bias (3, rad/s), SIGHT_ERRORS and, unless the gyro is perfect, its errors (6 to 18), see
     factors.gyro. With those errors
 
     - a picture was taken at stamp + time_offset - clock_skew * elapsed, and an encoder read its axis encoder_delay
@@ -103,7 +103,7 @@ class LosDirectionFactor(Model):
         gimbal: (n, 2) azimuth and elevation as read at the stamps, rad.
         names: the mounting angles that are variables; all others are zero.
         around: the pictures' surroundings, when errors of the sensors are variables.
-        errors: numbers of the gyro's errors: 6, 15, or 0 for a perfect gyro.
+        errors: numbers of the gyro's errors, 0 for a perfect gyro.
     """
 
     time: Array
@@ -256,7 +256,7 @@ def _carried(motion: LocalMotion, late: Array, bias: Array, errors: Array | None
         The turns, and their derivatives by `late` (n, 3, 1) and by bias and errors.
     """
     late = late[:, None]
-    excess, by_excess = rate_error(bias, errors, motion.rate, motion.force)
+    excess, by_excess = rate_error(bias, errors, motion.rate, motion.drivers)
     rate = motion.rate + motion.acceleration * late - excess
     arc = (motion.rate + 0.5 * motion.acceleration * late - excess) * late
     to_end = so3.right_jacobian(arc)

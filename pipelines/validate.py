@@ -115,7 +115,7 @@ def validate(
     held, own = _held(Session(chosen, data, config, Recorded(recording)), with_covariance(known, calibration_file))
     if held is None:
         return Validated(calibration, path.name, validations, False, recording.notes)
-    of_device = walks(chosen, config, list(own))
+    of_device = walks(chosen, config, [name for name in own if name in calibration.parameters])
     mixed = {**own, **{name: value for name, value in values.items() if name in of_device}}
     device, best = (chosen.validate(data, config, each) for each in (mixed, own))
     return Validated(calibration, path.name, validations, False, recording.notes, held, device, best)
@@ -136,7 +136,7 @@ def _held(session: Session, known: Known) -> tuple[Holding | None, dict[str, flo
             estimate = solve_batch(problem, device=device)
     except IndeterminateError:
         return None, {}
-    own = dict(zip(estimate.names, estimate.values.tolist(), strict=True))
+    own = {**problem.constants, **dict(zip(estimate.names, estimate.values.tolist(), strict=True))}
     if not estimate.converged or estimate.told is None:
         return None, {}
     inflations = dict(zip(estimate.names, estimate.inflations.tolist(), strict=True))

@@ -34,7 +34,12 @@ STAMPS = np.arange(0.0, 6.0, 0.005)
 FORCE = np.array([0.5, -1.0, 9.7])
 FORESEEN = 0.02 * np.random.default_rng(4).normal(size=(N, 2))
 GIMBAL = GimbalPath(STAMPS, _gimbal(STAMPS))
-MOTION = LocalMotion.around(TIMES, STAMPS, _rates(STAMPS), GIMBAL, np.tile(FORCE, (len(STAMPS), 1)))
+WARMTH = (2.0 * STAMPS)[:, None]
+# What moves the gyro's readings, by how many numbers its errors are.
+_FORCES = np.tile(FORCE, (len(STAMPS), 1))
+DRIVERS = {0: None, 6: None, 9: WARMTH, 15: _FORCES, 18: np.column_stack([_FORCES, WARMTH])}
+MOTIONS = {n: LocalMotion.around(TIMES, STAMPS, _rates(STAMPS), GIMBAL, each) for n, each in DRIVERS.items()}
+MOTION = MOTIONS[15]
 
 
 def _passive(axis: int, angle: float) -> Array:
@@ -62,7 +67,7 @@ def _factor(
     rng = np.random.default_rng(3)
     root = rng.normal(size=(N, width, width)) + 3 * np.eye(width)
     measured = 0.05 * rng.normal(size=(N, width))
-    around = Surroundings(MOTION, TIMES, TIMES - 0.2, FORESEEN)[rows] if sight else None
+    around = Surroundings(MOTIONS[gyro_errors], TIMES, TIMES - 0.2, FORESEEN)[rows] if sight else None
     return LosDirectionFactor(
         TIMES[rows], measured[rows], root[rows], GIMBAL.at(TIMES)[rows], names, around, gyro_errors
     )
@@ -72,7 +77,7 @@ def _factor(
 @pytest.mark.parametrize("width", [2, 3], ids=["without roll", "with roll"])
 @pytest.mark.parametrize("size", [0.5, 1e-6], ids=["large angles", "near zero"])
 @pytest.mark.parametrize("off", [0.3, 1e-7], ids=["off axis", "on axis"])
-@pytest.mark.parametrize(("sight", "gyro"), [(None, 0), (0.0, 15), (0.01, 0), (0.01, 6), (-0.02, 15)])
+@pytest.mark.parametrize(("sight", "gyro"), [(None, 0), (0.0, 15), (0.01, 0), (0.01, 6), (0.01, 9), (-0.02, 18)])
 def test_direction_jacobians(
     names: tuple[str, ...], width: int, size: float, off: float, sight: float | None, gyro: int
 ) -> None:
@@ -188,8 +193,8 @@ def test_local_motion_is_that_of_smooth_paths() -> None:
     np.testing.assert_allclose(MOTION.gimbal_rate, (ahead - back) / (2.0 * step), atol=2e-4)
     second = (ahead - 2.0 * _gimbal(TIMES) + back) / step**2
     np.testing.assert_allclose(MOTION.gimbal_acceleration, second, atol=3e-2)
-    assert MOTION.force is not None
-    np.testing.assert_allclose(MOTION.force, np.tile(FORCE, (N, 1)))
+    assert MOTION.drivers is not None
+    np.testing.assert_allclose(MOTION.drivers, np.tile(FORCE, (N, 1)))
 
 
 def test_the_noise_that_a_gimbal_follows_is_no_motion_of_the_line_of_sight() -> None:

@@ -67,7 +67,7 @@ def _values(problem: Problem) -> Any:
 @pytest.mark.parametrize(
     ("name", "rates"),
     [
-        ("los", {"image_rate_hz": 4.0, "gyro_rate_hz": 50.0, "gimbal_rate_hz": 50.0}),
+        ("los", {"image_rate_hz": 4.0, "gyro_rate_hz": 50.0, "gimbal_rate_hz": 50.0, "temperature": Warming()}),
         (
             "head",
             {"gyro_rate_hz": 50.0, "platform_gyro_rate_hz": 50.0, "vision_rate_hz": 5.0, "temperature": Warming()},

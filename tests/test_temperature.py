@@ -13,15 +13,16 @@ from scipy.stats import chi2
 
 from pipelines.config import load_config
 from pipelines.errors import InputError
+from pipelines.graph.problem import Estimate
 from pipelines.methods import method
 from pipelines.recording import series
 from pipelines.recording.reading import open_recording
 from pipelines.recording.temperature import Temperature, read_temperature
 from pipelines.recording.writing import write_session
 from pipelines.reports.calibration import load_calibration
-from pipelines.reports.result import Calibration
 from pipelines.session import Session
 from pipelines.simulation.simulated import Simulated
+from pipelines.solvers.batch import solve_batch
 from tests.command import Command
 
 T0 = 1_800_000_000_000_000_000
@@ -41,9 +42,17 @@ SHORT: dict[str, dict[str, Any]] = {
         "noise": {"vision_attitude": 2e-3},
         "temperature": {"rise_k": 20.0, "time_constant_s": 10.0},
     },
+    "los": {
+        "duration_s": 30,
+        "image_rate_hz": 10,
+        "gyro_rate_hz": 100,
+        "gimbal_rate_hz": 100,
+        "temperature": {"rise_k": 20.0, "time_constant_s": 10.0},
+    },
 }
 SLOPES = {
     "head": {"gyro_temperature_x": 2e-4, "gyro_temperature_y": -2.5e-4, "gyro_temperature_z": 1.5e-4},
+    "los": {"gyro_temperature_x": 1.5e-4, "gyro_temperature_y": -2e-4, "gyro_temperature_z": 2.5e-4},
 }
 METHODS = pytest.mark.parametrize("name", SHORT)
 
@@ -112,21 +121,20 @@ def test_a_slope_that_is_told_is_found_and_one_that_is_not_spoils_the_bias(name:
     assert calibration.status == "calibrated"
     for slope, true in SLOPES[name].items():
         found = calibration.parameters[slope]
-        assert abs(found.value - true) < 3.5 * found.sigma < 0.5 * abs(true)
+        assert abs(found.value - true) < 3.5 * found.sigma < 0.6 * abs(true)
         assert found.unit == ("rad/s/K" if slope.startswith("gyro") else "m/s^2/K")
         assert found.group == "assumption"
-    assert errors(calibration) < 4.0
-    blind = session_of(name, replace(made, data=replace(made.data, temperature=None))).calibrate()
-    assert not any("temperature" in name for name in blind.parameters)
-    print(blind.status, errors(blind), blind.headline, errors(calibration))
-    assert blind.status == "inconsistent" or errors(blind) > 6.0
+    assert worst(calibration.estimate, made) < 4.0
+    blind = solve_batch(session_of(name, replace(made, data=replace(made.data, temperature=None))).problem())
+    assert not any("temperature" in each for each in blind.names)
+    assert worst(blind, made) > 5.0
 
 
-def errors(calibration: Calibration) -> float:
-    """The largest of what was calibrated, in sigmas."""
-    truth = calibration.truth or {}
-    found = calibration.parameters.values()
-    return max(abs(p.value - float(str(truth[p.name]))) / p.sigma for p in found if p.group is None and p.sigma > 0.0)
+def worst(estimate: Estimate, made: Simulated) -> float:
+    """The largest error, in sigmas."""
+    free = estimate.sigmas > 0.0
+    error = estimate.values - np.array([made.truth[each] for each in estimate.names])
+    return float(np.abs(error[free] / estimate.sigmas[free]).max())
 
 
 @METHODS
@@ -144,20 +152,13 @@ def nees(name: str, seeds: range) -> tuple[float, int]:
     total, dof = 0.0, 0
     for seed in seeds:
         made = simulated(name, seed, sensors={})
-        problem = session_of(name, made).problem()
-        estimate = method_solve(problem)
+        estimate = solve_batch(session_of(name, made).problem())
         error = estimate.values - np.array([made.truth[each] for each in estimate.names])
         free = estimate.sigmas > 0.0
         covariance = estimate.covariance[np.ix_(free, free)]
         total += float(error[free] @ np.linalg.solve(covariance, error[free]))
         dof += int(free.sum())
     return total, dof
-
-
-def method_solve(problem: Any) -> Any:
-    from pipelines.solvers.batch import solve_batch
-
-    return solve_batch(problem)
 
 
 def assert_consistent(name: str, seeds: range) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from pipelines.graph.assumptions import Assumption, parameter
 from pipelines.graph.problem import Array
 from pipelines.recording import series
@@ -37,6 +39,16 @@ def reference(temperature: Temperature | None) -> float | None:
 def above(temperature: Temperature | None, reference: float | None, at: Array) -> Array | None:
     """By how much (n,), K, it is above the reference, degrees Celsius, at times (n,), s; None where nobody measures."""
     return None if temperature is None or reference is None else temperature.above(reference, at)
+
+
+def unsettled(temperature: Temperature | None) -> float:
+    """How long it may take, s, until it is known what the temperature is: from one message to the next."""
+    return 0.0 if temperature is None else float(np.diff(temperature.t).max(initial=0.0))
+
+
+def constants(reference: float | None) -> dict[str, float]:
+    """What formulas need to know beside the slopes."""
+    return {} if reference is None else {FIRST: reference}
 
 
 def topics(temperature: Temperature | None, epoch_ns: int) -> dict[str, series.Topic]:

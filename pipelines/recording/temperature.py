@@ -31,11 +31,6 @@ class Temperature:
         """The first one, degrees Celsius: at it a bias is the bias."""
         return float(self.celsius[0])
 
-    @property
-    def longest_interval(self) -> float:
-        """From one message to the next, s: for so long it may not be known yet what it is."""
-        return float(np.diff(self.t).max(initial=0.0))
-
     def above(self, reference: float, at: ArrayLike) -> Array:
         """By how much (n,), K, it is above another, degrees Celsius, at times (n,), s: linear between messages."""
         return np.asarray(np.interp(np.asarray(at, dtype=float), self.t, self.celsius) - reference)

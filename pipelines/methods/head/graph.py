@@ -89,9 +89,9 @@ def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
         dropped=data.dropped,
         premises=() if data.platform_t is not None else (_AT_REST,),
         onward=partial(_onward, config, model),
-        unsettled=0.0 if data.temperature is None else data.temperature.longest_interval,
+        unsettled=temperature.unsettled(data.temperature),
         noises=tuple(model.noises.values()),
-        constants={} if model.reference is None else {temperature.FIRST: model.reference},
+        constants=temperature.constants(model.reference),
     )
 
 

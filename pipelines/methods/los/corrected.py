@@ -13,17 +13,21 @@ import numpy as np
 from factors.gimbal import GimbalPath
 from pipelines.graph.problem import Array
 from pipelines.methods.formula import gyro_rate
-from pipelines.methods.los.formulas import S
-from pipelines.methods.los.parameters import BIAS, ONCE_PER_TURN, SENSITIVITY
+from pipelines.methods.los.formulas import DRIVERS, S
+from pipelines.methods.los.parameters import BIAS, ONCE_PER_TURN, SENSITIVITY, TEMPERATURE
 from pipelines.methods.los.recording import LosData
+from pipelines.methods.temperature import FIRST
 
 
 def rates(data: LosData, values: Mapping[str, float]) -> Array:
-    """True rates (N, 3) at the gyro's samples, rad/s; without an accelerometer the g-sensitivity stays in."""
-    known = {name: value for name, value in values.items() if data.force is not None or name not in SENSITIVITY.names}
+    """True rates (N, 3) at the gyro's samples, rad/s; what nobody measured the cause of stays in."""
+    warm = None if data.temperature is None or FIRST not in values else data.temperature.above(0.0, data.gyro_t)
+    causes = {SENSITIVITY: data.force, TEMPERATURE: warm}
+    unknown = {name for each, cause in causes.items() if cause is None for name in each.names}
+    known = {name: value for name, value in values.items() if name not in unknown}
     bias = np.array([values.get(name, 0.0) for name in BIAS])
-    measured = SimpleNamespace(**known, gyro=data.gyro, gyro_bias=bias, accel=data.force)
-    return gyro_rate(known, S, SENSITIVITY.names)[2](measured)
+    measured = SimpleNamespace(**known, gyro=data.gyro, gyro_bias=bias, accel=data.force, temperature=warm)
+    return gyro_rate(known, S, *DRIVERS)[2](measured)
 
 
 def taken(data: LosData, stamps: Array, values: Mapping[str, float]) -> Array:

@@ -17,11 +17,13 @@ from pipelines.methods.los.parameters import (
     ONCE_PER_TURN,
     SCALE,
     SENSITIVITY,
+    TEMPERATURE,
 )
 from pipelines.methods.los.topics import JOINTS
 
 _LEFT, _MIDDLE = ("camera_roll", "collimation"), "axis_nonperpendicularity"
 S = tuple(name for each in SCALE for name in each.names)
+DRIVERS = SENSITIVITY.names, TEMPERATURE.names
 
 
 def formulas(parameters: Collection[str]) -> list[Formula]:
@@ -33,7 +35,7 @@ def formulas(parameters: Collection[str]) -> list[Formula]:
         )
     angles = axis_angles(JOINTS, ONCE_PER_TURN.names, DELAY.names[0], parameters)
     azimuth, elevation = [angle.name for angle in angles] or JOINTS
-    true, measured, rate = gyro_rate(parameters, S, SENSITIVITY.names)
+    true, measured, rate = gyro_rate(parameters, S, *DRIVERS)
     found += [
         Formula(
             "IMU to carrier, Rx(a) = transpose(Exp(a ex)), Ry and Rz likewise",

@@ -18,18 +18,19 @@ from numpy.typing import NDArray
 from factors import so3
 from factors.chi_square import gate
 from factors.gimbal import SMOOTHING, GimbalPath, LocalMotion
-from factors.gyro import SCALE
 from factors.los import LosDirectionFactor, Surroundings
 from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
+from pipelines.graph.assumptions import acting
 from pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk
 from pipelines.graph.motion import Motion
 from pipelines.graph.noise import Level
 from pipelines.graph.priors import vector_prior
 from pipelines.graph.problem import Array, Factor, Problem, Step
 from pipelines.judgement.pictures import swaying
+from pipelines.methods import temperature
 from pipelines.methods.los.guess import camera, foreseen, guess, initial_attitudes, seen
-from pipelines.methods.los.parameters import BIAS, OFFSET, SPLIT, LosParameters
+from pipelines.methods.los.parameters import BIAS, OFFSET, SENSITIVITY, SPLIT, TEMPERATURE, LosParameters
 from pipelines.methods.los.pictures import select_pictures
 from pipelines.methods.los.recording import LosData
 from pipelines.methods.noise import sampled, stated, typical, walking
@@ -56,6 +57,7 @@ class _Model:
     around: Surroundings | None  # of the keyframes, when errors of the sensors are variables
     loss: TruncatedLoss
     parameters: LosParameters
+    reference: float | None  # degrees Celsius, the temperature at which the bias is the bias; None: nobody measures it
     noises: dict[str, Level]  # by name
 
 
@@ -80,8 +82,9 @@ def _problem(config: Config, data: LosData, model: _Model, dropped: Mapping[str,
         dropped=dropped,
         # Errors from pictures are against the first picture of a target, which the end of a recording does not show.
         onward=partial(_onward, config, model) if data.error_cov is None else None,
-        unsettled=_SETTLED if model.around is None else SMOOTHING,
+        unsettled=max(_SETTLED if model.around is None else SMOOTHING, temperature.unsettled(data.temperature)),
         noises=tuple(model.noises.values()),
+        constants=temperature.constants(model.reference),
     )
 
 
@@ -101,6 +104,8 @@ def _onward(config: Config, model: _Model, data: LosData, time: float) -> Proble
     trunk = ROOT if time == -np.inf else model.chain.trunk(time)
     if trunk is None or (trunk is not ROOT and time not in data.image_t):
         return None
+    if (data.temperature is None) != (model.reference is None):
+        return None
     grown, dropped = _prepare(data, config, model, trunk, time)
     return _problem(config, data, grown, dropped) if trunk is ROOT or grown.chain.time[0] == time else None
 
@@ -109,7 +114,11 @@ def _prepare(
     data: LosData, config: Config, before: _Model | None = None, trunk: Trunk | None = None, start: float = -np.inf
 ) -> tuple[_Model, dict[str, int]]:
     """The model of a recording, or of one that grows from a keyframe of its model until now on."""
-    parameters = LosParameters.of(config, data.force is not None, data.stamp_sigma)
+    reference = temperature.reference(data.temperature) if before is None else before.reference
+    drivers = {SENSITIVITY: data.force, TEMPERATURE: temperature.above(data.temperature, reference, data.gyro_t)}
+    caused = [each for each, driver in drivers.items() if driver is not None]
+    parameters = LosParameters.of(config, caused, data.stamp_sigma)
+    driving = acting(parameters.gyro, drivers)
     noises = _noises(data, config) if before is None else before.noises
     gimbal, gyro = GimbalPath(data.gimbal_t, data.gimbal), GyroPath(data.gyro_t, data.gyro)
     covariance = _covariance(data, gimbal, config)
@@ -128,12 +137,11 @@ def _prepare(
     else:
         mount, bias_hat = before.mount, before.chain.gyro.bias_hat
     cRm = camera(angles, mount, parameters.names)
-    sensitive = parameters.gyro is not None and len(parameters.gyro.quantities) > SCALE
     chain = GyroChain.over(
         time,
         starts,
         initial_attitudes(chains, time, cRm, measured, gyro),
-        GyroPath(data.gyro_t, data.gyro, bias_hat, data.force if sensitive else None),
+        GyroPath(data.gyro_t, data.gyro, bias_hat, driving),
         density=noises["gyro_density"].used,
         walk=noises["gyro_bias_walk"].used,
         errors=parameters.gyro,
@@ -141,7 +149,7 @@ def _prepare(
     )
     around = None
     if parameters.sight is not None:
-        motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal, data.force if sensitive else None)
+        motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal, driving)
         begun, found = data.image_t[0], time[starts]
         if before is not None and before.around is not None and start > -np.inf:
             # The data are the recording's end, and its first target may have been found before.
@@ -161,6 +169,7 @@ def _prepare(
         around=around,
         loss=TruncatedLoss(gate(3 if np.isfinite(measured[:, 2]).any() else 2)),
         parameters=parameters,
+        reference=reference,
         noises=noises,
     )
     return model, {**data.dropped, **dropped}

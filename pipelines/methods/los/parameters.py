@@ -11,11 +11,13 @@ from pipelines.errors import InputError
 from pipelines.graph.assumptions import (
     Assumption,
     encoder_assumptions,
+    gyro_errors,
     parameter,
     quantities,
     scale_assumptions,
     sensitivity_assumption,
     stamped,
+    temperature_assumption,
 )
 from pipelines.graph.problem import Parameter, Quantity
 from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
@@ -31,6 +33,7 @@ OFFSET = "time_offset"
 # roughly, machined gimbals.
 SCALE = scale_assumptions("gyro", "gyro", 3e-3)
 SENSITIVITY = sensitivity_assumption("gyro", "gyro", 2e-5)
+TEMPERATURE = temperature_assumption("gyro", "rad/s", 1e-4)
 ROLL = Assumption(("camera_roll",), "rad", "camera", "roll", 1e-2)
 COLLIMATION = Assumption(("collimation",), "rad", "gimbal", "collimation", 1e-3)
 AXES = Assumption(("axis_nonperpendicularity",), "rad", "gimbal", "nonperpendicularity", 1e-3)
@@ -42,7 +45,7 @@ ONCE_PER_TURN, DELAY = encoder_assumptions(JOINTS, 2e-4, 1e-3)
 
 # Of the mounting, one by one; and those of factors.los.SIGHT_ERRORS, in its order.
 MOUNTED, SIGHT = (ROLL, COLLIMATION, AXES), (TIME_OFFSET, CLOCK_SKEW, LOS_SCALE, TARGET_RATE, ONCE_PER_TURN, DELAY)
-ASSUMPTIONS = (*SCALE, SENSITIVITY, *MOUNTED, *SIGHT)
+ASSUMPTIONS = (*SCALE, SENSITIVITY, *MOUNTED, *SIGHT, TEMPERATURE)
 # The angles by which gyro, gimbal axes and camera are mounted.
 ANGLES = (*_ANGLES, "delta_z", *SPLIT, *(name for each in MOUNTED for name in each.names))
 
@@ -57,7 +60,7 @@ class LosParameters:
         angles: of the mounting.
         bias: of the gyro (3), rad/s, its first node.
         sight: factors.los.SIGHT_ERRORS; None when all are fixed.
-        gyro: S of the gyro (6), or S and G (15); None for a perfect one.
+        gyro: S of the gyro and what its drivers do, see factors.gyro; None for a perfect one.
     """
 
     angles: Parameter
@@ -66,12 +69,12 @@ class LosParameters:
     gyro: Parameter | None
 
     @classmethod
-    def of(cls, config: Config, accelerometer: bool, stamp_sigma: float = 0.0) -> LosParameters:
+    def of(cls, config: Config, drivers: Sequence[Assumption], stamp_sigma: float = 0.0) -> LosParameters:
         """With the priors in force.
 
         Args:
             config: priors, data sheets, accuracies wanted.
-            accelerometer: whether the gyro's IMU measures specific force.
+            drivers: SENSITIVITY and TEMPERATURE, in this order, where the gyro's IMU measures their causes.
             stamp_sigma: s, how well the stamps are known.
         """
         if config.noise.gyro_scale:
@@ -96,12 +99,11 @@ class LosParameters:
 
         angles = calibrated((*_ANGLES, *(SPLIT if given else ("delta_z",))), "rad", _PRIOR_ANGLE)
         mounted = tuple(assumed[name] for each in MOUNTED for name in each.names if assumed[name].prior_sigma != 0.0)
-        sensitive = accelerometer and parameter(_key("G"), (SENSITIVITY,), config) is not None
         return cls(
             angles=Parameter(_key("a"), (*angles, *mounted)),
             bias=Parameter(FIRST_BIAS, calibrated(BIAS, "rad/s", _PRIOR_BIAS)),
             sight=stamped(parameter(_key("S"), SIGHT, config), OFFSET, stamp_sigma),
-            gyro=parameter(_key("G"), (*SCALE, SENSITIVITY) if sensitive else SCALE, config),
+            gyro=gyro_errors(_key("G"), SCALE, drivers, config),
         )
 
     @property

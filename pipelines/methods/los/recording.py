@@ -11,11 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import InputError
+from pipelines.methods import temperature
+from pipelines.methods.los import parameters
 from pipelines.methods.los.topics import GIMBAL, JOINTS, LOS_ERROR
 from pipelines.recording import series
 from pipelines.recording.checks import check_overlap, clean, count, nanoseconds
 from pipelines.recording.gyro import read_imu
 from pipelines.recording.reading import Recording
+from pipelines.recording.temperature import Temperature
 from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU
 from pipelines.recording.writing import attached, write_session
 from pipelines.settings import Config
@@ -42,7 +45,7 @@ class LosData:
     roll was not measured. error_cov (K, 3, 3) rad^2: the tracker's covariance, None if unknown. gyro_density,
     rad/s/sqrt(Hz): from the covariances of the messages, None if they say nothing. force (N, 3) m/s^2: specific force
     by the IMU's accelerometer in m, at gyro_t; None if it has none. dropped: reason -> messages. stamp_sigma, s: how
-    well the stamps are known.
+    well the stamps are known. temperature: of the IMU, None where nobody measures it.
     """
 
     epoch_ns: int
@@ -57,6 +60,7 @@ class LosData:
     force: Array | None = None
     dropped: dict[str, int] = field(default_factory=dict)
     stamp_sigma: float = 0.0
+    temperature: Temperature | None = None
 
 
 def read_los(recording: Recording, config: Config) -> LosData:
@@ -81,8 +85,9 @@ def read_los(recording: Recording, config: Config) -> LosData:
         image_t, error = _error(recording, error_name, epoch, dropped)
     check_overlap({gyro_name: gyro_t, gimbal_name: gimbal_t, error_name: image_t})
     stamp_sigma = recording.stamp_sigma_s
+    warmth = temperature.read(recording, config, (parameters.TEMPERATURE,), gyro_t, dropped)
     data = LosData(
-        epoch, gyro_t, gyro, gimbal_t, gimbal, image_t, error, covariance, density, force, dropped, stamp_sigma
+        epoch, gyro_t, gyro, gimbal_t, gimbal, image_t, error, covariance, density, force, dropped, stamp_sigma, warmth
     )
     check_gimbal(gimbal_name, data)
     check_signs(gyro_name, data)
@@ -116,6 +121,7 @@ def write_los(
         topics[LOS_ERROR.name] = series.VectorSeries(ns(data.image_t), vector, frame_id="los")
     else:
         topics[CAMERA_INFO.name], topics[IMAGE.name] = pictures
+    topics |= temperature.topics(data.temperature, data.epoch_ns)
     write_session(path, topics, attached(truth, config_yaml))
 
 

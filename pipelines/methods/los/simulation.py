@@ -33,6 +33,7 @@ from pipelines.settings import SensorSheets
 from pipelines.simulation.motion import EulerMotion, Swing, sample_times
 from pipelines.simulation.sensors import read_by, true_values
 from pipelines.simulation.simulated import Simulated
+from pipelines.simulation.temperature import Warming, drift, known, measured
 
 Array = NDArray[np.float64]
 
@@ -126,6 +127,7 @@ class LosScenario(BaseModel):
     camera: LosCamera = LosCamera()
     outlier_share: Share = 0.0
     outlier_size: NotNegative = 5e-3  # rad, sigma per axis
+    temperature: Warming | None = None  # of the IMU; null: nobody measures it
     # Data sheets that errors of the sensors are drawn from, passed on to the config; ideal: there are none; null: none
     # either, but the config does not know.
     sensors: SensorSheets | None = None
@@ -178,7 +180,7 @@ def simulate_los(scenario: LosScenario, seed: int) -> tuple[LosData, dict[str, f
     """A session and the true values of its parameters (rad, rad/s, s; the bias is its mean over the session)."""
     # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
     rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
-    effects = true_values(ASSUMPTIONS, scenario.sensors, scenario.effects, rng_of_sensors)
+    effects = true_values(known(ASSUMPTIONS, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
     motion = simulate_motion(scenario, effects, rng)
     image_t, cRt = targets(scenario, motion, rng)
     noise = scenario.noise
@@ -201,6 +203,7 @@ def simulate_los(scenario: LosScenario, seed: int) -> tuple[LosData, dict[str, f
         error=error,
         gyro_density=noise.gyro_density or None,
         force=motion.force + shaken,
+        temperature=measured(scenario.temperature, scenario.duration_s),
     )
     return data, _truth(scenario, motion)
 
@@ -222,7 +225,7 @@ def simulate_motion(scenario: LosScenario, effects: Mapping[str, float], rng: np
     start = scenario.gyro_turn_on_bias * rng.standard_normal(3)
     steps = scenario.noise.gyro_bias_walk / np.sqrt(rate_hz) * rng.standard_normal(exact.shape)
     bias = np.asarray(start + np.cumsum(steps, axis=0))
-    gyro = read_by(exact, "gyro", effects, force) + bias
+    gyro = read_by(exact, "gyro", effects, force) + bias + drift(scenario.temperature, "gyro", effects, gyro_t)
     gyro = gyro + scenario.noise.gyro_density * np.sqrt(rate_hz) * rng.standard_normal(exact.shape)
     first = np.deg2rad(scenario.azimuth_deg), np.deg2rad(scenario.elevation_deg)
     gimbal = _stabilise(gyro, _slew(scenario, gyro_t), 1.0 / rate_hz, *first)
@@ -277,7 +280,8 @@ def simulated(scenario: LosScenario, seed: int, images: bool = False) -> Simulat
 def simulate_pictures(scenario: LosScenario, seed: int) -> tuple[series.CameraInfo, series.ImageSeries]:
     """The pictures behind the LOS errors of `simulate_los` with the same seed; drawn one by one as they are taken."""
     rng = np.random.default_rng(seed)
-    effects = true_values(ASSUMPTIONS, scenario.sensors, scenario.effects, np.random.default_rng([seed, 1]))
+    rng_of_sensors = np.random.default_rng([seed, 1])
+    effects = true_values(known(ASSUMPTIONS, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
     motion = simulate_motion(scenario, effects, rng)
     stamps, cRt = targets(scenario, motion, rng)
     if scenario.losses:
