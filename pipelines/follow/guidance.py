@@ -11,6 +11,7 @@ import numpy as np
 
 from pipelines.graph.motion import Motion
 from pipelines.graph.problem import Array, Quantity
+from pipelines.judgement import noise_levels
 from pipelines.judgement.checklist import ChecklistItem
 from pipelines.judgement.observability import Assessment, assess
 from pipelines.judgement.stability import Stability, stability
@@ -162,6 +163,7 @@ def view_of(epoch_ns: int, run: Run, checklist: tuple[ChecklistItem, ...], chang
     values, assessment = None, None
     if run.started:
         values = run.values()
-        assessment = assess(quantities, run.covariance(), run.chi_square(), run.problem.advice)
+        decides = not noise_levels.asked(run.levels)
+        assessment = assess(quantities, run.covariance(), run.chi_square(), run.problem.advice, decides)
     time = run.time if np.isfinite(run.time) else 0.0
     return View(time, epoch_ns, quantities, values, assessment, checklist, change)
