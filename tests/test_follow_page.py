@@ -204,4 +204,4 @@ def test_a_recording_followed_on_a_phone_and_on_a_desktop(name: str, tmp_path: P
 
 def _sigmas(lines: list[str]) -> list[float]:
     """What stands before the units."""
-    return [float(line.split()[1]) for line in lines if line.startswith("± ")]
+    return [float(line.split()[1].rstrip(",")) for line in lines if line.startswith("± ")]
