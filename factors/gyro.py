@@ -261,8 +261,8 @@ def needed(given: Array | None) -> Array:
     """What variables were told to depend on. Raises ValueError when it was not given."""
     if given is None:
         raise ValueError(
-            "errors of a gyro need increments with scale=True and, for D, drivers; skew and scale of pictures need "
-            "elapsed and first"
+            "errors of a gyro need increments with scale=True and, for D, drivers; its slope over temperature needs "
+            "warmth; skew and scale of pictures need elapsed and first"
         )
     return given
 

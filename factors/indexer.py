@@ -23,15 +23,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from factors import so3
-from factors.gyro import by_symmetric, symmetric
+from factors.gyro import by_symmetric, needed, symmetric
 from factors.model import Array, Block, Model, Residuals
 
-Option = Literal["errors", "encoder", "epsilon", "tilt"]
+Option = Literal["errors", "temperature", "encoder", "epsilon", "tilt"]
 # What the encoders' errors are, in the order of their block.
 ENCODER_ERRORS = ("outer sin", "outer cos", "inner sin", "inner cos", "delay")
 
 _EX, _EY, _EZ = np.eye(3)
-_SIZES: dict[Option, int] = {"errors": 6, "encoder": len(ENCODER_ERRORS), "epsilon": 1, "tilt": 3}
+_SIZES: dict[Option, int] = {"errors": 6, "temperature": 3, "encoder": len(ENCODER_ERRORS), "epsilon": 1, "tilt": 3}
 # Nodes of two-point Gauss quadrature on [0, 1], weights 1/2.
 _GAUSS = 0.5 + np.array([-1.0, 1.0]) / np.sqrt(12.0)
 
@@ -245,12 +245,13 @@ def gyro_means(edges: Array, rate: Array, cuts: NDArray[np.intp]) -> Array:
 class IndexerAverageFactor(Model):
     """Mean gyro rate over n adjoining windows against the mean that the encoders and the earth's rate say.
 
-        gyro = (I + S) mRt w + bias,    w = fixed + cos(epsilon) cosine + sin(epsilon) sine
+        gyro = (I + S) mRt w + bias + c warmth,    w = fixed + cos(epsilon) cosine + sin(epsilon) sine
 
     compared in frame t, where encoder noise has fixed directions. Blocks: theta (3), gyro bias (3, rad/s), then
-    the options: "errors" (6), the numbers of S as factors.gyro has them; "encoder" (5), the encoders' errors, on which
-    w depends linearly; "epsilon" (1, rad); "tilt" (3, rad), a small rotation of the true platform rate against the
-    encoders' account of it, w -> Exp(tilt) w, for errors that come again with every turn.
+    the options: "errors" (6), the numbers of S as factors.gyro has them; "temperature" (3, rad/s/K), which is c;
+    "encoder" (5), the encoders' errors, on which w depends linearly; "epsilon" (1, rad); "tilt" (3, rad), a small
+    rotation of the true platform rate against the encoders' account of it, w -> Exp(tilt) w, for errors that come
+    again with every turn.
 
     Attributes:
         gyro: (n, 3) mean rates, rad/s.
@@ -258,6 +259,7 @@ class IndexerAverageFactor(Model):
         sqrt_information: (3 n, 3 n) of the difference, in t: neighbours share the encoder noise at their common edge.
         options: those that are variables, in the order of their blocks; the others are zero.
         theta_unit: rad, what theta's block counts.
+        warmth: (n,) K, mean temperature over the windows above the one at which the bias is the bias; needed for c.
     """
 
     gyro: Array
@@ -265,6 +267,7 @@ class IndexerAverageFactor(Model):
     sqrt_information: Array
     options: tuple[Option, ...] = ()
     theta_unit: float = 1.0
+    warmth: Array | None = None
     rows: int = 3
 
     @classmethod
@@ -277,11 +280,12 @@ class IndexerAverageFactor(Model):
         options: tuple[Option, ...] = (),
         wander: float = 0.0,
         theta_unit: float = 1.0,
+        warmth: Array | None = None,
     ) -> IndexerAverageFactor:
         """From the noise of the sensors.
 
         Args:
-            gyro, rates, options, theta_unit: as the attributes.
+            gyro, rates, options, theta_unit, warmth: as the attributes.
             density: gyro noise, rad/s/sqrt(Hz): angle random walk in each window.
             encoder: white encoder noise at the edges, rad, one for both axes or (2,) for outer and inner.
             wander: error of the encoders' account of the platform's attitude, about any axis, rad, that changes from
@@ -296,7 +300,7 @@ class IndexerAverageFactor(Model):
         across = so3.hat(rates.fixed + rates.cosine)
         for i, block in enumerate(across @ np.swapaxes(across, 1, 2)):
             covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += wander**2 * block
-        return cls(gyro, rates, np.linalg.inv(np.linalg.cholesky(covariance)), options, theta_unit)
+        return cls(gyro, rates, np.linalg.inv(np.linalg.cholesky(covariance)), options, theta_unit, warmth)
 
     @property
     def time(self) -> Array:
@@ -309,12 +313,14 @@ class IndexerAverageFactor(Model):
         return (3, 3, *(_SIZES[option] for option in self.options))
 
     def __call__(self, theta: Array, bias: Array, *more: Array) -> Residuals:
-        """Residual sqrt_information * (tRm (I + S)^-1 (gyro - bias) - Exp(tilt) w), (n, 3)."""
+        """Residual sqrt_information * (tRm (I + S)^-1 (gyro - bias - c warmth) - Exp(tilt) w), (n, 3)."""
         given = dict(zip(self.options, more, strict=True))
         epsilon, tilt = given.get("epsilon", np.zeros(1)), given.get("tilt", np.zeros(3))
         theta = self.theta_unit * theta
         tRm = mounting(theta)
         corrected, N = self.gyro - bias, np.asarray(np.eye(3))
+        if "temperature" in given:
+            corrected = corrected - needed(self.warmth)[:, None] * given["temperature"]
         if "errors" in given:
             N = np.asarray(np.linalg.inv(np.eye(3) + symmetric(given["errors"])))
             corrected = np.einsum("nij,nj->ni", N, corrected)
@@ -330,6 +336,7 @@ class IndexerAverageFactor(Model):
             by_epsilon = -np.sin(epsilon) * parts[:, 1] + np.cos(epsilon) * parts[:, 2]
             blocks: dict[Option, Callable[[], Array]] = {
                 "errors": lambda: -by_symmetric(by_gyro[..., None] * corrected[:, None, None]),
+                "temperature": lambda: -by_gyro * needed(self.warmth)[:, None, None],
                 "encoder": lambda: (
                     -so3.matrix(turn) @ (by_encoder[:, 0] + cosine * by_encoder[:, 1] + sine * by_encoder[:, 2])
                 ),

@@ -28,7 +28,8 @@ from tests.numerics import assert_rows_are_independent
 RNG = np.random.default_rng(3)
 N = 9
 BASE_RATE = so3.rotate(so3.exp([0.3, -0.2, 0.9]), earth_rate(0.7))
-OPTIONS: tuple[Option, ...] = ("errors", "encoder", "epsilon", "tilt")
+OPTIONS: tuple[Option, ...] = ("errors", "temperature", "encoder", "epsilon", "tilt")
+WARMTH = np.linspace(0.0, 8.0, N)
 
 
 def _angles(t: Array) -> tuple[Array, Array]:
@@ -52,7 +53,7 @@ def _rates(n: int = N, spread: float = 0.3) -> PlatformRates:
 
 
 def _model(gyro: Array, rates: PlatformRates) -> IndexerAverageFactor:
-    return IndexerAverageFactor(gyro, rates, RNG.normal(size=(3 * N, 3 * N)), OPTIONS)
+    return IndexerAverageFactor(gyro, rates, RNG.normal(size=(3 * N, 3 * N)), OPTIONS, warmth=WARMTH)
 
 
 @pytest.mark.parametrize("epsilon", [0.0, 2e-3, -0.4])
@@ -118,7 +119,7 @@ def test_gyro_mean_is_the_integral_between_sample_edges() -> None:
 
 
 def _blocks(size: float) -> list[Array]:
-    shapes = [(3, 1.0), (3, 0.05), (6, 0.05), (5, 0.1), (1, 0.3), (3, 0.5)]
+    shapes = [(3, 1.0), (3, 0.05), (6, 0.05), (3, 0.01), (5, 0.1), (1, 0.3), (3, 0.5)]
     return [np.tile(RNG.normal(scale=size * spread, size=width), (N, 1)) for width, spread in shapes]
 
 
@@ -127,7 +128,7 @@ def test_jacobians(size: float) -> None:
     assert_jacobians(_model(RNG.normal(size=(N, 3)), _rates()), _blocks(size))
 
 
-@pytest.mark.parametrize("options", [(), ("errors",), ("tilt", "encoder", "epsilon")])
+@pytest.mark.parametrize("options", [(), ("errors",), ("temperature",), ("tilt", "encoder", "epsilon")])
 def test_jacobians_with_some_options(options: tuple[Option, ...]) -> None:
     model = replace(_model(RNG.normal(size=(N, 3)), _rates()), options=options)
     blocks = dict(zip(("theta", "bias", *OPTIONS), _blocks(0.3), strict=True))
@@ -139,7 +140,7 @@ def test_theta_may_count_another_unit() -> None:
     blocks = _blocks(0.3)
     in_units = [blocks[0] / 1e-3, *blocks[1:]]
     np.testing.assert_allclose(model(*in_units)[0], replace(model, theta_unit=1.0)(*blocks)[0], atol=1e-12)
-    assert_jacobians(model, in_units, [1e-2, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5])
+    assert_jacobians(model, in_units, [1e-2, *[1e-5] * 6])
 
 
 def test_jacobians_near_the_singular_angle() -> None:
@@ -162,7 +163,7 @@ def test_windows_without_encoder_noise_are_independent() -> None:
             rates.by_encoder[rows],
             np.zeros((3 * len(rows), 3 * len(rows) + 2)),
         )
-        return IndexerAverageFactor.of(gyro[rows], some, 1e-3, 0.0, OPTIONS)
+        return IndexerAverageFactor.of(gyro[rows], some, 1e-3, 0.0, OPTIONS, warmth=WARMTH[rows])
 
     assert_rows_are_independent(model, blocks)
 
@@ -182,16 +183,16 @@ def test_encoder_noise_at_a_common_edge_cancels_in_the_sum() -> None:
 
 
 def test_residual_vanishes_at_the_truth() -> None:
-    theta, bias, errors, encoder, epsilon, tilt = _blocks(0.3)
+    theta, bias, errors, slope, encoder, epsilon, tilt = _blocks(0.3)
     rates = _rates()
     fixed, cosine, sine = np.moveaxis(rates.parts(encoder), 1, 0)
     w = so3.rotate(so3.exp(tilt), fixed + np.cos(epsilon) * cosine + np.sin(epsilon) * sine)
     xx, yy, zz, xy, xz, yz = errors[0]
     gain = np.eye(3) + np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    gyro = so3.rotate(so3.inverse(mounting(theta)), w) @ gain + bias
-    model = IndexerAverageFactor.of(gyro, rates, 1.0, 0.0, OPTIONS)
-    np.testing.assert_allclose(model(theta, bias, errors, encoder, epsilon, tilt)[0], 0.0, atol=1e-13)
-    assert np.abs(model(theta + 1e-3, bias, errors, encoder, epsilon, tilt)[0]).max() > 1e-5
+    gyro = so3.rotate(so3.inverse(mounting(theta)), w) @ gain + bias + WARMTH[:, None] * slope
+    model = IndexerAverageFactor.of(gyro, rates, 1.0, 0.0, OPTIONS, warmth=WARMTH)
+    np.testing.assert_allclose(model(theta, bias, errors, slope, encoder, epsilon, tilt)[0], 0.0, atol=1e-13)
+    assert np.abs(model(theta + 1e-3, bias, errors, slope, encoder, epsilon, tilt)[0]).max() > 1e-5
 
 
 @pytest.mark.parametrize("size", [1e-6, 1e-3])

@@ -43,16 +43,22 @@ SHORT: dict[str, dict[str, Any]] = {
         "temperature": {"rise_k": 20.0, "time_constant_s": 10.0},
     },
     "los": {
-        "duration_s": 30,
+        "duration_s": 20,
         "image_rate_hz": 10,
         "gyro_rate_hz": 100,
         "gimbal_rate_hz": 100,
         "temperature": {"rise_k": 20.0, "time_constant_s": 10.0},
     },
+    "indexer": {
+        "gyro_rate_hz": 50,
+        "encoder_rate_hz": 50,
+        "temperature": {"rise_k": 20.0, "time_constant_s": 100.0},
+    },
 }
 SLOPES = {
     "head": {"gyro_temperature_x": 2e-4, "gyro_temperature_y": -2.5e-4, "gyro_temperature_z": 1.5e-4},
     "los": {"gyro_temperature_x": 1.5e-4, "gyro_temperature_y": -2e-4, "gyro_temperature_z": 2.5e-4},
+    "indexer": {"gyro_temperature_x": 1.5e-4, "gyro_temperature_y": -2e-4, "gyro_temperature_z": 2.5e-4},
 }
 METHODS = pytest.mark.parametrize("name", SHORT)
 

@@ -27,7 +27,8 @@ _AXES = "xyz"
 def indexer_plots(data: IndexerData, calibration: Calibration) -> list[Plot]:
     """The method's own figures; those that the recording has no data for are left out."""
     config = calibration.config
-    values = dict(zip(calibration.estimate.names, calibration.estimate.values.tolist(), strict=True))
+    estimate = calibration.estimate
+    values = {**calibration.problem.constants, **dict(zip(estimate.names, estimate.values.tolist(), strict=True))}
     turning = [g for g in groups_of(data, config, axis_motion(data)) if g.position is not None]
     plots = [_misfit(turning, values), _contributions(turning, values)]
     half = _half_differences(data, values)

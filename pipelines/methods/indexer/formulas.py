@@ -6,7 +6,7 @@ from collections.abc import Collection
 
 from factors import so3
 from pipelines.methods.formula import Formula, axis_angles, gyro_rate, passive
-from pipelines.methods.indexer.parameters import DELAY, ERRORS, ONCE_PER_TURN
+from pipelines.methods.indexer.parameters import DELAY, ERRORS, ONCE_PER_TURN, TEMPERATURE
 
 _AXES = ("outer", "inner")
 
@@ -37,7 +37,7 @@ def formulas(parameters: Collection[str]) -> list[Formula]:
 
 
 def _rate(parameters: Collection[str]) -> Formula:
-    true, measured, rate = gyro_rate(parameters, ERRORS, ())
+    true, measured, rate = gyro_rate(parameters, ERRORS, (), TEMPERATURE.names)
     return Formula(
         "rate of the platform, rad/s",
         "w_it",

@@ -28,6 +28,7 @@ from pipelines.graph.priors import prior_sigmas, vector_prior
 from pipelines.graph.problem import Array, Attitudes, Factor, Parameter, Problem, Step
 from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
 from pipelines.graph.walking_bias import WalkingBias
+from pipelines.methods import temperature
 from pipelines.methods.indexer.attitude import carrier, frames
 from pipelines.methods.indexer.groups import KINDS, Group, groups_of
 from pipelines.methods.indexer.guess import agreeing, guess
@@ -80,7 +81,7 @@ class _Model:
     def options(self) -> tuple[Option, ...]:
         """The factor's options that are parameters."""
         given = {p.key for p in self.parameters}
-        names: tuple[Option, ...] = ("errors", "encoder", "epsilon")
+        names: tuple[Option, ...] = ("errors", "temperature", "encoder", "epsilon")
         return tuple(name for name in names if KEYS[name] in given)
 
 
@@ -101,6 +102,7 @@ def problem(data: IndexerData, config: Config) -> Problem:
         advice=_advice,
         dropped=dropped,
         noises=model.noises,
+        constants=temperature.constants(temperature.reference(data.temperature)),
     )
 
 
@@ -129,7 +131,7 @@ def _encoders(noise: Noise, scatter: float) -> Level:
 
 
 def _prepare(data: IndexerData, config: Config) -> tuple[_Model, dict[str, int]]:
-    parameters = indexer_parameters(config, data.stamp_sigma)
+    parameters = indexer_parameters(config, data.stamp_sigma, data.temperature is not None)
     motion = axis_motion(data)
     scatter = encoder_scatter(motion)
     gyro, encoders = (
@@ -235,7 +237,10 @@ def _add_measurement(model: _Model, i: int, seen: set[tuple[str, int]], step: St
     # A resting encoder repeats its slow errors from edge to edge, a turning one need not (quantisation).
     turning = np.array([group.run.axis in ("outer", "both"), group.run.axis in ("inner", "both")])
     encoder = np.hypot(model.encoder, np.where(turning, model.slow, 0.0))
-    average = IndexerAverageFactor.of(group.gyro, group.rates, model.density, encoder, options, wander, THETA_UNIT)
+    warmth = group.warmth(temperature.reference(model.data.temperature))
+    average = IndexerAverageFactor.of(
+        group.gyro, group.rates, model.density, encoder, options, wander, THETA_UNIT, warmth
+    )
     step.factors.append(Factor.of(group.kind, average.on(*columns, compress=compress)))
 
 

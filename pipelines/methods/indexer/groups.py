@@ -11,6 +11,7 @@ from factors import so3
 from factors.earth import earth_rate
 from factors.indexer import AxisPath, PlatformRates, gyro_edges, gyro_means
 from pipelines.graph.problem import Array
+from pipelines.methods import temperature
 from pipelines.methods.indexer.recording import IndexerData
 from pipelines.methods.indexer.runs import AxisMotion, Run
 from pipelines.methods.indexer.topics import IndexerConfig
@@ -40,12 +41,14 @@ class Group:
         run: the run it is part of.
         gyro: (n, 3) mean rates in m, rad/s.
         rates: the platform's mean rates.
+        celsius: (n,) mean temperatures, degrees Celsius; None where nobody measures them.
     """
 
     kind: str
     run: Run
     gyro: Array
     rates: PlatformRates
+    celsius: Array | None = None
 
     @property
     def duration(self) -> float:
@@ -56,6 +59,10 @@ class Group:
     def mean_gyro(self) -> Array:
         """(3,) mean rate over the whole group, rad/s."""
         return np.asarray(np.diff(self.rates.edges) @ self.gyro / self.duration)
+
+    def warmth(self, reference: float | None) -> Array | None:
+        """Mean temperatures (n,) above another, degrees Celsius, K; None where nobody measures them."""
+        return None if self.celsius is None or reference is None else self.celsius - reference
 
     @property
     def mean_platform(self) -> Array:
@@ -79,6 +86,7 @@ def groups_of(data: IndexerData, config: Config, motion: AxisMotion, split: bool
     path = AxisPath(motion.t, motion.angles[:, 0], motion.angles[:, 1], so3.rotate(so3.inverse(nRbase), earth))
     edges = gyro_edges(data.gyro_t)
     middles = 0.5 * (edges[1:] + edges[:-1])
+    celsius = temperature.above(data.temperature, 0.0, data.gyro_t)
     groups: list[Group] = []
     free_from = before = -np.inf
     for run in motion.runs:
@@ -96,7 +104,8 @@ def groups_of(data: IndexerData, config: Config, motion: AxisMotion, split: bool
             cuts = cuts[np.concatenate([[True], np.diff(cuts) >= _FEWEST_SAMPLES])]
             if len(cuts) < 2:
                 continue
-            groups.append(Group(kind, run, gyro_means(edges, data.gyro, cuts), path.rates(edges[cuts])))
+            mean = None if celsius is None else gyro_means(edges, celsius[:, None], cuts)[:, 0]
+            groups.append(Group(kind, run, gyro_means(edges, data.gyro, cuts), path.rates(edges[cuts]), mean))
             # The angle at the last edge is made of the two encoder samples on either side of it, and so is that at
             # the first edge of the next group.
             after = np.searchsorted(motion.t, edges[cuts[-1]], side="right") + 3

@@ -9,10 +9,17 @@ from itertools import chain
 import gtsam
 import numpy as np
 
-from pipelines.graph.assumptions import encoder_assumptions, parameter, quantities, scale_assumptions, stamped
+from pipelines.graph.assumptions import (
+    encoder_assumptions,
+    parameter,
+    quantities,
+    scale_assumptions,
+    stamped,
+    temperature_assumption,
+)
 from pipelines.graph.problem import Array, Parameter, Quantity
 from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
-from pipelines.methods.indexer.recording import JOINTS
+from pipelines.methods.indexer.topics import JOINTS
 from pipelines.settings import Config, check_names
 
 THETA = ("theta_x", "theta_y", "theta_z")
@@ -23,11 +30,13 @@ EPSILON = ("axis_nonperpendicularity",)
 # axes that turn with encoders of some arc seconds.
 SCALE, SKEW = scale_assumptions("gyro", "gyro", 1e-4, 2e-5)
 ONCE_PER_TURN, DELAY = encoder_assumptions(JOINTS, 5e-6, 1e-3)
-ASSUMPTIONS = (SCALE, SKEW, ONCE_PER_TURN, DELAY)
+TEMPERATURE = temperature_assumption("gyro", "rad/s", 1e-4)
+ASSUMPTIONS = (SCALE, SKEW, ONCE_PER_TURN, DELAY, TEMPERATURE)
 ERRORS, ENCODER = (*SCALE.names, *SKEW.names), (*ONCE_PER_TURN.names, *DELAY.names)
 
 KEYS: dict[str, int] = {
-    name: int(gtsam.symbol(c, 0)) for name, c in zip(("theta", "errors", "encoder", "epsilon"), "TSNE", strict=True)
+    name: int(gtsam.symbol(c, 0))
+    for name, c in zip(("theta", "errors", "temperature", "encoder", "epsilon"), "TSKNE", strict=True)
 }
 
 # The variable theta counts these, rad: a smoother linearises anew when a variable has moved by some hundredth, and
@@ -35,11 +44,11 @@ KEYS: dict[str, int] = {
 THETA_UNIT = 1e-3
 
 
-def indexer_parameters(config: Config, stamp_sigma: float = 0.0) -> tuple[Parameter, ...]:
+def indexer_parameters(config: Config, stamp_sigma: float = 0.0, thermometer: bool = False) -> tuple[Parameter, ...]:
     """The method's parameters with their priors in force; of the assumptions those that are not all fixed.
 
     That the axes are not perpendicular is assumed only where the config gives it a prior. `stamp_sigma`, s: how well
-    the stamps are known.
+    the stamps are known; `thermometer`: whether the IMU's temperature is measured.
     """
     assumed = chain.from_iterable(quantities(each, config) for each in ASSUMPTIONS)
     known = [*THETA, *BIAS, *(q.name for q in assumed), *EPSILON]
@@ -59,6 +68,7 @@ def indexer_parameters(config: Config, stamp_sigma: float = 0.0) -> tuple[Parame
         Parameter(KEYS["theta"], calibrated(THETA, "rad", 0.1, 5e-5), theta_coordinates),
         Parameter(FIRST_BIAS, calibrated(BIAS, "rad/s", 1e-3, 1e-5)),
         parameter(KEYS["errors"], (SCALE, SKEW), config),
+        parameter(KEYS["temperature"], (TEMPERATURE,), config) if thermometer else None,
         stamped(parameter(KEYS["encoder"], (ONCE_PER_TURN, DELAY), config), DELAY.names[0], stamp_sigma),
         Parameter(KEYS["epsilon"], axes) if any(q.prior_sigma != 0.0 for q in axes) else None,
     )

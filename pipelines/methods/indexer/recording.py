@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import InputError
-from pipelines.methods.indexer.topics import INDEXER
+from pipelines.methods import temperature
+from pipelines.methods.indexer import parameters
+from pipelines.methods.indexer.topics import INDEXER, JOINTS
 from pipelines.recording import series
 from pipelines.recording.checks import (
     LEAST_GYRO,
@@ -24,13 +26,12 @@ from pipelines.recording.checks import (
 )
 from pipelines.recording.gyro import usable
 from pipelines.recording.reading import Recording
+from pipelines.recording.temperature import Temperature
 from pipelines.recording.topics import FIX, IMU
 from pipelines.recording.writing import attached, write_session
 from pipelines.settings import Config
 
 Array = NDArray[np.float64]
-
-JOINTS = ("outer_x", "inner_z")
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class IndexerData:
     rad: axis angles as recorded, wrapped or continuous. latitude_deg: from /fix or the config, None if unknown.
     attitude (N, 4): nRm as the INS puts it out with each gyro sample, unit, or None. gyro_density, rad/s/sqrt(Hz): from
     the covariances of the messages, None if they say nothing. dropped: reason -> messages. stamp_sigma, s: how well the
-    stamps are known.
+    stamps are known. temperature: of the IMU, None where nobody measures it.
     """
 
     epoch_ns: int
@@ -55,6 +56,7 @@ class IndexerData:
     gyro_density: float | None = None
     dropped: dict[str, int] = field(default_factory=dict)
     stamp_sigma: float = 0.0
+    temperature: Temperature | None = None
 
 
 def read_indexer(recording: Recording, config: Config) -> IndexerData:
@@ -92,6 +94,7 @@ def read_indexer(recording: Recording, config: Config) -> IndexerData:
         density(imu_topic, gyro_t, imu.gyro_cov[keep], LEAST_GYRO, dropped),
         dropped,
         recording.stamp_sigma_s,
+        temperature.read(recording, config, (parameters.TEMPERATURE,), gyro_t, dropped),
     )
 
 
@@ -115,6 +118,7 @@ def write_indexer(
         start = np.array([data.epoch_ns])
         fix = series.FixSeries(start, np.array([data.latitude_deg]), np.zeros(1), frame_id="gnss")
         topics[FIX.name] = fix
+    topics |= temperature.topics(data.temperature, data.epoch_ns)
     write_session(path, topics, attached(truth, config_yaml))
 
 

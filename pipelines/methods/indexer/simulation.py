@@ -20,11 +20,13 @@ from factors import so3
 from factors.earth import earth_rate
 from pipelines.errors import InputError
 from pipelines.methods.indexer.parameters import ASSUMPTIONS
-from pipelines.methods.indexer.recording import JOINTS, IndexerData
+from pipelines.methods.indexer.recording import IndexerData
+from pipelines.methods.indexer.topics import JOINTS
 from pipelines.settings import SensorSheets
 from pipelines.simulation.motion import sample_times
 from pipelines.simulation.sensors import read_by, true_values
 from pipelines.simulation.simulated import Simulated
+from pipelines.simulation.temperature import Warming, drift, known, measured
 
 Array = NDArray[np.float64]
 
@@ -93,6 +95,7 @@ class IndexerScenario(BaseModel):
     encoder_rate_hz: Positive = 100.0
     encoder_phase: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0  # of the first stamp, in sample intervals
     attitude_noise_arcsec: NotNegative | None = None  # of the attitude the INS puts out; null: it puts out none
+    temperature: Warming | None = None  # of the IMU; null: nobody measures it
     # Data sheets that errors of the sensors are drawn from, passed on to the config; ideal: there are none; null: none
     # either, but the config does not know.
     sensors: SensorSheets | None = None
@@ -127,7 +130,8 @@ def simulate_indexer(scenario: IndexerScenario, seed: int) -> tuple[IndexerData,
     """A session and the true values of its parameters (rad, rad/s; the bias is its mean over the session)."""
     # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
     rng = np.random.default_rng(seed)
-    effects = true_values(ASSUMPTIONS, scenario.sensors, scenario.effects, np.random.default_rng([seed, 1]))
+    rng_of_sensors = np.random.default_rng([seed, 1])
+    effects = true_values(known(ASSUMPTIONS, scenario.temperature), scenario.sensors, scenario.effects, rng_of_sensors)
     drives, duration = _program(scenario)
     phases = rng.uniform(0.0, 2.0 * np.pi, size=(2, 1 + len(scenario.encoder_harmonics_arcsec)))
     gyro_t = _recorded(sample_times(duration, scenario.gyro_rate_hz), drives, scenario)
@@ -151,13 +155,14 @@ def simulate_indexer(scenario: IndexerScenario, seed: int) -> tuple[IndexerData,
     data = IndexerData(
         EPOCH_NS,
         gyro_t,
-        read_by(rate, "gyro", effects) + bias + white,
+        read_by(rate, "gyro", effects) + drift(scenario.temperature, "gyro", effects, gyro_t) + bias + white,
         encoder_t,
         outer,
         inner,
         scenario.latitude_deg,
         attitude,
         noise.gyro_density or None,
+        temperature=measured(scenario.temperature, duration),
     )
     return data, {**_truth(scenario, bias), **effects}
 

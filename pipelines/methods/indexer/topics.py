@@ -5,12 +5,15 @@ from __future__ import annotations
 from typing import ClassVar
 
 from pipelines.recording import messages
-from pipelines.recording.topics import FIX, IMU, Need, Setting, Topic
+from pipelines.recording.topics import FIX, IMU, TEMPERATURE, Need, Setting, Topic
 from pipelines.settings import MethodSection, Quaternion
 
 INDEXER = Topic("indexer", "/indexer/joint_states", (messages.JOINT_STATE,))
 
-TOPICS = (IMU, INDEXER, FIX)
+# The axes, as the messages name them.
+JOINTS = ("outer_x", "inner_z")
+
+TOPICS = (IMU, INDEXER, FIX, TEMPERATURE)
 _LATITUDE = Setting("latitude_deg in the config", lambda config: config.latitude_deg is not None)
 NEEDS: tuple[Need, ...] = (((IMU,),), ((INDEXER,),), ((FIX,), (_LATITUDE,)))
 

@@ -14,10 +14,11 @@ from pipelines.graph.problem import Array
 from pipelines.judgement.validation import Validation
 from pipelines.methods.indexer.attitude import carrier
 from pipelines.methods.indexer.groups import Group, groups_of
-from pipelines.methods.indexer.parameters import BIAS, ENCODER, EPSILON, ERRORS, THETA, several
+from pipelines.methods.indexer.parameters import BIAS, ENCODER, EPSILON, ERRORS, TEMPERATURE, THETA, several
 from pipelines.methods.indexer.recording import IndexerData
 from pipelines.methods.indexer.runs import AxisMotion, axis_motion
 from pipelines.methods.indexer.topics import IndexerConfig
+from pipelines.methods.temperature import FIRST
 from pipelines.settings import Config
 
 
@@ -68,11 +69,14 @@ def misfit(groups: Sequence[Group], values: Mapping[str, float]) -> tuple[Array,
         np.eye(3) + symmetric(several(values, ERRORS)),
     )
     epsilon, encoder = several(values, EPSILON), several(values, ENCODER)
+    slope = several(values, TEMPERATURE.names)
     errors = []
     for group in groups:
         share = np.diff(group.rates.edges) / group.duration
         fixed, cosine, sine = np.moveaxis(group.rates.parts(encoder), 1, 0)
         expected = share @ (fixed + np.cos(epsilon) * cosine + np.sin(epsilon) * sine)
-        found = so3.rotate(tRm, np.linalg.solve(gain, group.mean_gyro - bias))
+        warmth = group.warmth(values.get(FIRST))
+        drift = bias if warmth is None else bias + share @ warmth * slope
+        found = so3.rotate(tRm, np.linalg.solve(gain, group.mean_gyro - drift))
         errors.append((found - expected) / np.linalg.norm(expected))
     return np.array([float(g.rates.edges[-1]) for g in groups]), np.array(errors).reshape(-1, 3)
