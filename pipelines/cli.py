@@ -546,12 +546,13 @@ def certificate(
     fields: Annotated[Path | None, typer.Option(help="YAML of what only people know: number, item, serial ...")] = None,
     before: Annotated[Path | None, typer.Option(help="An earlier result.json or calibration.yaml of the item.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the certificate; default: that of the results.")] = None,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Print it too, certificate.pdf.")] = False,
 ) -> None:
     """A calibration certificate, certificate.html to be printed and certificate.json."""
     from pipelines import terminal
     from pipelines.reports.certificate import write_certificate
 
-    written, missing = write_certificate(results, fields, before, out)
+    written, missing = write_certificate(results, fields, before, out, pdf)
     terminal.say(f"Wrote {', '.join(map(str, written))}")
     if missing:
         terminal.say(f"not stated: {', '.join(missing)}")

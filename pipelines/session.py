@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from pipelines import methods, progress
 from pipelines.config import load_config, recorded_config
 from pipelines.discovery import idle, nearest_suggestion, suggestions, with_suggested
 from pipelines.errors import InputError
-from pipelines.graph.problem import Estimate, Problem, Quantity, Step
+from pipelines.graph.problem import Estimate, Problem, Quantity, Step, Told
 from pipelines.judgement import noise_levels
 from pipelines.judgement.assumptions import Strained, strained
 from pipelines.judgement.causes import find_causes
@@ -234,6 +234,15 @@ class Session:
                 raise InputError(f"no solver {solver!r}; there are {', '.join(SOLVERS)}")
         return self.judged((self._solve(solver, window) for solver in solvers), seconds or {}, check)
 
+    def calibrated_beside(self, others: Callable[[Told], Mapping[str, float]]) -> Calibration:
+        """The calibration by batch, what it says of its numbers linear where others have them. Raises as `calibrate`.
+
+        Args:
+            others: of what the recording says, linear about its solution, the numbers as they are with the others.
+        """
+        (calibration,) = self.judged([self._solve("batch", None, others)], {})
+        return calibration
+
     def judged(
         self, solved: Iterable[tuple[Estimate, Problem]], seconds: Mapping[str, float], check: bool = False
     ) -> list[Calibration]:
@@ -315,7 +324,9 @@ class Session:
         with progress.doing("looking at both sides of a change"):
             return Moved(split_at(self.method, self.data, self.config, change.time_s))
 
-    def _solve(self, solver: str, window: float | None) -> tuple[Estimate, Problem]:
+    def _solve(
+        self, solver: str, window: float | None, others: Callable[[Told], Mapping[str, float]] | None = None
+    ) -> tuple[Estimate, Problem]:
         problem = self.problem()
         if solver == "published":
             return self.method.published(self.data, self.config, problem), problem
@@ -328,7 +339,7 @@ class Session:
 
         device = walks(self.method, self.config, [q.name for q in problem.quantities])
         with progress.doing("solving"):
-            return solve_batch(problem, budget=True, changed=self._changed(), device=device), problem
+            return solve_batch(problem, budget=True, changed=self._changed(), device=device, elsewhere=others), problem
 
     def _changed(self) -> Iterator[tuple[str, Problem]]:
         """Each input that the graph takes for exact, and the graph with that input off by its step."""

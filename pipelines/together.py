@@ -1,8 +1,9 @@
 """Several recordings of one device as one calibration.
 
-Each recording is solved by itself, and what it says of the device is joined with what the others say. Then each is
-solved again with that of the others as prior, which moves its linearisation to the joint estimate, until the joint
-estimate stays. What is kept of a recording meanwhile is small; its data wait in a temporary file.
+Each recording is solved by itself, and what it says of the device, linear about the joint estimate of those before it
+and itself, is joined with what the others say. Then those that were farthest from the final estimate are solved again
+with that of the others as prior, which moves their linearisation there, until the joint estimate stays. What is kept of
+a recording meanwhile is small; its data wait in a temporary file.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from pipelines import progress
 from pipelines.belief import Belief
 from pipelines.errors import InputError
 from pipelines.graph.believing import believing
-from pipelines.graph.problem import ChiSquare, Estimate, Parameter, Problem, Quantity, Step, Told
+from pipelines.graph.problem import Array, ChiSquare, Estimate, Parameter, Problem, Quantity, Step, Told
 from pipelines.judgement import noise_levels
 from pipelines.judgement.changes import changes
 from pipelines.judgement.observability import Assessment, Fit, assess
@@ -39,8 +40,8 @@ from pipelines.session import Session
 from pipelines.sharing import DAY_S, walks
 from pipelines.solvers.joint import Joined, grown, join, tell
 
-# The joint estimate stays when another linearisation moves it by less than this, in sigmas (what is left is about the
-# square); so many are tried.
+# The joint estimate stays when other linearisations move it by less than this, in sigmas (what is left is about the
+# square), and those that were not tried are foreseen to; so many times they are tried.
 _STAYS, _MOST_PASSES = 1e-2, 6
 # Where chi-square between the recordings is so many times its freedoms the device is not one: no need to be exact.
 _FAR_APART = 10.0
@@ -80,8 +81,6 @@ class Alone:
         assert estimate.told is not None
         with data.open("wb") as stream:
             pickle.dump(session.data, stream)
-        date = session.config.date
-        noon = None if date is None else datetime.datetime(date.year, date.month, date.day, 12, tzinfo=datetime.UTC)
         small = Estimate(
             solver=estimate.solver,
             names=estimate.names,
@@ -97,7 +96,7 @@ class Alone:
         problem = replace(calibration.problem, steps=_no_steps, steps_after=None, onward=None, attitudes=None)
         return cls(
             calibration=replace(calibration, estimate=small, problem=problem, plots=None, beside=None),
-            day=(calibration.facts.epoch_ns * 1e-9 if noon is None else noon.timestamp()) / DAY_S,
+            day=_day(session),
             told=estimate.told,
             quantities={q.name: q for q in problem.quantities},
             data=data,
@@ -169,14 +168,13 @@ def calibrate_together(
         for i, read in enumerate(sessions):
             with progress.doing("reading"):
                 session = read()
-            calibration = session.calibrate()
+            calibration = session.calibrated_beside(partial(_with_those_before, session, alone))
             alone.append(Alone.of(session, calibration, Path(folder) / str(i)))
             written(calibration)
             del session, calibration
         method = _one_device(alone)
         alone.sort(key=lambda each: each.day)
-        names = list(dict.fromkeys(name for each in alone for name in each.quantities))
-        rates = walks(method, alone[0].calibration.config, names)
+        rates = _rates(method, alone)
         joined, step = _joined(method, alone, rates)
         newest = alone[-1]
         problem = method.graph(newest.loaded(), newest.calibration.config)
@@ -201,20 +199,58 @@ def _one_device(alone: Sequence[Alone]) -> Method:
     return first.method
 
 
+def _rates(method: Method, alone: Sequence[Alone]) -> dict[str, float]:
+    """How far each of the device's numbers walks. Raises InputError as `walks` does."""
+    names = list(dict.fromkeys(name for each in alone for name in each.quantities))
+    return walks(method, alone[0].calibration.config, names)
+
+
+def _with_those_before(session: Session, alone: Sequence[Alone], told: Told) -> dict[str, float]:
+    """A recording's numbers as they are with the recordings before it; none where these are of another device."""
+    if not alone or alone[0].calibration.method is not session.method:
+        return {}
+    rates = _rates(session.method, alone)
+    before = [(each.day, each.told) for each in alone]
+    order = sorted([*before, (_day(session), told)], key=lambda each: each[0])
+    joined = join([each for _, each in order], rates, [day for day, _ in order])
+    if _far_apart(joined):
+        return {}
+    place = next(i for i, (_, each) in enumerate(order) if each is told)
+    belief = joined.all(place)
+    return {name: float(mean) for name, mean in zip(belief.names, belief.mean, strict=True) if name in told.names}
+
+
+def _day(session: Session) -> float:
+    """The date of a recording, days since 1970."""
+    date = session.config.date
+    if date is None:
+        return session.origin.epoch_ns * 1e-9 / DAY_S
+    return datetime.datetime(date.year, date.month, date.day, 12, tzinfo=datetime.UTC).timestamp() / DAY_S
+
+
+def _far_apart(joined: Joined) -> bool:
+    value, dof = joined.disagreement
+    return value > _FAR_APART * max(dof, 1)
+
+
 def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) -> tuple[Joined, float]:
     """The joint estimate, and by how much it moved last, in sigmas."""
     told, days = [each.told for each in alone], [each.day for each in alone]
     joined, step = join(told, rates, days), np.inf
-    value, dof = joined.disagreement
-    if value > _FAR_APART * max(dof, 1):
+    if _far_apart(joined):
         return joined, 0.0
     for _ in range(_MOST_PASSES if len(alone) > 1 else 0):
-        told = [
-            _again(method, each, joined.others(i), rates).with_priors_of(before)
-            for i, (each, before) in enumerate(zip(progress.track(alone, "joining", len(alone)), told, strict=True))
-        ]
-        before, joined = joined, join(told, rates, days)
-        step = before.sigmas_to(joined)
+        before = joined
+        # What is wrong with a linearisation grows with the square of how far it is from there.
+        squares = [joined.distance(i, each) ** 2 for i, each in enumerate(told)]
+        order = sorted(range(len(alone)), key=lambda i: -squares[i])
+        for done, i in enumerate(progress.track(order, "joining", len(order)), 1):
+            told[i] = _again(method, alone[i], joined.others(i), rates).with_priors_of(told[i])
+            joined = join(told, rates, days)
+            step = before.sigmas_to(joined)
+            near, far = (sum(squares[k] for k in some) for some in (order[:done], order[done:]))
+            if step * far < _STAYS * near:
+                break
         if step < _STAYS:
             break
     return joined, step
@@ -243,6 +279,7 @@ def _calibration(problem: Problem, method: Method, alone: Sequence[Alone], joine
     extra = np.diag([quantities[name].extra_sigma ** 2 if name in found else 0.0 for name in names])
     covariance = covariance * np.outer(inflation, inflation) + extra
     converged = len(alone) == 1 or step < _STAYS
+    shares = joined.budget(last, [each.name for each in alone])
     estimate = Estimate(
         solver="batch",
         names=names,
@@ -253,6 +290,7 @@ def _calibration(problem: Problem, method: Method, alone: Sequence[Alone], joine
         chi_square=_sum([each.calibration.estimate.chi_square for each in alone]),
         rejected=_counts([each.calibration.estimate.rejected for each in alone]),
         inflation=inflation,
+        budget={name: _with_extra(shares[name], names.index(name), covariance, extra) for name in shares},
     )
     parts = [_part(each, joined, i) for i, each in enumerate(alone)]
     changed = changes(joined, [each.day for each in alone], dict(zip(names, inflation.tolist(), strict=True)))
@@ -272,6 +310,13 @@ def _calibration(problem: Problem, method: Method, alone: Sequence[Alone], joine
         changes=changed,
         plots=recordings_shown,
     )
+
+
+def _with_extra(shares: Mapping[str, float], k: int, covariance: Array, extra: Array) -> dict[str, float]:
+    """Shares of a number's variance with that of what its graph does not model."""
+    beyond = float(extra[k, k] / covariance[k, k])
+    told = {source: share * (1.0 - beyond) for source, share in shares.items()}
+    return {**told, "not modelled": beyond} if beyond else told
 
 
 def _with_others(problem: Problem, alone: Sequence[Alone], found: Mapping[str, float]) -> tuple[Parameter, ...]:
@@ -363,6 +408,13 @@ def _part(alone: Alone, joined: Joined, i: int) -> PartResult:
         duration_s=by_itself.facts.duration_s,
         status=by_itself.assessment.status,
         headline=by_itself.headline,
+        dof=_freedoms(by_itself),
         parameters=[number(*each) for each in zip(belief.names, belief.mean, belief.sigmas, strict=True)],
         alone=[PartParameter(name=p.name, value=p.value, sigma=p.sigma, unit=p.unit) for p in found],
     )
+
+
+def _freedoms(by_itself: Calibration) -> float | None:
+    """Degrees of freedom by which a recording tells its own noise; None: it was stated, or there is no chi-square."""
+    estimate = by_itself.estimate
+    return estimate.chi_square.dof if estimate.chi_square and noise_levels.asked(estimate.levels) else None

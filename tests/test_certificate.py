@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
+import sys
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -106,3 +109,52 @@ def test_what_is_no_result_is_not_certified(results: Path, tmp_path: Path) -> No
         write_certificate(tmp_path, None, None, None)
     with pytest.raises(InputError, match="cannot be opened"):
         write_certificate(tmp_path / "none", None, None, None)
+
+
+def pages(pdf: bytes) -> int:
+    """Of a PDF, whose objects are packed."""
+    streams = [
+        pdf[found.end() :] for found in re.finditer(rb"stream\r?\n", pdf) if not pdf[: found.start()].endswith(b"end")
+    ]
+    unpacked = b"".join(zlib.decompressobj().decompress(each) for each in streams if each[:1] == b"x")
+    return len(re.findall(rb"/Type /Page(?!s)", unpacked + pdf))
+
+
+def test_it_is_printed_page_by_page(results: Path, tmp_path: Path, alidade: Command) -> None:
+    """As many pages as the PDF says, and none is left behind by the next one that is not printed."""
+    try:
+        import weasyprint  # noqa: F401
+    except (ImportError, OSError):
+        pytest.skip("needs the extra alidade[pdf] and Pango")
+    (tmp_path / "f.yaml").write_text(FIELDS)
+    arguments = ("certificate", results, "--fields", tmp_path / "f.yaml", "--out", tmp_path / "out")
+    assert alidade(*arguments, "--pdf").code == 0
+    printed = (tmp_path / "out" / "certificate.pdf").read_bytes()
+    assert printed.startswith(b"%PDF")
+    assert printed.rstrip().endswith(b"%%EOF")
+    assert pages(printed) == 2
+    assert alidade(*arguments).code == 0
+    assert not (tmp_path / "out" / "certificate.pdf").exists()
+
+
+def test_without_a_printer_nothing_is_written(results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "weasyprint", None)
+    with pytest.raises(InputError, match=r"--pdf needs WeasyPrint, pip install 'alidade\[pdf\]', and Pango"):
+        write_certificate(results, None, None, tmp_path / "out", pdf=True)
+    assert not (tmp_path / "out").exists()
+
+
+def test_of_several_recordings_each_counts_with_its_freedoms(results: Path, tmp_path: Path) -> None:
+    changed = json.loads((results / "result.json").read_text())
+    part = {"start": "2026-03-01T12:00:00+00:00", "duration_s": 60.0}
+    sources = {"march.mcap": 20.0, "june.mcap": 5.0, "stated.mcap": None}
+    changed["recordings"] = [{"recording": name, "sha256": name, "dof": dof, **part} for name, dof in sources.items()]
+    changed["noise"] = []
+    changed["budget"]["theta_y"] = {f"recording {name}": 0.3 for name in sources} | {"prior of gyro_skew_xz": 0.1}
+    (tmp_path / "result.json").write_text(json.dumps(changed))
+    write_certificate(tmp_path, None, None, None)
+    rows = {row["name"]: row for row in json.loads((tmp_path / "certificate.json").read_text())["results"]}
+    assert rows["theta_y"]["degrees"] == pytest.approx(1.0 / (0.3**2 / 20.0 + 0.3**2 / 5.0))
+    page = (tmp_path / "certificate.html").read_text()
+    assert page.count("SHA-256") == 3
+    assert "recording june.mcap 30.0 %" in page

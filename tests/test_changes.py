@@ -94,6 +94,28 @@ def test_steps_of_three_sigmas_are_found() -> None:
     assert sum(any(s.name == "arm_mount_y" for s in each.found) for each in found) >= 90
 
 
+@pytest.mark.slow
+def test_no_test_of_that_level_finds_many_more() -> None:
+    """The best one, on average over numbers, dates and signs, is the mixture's likelihood ratio (Neyman, Pearson)."""
+    n, count = 6, 200
+    steps = np.tri(n, n, -1).T[:-1]  # (n - 1, n) one after a recording
+    steps = steps - steps.mean(axis=1, keepdims=True)
+    sizes = 3.0 * np.linalg.norm(steps, axis=1)
+
+    def ratio(values: Array) -> Array:
+        """Of values (k, n, 3) of three numbers, each known to one sigma."""
+        z = np.einsum("sn,knm->kms", 3.0 * steps / sizes[:, None], values)
+        return np.asarray(np.log(np.cosh(z * sizes) * np.exp(-0.5 * sizes**2)).reshape(len(values), -1).sum(axis=1))
+
+    rng = np.random.default_rng(21)
+    limit = np.quantile(ratio(rng.standard_normal((20_000, n, 3))), 0.95)
+    shifted = rng.standard_normal((20_000, n, 3))
+    shifted[:, n // 2 :, 1] += 3.0
+    best = float((ratio(shifted) > limit).mean())
+    found = sum(of(history(rng, n, step=3.0)).any for _ in range(count))
+    assert found > count * best - 3.0 * (count * best * (1.0 - best)) ** 0.5
+
+
 def test_the_rate_of_a_walk_is_estimated() -> None:
     rates = [of(history(np.random.default_rng(seed), 16, walk=0.7)).rates["arm_mount"] for seed in range(30)]
     assert np.mean([r.rate for r in rates]) == pytest.approx(0.7, abs=0.1)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -186,6 +188,49 @@ def test_joining_is_least_squares_of_everything() -> None:
     np.testing.assert_allclose(np.linalg.inv(information), joined.device(1).covariance, atol=1e-10)
 
 
+def test_the_variance_is_told_by_source() -> None:
+    """Of each source the share that the variance falls by when its rows alone have no noise, to first order."""
+    rng = np.random.default_rng(3)
+    tellings = [linear(rng, ("a", "b", "own"), np.array([1.0, 2.0, 3.0]), 2) for _ in range(3)]
+    joined = join(tellings, {"a": 0.0, "b": 0.1}, [0.0, 10.0, 30.0])
+    budget = joined.budget(2, ["x", "y", "z"])
+    known = joined.all(2)
+    assert set(budget) == set(known.names)
+    assert all(sum(shares.values()) == pytest.approx(1.0) for shares in budget.values())
+    assert set(budget["b"]) >= {"recording x", "recording y", "recording z", "walk between recordings"}
+    # Drawn: what scatters when the noise of one recording alone is drawn anew.
+    share = budget["own"]["recording z"]
+    drawn = []
+    for _ in range(2000):
+        other = replace(tellings[2], d=tellings[2].d + rng.standard_normal(len(tellings[2].d)))
+        again = join([*tellings[:2], other], {"a": 0.0, "b": 0.1}, [0.0, 10.0, 30.0]).all(2)
+        drawn.append(again.mean[again.names.index("own")])
+    assert np.var(drawn) / known.sigmas[known.names.index("own")] ** 2 == pytest.approx(share, rel=0.15)
+
+
+@pytest.mark.slow
+def test_many_recordings_take_as_long_as_one_by_one() -> None:
+    """A tenth more at most, in a process of its own for both, and hardly more memory than one."""
+    count, seconds, memory = 30, {}, {}
+    for how in ("one", "alone", "together"):
+        done = subprocess.run([sys.executable, "-c", MANY, how, str(count)], capture_output=True, text=True, check=True)
+        seconds[how], memory[how] = map(float, done.stdout.split()[-2:])
+    assert seconds["together"] < 1.1 * seconds["alone"]
+    assert memory["together"] < memory["one"] + 60.0
+
+
+MANY = """
+import resource, sys, time
+import alidade
+
+how, count = sys.argv[1], int(sys.argv[2])
+made = [alidade.simulate("indexer", None, seed=seed) for seed in range(1 if how == "one" else count)]
+start = time.process_time()
+alidade.calibrate(made) if how == "together" else [alidade.calibrate(each) for each in made]
+print(time.process_time() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0)
+"""
+
+
 def test_recordings_that_are_of_another_device_are_told() -> None:
     opened = sessions("indexer", [1, 2], EXACT)
     moved = alidade.simulate("indexer", {"mounting_deg": [0.5, -0.3 - 1.02 / 3600.0, 0.4]}, seed=3)
@@ -258,6 +303,9 @@ def test_the_command_takes_several_recordings(tmp_path: Path) -> None:
     assert "2 recordings of one device: march.mcap, june.mcap" in ended.output
     result = json.loads((out / "result.json").read_text())
     assert [part["recording"] for part in result["recordings"]] == ["march.mcap", "june.mcap"]
+    assert all(part["dof"] > 100.0 for part in result["recordings"])
+    assert set(result["budget"]["theta_y"]) >= {"recording march.mcap", "recording june.mcap", "prior of theta_y"}
+    assert sum(result["budget"]["theta_y"].values()) == pytest.approx(1.0)
     own = [{p["name"]: p["value"] for p in part["parameters"]} for part in result["recordings"]]
     assert own[0].keys() == {"gyro_bias_x", "gyro_bias_y", "gyro_bias_z"}
     assert own[0]["gyro_bias_x"] != own[1]["gyro_bias_x"]
@@ -268,6 +316,7 @@ def test_the_command_takes_several_recordings(tmp_path: Path) -> None:
     page = (out / "report.html").read_text()
     assert "march.mcap" in page
     assert "What each recording has of its own" in page
+    assert "recording june.mcap" in page
     twice = CliRunner().invoke(app, ["calibrate", str(paths[0]), str(paths[0]), "--out", str(tmp_path / "no")])
     assert isinstance(twice.exception, InputError)
     assert "named twice" in str(twice.exception)

@@ -29,6 +29,7 @@ from pipelines.solvers.joint import Joined
 LEVEL, _JOINTLY = 0.05, 0.2
 # Histories drawn; beyond so many tests, or where fewer of them would be beyond the limit, chance is bounded instead.
 _DRAWN, _MOST_TESTS, _FEW = 4000, 1500, 40
+_AT_ONCE = 200
 # A step of a number is asked for where its sigma is less than this of the prior's.
 _TOLD = 1.0
 _MOST_STEPS = 20
@@ -161,7 +162,7 @@ def _without(A: Array, columns: Array, b: Array) -> tuple[Array, Array]:
 
 
 def _steps(questions: Sequence[tuple[str, int, int]], left: Array, residual: Array, grown: Array) -> list[Change]:
-    information = (left**2).sum(axis=0)
+    information = np.einsum("ij,ij->j", left, left)
     sizes, sigmas = left.T @ residual / information, grown / np.sqrt(information)
     return [
         Change(name, after, float(size), float(sigma))
@@ -199,9 +200,12 @@ def _limit(left: Array, level: float) -> float:
     if tests > _MOST_TESTS or singly * _DRAWN < _FEW:
         return float(quantile(1.0 - singly / tests, 1.0)) ** 0.5
     unit = left / np.linalg.norm(left, axis=0)
-    triangle = np.linalg.qr(unit).R
-    drawn = np.random.default_rng(0).standard_normal((_DRAWN, len(triangle))) @ triangle
-    return float(np.quantile(np.abs(drawn).max(axis=1), 1.0 - singly))
+    triangle = np.linalg.qr(unit, mode="r")
+    rng = np.random.default_rng(0)
+    largest = [
+        np.abs(rng.standard_normal((_AT_ONCE, len(triangle))) @ triangle).max(axis=1) for _ in range(_DRAWN // _AT_ONCE)
+    ]
+    return float(np.quantile(np.concatenate(largest), 1.0 - singly))
 
 
 def _together(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from pipelines.graph.assumptions import kind
 from pipelines.graph.problem import Quantity
+from pipelines.solvers.joint import RECORDING, WALK
 
 _PRIOR = "prior of "
 # Smaller shares are told together, and so are those after so many.
@@ -57,6 +58,10 @@ def _limit(name: str, shares: Mapping[str, float], assumed: set[str]) -> Limit:
 
 def _told(name: str, source: str, assumed: set[str]) -> tuple[str, str]:
     """A source in words, and what would make it smaller."""
+    if source.startswith(RECORDING):
+        return source, "record longer, or more often"
+    if source == WALK:
+        return source, "calibrate more often"
     if not source.startswith(_PRIOR):
         return f"{source} noise", "record longer, or measure it better"
     of = source.removeprefix(_PRIOR)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import datetime
 import json
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -24,11 +25,11 @@ from pipelines.reports.known import load_known
 from pipelines.reports.templating import environment
 from pipelines.reports.units import human_unit, to_digits_of
 from pipelines.reports.whole import write_whole
+from pipelines.solvers.joint import RECORDING
 
-FILES = ("certificate.html", "certificate.json")
+FILES = ("certificate.html", "certificate.pdf", "certificate.json")
 # Of effective degrees of freedom more than this are as good as infinitely many.
 _MANY = 1e4
-_PRIOR = "prior of "
 
 Conformity = Literal["conforms", "does not conform", "no statement"]
 Text = Annotated[str, BeforeValidator(lambda value: value.isoformat() if isinstance(value, datetime.date) else value)]
@@ -122,9 +123,11 @@ class _ChiSquare(_Fit):
 
 
 class _Session(_Read):
+    recording: str = ""
     sha256: str
     start: str
     duration_s: float
+    dof: float | None = None
 
 
 class _Result(_Read):
@@ -139,21 +142,23 @@ class _Result(_Read):
     session: _Session
     software: dict[str, str]
     budget: dict[str, dict[str, float]] | None
+    recordings: list[_Session] = []
 
 
 def write_certificate(
-    results: Path, fields: Path | None, before: Path | None, out: Path | None
+    results: Path, fields: Path | None, before: Path | None, out: Path | None, pdf: bool = False
 ) -> tuple[tuple[Path, ...], list[str]]:
-    """Write certificate.html and certificate.json; returns their paths and what was not stated.
+    """Write certificate.html, certificate.json and certificate.pdf; returns their paths and what was not stated.
 
     Args:
         results: folder of a calibration, or its result.json.
         fields: YAML; None: nothing is stated.
         before: an earlier calibration of the item, result.json or calibration.yaml, as found against it.
         out: folder; None: that of the results.
+        pdf: print it, by WeasyPrint.
 
     Raises:
-        InputError: a file cannot be used, or the result is none to certify.
+        InputError: a file cannot be used, the result is none to certify, or there is no WeasyPrint that works.
     """
     path = results / "result.json" if results.is_dir() else results
     result, stated = _read_result(path), _read_fields(fields)
@@ -165,9 +170,14 @@ def write_certificate(
     missing = [name for name, value in stated.model_dump(exclude={"remarks", "limits"}).items() if value is None]
     content = _content(result, stated, rows, missing)
 
+    page = _html(result, stated, rows, before)
+    printed = _printed(page) if pdf else None
+
     def make(folder: Path) -> None:
-        (folder / FILES[0]).write_text(_html(result, stated, rows, before), encoding="utf-8")
-        (folder / FILES[1]).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        (folder / FILES[0]).write_text(page, encoding="utf-8")
+        if printed is not None:
+            (folder / FILES[1]).write_bytes(printed)
+        (folder / FILES[2]).write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
     return write_whole(out or path.parent, FILES, make), missing
 
@@ -216,7 +226,7 @@ def _rows(result: _Result, stated: Fields, earlier: Mapping[str, float]) -> list
     for p in result.parameters:
         if p.group is not None or p.require is None or p.sigma == 0.0:
             continue
-        shares = (result.budget or {}).get(p.name, {"all measurements and priors": 1.0})
+        shares = (result.budget or {}).get(p.name, {})
         degrees = _effective(result, shares)
         normal = NormalDist().inv_cdf(0.5 + 0.5 * stated.coverage_probability)
         k = normal if degrees is None else student(normal, degrees)
@@ -232,13 +242,13 @@ def _effective(result: _Result, shares: Mapping[str, float]) -> float | None:
 
     Noise that was stated and not asked of the recording, and priors, count as known.
     """
-    asked = any(noise.estimated is not None for noise in result.noise)
-    families = {name: fit.dof for name, fit in result.chi_square.families.items()}
-    families["all measurements and priors"] = result.chi_square.dof
+    freedoms: dict[str, float | None] = {f"{RECORDING}{part.recording}": part.dof for part in result.recordings}
+    if any(noise.estimated is not None for noise in result.noise):
+        freedoms |= {name: fit.dof for name, fit in result.chi_square.families.items()}
     doubt = 0.0
     for source, share in shares.items():
-        dof = families.get(source)
-        if asked and dof is not None and not source.startswith(_PRIOR):
+        dof = freedoms.get(source)
+        if dof is not None:
             doubt += share**2 / max(dof, 1.0)
     return None if doubt * _MANY < 1.0 else 1.0 / doubt
 
@@ -259,7 +269,7 @@ def _content(result: _Result, stated: Fields, rows: Sequence[Row], missing: Sequ
         "method": result.method,
         "solver": result.solver,
         "status": result.status,
-        "recording": result.session.model_dump(),
+        "recordings": [each.model_dump() for each in result.recordings or [result.session]],
         "software": result.software,
         "results": [asdict(row) for row in rows],
     }
@@ -281,6 +291,20 @@ def _html(result: _Result, stated: Fields, rows: Sequence[Row], before: Path | N
             limited=any(row.conformity for row in rows),
         )
     )
+
+
+def _printed(page: str) -> bytes:
+    """The page as PDF."""
+    try:
+        from weasyprint import HTML
+    except (ImportError, OSError) as error:  # OSError: the system has no Pango
+        raise InputError(
+            "--pdf needs WeasyPrint, pip install 'alidade[pdf]', and Pango of the system (Debian: apt install "
+            "libpango-1.0-0 libpangoft2-1.0-0 libharfbuzz-subset0); or print certificate.html by a browser"
+        ) from error
+    logging.getLogger("weasyprint").setLevel(logging.ERROR)  # else it tells of every style that is for screens
+    out: bytes = HTML(string=page).write_pdf()
+    return out
 
 
 def _readable(row: Row, quantity: Quantity, stated: Fields) -> dict[str, str]:

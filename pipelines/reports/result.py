@@ -526,7 +526,8 @@ class PartResult(_Record):
     """One recording of a joint calibration.
 
     `parameters` are its own numbers, and the device's that walk, from all recordings; `alone` is what it says of the
-    device by itself, `status` and `headline` are its own.
+    device by itself, `status` and `headline` are its own. `dof` are the degrees of freedom by which it tells its noise;
+    null where that was stated.
     """
 
     recording: str
@@ -535,6 +536,7 @@ class PartResult(_Record):
     duration_s: float
     status: Status
     headline: str
+    dof: float | None
     parameters: list[PartParameter]
     alone: list[PartParameter]
 

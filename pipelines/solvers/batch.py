@@ -8,7 +8,7 @@ is by QR: tight processes beside loose priors cost Cholesky its digits, and QR c
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
@@ -18,7 +18,7 @@ import numpy as np
 from factors.loss import TruncatedLoss
 from factors.vectorized import Ensemble
 from pipelines.graph.noise import Level
-from pipelines.graph.problem import Array, Estimate, Factor, Problem, Residuals
+from pipelines.graph.problem import Array, Estimate, Factor, Problem, Residuals, Told
 from pipelines.solvers.assembly import Assembly
 from pipelines.solvers.coloured import added_variance, coloured, inflations
 from pipelines.solvers.history import sequential_history
@@ -171,6 +171,7 @@ def solve_batch(
     budget: bool = False,
     changed: Iterable[tuple[str, Problem]] = (),
     device: Collection[str] = (),
+    elsewhere: Callable[[Told], Mapping[str, float]] | None = None,
 ) -> Estimate:
     """The maximum a-posteriori estimate with the joint marginal covariance of its parameters.
 
@@ -184,6 +185,7 @@ def solve_batch(
             is elsewhere in the `changed` graphs.
         changed: names and graphs of the same recording in which something is a little different.
         device: names of the numbers whose priors are not the recording's; asks for what it says without them.
+        elsewhere: of what it says, linear about its solution, the numbers about which it is to be linear instead.
 
     Raises:
         IndeterminateError: states other than the parameters are not determined; names the variable.
@@ -248,9 +250,33 @@ def solve_batch(
         strongest=pulls,
         rejected={family: int((~r.used).sum()) for family, r in residuals.items()},
         levels=levels,
-        told=told(problem, factors, linear, values, whole.current_keys, device) if device else None,
+        told=_told(problem, solution, linear, whole.current_keys, device, elsewhere) if device else None,
         seconds={"build": built - start, "solve": solved - built, "marginals": done - solved},
     )
+
+
+def _told(
+    problem: Problem,
+    solution: Solution,
+    linear: gtsam.GaussianFactorGraph,
+    current_keys: Mapping[int, int],
+    device: Collection[str],
+    elsewhere: Callable[[Told], Mapping[str, float]] | None,
+) -> Told:
+    """What a graph says, linear about its solution or where the reported numbers are to be."""
+    system, values = solution.system, solution.values
+    own = told(problem, system.factors, linear, values, current_keys, device)
+    wanted = {} if elsewhere is None else elsewhere(own)
+    if not wanted:
+        return own
+    moves = {}
+    for p in problem.parameters:
+        key = current_keys.get(p.key, p.key)
+        numbers, J = p.coordinates(values, key)
+        to = [wanted.get(q.name, number) for q, number in zip(p.quantities, numbers, strict=True)]
+        moves[key] = np.linalg.pinv(J) @ (np.array(to) - numbers)
+    there = values.retract(eliminated(held(linear, HELD, moves), system.ordering).optimize())
+    return told(problem, system.factors, system.linearize(there), there, current_keys, device)
 
 
 def _moves(changed: Problem, solution: Solution, levels: tuple[Level, ...], found: Influence) -> dict[str, float]:

@@ -30,6 +30,11 @@ _LEAST_DAYS = 1e-6
 # Of what recordings say of the device, directions with a sigma beyond so many times the priors' are not compared.
 _FAINT = 1e4
 
+# Elements of a prior's row below this share of its largest are rounding.
+_ROUNDING = 1e-9
+# Sources of a joint variance beside priors.
+RECORDING, WALK = "recording ", "walk between recordings"
+
 # A number of the device: its name and, where it walks, the recording.
 Unknown = tuple[str, int | None]
 
@@ -112,17 +117,60 @@ class Joined:
     def all(self, recording: int) -> Belief:
         """The device's numbers as they are in a recording, those that only others know as they were last, its own."""
         part = self.parts[recording]
-        latest = {name: i for i, (name, _) in enumerate(self.unknowns)}
-        missing = [name for name in latest if name not in part.names]
-        places = [*self._places(recording), *(latest[name] for name in missing)]
-        select = np.eye(len(self.unknowns))[places]
-        inverse = np.linalg.inv(part.T)
-        gain = np.vstack([select, -inverse @ part.S @ select[: len(part.names)]])
+        names, gain, inverse = self._of_unknowns(recording)
         covariance, mean = gain @ self.covariance @ gain.T, gain @ self.values
-        own = slice(len(places), None)
+        own = slice(len(names) - len(part.own), None)
         covariance[own, own] += inverse @ inverse.T
         mean[own] += inverse @ part.e
-        return Belief((*part.names, *missing, *part.own), mean, covariance)
+        return Belief(names, mean, covariance)
+
+    def budget(self, recording: int, recordings: Sequence[str]) -> dict[str, dict[str, float]]:
+        """Number of `all` -> source -> its share of the number's variance, the largest first; shares sum to one.
+
+        Sources are the recordings (what each says, with its own numbers' priors), every prior of the device by itself
+        ("prior of NAME"; "prior" of several together), and the walk between recordings.
+
+        Args:
+            recording: in which the numbers are as they are.
+            recordings: what they are called.
+        """
+        names, gain, inverse = self._of_unknowns(recording)
+        sources = [f"{RECORDING}{name}" for name in recordings]
+        variances: dict[str, Array] = {}
+        for source, (A, _) in zip([*sources, WALK, ""], self.rows, strict=True):
+            squares = (gain @ self.covariance @ A.T) ** 2
+            for label, column in zip(self._priors(A) if source == "" else [source] * len(A), squares.T, strict=True):
+                variances[label] = variances.get(label, np.zeros(len(names))) + column
+        variances[sources[recording]][len(names) - len(inverse) :] += (inverse**2).sum(axis=1)
+        total = np.sum(list(variances.values()), axis=0)
+        return {
+            name: dict(
+                sorted(((s, float(v[k] / total[k])) for s, v in variances.items() if v[k] > 0.0), key=lambda x: -x[1])
+            )
+            for k, name in enumerate(names)
+        }
+
+    def _of_unknowns(self, recording: int) -> tuple[tuple[str, ...], Array, Array]:
+        """Numbers of `all`, (k,), what each gets of the unknowns, (k, n), and its own of its rows, (m, m)."""
+        part = self.parts[recording]
+        latest = {name: i for i, (name, _) in enumerate(self.unknowns)}
+        missing = [name for name in latest if name not in part.names]
+        select = np.eye(len(self.unknowns))[[*self._places(recording), *(latest[name] for name in missing)]]
+        inverse = np.linalg.inv(part.T)
+        gain = np.vstack([select, -inverse @ part.S @ select[: len(part.names)]])
+        return (*part.names, *missing, *part.own), gain, np.asarray(inverse)
+
+    def _priors(self, A: Array) -> list[str]:
+        """What each of some priors' rows is about."""
+        size = np.abs(A * self.scales)
+        about = [np.flatnonzero(row > _ROUNDING * row.max(initial=0.0)) for row in size]
+        return [f"prior of {self.unknowns[k[0]][0]}" if len(k) == 1 else "prior" for k in about]
+
+    def distance(self, recording: int, told: Told) -> float:
+        """How far from the joint estimate a recording's telling is linear, in the sigmas of what it says."""
+        known = self.all(recording)
+        means = dict(zip(known.names, known.mean.tolist(), strict=True))
+        return float(np.linalg.norm(told.R @ ([means[name] for name in told.names] - told.at)))
 
     @property
     def walking(self) -> tuple[str, ...]:
