@@ -11,12 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 from factors import so3
 from pipelines.errors import InputError
 from pipelines.graph.problem import (
     Attitudes,
     ChiSquare,
+    History,
     Residuals,
 )
 from pipelines.recording.messages import definition
@@ -213,13 +215,64 @@ def test_estimates_read_back_with_a_ros_decoder(tmp_path: Path) -> None:
             assert schema is not None
             decoded = definition(schema.name, schema.data.decode()).decode(message.data)
             found.setdefault(channel.topic, []).append((message.log_time, decoded))
-    assert set(found) == {f"/estimate/{name}" for name in NAMES}
+    assert {topic for topic in found if topic.startswith("/estimate/")} == {f"/estimate/{name}" for name in NAMES}
     rows = found["/estimate/time_offset"]
     assert [t for t, _ in rows] == [EPOCH_NS + round(t * 1e9) for t in history.time.tolist()]
     for t_ns, message in rows:
         assert message.stamp.sec * 1_000_000_000 + message.stamp.nanosec == t_ns
         assert (message.value, message.sigma) == (0.012, 2e-4)
         assert (message.lower, message.upper) == pytest.approx((0.0118, 0.0122))
+
+
+def _lines(history: History, calibration: Calibration) -> dict[str, np.ndarray]:
+    """What is to be plotted, by the name of its line: values and the edges of their bands."""
+    free = {q.name for q in calibration.problem.quantities if q.prior_sigma != 0.0}
+    found = {}
+    for i, name in enumerate(calibration.estimate.names):
+        if name in free:
+            value, sigma = history.values[:, i], history.sigmas[:, i]
+            found |= {name: value, f"{name}_lower": value - sigma, f"{name}_upper": value + sigma}
+    return found
+
+
+def test_estimates_read_back_with_foxgloves_own_decoder(tmp_path: Path) -> None:
+    """Standard messages with named numbers, which PlotJuggler takes for lines of these names."""
+    calibration = make_calibration()
+    assert calibration.estimate.history is not None
+    write_results(tmp_path, calibration)
+    lines: dict[str, list[float]] = {}
+    sigmas: dict[str, list[float]] = {}
+    with (tmp_path / "estimates.mcap").open("rb") as stream:
+        for _, channel, _, message in make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+            if channel.topic.startswith(("/plot/", "/sigma/")):
+                into = lines if channel.topic.startswith("/plot/") else sigmas
+                for name, number in zip(message.name, message.position, strict=True):
+                    into.setdefault(name, []).append(number)
+    wanted = _lines(calibration.estimate.history, calibration)
+    assert lines.keys() == wanted.keys()
+    for name, numbers in wanted.items():
+        np.testing.assert_array_equal(lines[name], numbers, name)
+    assert sigmas.keys() == {name for name in wanted if not name.endswith(("_lower", "_upper"))}
+
+
+def test_estimates_open_with_plots_in_rerun(tmp_path: Path) -> None:
+    """Read with Rerun's own importer: lines with names, the numbers that were written."""
+    chunk = pytest.importorskip("rerun.chunk")
+    calibration = make_calibration()
+    assert calibration.estimate.history is not None
+    write_results(tmp_path, calibration)
+    lines: dict[str, list[float]] = {}
+    for one in chunk.McapReader(tmp_path / "estimates.mcap", include_topic_regex=["/plot/.*"]).stream():
+        batch = one.to_record_batch()
+        if "Scalars:scalars" in batch.schema.names and one.entity_path.endswith("/position"):
+            names, numbers = batch["SeriesLines:names"].to_pylist(), batch["Scalars:scalars"].to_pylist()
+            for row_names, row in zip(names, numbers, strict=True):
+                for name, number in zip(row_names, row, strict=True):
+                    lines.setdefault(name, []).append(number)
+    wanted = _lines(calibration.estimate.history, calibration)
+    assert lines.keys() == wanted.keys()
+    for name, numbers in wanted.items():
+        np.testing.assert_array_equal(lines[name], numbers, name)
 
 
 def test_the_foxglove_layout_plots_what_the_estimates_hold(tmp_path: Path) -> None:
@@ -229,7 +282,8 @@ def test_the_foxglove_layout_plots_what_the_estimates_hold(tmp_path: Path) -> No
     with (tmp_path / "estimates.mcap").open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None
-    free = {channel.topic for channel in summary.channels.values()} - {"/estimate/pinned"}
+    topics = {channel.topic for channel in summary.channels.values()}
+    free = {topic for topic in topics if topic.startswith("/estimate/")} - {"/estimate/pinned"}
     assert paths == {f"{topic}.{field}" for topic in free for field in ("value", "lower", "upper")}
 
     def leaves(node: Any) -> list[str]:

@@ -1,19 +1,30 @@
-"""estimates.mcap: every parameter and its sigma over time, for Foxglove and PlotJuggler.
+"""estimates.mcap: every parameter and its sigma over time, for Foxglove, Rerun and PlotJuggler.
 
-One topic per parameter, `/estimate/<parameter>`, of one ROS 2 message whose definition stands in the file: both tools
-plot the numbers of any ROS 2 message as they come, and so does whatever reads the recordings themselves. The fields
-are value, sigma, lower and upper, the last two one sigma away, so that the band can be plotted too. What moves along
-has `/smoothed/<parameter>` as well: its value at each moment from the whole recording.
+One topic per parameter, `/estimate/<parameter>`, of one ROS 2 message whose definition stands in the file: Foxglove and
+PlotJuggler plot the numbers of any ROS 2 message as they come, and so does whatever reads the recordings themselves.
+The fields are value, sigma, lower and upper, the last two one sigma away, so that the band can be plotted too. What
+moves along has `/smoothed/<parameter>` as well: its value at each moment from the whole recording.
+
+Rerun plots the messages that it knows. Of those of ROS sensor_msgs/JointState is the one with named numbers, which
+PlotJuggler shows by their names too: `/plot/<variable>` has a variable's values and the edges of their bands,
+`/sigma/<variable>` its sigmas, as positions.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.graph.problem import Array, History
+from pipelines.recording.mcap_records import MESSAGE_HEAD
+from pipelines.recording.message_source import message_source
+from pipelines.recording.messages import JOINT_STATE, definition_text
+from pipelines.recording.series import JointSeries
+from pipelines.reports.plots import variables
 from pipelines.reports.result import Calibration
 
 MESSAGE = "alidade_msgs/msg/Estimate"
@@ -53,12 +64,43 @@ def write_estimates(path: Path, calibration: Calibration, history: History) -> N
             for kind, over_time in known.items():
                 metadata = {"unit": p.unit, "method": calibration.problem.method}
                 channel = writer.register_channel(f"/{kind}/{p.name}", "cdr", schema, metadata)
-                stamps = epoch_ns + np.round(over_time.time * 1e9).astype(np.int64)
+                stamps = _stamps(epoch_ns, over_time)
                 encoded = _encode(stamps, over_time.values[:, i], over_time.sigmas[:, i])
                 messages += [(t, channel, row.tobytes()) for t, row in zip(stamps.tolist(), encoded, strict=True)]
+        joints = writer.register_schema(JOINT_STATE, "ros2msg", definition_text(JOINT_STATE).encode())
+        stamps = _stamps(epoch_ns, history)
+        for topic, unit, names, numbers in _plots(calibration, history):
+            channel = writer.register_channel(
+                topic, "cdr", joints, {"unit": unit, "method": calibration.problem.method}
+            )
+            series = JointSeries(stamps, numbers, names)
+            messages += [(t, channel, row) for t, row in zip(stamps.tolist(), _cdr(series), strict=True)]
         for k, (t_ns, channel, message) in enumerate(sorted(messages, key=lambda m: m[0])):
             writer.add_message(channel, t_ns, message, t_ns, k)
         writer.finish()  # type: ignore[no-untyped-call]
+
+
+def _plots(calibration: Calibration, history: History) -> Iterator[tuple[str, str, tuple[str, ...], Array]]:
+    """Topic, unit, names and numbers over time (n, names) of what is plotted together."""
+    column = {name: i for i, name in enumerate(calibration.estimate.names)}
+    for title, unit, members in variables(calibration):
+        variable = re.sub(r"\W+", "_", title)
+        rows = [column[q.name] for q in members]
+        values, sigmas = history.values[:, rows], history.sigmas[:, rows]
+        bands = np.stack([values, values - sigmas, values + sigmas], axis=2).reshape(len(values), -1)
+        edges = tuple(f"{q.name}{edge}" for q in members for edge in ("", "_lower", "_upper"))
+        yield f"/plot/{variable}", unit, edges, bands
+        yield f"/sigma/{variable}", unit, tuple(q.name for q in members), sigmas
+
+
+def _cdr(series: JointSeries) -> list[bytes]:
+    """Of all messages of a topic."""
+    source = message_source(0, series)
+    return [row[MESSAGE_HEAD.itemsize :].tobytes() for row in source.take(len(series))]
+
+
+def _stamps(epoch_ns: int, over_time: History) -> NDArray[np.int64]:
+    return np.asarray(epoch_ns + np.round(over_time.time * 1e9).astype(np.int64))
 
 
 def _encode(stamps: NDArray[np.int64], value: Array, sigma: Array) -> NDArray[np.void]:
