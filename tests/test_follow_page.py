@@ -61,7 +61,8 @@ def test_it_says_what_to_do_until_enough_is_there_and_comes_back_by_itself(tmp_p
             tab.wait(f"{WORDS} === 'Waiting for the recording'")
             page.show(_view(1.0, 2e-2))
             page.show(_view(2.0, 1e-2))
-            tab.wait(f"{WORDS} === 'Sway the carrier about its x'")
+            tab.wait("document.getElementById('time').textContent === '0:02'")
+            assert tab.value(WORDS) == "Sway the carrier about its x"
             assert tab.value("document.querySelectorAll('#picture svg').length") == 1
             for width in (PHONE, DESKTOP):
                 tab.size(width)

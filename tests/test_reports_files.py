@@ -227,7 +227,7 @@ def test_estimates_read_back_with_a_ros_decoder(tmp_path: Path) -> None:
 def _lines(history: History, calibration: Calibration) -> dict[str, np.ndarray]:
     """What is to be plotted, by the name of its line: values and the edges of their bands."""
     free = {q.name for q in calibration.problem.quantities if q.prior_sigma != 0.0}
-    found = {}
+    found: dict[str, np.ndarray] = {}
     for i, name in enumerate(calibration.estimate.names):
         if name in free:
             value, sigma = history.values[:, i], history.sigmas[:, i]
