@@ -157,6 +157,12 @@ class AccelSheet(Sheet):
     temperature: SigmaOrZero | None = None  # m/s^2/K, slope of the offset
 
 
+class MagSheet(Sheet):
+    """Of a magnetometer."""
+
+    delay: SigmaOrZero | None = None  # s, of a reading against its stamp
+
+
 class ReferenceSheet(Sheet):
     """Of an attitude reference."""
 
@@ -187,6 +193,7 @@ class Sensors(Section):
 
     gyro: GyroSheet = GyroSheet()
     accel: AccelSheet = AccelSheet()
+    mag: MagSheet = MagSheet()
     platform_gyro: PlatformGyroSheet = PlatformGyroSheet()
     camera: CameraSheet = CameraSheet()
     clock: ClockSheet = ClockSheet()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -114,14 +115,40 @@ def test_a_covariance_that_no_numbers_can_have_is_refused(tmp_path: Path) -> Non
 
 
 def test_a_layout_of_one_recording_serves_another(alidade: Command, tmp_path: Path) -> None:
-    """Tags glued on by hand: refused or off as given, calibrated with the layout found from other pictures."""
+    """Tags glued on by hand, a camera not as it says: refused as given, calibrated with what other pictures told."""
+    off = {"camera_focal": 8e-3, "camera_centre_x": 4.0}
     for name, poses in (("turned", 20), ("still", 16)):
-        scenario = _scenario(poses, 0.02).model_copy(update={"cube": TagCube()})
+        scenario = _scenario(poses, 0.02).model_copy(update={"cube": TagCube(), "effects": off})
         data, truth = simulate_cube(scenario, 3)
         write_cube(tmp_path / f"{name}.mcap", data, truth, cube_config(scenario))
-    assert alidade("cube-layout", tmp_path / "turned.mcap", "--out", tmp_path / "cube.yaml").code == 0
+    assert (
+        alidade("cube-layout", tmp_path / "turned.mcap", "--out", tmp_path / "cube.yaml", "--refine-camera").code == 0
+    )
     as_given = alidade("calibrate", tmp_path / "still.mcap", "--out", tmp_path / "a")
     assert as_given.code == 4
     run = alidade("calibrate", tmp_path / "still.mcap", "--config", tmp_path / "cube.yaml", "--out", tmp_path / "b")
     assert run.code in (0, 3), run.out
     assert "the covariance of the tags' layout" in run.out
+    parameters = json.loads((tmp_path / "b" / "result.json").read_text())["parameters"]
+    found = {each["name"]: each for each in parameters}
+    camera = load_config(None, tmp_path / "cube.yaml").section(CubeConfig).camera
+    assert camera is not None
+    # What is calibrated is what the layout's camera is off by yet.
+    focal = found["camera_focal"]
+    assert focal["sigma"] < 3e-3
+    assert abs(camera.focal[0] * (1.0 + focal["value"]) / (1150.0 * 1.008) - 1.0) < 4.0 * focal["sigma"]
+    centre = found["camera_centre_x"]
+    assert abs(camera.centre[0] + centre["value"] - 645.3) < 4.0 * centre["sigma"]
+
+
+def test_a_camera_of_another_recording_is_refused(alidade: Command, tmp_path: Path) -> None:
+    scenario = _scenario(4, 0.0)
+    write_cube(tmp_path / "s.mcap", *simulate_cube(scenario, 0), cube_config(scenario))
+    for text, says in (
+        ("focal: [600, 600], centre: [640, 480], distortion: [0, 0, 0, 0, 0]", "its focal length is 600 px"),
+        ("focal: [1150, 1150], centre: [640, 480], distortion: [0, 0, 0, 0]", "it has 4 coefficients of distortion"),
+    ):
+        (tmp_path / "c.yaml").write_text(f"cube: {{camera: {{{text}}}}}\n")
+        run = alidade("calibrate", tmp_path / "s.mcap", "--config", tmp_path / "c.yaml")
+        assert run.code == 2
+        assert says in run.err.replace("\n", " ")

@@ -229,12 +229,37 @@ def test_a_camera_that_is_off_is_found() -> None:
     assert float(error @ np.linalg.solve(layout.covariance, error)) / len(error) < 1.6
 
 
+def test_pictures_that_err_alike_tell_less_of_a_camera_than_its_prior() -> None:
+    """Corners that err by the same for fifteen pictures in a row: centres are drawn from their prior."""
+    squares = []
+    for seed in range(2):
+        drawn, rng = scene(6, 45, 20 + seed, distance=(0.35, 0.7)), np.random.default_rng(seed)
+        off = rng.normal(scale=5.0, size=2)
+        for start in range(0, 45, 15):
+            alike = rng.normal(scale=1.0, size=(6, 4, 2))
+            for k in range(start, start + 15):
+                seen = drawn.pictures[k]
+                drawn.pictures[k] = detections(seen.ids, seen.corners + alike[seen.ids])
+        wrong = CAMERA.with_intrinsics(CAMERA.intrinsics + np.array([0.0, 0.0, *off, 0.0, 0.0, 0.0, 0.0, 0.0]))
+        layout = estimate_layout([Shots(wrong, drawn.pictures)], drawn.given(), refine_camera=True)
+        assert layout.camera_sigma is not None
+        assert layout.with_camera is not None
+        assert layout.camera_sigma[0, 2:4].max() < 5.0
+        focal = np.hypot(*(0.5 * layout.camera_sigma[0, :2] / layout.cameras[0].focal))
+        assert 0.9 * focal < layout.with_camera[-3, -3] ** 0.5 < 1.42 * focal
+        np.testing.assert_allclose(np.diag(layout.with_camera)[-2:] ** 0.5, layout.camera_sigma[0, 2:4])
+        np.testing.assert_array_equal(layout.with_camera[:-3, :-3], layout.covariance)
+        squares.append(((layout.cameras[0].centre - CAMERA.centre) / layout.camera_sigma[0, 2:4]) ** 2)
+    assert np.mean(squares) < 3.0
+
+
 def test_recordings_of_two_cameras_are_one_layout() -> None:
     other = Camera(1280, 960, np.array([[900.0, 0, 600.0], [0, 900.0, 500.0], [0, 0, 1]]))
     first, second = scene(8, 30, 5), scene(8, 30, 5, other, take=1)
     shots = [Shots(CAMERA, first.pictures), Shots(other, second.pictures)]
     both, alone = estimate_layout(shots, first.given()), estimate_layout(shots[:1], first.given())
     assert len(both.cameras) == 2
+    assert both.with_camera is None
     assert np.trace(both.covariance) < 0.8 * np.trace(alone.covariance)
     error = first.errors(both)
     assert float(error @ np.linalg.solve(both.covariance, error)) / len(error) < 2.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -20,6 +21,25 @@ from pipelines.graph.walking_bias import WalkingBias
 def state(keyframe: int) -> int:
     """Variable of the attitude at a keyframe, Rot3."""
     return int(gtsam.symbol("x", keyframe))
+
+
+def shared_keyframes(stamps: Array, origin: float, shared: float, longest: float) -> tuple[Array, NDArray[np.intp]]:
+    """Times (K,) of keyframes and, (K + 1,), where the measurements of each begin; some, in gaps, have none.
+
+    Measurements share one as long as they are within the same `shared` s, counted from `origin`; it is the one in their
+    middle. None is farther than `longest`, s, from the next.
+    """
+    group = np.floor((stamps - origin) / shared) if shared > 0.0 else np.arange(len(stamps))
+    begins = np.flatnonzero(np.diff(group, prepend=-1.0))
+    middles = stamps[(begins + np.append(begins[1:], len(stamps)) - 1) // 2]
+    bridges = [
+        np.linspace(a, b, int(np.ceil((b - a) / longest)) + 1)[1:-1] for a, b in pairwise(middles) if b - a > longest
+    ]
+    time = np.concatenate([middles, *bridges])
+    count = np.zeros(len(time), dtype=int)
+    count[: len(middles)] = np.diff(begins, append=len(stamps))
+    order = np.argsort(time, kind="stable")
+    return time[order], np.append(0, np.cumsum(count[order]))
 
 
 @dataclass(frozen=True)

@@ -67,6 +67,8 @@ def _show(layout: Layout) -> None:
         terminal.say(f"  {sentence}")
     for camera, name, given, found, sigma in camera_rows(layout):
         terminal.say(f"  camera {camera}: {name} {found} ± {sigma}, given {given}")
+    if layout.camera_sigma is not None and layout.with_camera is None:
+        terminal.say("  calibrate takes the camera's numbers from a layout of one camera; here they are several")
 
 
 def cube_print(

@@ -17,11 +17,12 @@ from pipelines.recording.topics import IMAGE
 from pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 if TYPE_CHECKING:
+    from pipelines.vision.camera import Camera
     from pipelines.vision.layout import Layout
     from pipelines.vision.tags import Detections
 
 
-# A row of the covariance stands on a line of its own.
+# A line of the file holds whatever belongs together.
 _WIDE = 10_000
 # Many pictures of one pose tell little more than a few; each is a pose to be found.
 _MOST_PICTURES = 800
@@ -91,6 +92,8 @@ def layout_yaml(layout: Layout) -> str:
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style = None
     cube: dict[str, object] = {"tag_family": body.family, "tags": tags, "covariance": _covariance(layout)}
+    if layout.with_camera is not None:
+        cube["camera"] = _camera(layout.cameras[0])
     yaml.width = _WIDE
     yaml.dump({"cube": cube}, text)
     sigmas = np.sqrt(np.diag(layout.covariance)).reshape(-1, 6)
@@ -106,5 +109,16 @@ def layout_yaml(layout: Layout) -> str:
 
 def _covariance(layout: Layout) -> dict[str, object]:
     """As the config's cube.covariance has it."""
-    rows = [" ".join(f"{x:.7g}" for x in row[: i + 1]) for i, row in enumerate(layout.covariance.tolist())]
-    return {"tags": [int(i) for i in layout.body.ids[1:]], "rows": rows}
+    known = layout.covariance if layout.with_camera is None else layout.with_camera
+    rows = [" ".join(f"{x:.7g}" for x in row[: i + 1]) for i, row in enumerate(known.tolist())]
+    tags: dict[str, object] = {"tags": [int(i) for i in layout.body.ids[1:]]}
+    return {**tags, **({} if layout.with_camera is None else {"camera": True}), "rows": rows}
+
+
+def _camera(camera: Camera) -> dict[str, object]:
+    """As the config's cube.camera has it."""
+    return {
+        "focal": camera.focal.tolist(),
+        "centre": camera.centre.tolist(),
+        "distortion": camera.coefficients.tolist(),
+    }

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 COLUMNS = ("tag", "pictures", "px", "sigma, deg", "sigma, mm", "false", "correlation")
 
+# The first tag in less than this share of the pictures that show the others is what all their sigmas have in them.
+_SELDOM = 0.25
 # A tag that misses by this many times the others' median is no flat square of its size.
 _MISFIT = 2.5
 
@@ -44,6 +46,13 @@ def advice(layout: Layout) -> list[str]:
         out.append(
             f"tag{'s' if len(bad) > 1 else ''} {names}: corners miss by {_MISFIT:g} times as much as others' or more; "
             "check the size in the config, and that the tag is flat"
+        )
+    first, *others = layout.seen.items()
+    often = float(np.median([seen.pictures for _, seen in others]))
+    if first[1].pictures < _SELDOM * often:
+        out.append(
+            f"tag {first[0]} defines the body's frame and is in {first[1].pictures} pictures only, others in "
+            f"{often:.0f}: its error is in the sigmas of all; take more pictures of it with others"
         )
     return out
 

@@ -17,7 +17,7 @@ from pipelines.graph.assumptions import Assumption, quantities, sensitivity_assu
 from pipelines.graph.linear import linear_factor
 from pipelines.graph.priors import prior_sigmas, rotation_prior, vector_prior
 from pipelines.graph.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
-from pipelines.methods.cube.tag_places import tag_place_names, tag_places
+from pipelines.methods.cube.tag_places import CAMERA_NUMBERS, tag_place_names, tag_places
 from pipelines.methods.cube.topics import CubeConfig, RawConversion
 from pipelines.methods.place import FIELD, STRENGTH_SIGMA
 from pipelines.methods.triads import TRIADS, triad_names
@@ -215,6 +215,9 @@ def cube_parameters(config: Config, camera: bool, reference: bool, field: Array 
 
 def is_stated(assumption: Assumption, config: Config) -> bool:
     """Whether the config says anything of it."""
+    layout = config.section(CubeConfig).covariance
+    if layout is not None and layout.camera and set(CAMERA_NUMBERS) >= set(assumption.names):
+        return True
     sheet = getattr(config.sensors, assumption.sheet)
     return assumption.figure in sheet.model_fields_set or any(name in config.priors for name in assumption.names)
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pipelines.errors import InputError
 from pipelines.methods.cube.data import Array, CubeData, Sightings
 from pipelines.methods.cube.static_intervals import static_intervals
-from pipelines.methods.cube.topics import TAG_DETECTIONS, CubeConfig
+from pipelines.methods.cube.topics import TAG_DETECTIONS, CubeConfig, RefinedCamera
 from pipelines.recording.checks import clean, count
 from pipelines.recording.reading import Recording
 from pipelines.recording.topics import IMAGE, wanted
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 _FAMILIES = ("", "36h11", "tag36h11")
 # More pictures than this share with one id twice are two tags with one id, not a false detection.
 _TWICE = 0.1
+# Focal lengths that differ by more than this share are of two cameras.
+_OTHER_CAMERA = 0.05
 
 
 def read_camera(recording: Recording, config: Config) -> Camera:
@@ -31,7 +33,23 @@ def read_camera(recording: Recording, config: Config) -> Camera:
         raise InputError(
             "the tags on the cube are not given: name them in the config as cube.tags {id: {size, rotation, position}}"
         )
-    return camera_of(recording, config)
+    camera, refined = camera_of(recording, config), config.section(CubeConfig).camera
+    return camera if refined is None else _refined(camera, refined)
+
+
+def _refined(camera: Camera, refined: RefinedCamera) -> Camera:
+    """The recording's camera with the intrinsics of the config. Raises InputError when these are of another one."""
+    if np.abs(np.array(refined.focal) / camera.focal - 1.0).max() > _OTHER_CAMERA:
+        raise InputError(
+            f"cube.camera is of another camera: its focal length is {refined.focal[0]:.6g} px, that of the recording's "
+            f"CameraInfo {camera.focal[0]:.6g}; take cube.camera out, and `camera` out of cube.covariance"
+        )
+    if len(refined.distortion) != len(camera.coefficients):
+        raise InputError(
+            f"cube.camera is of another camera: it has {len(refined.distortion)} coefficients of distortion, that of "
+            f"the recording's CameraInfo {len(camera.coefficients)}"
+        )
+    return camera.with_intrinsics(np.array([*refined.focal, *refined.centre, *refined.distortion]))
 
 
 def read_sightings(recording: Recording, data: CubeData, config: Config, dropped: dict[str, int]) -> Sightings:

@@ -1,4 +1,4 @@
-"""What cube-layout knows of where the tags are, as parameters and as their joint prior."""
+"""What cube-layout knows of where the tags are, and of the camera, as parameters and as their joint prior."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from pipelines.settings import Config
 
 # Of a tag, as cube.covariance has them: rotation, position.
 _NUMBERS = ("x", "y", "z", "px", "py", "pz")
+# Of a camera, likewise.
+CAMERA_NUMBERS = ("camera_focal", "camera_centre_x", "camera_centre_y")
 # The yardstick of a tag's position, m.
 _PRIOR = 1e-3
 
@@ -41,13 +43,14 @@ def tag_places(config: Config) -> tuple[Parameter, ...]:
 
 
 def layout_belief(config: Config) -> Belief | None:
-    """What the layout's covariance says of tags, but for numbers whose prior is given elsewhere; None: nothing."""
+    """What the layout's covariance says of tags and of the camera, but for numbers with a prior given elsewhere."""
     cube = config.section(CubeConfig)
     if cube.covariance is None:
         return None
     elsewhere = {*config.priors, *(name for belief in config.beliefs for name in belief.names)}
-    names = tuple(f"tag_{tag}_{number}" for tag in cube.covariance.tags for number in _NUMBERS)
-    told = {f"tag_{tag}_{number}" for tag in _told(cube) for number in _NUMBERS}
+    of_camera = CAMERA_NUMBERS if cube.covariance.camera else ()
+    names = (*(f"tag_{tag}_{number}" for tag in cube.covariance.tags for number in _NUMBERS), *of_camera)
+    told = {*(f"tag_{tag}_{number}" for tag in _told(cube) for number in _NUMBERS), *of_camera}
     whole = Belief(names, np.zeros(len(names)), cube.covariance.matrix, "the covariance of the tags' layout")
     return whole.of(told - elsewhere)
 

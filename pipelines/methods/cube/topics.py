@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import datetime
-from typing import ClassVar, Self
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from pipelines.recording import messages
 from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, MAG, Need, Setting, Topic
@@ -40,19 +40,22 @@ class LayoutCovariance(Section):
     """What cube-layout knows of its tags: covariance of rotation (rad) and position (m) of each, six numbers a tag."""
 
     tags: list[int]  # ids in order
+    camera: bool = False  # whether its focal length (a share) and centre (px) follow after the tags
     rows: list[str]  # the lower triangle, each row its numbers with blanks between them
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
-        if len(self.rows) != 6 * len(self.tags):
-            raise ValueError(f"{len(self.tags)} tags need {6 * len(self.tags)} rows, there are {len(self.rows)}")
+        needed = 6 * len(self.tags) + 3 * self.camera
+        if len(self.rows) != needed:
+            what = f"{len(self.tags)} tags{' and a camera' if self.camera else ''}"
+            raise ValueError(f"{what} need {needed} rows, there are {len(self.rows)}")
         if np.linalg.eigvalsh(self.matrix).min(initial=0.0) < -_ROUNDING * np.diag(self.matrix).max(initial=0.0):
             raise ValueError("rows are no covariance: a combination of the numbers has a negative variance")
         return self
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """(6 n, 6 n)."""
+        """(6 n, 6 n), of a layout with camera (6 n + 3, 6 n + 3)."""
         out = np.zeros((len(self.rows), len(self.rows)))
         for i, row in enumerate(self.rows):
             try:
@@ -65,8 +68,16 @@ class LayoutCovariance(Section):
         return out
 
 
+class RefinedCamera(Section):
+    """What cube-layout found of the camera, which goes before the numbers of its CameraInfo."""
+
+    focal: Annotated[tuple[Sigma, Sigma], Field(strict=False)]  # px
+    centre: Annotated[tuple[float, float], Field(strict=False)]  # px
+    distortion: list[float]  # coefficients of CameraInfo's model
+
+
 class CubeConfig(Board, MethodSection):
-    """The cube: its tags and how well they are known, the camera on the reference (BRC: w, x, y, z), counts, date."""
+    """The cube: its tags and how well they are known, the camera on the reference, counts, date."""
 
     key: ClassVar[str] = "cube"
 
@@ -74,6 +85,7 @@ class CubeConfig(Board, MethodSection):
     raw: Raw = Raw()  # of sensors that record counts
     date: Date | None = None  # of the field model, as at the top level
     covariance: LayoutCovariance | None = None  # as cube-layout writes it
+    camera: RefinedCamera | None = None  # as cube-layout --refine-camera writes it
 
 
 def field_date(config: Config) -> datetime.date | None:

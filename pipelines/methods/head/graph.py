@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -22,7 +21,7 @@ from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
 from pipelines.errors import InputError
 from pipelines.graph.assumptions import acting
-from pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk
+from pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk, shared_keyframes
 from pipelines.graph.motion import Motion
 from pipelines.graph.noise import Level
 from pipelines.graph.priors import rotation_prior, vector_prior
@@ -154,7 +153,7 @@ def _prepare(
         first, origins = data.vision_wxyz[0], (data.vision_t[0], vision_t[0], min(_SHARED, negligible))
     else:
         bias_hat, vRh, first, origins = before.chain.gyro.bias_hat, before.helmet_guess, before.first, before.origins
-    time, pictures = _keyframes(vision_t, *origins[1:])
+    time, pictures = shared_keyframes(vision_t, *origins[1:], _LONGEST_INCREMENT)
     late = int(np.searchsorted(time, start))
     time, pictures = time[late:], pictures[late:] - pictures[late]
     frames = slice(len(vision_t) - pictures[-1], None)
@@ -196,27 +195,6 @@ def _sqrt_information(covariance: Array | None, inside: NDArray[np.bool_], confi
         return np.broadcast_to(np.eye(3) / sigma, (int(inside.sum()), 3, 3))
     root: Array = np.linalg.cholesky(np.linalg.inv(covariance[inside]))
     return np.swapaxes(root, 1, 2)
-
-
-def _keyframes(stamps: Array, origin: float, shared: float) -> tuple[Array, NDArray[np.intp]]:
-    """Times (K,) of the keyframes and, (K + 1,), where the pictures of each begin; some, in gaps, have none.
-
-    Pictures share one as long as they are within the same `shared` s, counted from `origin`; it is the one in their
-    middle.
-    """
-    group = np.floor((stamps - origin) / shared) if shared > 0.0 else np.arange(len(stamps))
-    begins = np.flatnonzero(np.diff(group, prepend=-1.0))
-    middles = stamps[(begins + np.append(begins[1:], len(stamps)) - 1) // 2]
-    bridges = [
-        np.linspace(a, b, int(np.ceil((b - a) / _LONGEST_INCREMENT)) + 1)[1:-1]
-        for a, b in pairwise(middles)
-        if b - a > _LONGEST_INCREMENT
-    ]
-    time = np.concatenate([middles, *bridges])
-    count = np.zeros(len(time), dtype=int)
-    count[: len(middles)] = np.diff(begins, append=len(stamps))
-    order = np.argsort(time, kind="stable")
-    return time[order], np.append(0, np.cumsum(count[order]))
 
 
 def _guess(data: HeadData, vision_t: Array, iRh: Array, sigma: float) -> tuple[Array, Array]:

@@ -1,4 +1,4 @@
-"""The tumble method: magnetometer and accelerometer of a device that is turned by hand, with nothing beside them."""
+"""The tumble method: magnetometer, accelerometer and gyro of a device turned by hand, which nothing watches."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Tumble(Method):
     topics = TOPICS
     needs = NEEDS
     sheets = ("field",)
-    of_recording = ("accel_b?", "gravity", "field_*")
+    of_recording = ("accel_b?", "gyro_bias_*", "gravity", "field_*")
     drawn = True
     yields = True
 

@@ -1,12 +1,13 @@
-"""How a tumble result is applied. Frame b: the axes in which the K of the accelerometer, or else the magnetometer's, is
-symmetric."""
+"""How a tumble result is applied. Frame b: the axes in which the first of these is symmetric that there is: the gyro's
+errors, the K of the accelerometer, the magnetometer's."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
 
-from pipelines.methods.formula import Formula
+from pipelines.methods.formula import Formula, gyro_rate
 from pipelines.methods.triads import triad_formula
+from pipelines.methods.tumble.turning import BIAS, SCALE, SENSITIVITY
 
 
 def formulas(parameters: Collection[str]) -> list[Formula]:
@@ -17,4 +18,9 @@ def formulas(parameters: Collection[str]) -> list[Formula]:
     if "mag_k11" in parameters:
         unit = "the unit of field_strength"
         found.append(triad_formula("mag", parameters, "mag", ("mag",), lambda v: v.mag, "body's", unit))
+    if BIAS[0] in parameters:
+        names = tuple(name for each in SCALE for name in each.names)
+        found.append(
+            Formula("rate, rad/s along the body's axes", "w_b", *gyro_rate(parameters, names, SENSITIVITY.names))
+        )
     return found

@@ -1,14 +1,15 @@
 """The tumble method: a magnetometer, an accelerometer, or both, turned by hand through all attitudes, and nothing else.
 
-There is no camera, no reference and no gyro, so that attitudes are unknown: what is known is that the field has one
+There is no camera and no reference. Without a gyro attitudes are unknown: what is known is that the field has one
 strength, the specific force at rest another, and that the angle between them stays. That tells of each sensor scale,
 non-orthogonality and offset, and of two how they are turned against each other. The body's axes are those in which the
-K of the accelerometer, or of a magnetometer alone, is symmetric: as near to the sensor's own as any can be.
+K of the accelerometer, or of a magnetometer alone, is symmetric: as near to the sensor's own as any can be. A gyro
+chains the attitudes (`chained`): each sample of the field then tells three numbers instead of one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import partial
 from itertools import pairwise
 
@@ -17,18 +18,16 @@ import numpy as np
 from factors.chi_square import gate
 from factors.ellipsoid import DipFactor, StrengthFactor
 from factors.loss import TruncatedLoss
-from pipelines.graph.motion import Motion
 from pipelines.graph.noise import Level
 from pipelines.graph.problem import Array, Factor, Problem, Step
-from pipelines.judgement.pictures import swaying
-from pipelines.methods.tumble.model import Dip, Model, Sensor, prepare
+from pipelines.methods.tumble.chained import FAMILIES, advice, chained
+from pipelines.methods.tumble.model import Model, Moments, Sensor, prepare
 from pipelines.methods.tumble.parameters import DIP_KEY, STRENGTH_KEYS, TRIAD_KEYS, Variable, variables
 from pipelines.methods.tumble.recording import TumbleData
 from pipelines.settings import Config
 
 # What is measured within this time, s, makes one step.
 _STRETCH = 0.5
-_FAMILIES = {"accel": "accelerometer", "mag": "magnetometer"}
 
 
 def problem(data: TumbleData, config: Config) -> Problem:
@@ -39,15 +38,17 @@ def problem(data: TumbleData, config: Config) -> Problem:
     """
     model = prepare(data, config)
     found = variables(model, config)
+    if model.mounted is not None:
+        return chained(data, config, model, found)
     noises = [Level(sensor.noise) for sensor in model.sensors]
-    if model.dip is not None:
-        noises.append(Level(model.dip.noise))
+    if model.moments is not None:
+        noises.append(Level(model.moments.noise))
     return Problem(
         method="tumble",
         parameters=tuple(variable.parameter for variable in found),
         steps=partial(_steps, model, found),
         loss=TruncatedLoss(gate(1)),
-        advice=_advice,
+        advice=advice,
         dropped=model.dropped,
         premises=model.premises,
         noises=tuple(noises),
@@ -57,7 +58,7 @@ def problem(data: TumbleData, config: Config) -> Problem:
 def _steps(model: Model, found: tuple[Variable, ...], chunk: int) -> Iterator[Step]:
     """A step for each stretch of time; the first brings the variables and their priors too."""
     loss = TruncatedLoss(gate(1))
-    times = [each.time for each in (*model.sensors, model.dip) if each is not None]
+    times = [each.time for each in (*model.sensors, model.moments) if each is not None]
     start, stop = min(t[0] for t in times), max(t[-1] for t in times)
     edges = np.append(np.arange(start, stop, chunk * _STRETCH), np.inf)
     first = True
@@ -69,9 +70,9 @@ def _steps(model: Model, found: tuple[Variable, ...], chunk: int) -> Iterator[St
                 step.factors.append(variable.prior)
         for sensor in model.sensors:
             step.factors.extend(_strengths(sensor, _rows(sensor.time, low, high), loss))
-        if model.dip is not None:
+        if model.moments is not None:
             symmetric = model.sensors[0].symmetric, model.sensors[1].symmetric
-            step.factors.extend(_dips(model.dip, _rows(model.dip.time, low, high), symmetric, loss))
+            step.factors.extend(_dips(model.moments, _rows(model.moments.time, low, high), symmetric, loss))
         if first or step.factors:
             yield step
         first = False
@@ -89,23 +90,12 @@ def _strengths(sensor: Sensor, rows: slice, loss: TruncatedLoss) -> list[Factor]
         sensor.time[rows], sensor.scaled[rows], sensor.sigma[rows], sensor.excess[rows], sensor.symmetric
     )
     keys = TRIAD_KEYS[sensor.name], STRENGTH_KEYS[sensor.name]
-    return [Factor.of(_FAMILIES[sensor.name], factor.on(*keys, loss=loss))]
+    return [Factor.of(FAMILIES[sensor.name], factor.on(*keys, loss=loss))]
 
 
-def _dips(dip: Dip, rows: slice, symmetric: tuple[bool, bool], loss: TruncatedLoss) -> list[Factor]:
+def _dips(moments: Moments, rows: slice, symmetric: tuple[bool, bool], loss: TruncatedLoss) -> list[Factor]:
     """The angles between field and gravity in a stretch of time."""
     if rows.start == rows.stop:
         return []
-    factor = DipFactor(dip.time[rows], dip.accel[rows], dip.mag[rows], dip.sigma[rows], symmetric)
+    factor = DipFactor(moments.time[rows], moments.accel[rows], moments.mag[rows], moments.sigma[rows], symmetric)
     return [Factor.of("dip", factor.on(TRIAD_KEYS["accel"], TRIAD_KEYS["mag"], DIP_KEY, loss=loss))]
-
-
-def _advice(weights: Mapping[str, float]) -> Motion:
-    """The motion that would make a weak direction observable."""
-    strong = [name for name, weight in weights.items() if abs(weight) > 0.3] or list(weights)
-    if any(name.startswith("accel") for name in strong):
-        return Motion("rest the device for a second or two in each of twenty and more attitudes, every side up")
-    return Motion(
-        "turn the device through more attitudes, each end of each axis up, down, north and south, away from iron",
-        swaying("xyz", "device"),
-    )

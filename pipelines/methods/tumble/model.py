@@ -25,6 +25,7 @@ from pipelines.methods.static_intervals import quiet_intervals
 from pipelines.methods.triads import triad_names
 from pipelines.methods.tumble.published import FEWEST, ellipsoid
 from pipelines.methods.tumble.recording import TumbleData
+from pipelines.methods.tumble.turning import Mounted, mounted
 from pipelines.settings import Config
 
 # Typical norms, SI, by which counts are told; of a sensor with its offset.
@@ -37,8 +38,16 @@ _FEWEST_RESTS = 9
 _FAR, _ROUNDS = 5.0, 5
 # A rotation is told by pairs of vectors if the second-best answer fits this many times worse.
 _CLEAR = 2.0
+# How well what the hand adds is known beforehand, in the logarithm.
+_HARDLY = 2.0
 # What the sine of the dip may be off before a sign is called wrong, and the least sine that tells.
 _SINE = 0.35
+_AT_REST = "every sample counts as one at rest, and its motion as noise"
+_SWUNG = "all its samples are used, swung about a point (accel_arm); what the hand adds counts as noise"
+_LEFT_HANDED = (
+    "Beside the accelerometer the magnetometer's axes are left-handed: an axis of one of them has the wrong sign, or "
+    "the accelerometer shows gravity down where it has to show up; K of the magnetometer mends the first."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +65,7 @@ class Sensor:
         unit: of the strength; "1" where it is unknown and called 1.
         start: (9,) or (12,) first guess, without unit.
         turned: (3, 3) the part of that which turns: the body's axes against those of a symmetric K.
+        rested: whether the readings are means over rests.
         noise: of a sample, with its family.
     """
 
@@ -72,6 +82,7 @@ class Sensor:
     unit: str
     start: Array
     turned: Array
+    rested: bool
     noise: Noise
 
     @property
@@ -90,22 +101,32 @@ class Sensor:
         gains = len(self.start) - 3
         return np.repeat([self.strength / self.radius, self.strength], [gains, 3])
 
+    def nominal(self, raw: Array) -> Array:
+        """(m, 3) what readings (m, 3) mean at the first guess, in the unit of the strength."""
+        return self.strength * nominal_of(raw / self.radius, self.start @ entries(self.symmetric).T)
+
     @property
     def directions(self) -> Array:
         """(n, 3) of what it measured, unit vectors, at the first guess."""
-        vectors = nominal_of(self.scaled, self.start @ entries(self.symmetric).T)
+        vectors = self.nominal(self.raw)
         return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
 @dataclass(frozen=True, eq=False)
 class Dip:
-    """Moments at which both sensors are used together.
+    """The field's inclination: first guess, rad, and by the field model, rad, with how well that is known, or None."""
+
+    start: float
+    model: tuple[float, float] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """At which both sensors are used together.
 
     Attributes:
         time, accel, mag: (n,) s, (n, 3) and (n, 3), without unit.
         sigma: (n,) of the cosine between them.
-        start: first guess, rad.
-        model: by the field model, rad, and how well that is known; None where the place is unknown.
         noise: of the cosine.
     """
 
@@ -113,17 +134,28 @@ class Dip:
     accel: Array
     mag: Array
     sigma: Array
-    start: float
-    model: tuple[float, float] | None
     noise: Noise
 
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """What the graph needs: sensors, accelerometer first, what they measured together, and what has to be told."""
+    """What the graph needs.
+
+    Attributes:
+        sensors: accelerometer first.
+        dip: None where a sensor is alone.
+        moments: what the sensors measured together, where no gyro ties them.
+        mounted: how the gyro is mounted that chains the attitudes; None: these are eliminated.
+        declination: of the field, rad east, where the place is known.
+        premises: what has to be told.
+        dropped: what was left out.
+    """
 
     sensors: tuple[Sensor, ...]
     dip: Dip | None
+    moments: Moments | None
+    mounted: Mounted | None
+    declination: float
     premises: tuple[str, ...]
     dropped: Mapping[str, int]
 
@@ -138,11 +170,6 @@ def prepare(data: TumbleData, config: Config) -> Model:
     rests = None
     if data.accel is not None and data.accel_t is not None:
         rests = _rests(data, config)
-        if rests is None:
-            premises.append(
-                f"The accelerometer has fewer than {_FEWEST_RESTS} rests: every sample counts as one at rest, and its "
-                "motion as noise."
-            )
         sensors.append(_accelerometer(data, config, rests))
     if data.mag is not None and data.mag_t is not None:
         sensors.append(_magnetometer(data, config, field, alone=data.accel is None))
@@ -151,11 +178,84 @@ def prepare(data: TumbleData, config: Config) -> Model:
                 "No position, so that the field's strength is unknown and called 1: K and b give the field in units of "
                 "it; state latitude_deg and longitude_deg in the config for T."
             )
-    dip = None
-    if len(sensors) > 1:
-        sensors[1], dip, more = _together(data, config, sensors[0], sensors[1], rests, field)
+    gyro, more = _gyro(data, sensors, field)
+    premises += more
+    if sensors[0].name == "accel" and not sensors[0].rested:
+        done = _AT_REST if gyro is None else _SWUNG
+        premises.append(f"The accelerometer has fewer than {_FEWEST_RESTS} rests: {done}.")
+    dip = moments = None
+    if gyro is not None:
+        assert field is not None
+        sensors, dip, gyro, more = _chained(sensors, gyro, _modelled(config, field))
         premises += more
-    return Model(tuple(sensors), dip, tuple(premises), data.dropped)
+    elif len(sensors) > 1:
+        modelled = None if field is None else _modelled(config, field)
+        sensors[1], dip, moments, more = _together(data, config, sensors[0], sensors[1], rests, modelled)
+        premises += more
+    declination = 0.0 if field is None else float(np.arctan2(field[0], field[1]))
+    return Model(tuple(sensors), dip, moments, gyro, declination, tuple(premises), data.dropped)
+
+
+def _modelled(config: Config, field: Array) -> tuple[float, float]:
+    """The dip of the field (3,) and its sigma, rad."""
+    strength = float(np.linalg.norm(field))
+    return float(np.arcsin(-field[2] / strength)), sheet(config, FIELD) / strength
+
+
+def _gyro(data: TumbleData, sensors: list[Sensor], field: Array | None) -> tuple[Mounted | None, list[str]]:
+    """How the gyro is mounted, and why it is not used though it is there."""
+    if data.gyro is None or data.mag is None:
+        return None, []
+    if field is None:
+        return None, ["The gyro is not used: that needs latitude_deg and longitude_deg, for the earth turns beside it."]
+    mag = sensors[-1]
+    found = mounted(data, mag.time, _directions(mag))
+    if found is None:
+        return None, ["The gyro is not used: it does not turn as the field does; are its axes and clock right?"]
+    return found, []
+
+
+def _chained(
+    sensors: list[Sensor], gyro: Mounted, model: tuple[float, float]
+) -> tuple[list[Sensor], Dip, Mounted, list[str]]:
+    """Sensors in the gyro's axes, and the dip."""
+    *beside, mag = sensors
+    beside = [replace(each, symmetric=False, start=each.start @ entries(True).T) for each in map(_of_hand, beside)]
+    sine, premises = np.sin(model[0]), []
+    if beside:
+        accel = beside[0]
+        rows = np.clip(np.searchsorted(mag.time, accel.time), 0, len(mag.time) - 1)
+        sine = -float(np.mean((accel.directions * (_directions(mag)[rows] @ gyro.Q.T)).sum(axis=1)))
+        if _contradicts(sine, model[0]):
+            gyro, sine = replace(gyro, Q=-gyro.Q), -sine
+            premises.append(_LEFT_HANDED)
+    dip = Dip(float(np.arcsin(np.clip(sine, -0.99, 0.99))), model)
+    return [*beside, _turned(mag, gyro.Q)], dip, gyro, premises
+
+
+def _of_hand(accel: Sensor) -> Sensor:
+    """An accelerometer that is used while it moves: what the hand adds nobody states, and the residuals tell."""
+    if accel.rested or accel.noise.known == 0.0:
+        return accel
+    return replace(accel, noise=replace(accel.noise, name="accel_motion", source="default", known=_HARDLY))
+
+
+def _contradicts(sine: float, dip: float) -> bool:
+    """Whether the sine of a dip has the wrong sign."""
+    return bool(abs(np.sin(dip)) > _SINE and sine * np.sin(dip) < 0.0)
+
+
+def _directions(mag: Sensor) -> Array:
+    """(n, 3) of the field in the axes in which K is symmetric, whatever those of its start are."""
+    return np.asarray(mag.directions @ mag.turned)
+
+
+def _turned(mag: Sensor, rotation: Array) -> Sensor:
+    """A magnetometer whose start is symmetric, turned by an orthogonal matrix."""
+    numbers = mag.start @ entries(mag.symmetric).T
+    K = rotation @ numbers[:9].reshape(3, 3)
+    start = np.concatenate([K.ravel(), rotation @ numbers[9:]])
+    return replace(mag, symmetric=False, start=start, turned=rotation)
 
 
 def _rests(data: TumbleData, config: Config) -> Array | None:
@@ -250,6 +350,7 @@ def _sensor(
         unit=known[2],
         start=start,
         turned=np.eye(3),
+        rested=bool(number.max() > 1.0),
         noise=noise,
     )
 
@@ -306,8 +407,13 @@ def _means(t: Array, values: Array, rests: Array | None) -> tuple[Array, Array, 
 
 
 def _together(
-    data: TumbleData, config: Config, accel: Sensor, mag: Sensor, rests: Array | None, field: Array | None
-) -> tuple[Sensor, Dip | None, list[str]]:
+    data: TumbleData,
+    config: Config,
+    accel: Sensor,
+    mag: Sensor,
+    rests: Array | None,
+    model: tuple[float, float] | None,
+) -> tuple[Sensor, Dip, Moments, list[str]]:
     """The magnetometer turned into the accelerometer's axes, and the angles between what they measured."""
     assert data.mag_t is not None
     assert data.mag is not None
@@ -315,38 +421,21 @@ def _together(
     up = accel.directions[rows]
     vectors = nominal_of(readings / mag.radius, mag.start)
     seen = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-    model = None
-    if field is not None:
-        sine = -float(field[2]) / float(np.linalg.norm(field))
-        model = float(np.arcsin(sine)), sheet(config, FIELD) / float(np.linalg.norm(field))
     rotation, sine, clear = _rotation(up, seen)
     premises = []
     if not clear:
         rotation, sine = np.eye(3), -float(np.mean((up * seen).sum(axis=1)))
-    elif model is not None and abs(np.sin(model[0])) > _SINE and sine * np.sin(model[0]) < 0.0:
+    elif model is not None and _contradicts(sine, model[0]):
         rotation, sine = -rotation, -sine
-        premises.append(
-            "Beside the accelerometer the magnetometer's axes are left-handed: an axis of one of them has the wrong "
-            "sign, or the accelerometer shows gravity down where it has to show up; K of the magnetometer mends the "
-            "first."
-        )
-    K = rotation @ mag.start[:9].reshape(3, 3)
-    turned = replace(mag, start=np.concatenate([K.ravel(), rotation @ mag.start[9:]]), turned=rotation)
+        premises.append(_LEFT_HANDED)
+    turned = _turned(mag, rotation)
     interval = float(np.median(np.diff(mag.time)))
     own = mag.noise.stated * interval**-0.5 / mag.radius / np.sqrt(number)
     cosine2 = max(1.0 - sine**2, 1e-2)
     sigma = np.sqrt(cosine2 * (accel.sigma[rows] ** 2 + own**2))
     noise = Noise("dip", float(np.median(sigma)), "default", 0.0 if config.noise_known == 0.0 else ROUGHLY, ("dip",))
-    dip = Dip(
-        time,
-        accel.scaled[rows],
-        readings / mag.radius,
-        sigma,
-        float(np.arcsin(np.clip(sine, -0.99, 0.99))),
-        model,
-        noise,
-    )
-    return turned, dip, premises
+    moments = Moments(time, accel.scaled[rows], readings / mag.radius, sigma, noise)
+    return turned, Dip(float(np.arcsin(np.clip(sine, -0.99, 0.99))), model), moments, premises
 
 
 def _beside(t: Array, values: Array, at: Array, rests: Array | None) -> tuple[NDArray[np.intp], Array, Array, Array]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 
 import gtsam
 import numpy as np
@@ -14,6 +15,7 @@ from pipelines.graph.priors import prior_sigmas
 from pipelines.graph.problem import Array, Factor, Parameter, Quantity
 from pipelines.methods.triads import triad_names
 from pipelines.methods.tumble.model import Model, Sensor, nearest_axes
+from pipelines.methods.tumble.turning import ARM, BIAS, DELAY, SCALE, SENSITIVITY
 from pipelines.settings import Config, check_names
 
 TRIAD_KEYS = {"accel": int(gtsam.symbol("A", 0)), "mag": int(gtsam.symbol("M", 0))}
@@ -48,7 +50,10 @@ class Variable:
 
 
 def variables(model: Model, config: Config) -> tuple[Variable, ...]:
-    """Triads, strengths and dip, in reporting order. Raises InputError when the config names no such parameter."""
+    """Triads, strengths and dip, in reporting order; a gyro's are `turning.parameters`.
+
+    Raises InputError when the config names no such parameter.
+    """
     _check_names(config)
     found = [_triad(sensor, config) for sensor in model.sensors]
     found += [_strength(sensor, config) for sensor in model.sensors]
@@ -121,6 +126,12 @@ def _scaled(scales: Array, values: gtsam.Values, key: int) -> tuple[Array, Array
 
 def _check_names(config: Config) -> None:
     known = [name for sensor in TRIAD_KEYS for name in triad_names(sensor)]
-    known += [*STRENGTHS.values(), _DIP]
+    known += [
+        *STRENGTHS.values(),
+        _DIP,
+        *BIAS,
+        *ARM,
+        *chain.from_iterable(each.names for each in (*SCALE, SENSITIVITY, DELAY)),
+    ]
     check_names(config.priors, known, "priors")
     check_names(config.require, known, "require")

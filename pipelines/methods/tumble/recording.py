@@ -11,7 +11,17 @@ from numpy.typing import NDArray
 from pipelines.errors import InputError
 from pipelines.methods.place import read_place
 from pipelines.recording import series
-from pipelines.recording.checks import LEAST_ACCEL, LEAST_MAG, check_overlap, clean, count, density, nanoseconds
+from pipelines.recording.checks import (
+    LEAST_ACCEL,
+    LEAST_GYRO,
+    LEAST_MAG,
+    check_overlap,
+    clean,
+    count,
+    density,
+    nanoseconds,
+    too_fast,
+)
 from pipelines.recording.faults import drop_faults
 from pipelines.recording.reading import Recording
 from pipelines.recording.topics import FIX, IMU, MAG, wanted
@@ -27,9 +37,9 @@ class TumbleData:
     """What was measured. Times are s from epoch_ns (Unix ns), strictly increasing.
 
     mag_t (N,), mag (N, 3): T, or counts; accel_t (M,), accel (M, 3): m/s^2, or counts; None for a sensor that there is
-    not, but one there is. mag_density, accel_density: from the covariances of the messages, in the unit recorded per
-    sqrt(Hz), None if they say nothing. latitude, longitude, rad, height, m: None if unknown. dropped: reason ->
-    messages.
+    not, but one there is. gyro_t (L,), gyro (L, 3): rad/s, where there is one beside a magnetometer. mag_density,
+    accel_density, gyro_density: from the covariances of the messages, in the unit recorded per sqrt(Hz), None if they
+    say nothing. latitude, longitude, rad, height, m: None if unknown. dropped: reason -> messages.
     """
 
     epoch_ns: int
@@ -43,6 +53,9 @@ class TumbleData:
     longitude: float | None = None
     height: float = 0.0
     dropped: dict[str, int] = field(default_factory=dict)
+    gyro_t: Array | None = None
+    gyro: Array | None = None
+    gyro_density: float | None = None
 
 
 def read_tumble(recording: Recording, config: Config) -> TumbleData:
@@ -55,6 +68,7 @@ def read_tumble(recording: Recording, config: Config) -> TumbleData:
     recording.read_together(dict.fromkeys(map(config.topic, (MAG, IMU, FIX)), ()))
     spans = {}
     mag_t = mag = mag_density = accel_t = accel = accel_density = None
+    gyro_t = gyro = gyro_density = None
     name = config.topic(MAG)
     if wanted(recording, config, MAG):
         measured = recording.magnetic(name)
@@ -74,6 +88,8 @@ def read_tumble(recording: Recording, config: Config) -> TumbleData:
             accel_t, keep = accel_t[sound], keep[sound]
             accel, accel_density = imu.accel[keep], density(name, accel_t, imu.accel_cov[keep], LEAST_ACCEL, dropped)
             spans[name] = accel_t
+        if mag is not None:
+            gyro_t, gyro, gyro_density = _gyro(name, imu, epoch, dropped)
     if not spans:
         raise InputError(
             f"neither {config.topic(MAG)} (MagneticField) nor an accelerometer in {config.topic(IMU)} (Imu); "
@@ -82,8 +98,35 @@ def read_tumble(recording: Recording, config: Config) -> TumbleData:
     check_overlap(spans)
     latitude, longitude, height = read_place(recording, config, FIX)
     return TumbleData(
-        epoch, mag_t, mag, accel_t, accel, mag_density, accel_density, latitude, longitude, height, dropped
+        epoch_ns=epoch,
+        mag_t=mag_t,
+        mag=mag,
+        accel_t=accel_t,
+        accel=accel,
+        mag_density=mag_density,
+        accel_density=accel_density,
+        latitude=latitude,
+        longitude=longitude,
+        height=height,
+        dropped=dropped,
+        gyro_t=gyro_t,
+        gyro=gyro,
+        gyro_density=gyro_density,
     )
+
+
+def _gyro(
+    topic: str, imu: series.ImuSeries, epoch: int, dropped: dict[str, int]
+) -> tuple[Array | None, Array | None, float | None]:
+    """Times, rates and density; None where there is none, or one that is not in rad/s."""
+    absent = not np.nan_to_num(imu.gyro).any() or (imu.gyro_cov[:, 0, 0] == -1.0).all()
+    if absent:
+        return None, None, None
+    t, keep = clean(topic, imu.t_ns, epoch, imu.gyro, {})
+    if too_fast(topic, t, imu.gyro[keep]):
+        count(dropped, f"{topic}: gyro beyond what rad/s can be, not used", len(t))
+        return None, None, None
+    return t, imu.gyro[keep], density(topic, t, imu.gyro_cov[keep], LEAST_GYRO, dropped)
 
 
 def write_tumble(path: Path, simulated: Simulated) -> None:
@@ -98,14 +141,15 @@ def write_tumble(path: Path, simulated: Simulated) -> None:
     if data.mag_t is not None and data.mag is not None:
         cov = covariance(data.mag_t, data.mag_density)
         topics[MAG.name] = series.MagneticSeries(nanoseconds(data.mag_t, epoch), data.mag, field_cov=cov, frame_id="b")
-    if data.accel_t is not None and data.accel is not None:
-        cov, absent = covariance(data.accel_t, data.accel_density), np.diag([-1.0, 0.0, 0.0])
+    imu_t = data.gyro_t if data.accel_t is None else data.accel_t
+    if imu_t is not None:
+        absent = np.diag([-1.0, 0.0, 0.0])
         topics[IMU.name] = series.ImuSeries(
-            nanoseconds(data.accel_t, epoch),
-            np.zeros((len(data.accel_t), 3)),
-            data.accel,
-            gyro_cov=absent,
-            accel_cov=cov,
+            nanoseconds(imu_t, epoch),
+            np.zeros((len(imu_t), 3)) if data.gyro is None else data.gyro,
+            np.zeros((len(imu_t), 3)) if data.accel is None else data.accel,
+            gyro_cov=absent if data.gyro is None else covariance(imu_t, data.gyro_density),
+            accel_cov=absent if data.accel is None else covariance(imu_t, data.accel_density),
             frame_id="b",
         )
     if data.latitude is not None and data.longitude is not None:

@@ -38,6 +38,18 @@ class TumbledAccelerometer(_Part):
     arm: NotNegative = 0.1  # m, from the centre that the device is turned about
 
 
+class TumbledGyro(_Part):
+    """The gyro, which samples when the accelerometer does, if there is one."""
+
+    rate_hz: Positive = 100.0
+    density: Positive = 1e-4  # rad/s/sqrt(Hz)
+    bias: NotNegative = 1e-2  # rad/s, sigma of each component
+    scale: NotNegative = 1e-2  # sigma of each number of S
+    g_sensitivity: NotNegative = 2e-4  # rad/s per m/s^2, sigma of each number of G, beside an accelerometer
+    mounting_deg: NotNegative = 0.5  # sigma of the next sensor's rotation against it, each component
+    mag_delay: NotNegative = 1e-2  # s, sigma
+
+
 class TumbleScenario(_Part):
     """What the `tumble` simulator is asked for; every key has a default, `null` leaves a sensor out."""
 
@@ -47,6 +59,7 @@ class TumbleScenario(_Part):
     tilt_deg: Annotated[float, Field(gt=0.0, le=180.0)] = 180.0  # the attitudes are within this of level, any heading
     magnetometer: TumbledMagnetometer | None = TumbledMagnetometer()
     accelerometer: TumbledAccelerometer | None = None
+    gyro: TumbledGyro | None = None
     latitude_deg: float | None = 40.0  # null: nobody knows where it was
     longitude_deg: float = 116.3
     field_error: NotNegative = 1.33e-7  # T, sigma of the strength about its model
@@ -62,6 +75,8 @@ def tumble_config(scenario: TumbleScenario) -> str:
         noise["mag_density"] = scenario.magnetometer.density
     if scenario.accelerometer is not None:
         noise["accel_density"] = scenario.accelerometer.density
+    if scenario.gyro is not None:
+        noise |= {"gyro_density": scenario.gyro.density, "gyro_bias_walk": 0.0}
     config: dict[str, Any] = {"method": "tumble", "noise": noise, "priors": scenario.priors, "date": "2026-11-20"}
     text = StringIO()
     YAML(typ="safe", pure=True).dump(config, text)

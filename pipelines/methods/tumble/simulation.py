@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import so3
-from factors.earth import gravity, magnetic_field
+from factors.earth import earth_rate, gravity, magnetic_field
 from pipelines.errors import InputError
 from pipelines.methods.tumble.recording import TumbleData
 from pipelines.methods.tumble.scenario import (
     EPOCH_NS,
     YEAR,
     TumbledAccelerometer,
+    TumbledGyro,
     TumbledMagnetometer,
     TumbleScenario,
     tumble_config,
@@ -51,23 +52,32 @@ def simulated(scenario: TumbleScenario, seed: int, images: bool = False) -> Simu
     found: dict[str, object] = {}
     if place is not None:
         found |= {"latitude": float(place[0]), "longitude": float(place[1])}
-    mounting = so3.identity()
+    mounting, delay = so3.identity(), 0.0
+    g = 9.80665 if place is None else float(gravity(float(place[0]), 0.0))
+    if (gyro := scenario.gyro) is not None:
+        earth = np.zeros(3) if place is None else earth_rate(float(place[0]))
+        t, raw, own = _gyro(motion, gyro, scenario.accelerometer, earth, g, rng)
+        found |= {"gyro_t": t, "gyro": raw, "gyro_density": gyro.density}
+        delay = gyro.mag_delay * float(rng.standard_normal())
+        truth |= own | {"mag_delay": delay}
+        mounting = so3.exp(np.deg2rad(gyro.mounting_deg) * rng.standard_normal(3))
     if (accel := scenario.accelerometer) is not None:
-        g = 9.80665 if place is None else float(gravity(float(place[0]), 0.0))
         K, b = _drawn(rng, accel.gain, accel.bias)
+        K, b = so3.matrix(mounting) @ K, so3.rotate(mounting, b)
         t, raw = _accelerometer(motion, accel, g, K, b, rng)
         found |= {"accel_t": t, "accel": raw, "accel_density": accel.density}
-        truth |= _truth("accel", K, b, symmetric=True) | {"gravity": g}
+        truth |= _truth("accel", K, b, symmetric=gyro is None) | {"gravity": g}
+        truth |= {"accel_arm_x": accel.arm, "accel_arm_y": 0.0, "accel_arm_z": 0.0}
         mounting = so3.exp(np.deg2rad(accel.mounting_deg) * rng.standard_normal(3))
     if (mag := scenario.magnetometer) is not None:
         K, b = _drawn(rng, mag.soft_iron, mag.hard_iron)
-        t, raw = _magnetometer(motion, mag, field, so3.matrix(mounting) @ K, so3.rotate(mounting, b), rng)
+        t, raw = _magnetometer(motion, mag, field, so3.matrix(mounting) @ K, so3.rotate(mounting, b), delay, rng)
         found |= {"mag_t": t, "mag": raw, "mag_density": mag.density}
         unit = 1.0 if place is not None else float(np.linalg.norm(field))
         K, b = so3.matrix(mounting) @ K / unit, so3.rotate(mounting, b) / unit
-        truth |= _truth("mag", K, b, symmetric=accel is None)
+        truth |= _truth("mag", K, b, symmetric=accel is None and gyro is None)
         truth |= {"field_strength": float(np.linalg.norm(field)) / unit}
-        if accel is not None:
+        if accel is not None or gyro is not None:
             truth |= {"field_dip": float(np.arcsin(-field[2] / np.linalg.norm(field)))}
     return Simulated(TumbleData(EPOCH_NS, **found), truth, tumble_config(scenario))  # type: ignore[arg-type]
 
@@ -106,20 +116,59 @@ def _drawn(rng: np.random.Generator, gain: float, bias: float) -> tuple[Array, A
 
 
 def _magnetometer(
-    motion: _Motion, sensor: TumbledMagnetometer, field: Array, K: Array, b: Array, rng: np.random.Generator
+    motion: _Motion,
+    sensor: TumbledMagnetometer,
+    field: Array,
+    K: Array,
+    b: Array,
+    delay: float,
+    rng: np.random.Generator,
 ) -> tuple[Array, Array]:
     t = sample_times(motion.duration, sensor.rate_hz)
-    return t, _read(so3.rotate(so3.inverse(motion.attitude(t)), field), K, b, sensor.density, sensor.rate_hz, rng)
+    seen = so3.rotate(so3.inverse(motion.attitude(t + delay)), field)
+    return t, _read(seen, K, b, sensor.density, sensor.rate_hz, rng)
+
+
+def _gyro(
+    motion: _Motion,
+    sensor: TumbledGyro,
+    beside: TumbledAccelerometer | None,
+    earth: Array,
+    g: float,
+    rng: np.random.Generator,
+) -> tuple[Array, Array, dict[str, float]]:
+    """Stamps, readings (I + S) w + G f + bias, and the true values of S, G and bias."""
+    rate_hz = sensor.rate_hz if beside is None else beside.rate_hz
+    t = sample_times(motion.duration, rate_hz, 0.3)
+    before, now, after = (motion.attitude(t + step) for step in (-_STEP, 0.0, _STEP))
+    rate = so3.log(so3.multiply(so3.inverse(before), after)) / (2.0 * _STEP) + so3.rotate(so3.inverse(now), earth)
+    S, bias = sensor.scale * rng.standard_normal(6), sensor.bias * rng.standard_normal(3)
+    G = (0.0 if beside is None else sensor.g_sensitivity) * rng.standard_normal((3, 3))
+    gain = np.eye(3) + np.array([[S[0], S[3], S[4]], [S[3], S[1], S[5]], [S[4], S[5], S[2]]])
+    exact = rate @ gain.T + bias
+    if beside is not None:
+        exact = exact + _force(motion, beside, g, t) @ G.T
+    names = (*(f"gyro_scale_{a}" for a in "xyz"), *(f"gyro_skew_{a}" for a in ("xy", "xz", "yz")))
+    truth = dict(zip(names, S.tolist(), strict=True))
+    truth |= {f"gyro_bias_{a}": float(x) for a, x in zip("xyz", bias, strict=True)}
+    if beside is not None:
+        truth |= {f"gyro_g_{a}{c}": float(G[i, j]) for i, a in enumerate("xyz") for j, c in enumerate("xyz")}
+    return t, exact + sensor.density * np.sqrt(rate_hz) * rng.standard_normal(exact.shape), truth
 
 
 def _accelerometer(
     motion: _Motion, sensor: TumbledAccelerometer, g: float, K: Array, b: Array, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     t = sample_times(motion.duration, sensor.rate_hz, 0.3)
+    return t, _read(_force(motion, sensor, g, t), K, b, sensor.density, sensor.rate_hz, rng)
+
+
+def _force(motion: _Motion, sensor: TumbledAccelerometer, g: float, t: Array) -> Array:
+    """Specific force (n, 3) in b where the accelerometer is."""
     arm = np.array([sensor.arm, 0.0, 0.0])
     before, now, after = (so3.rotate(motion.attitude(t + step), arm) for step in (-_STEP, 0.0, _STEP))
     force = (before - 2.0 * now + after) / _STEP**2 + np.array([0.0, 0.0, g])
-    return t, _read(so3.rotate(so3.inverse(motion.attitude(t)), force), K, b, sensor.density, sensor.rate_hz, rng)
+    return so3.rotate(so3.inverse(motion.attitude(t)), force)
 
 
 def _read(nominal: Array, K: Array, b: Array, density: float, rate_hz: float, rng: np.random.Generator) -> Array:

@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from pipelines import progress
 from pipelines.errors import InputError
 from pipelines.vision.camera import Camera
+from pipelines.vision.layout.bundle import moved, refined_pictures
 from pipelines.vision.layout.cameras import free_cameras
-from pipelines.vision.layout.covariance import covariance
+from pipelines.vision.layout.covariance import Covariance, covariance
 from pipelines.vision.layout.pictures import Gathered, Shots, gathered
 from pipelines.vision.layout.placing import joint
 from pipelines.vision.layout.robust import Fit, fitted
-from pipelines.vision.layout.sights import Array, Sights
+from pipelines.vision.layout.sights import Array, Sights, linearized
 from pipelines.vision.layout.whole import adjusted_whole, flip_told
 from pipelines.vision.pose import TagBody, part
 
@@ -59,6 +60,8 @@ class Layout:
         unplaced: id -> why it could not be placed, and what to do.
         cameras, given_cameras: as used in the end, and as given.
         camera_sigma: (c, n) of their intrinsics, None if not adjusted.
+        with_camera: (6 (n - 1) + 3, the same) covariance of the tags, of the focal length, as a share, and of the
+            centre, px, where the one camera that there is was adjusted; else None.
     """
 
     body: TagBody
@@ -71,6 +74,7 @@ class Layout:
     cameras: tuple[Camera, ...]
     given_cameras: tuple[Camera, ...]
     camera_sigma: Array | None
+    with_camera: Array | None
 
 
 def estimate_layout(shots: Sequence[Shots], given: TagBody, refine_camera: bool = False) -> Layout:
@@ -160,6 +164,11 @@ def _wrong(views: Gathered, fit: Fit) -> dict[int, str]:
 
 def _layout(views: Gathered, fit: Fit, unplaced: Mapping[int, str]) -> Layout:
     known = covariance(fit, 0, views.view)
+    if known.correction is not None:
+        stay = np.zeros((len(fit.bundle.cRb), 6))
+        there = moved(fit.bundle, known.correction, stay, fit.cameras)
+        bundle, *_ = refined_pictures(there, fit.sights)
+        fit = replace(fit, bundle=bundle, rows=linearized(bundle, fit.sights))
     body = fit.bundle.body
     seen = {}
     for k, tag in enumerate(body.ids.tolist()):
@@ -177,4 +186,17 @@ def _layout(views: Gathered, fit: Fit, unplaced: Mapping[int, str]) -> Layout:
         cameras=fit.bundle.cameras,
         given_cameras=views.start.cameras,
         camera_sigma=known.cameras,
+        with_camera=_with_camera(known, fit.bundle.cameras),
     )
+
+
+def _with_camera(known: Covariance, cameras: tuple[Camera, ...]) -> Array | None:
+    """As a layout has it; the share is the mean of those of the two focal lengths."""
+    if known.cameras is None or len(cameras) > 1:
+        return None
+    tags = len(known.tags)
+    pick = np.zeros((tags + 3, len(known.whole)))
+    pick[:tags, :tags] = np.eye(tags)
+    pick[tags, tags : tags + 2] = 0.5 / cameras[0].focal
+    pick[tags + 1, tags + 2] = pick[tags + 2, tags + 3] = 1.0
+    return np.asarray(pick @ known.whole @ pick.T)

@@ -5,6 +5,11 @@ and the more so in one in which nothing has moved. The layout errs by L r, L the
 with autocovariance g of r its covariance is the sum over tags, views and lags of L' g(lag) L, as for noise coloured in
 time (pipelines.solvers.coloured). g is that of the errors left, all tags together, up to the lag where it has died out;
 tags that fit worse than the others have a variance of their own.
+
+Priors of cameras are weighed against such errors, not against independent ones: with the information A of independent
+errors, of which the gradient has covariance S, and that of the priors P, the best linear estimate has the information
+A S^-1 A + P. The adjustment, whose information is A + P, takes pictures for better than they are; `correction` is the
+step from there.
 """
 
 from __future__ import annotations
@@ -27,6 +32,8 @@ _CLEARLY = 2.0
 _LEAST_LEFT = 0.1
 # Of the views, the longest lag.
 _LONGEST = 0.25
+# Of the variance of independent errors, what correlated ones have at least, so that it has an inverse.
+_LEAST_VARIANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,13 +42,17 @@ class Covariance:
 
     Attributes:
         tags: (6 (n - 1), 6 (n - 1)), of all tags but the fixed one, rad and m.
+        whole: (q, q) of these tags and of all that is adjusted of the cameras.
         cameras: (c, k) sigmas of the cameras' intrinsics; None where they are as given.
         inflation: (n,) by what each tag's sigmas exceed those of independent corners.
+        correction: (6 n + c k,) what priors of cameras move yet, tags first; None where there are none.
     """
 
     tags: Array
+    whole: Array
     cameras: Array | None
     inflation: Array
+    correction: Array | None
 
 
 def covariance(fit: Fit, fixed: int, view: Index) -> Covariance:
@@ -57,6 +68,12 @@ def covariance(fit: Fit, fixed: int, view: Index) -> Covariance:
     information = normal_equations(bundle, sights, rows, curved, fixed, fit.cameras).information
     white: Array = np.asarray(np.linalg.inv(information), dtype=float)
     found = _sandwich(fit, fixed, view, white)
+    correction = None
+    if fit.cameras.free.any():
+        found, free = _with_priors(fit, information, found)
+        correction = np.zeros(6 * len(bundle.body.ids) + fit.cameras.sigma.size)
+        of_tags = np.repeat(np.arange(len(bundle.body.ids)) != fixed, 6)
+        correction[np.concatenate([of_tags, fit.cameras.free])] = free
     n, tags = len(bundle.body.ids), 6 * (len(bundle.body.ids) - 1)
     inflation = np.ones(n)
     for k, tag in enumerate(np.flatnonzero(np.arange(n) != fixed)):
@@ -66,7 +83,32 @@ def covariance(fit: Fit, fixed: int, view: Index) -> Covariance:
     if fit.cameras.free.any():
         cameras = np.zeros(fit.cameras.sigma.shape)
         cameras[fit.cameras.sigma > 0.0] = np.sqrt(np.diag(found)[tags:])
-    return Covariance(found[:tags, :tags], cameras, inflation)
+    return Covariance(found[:tags, :tags], found, cameras, inflation, correction)
+
+
+def _with_priors(fit: Fit, information: Array, found: Array) -> tuple[Array, Array]:
+    """Covariance (q, q) and step (q,) of the best estimate with the cameras' priors.
+
+    Args:
+        fit: adjusted with independent errors.
+        information: (q, q) of that, A + P.
+        found: (q, q) covariance of its errors but for what the priors bring, (A + P)^-1 S (A + P)^-1.
+    """
+    cameras = fit.cameras
+    q, free = len(information), cameras.sigma.ravel()[cameras.free]
+    prior = np.zeros(q)
+    prior[q - len(free) :] = free**-2.0
+    # In units of A + P, which is positive definite even where pictures alone tell nothing.
+    L = np.linalg.cholesky(information)
+    back = np.linalg.inv(L)
+    P = back * prior @ back.T
+    A, S = np.eye(q) - P, L.T @ found @ L + _LEAST_VARIANCE * np.eye(q)
+    weighed = A @ np.linalg.inv(S)
+    covariance = np.linalg.inv(weighed @ A + P)
+    pull = np.zeros(q)
+    pull[q - len(free) :] = prior[q - len(free) :] * cameras.off(fit.bundle.cameras)[cameras.free]
+    step = -covariance @ ((np.eye(q) - weighed) @ (back @ pull))
+    return np.asarray(back.T @ covariance @ back), np.asarray(back.T @ step)
 
 
 def _sandwich(fit: Fit, fixed: int, view: Index, white: Array) -> Array:
@@ -78,10 +120,9 @@ def _sandwich(fit: Fit, fixed: int, view: Index, white: Array) -> Array:
     own = shared - rows.by_picture @ by_pose
     of, views = view[sights.picture], int(view.max()) + 1
     power, common = _spectrum(_correlations(fit, of, views), views), _common(fit, of)
-    # Priors of cameras are information that no error brought.
     free = fit.cameras.sigma.ravel()[fit.cameras.free]
-    prior = white[:, len(white) - len(free) :]
-    parts, taken = [(prior * free**-2.0) @ prior.T], []
+    of_priors = white[:, len(white) - len(free) :]
+    parts, taken = [], []
     for tag in range(len(bundle.body.ids)):
         mine = sights.tag == tag
         dense = np.zeros((views, 8, len(white)))
@@ -91,9 +132,10 @@ def _sandwich(fit: Fit, fixed: int, view: Index, white: Array) -> Array:
         square += (1.0 - common) * np.einsum("mia,mib->ab", own[mine], own[mine], optimize=True)
         parts.append(white @ square @ white)
         taken.append(2.0 * float((white * square).sum()))
-    left = np.einsum("mia,ab,mib->m", own, np.sum(parts, axis=0), own, optimize=True)
+    spread = np.sum(parts, axis=0) + (of_priors * free**-2.0) @ of_priors.T
+    left = np.einsum("mia,ab,mib->m", own, spread, own, optimize=True)
     variance = _variances(fit, np.array(taken) - np.bincount(sights.tag, left, len(taken)))
-    return np.asarray(parts[0] + np.einsum("t,tab->ab", variance, np.array(parts[1:])))
+    return np.asarray(np.einsum("t,tab->ab", variance, np.array(parts)))
 
 
 def _correlations(fit: Fit, of: Index, views: int) -> Array:

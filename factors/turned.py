@@ -1,0 +1,175 @@
+"""Constant vectors of the level frame as a triad measures them at attitudes that a gyro carries.
+
+Frames: a inertial, n level (x to the east of the field, y along its horizontal part, z up), which turns with the earth,
+b the body. A triad has nominal = K raw + b, by rows of K and b (12 numbers), as in factors.ellipsoid; what is predicted
+is raw, whose noise is white. The gyro's own samples carry the attitude from the time of its variable to that of the
+measurement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from factors import so3
+from factors.gyro import SCALE, Derivatives, carried, rate_error
+from factors.model import ROT3, Array, Block, Model, Residuals
+from factors.preintegration import GyroPath
+
+# The rate's change is the difference of what it is so much before and after, s.
+_SHORT = 0.01
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class FieldFactor(Model):
+    """The earth's field: raw = K^-1 (bRa(time + delay) aRn s (0, cos dip, -sin dip) - b).
+
+    Blocks: attitude aRb at the anchor (rotations), gyro bias (3), triad (12), strength s (1), dip (1; rad, the field's
+    inclination, positive down), delay (1; s by which a reading was taken later than its stamp says) and, unless the
+    gyro is perfect, its errors (6 to 18), see factors.gyro.
+
+    Attributes:
+        time: (n,) stamps, s.
+        anchor: (n,) s, times of the attitudes.
+        raw: (n, 3).
+        sigma: (n,) per axis.
+        aRn: (n, 4) how the earth has turned.
+        gyro: whose bias_hat was taken off.
+        errors: numbers of the gyro's errors, 0 for a perfect one.
+    """
+
+    time: Array
+    anchor: Array
+    raw: Array
+    sigma: Array
+    aRn: Array
+    gyro: GyroPath
+    errors: int = 0
+    rows: int = 3
+    stacked: ClassVar = ("time", "anchor", "raw", "sigma", "aRn")
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """Attitude, bias, triad, strength, dip, delay and the gyro's errors."""
+        return ROT3, 3, 12, 1, 1, 1, *([self.errors] if self.errors else [])
+
+    def __call__(
+        self, aRb: Array, bias: Array, triads: Array, strength: Array, dip: Array, delay: Array, *errors: Array
+    ) -> Residuals:
+        """Residual (predicted - raw) / sigma, (n, 3)."""
+        middle = 0.5 * (self.anchor + self.time)
+        own = errors[0] if errors else None
+        dV, rate, by_gyro = carried(self.gyro, self.anchor, middle, self.time + delay[:, 0], bias, own)
+        bRn = so3.multiply(so3.inverse(so3.multiply(aRb, dV)), self.aRn)
+        cosine, sine, none = np.cos(dip), np.sin(dip), np.zeros_like(dip)
+        unit = so3.rotate(bRn, np.concatenate([none, cosine, -sine], axis=1))
+        lower = so3.rotate(bRn, np.concatenate([none, -sine, -cosine], axis=1))
+        error, across, by_triad = _predicted(self.raw, self.sigma, triads, strength * unit)
+
+        def jacobians() -> tuple[Array, ...]:
+            by_attitude = across @ so3.hat(strength * unit)
+            by_bias, *by_errors = (by_attitude @ each for each in by_gyro())
+            return (
+                by_attitude @ so3.matrix(so3.inverse(dV)),
+                by_bias,
+                by_triad(),
+                across @ unit[..., None],
+                across @ (strength * lower)[..., None],
+                by_attitude @ rate[..., None],
+                *by_errors,
+            )
+
+        return error, jacobians
+
+
+@dataclass(frozen=True)
+class UpFactor(Model):
+    """Specific force: raw = K^-1 (bRa(time) aRn (0, 0, s) + (w' x arm + w x (w x arm)) / unit - b).
+
+    Blocks: attitude aRb at the anchor (rotations), gyro bias (3), triad (12), strength s (1), unless the gyro is
+    perfect its errors (6 to 18) and, of a sensor that is swung about a point, arm (3; in b, from there to the sensor).
+
+    Attributes:
+        time, anchor, raw, sigma, aRn, gyro, errors: as of the field.
+        unit: m/s^2, of the strength, of a sensor that is swung; None: it is at rest.
+    """
+
+    time: Array
+    anchor: Array
+    raw: Array
+    sigma: Array
+    aRn: Array
+    gyro: GyroPath
+    errors: int = 0
+    unit: float | None = None
+    rows: int = 3
+    stacked: ClassVar = ("time", "anchor", "raw", "sigma", "aRn")
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """Attitude, bias, triad, strength, the gyro's errors and the arm."""
+        return ROT3, 3, 12, 1, *([self.errors] if self.errors else []), *([] if self.unit is None else [3])
+
+    def __call__(self, aRb: Array, bias: Array, triads: Array, strength: Array, *others: Array) -> Residuals:
+        """Residual (predicted - raw) / sigma, (n, 3)."""
+        middle = 0.5 * (self.anchor + self.time)
+        own = others[0] if self.errors else None
+        dV, _, by_gyro = carried(self.gyro, self.anchor, middle, self.time, bias, own)
+        up = strength * so3.rotate(so3.multiply(so3.inverse(so3.multiply(aRb, dV)), self.aRn), _UP)
+        swung, by_swing = self._swung(bias, own, others[-1]) if self.unit else (np.zeros_like(up), None)
+        error, across, by_triad = _predicted(self.raw, self.sigma, triads, up + swung)
+
+        def jacobians() -> tuple[Array, ...]:
+            by_attitude = across @ so3.hat(up)
+            by_bias, *by_errors = (by_attitude @ each for each in by_gyro())
+            by_strength = across @ (up / strength)[..., None]
+            by_arm = []
+            if by_swing is not None:
+                arm, *more = (across @ each for each in by_swing())
+                by_arm = [arm]
+                by_bias, *by_errors = (a + b for a, b in zip((by_bias, *by_errors), more, strict=True))
+            return by_attitude @ so3.matrix(so3.inverse(dV)), by_bias, by_triad(), by_strength, *by_errors, *by_arm
+
+        return error, jacobians
+
+    def _swung(self, bias: Array, errors: Array | None, arm: Array) -> tuple[Array, Derivatives]:
+        """(w' x arm + w x (w x arm)) / unit, (n, 3), and its derivatives by arm, bias and errors; w' by differences."""
+        n, per_unit = len(arm), 1.0 / (self.unit or 1.0)
+        times = np.concatenate([self.time - _SHORT, self.time, self.time + _SHORT])
+        drivers = None if self.errors <= SCALE else self.gyro.drivers(times)
+        read, three = self.gyro.rate(times), (3, 1)
+        own = None if errors is None else np.tile(errors, three)
+        excess, by_excess = rate_error(np.tile(bias - self.gyro.bias_hat, three), own, read, drivers)
+        before, rate, after = (read - excess).reshape(3, n, 3)
+        change = (after - before) / (2.0 * _SHORT)
+        around = so3.cross(rate, arm)
+
+        def derivatives() -> tuple[Array, ...]:
+            lever = so3.hat(arm)
+            by_rate = -so3.hat(around) - so3.hat(rate) @ lever
+            out = [per_unit * (so3.hat(change) + so3.hat(rate) @ so3.hat(rate))]
+            for each in by_excess():
+                early, now, late = -np.broadcast_to(each, (3 * n, 3, each.shape[-1])).reshape(3, n, 3, -1)
+                out.append(per_unit * (by_rate @ now - lever @ ((late - early) / (2.0 * _SHORT))))
+            return tuple(out)
+
+        return per_unit * (so3.cross(change, arm) + so3.cross(rate, around)), derivatives
+
+
+def _predicted(raw: Array, sigma: Array, triads: Array, nominal: Array) -> tuple[Array, Array, Callable[[], Array]]:
+    """Whitened error (n, 3), its Jacobian (n, 3, 3) by the nominal, and a function that gives that by the triad."""
+    inverse = np.linalg.inv(triads[:, :9].reshape(-1, 3, 3))
+    weight = 1.0 / sigma[:, None]
+    predicted = np.einsum("nij,nj->ni", inverse, nominal - triads[:, 9:])
+    across = inverse * weight[..., None]
+
+    def by_triad() -> Array:
+        # dK and db change what is predicted by -K^-1 (dK predicted + db).
+        by_K = -np.einsum("nij,nk->nijk", across, predicted).reshape(len(raw), 3, 9)
+        return np.concatenate([by_K, -across], axis=2)
+
+    return (predicted - raw) * weight, across, by_triad

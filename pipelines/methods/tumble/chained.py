@@ -1,0 +1,167 @@
+"""The graph of a tumbled device with a gyro: attitudes at keyframes, at which field and gravity are what they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import gtsam
+import numpy as np
+
+from factors import so3
+from factors.chi_square import gate
+from factors.loss import TruncatedLoss
+from factors.turned import FieldFactor, UpFactor
+from pipelines.graph.motion import Motion
+from pipelines.graph.noise import Level
+from pipelines.graph.priors import vector_prior
+from pipelines.graph.problem import Array, Attitudes, Factor, Problem, Step
+from pipelines.judgement.pictures import swaying
+from pipelines.methods.tumble.model import Model, Sensor
+from pipelines.methods.tumble.parameters import DIP_KEY, STRENGTH_KEYS, TRIAD_KEYS, Variable
+from pipelines.methods.tumble.recording import TumbleData
+from pipelines.methods.tumble.turning import DELAY_KEY, Rows, Seen, Turning, turning
+from pipelines.settings import Config
+
+FAMILIES = {"accel": "accelerometer", "mag": "magnetometer"}
+# As good as none, rad: of the first attitude, of which nothing tells the turn about the field or about up.
+_ANY_ATTITUDE = np.pi
+
+
+@dataclass(frozen=True, eq=False)
+class _Graph:
+    """What every step needs: sensors by name, the chain, variables that all share, and how outliers are weighed."""
+
+    sensors: Mapping[str, Sensor]
+    turning: Turning
+    shared: tuple[Variable, ...]
+    loss: TruncatedLoss
+
+
+def chained(data: TumbleData, config: Config, model: Model, shared: tuple[Variable, ...]) -> Problem:
+    """The graph with the gyro that the model says how it is mounted."""
+    assert model.mounted is not None
+    assert model.dip is not None
+    sensors = {sensor.name: sensor for sensor in model.sensors}
+    accel = sensors.get("accel")
+    turned = turning(
+        data,
+        config,
+        model.mounted,
+        _seen(sensors["mag"], data.mag),
+        None if accel is None else _seen(accel, data.accel),
+        model.declination,
+        model.dip.start,
+    )
+    graph = _Graph(sensors, turned, shared, TruncatedLoss(gate(3)))
+    return Problem(
+        method="tumble",
+        parameters=(*(each.parameter for each in shared), *turned.parameters),
+        steps=partial(_steps, graph),
+        loss=graph.loss,
+        attitudes=partial(_trajectory, graph),
+        attitude_name="nRb",
+        advice=advice,
+        dropped=model.dropped,
+        premises=model.premises,
+        noises=(*(Level(sensor.noise) for sensor in model.sensors), *turned.levels),
+    )
+
+
+def _seen(sensor: Sensor, whole: Array | None) -> Seen:
+    assert whole is not None
+    return Seen(sensor.time, sensor.directions, sensor.nominal(whole), not sensor.rested)
+
+
+def _steps(graph: _Graph, chunk: int) -> Iterator[Step]:
+    """The first keyframe with all that measurements share and its priors, then `chunk` keyframes at a time."""
+    count = len(graph.turning.chain.time)
+    yield _step(graph, range(1))
+    for begin in range(1, count, chunk):
+        yield _step(graph, range(begin, min(begin + chunk, count)))
+
+
+def _step(graph: _Graph, keyframes: range) -> Step:
+    chain = graph.turning.chain
+    step = Step(
+        time=float(chain.time[keyframes[-1]]),
+        predict=partial(chain.predict, keyframes, lambda k, _: chain.initial[k]),
+        keyframes=chain.numbers(keyframes),
+    )
+    if keyframes.start == 0:
+        _begin(graph, step)
+    chain.add(step, keyframes)
+    step.factors.extend([*_field(graph, keyframes), *_up(graph, keyframes)])
+    return step
+
+
+def _begin(graph: _Graph, step: Step) -> None:
+    for variable in graph.shared:
+        step.initial.insert(variable.parameter.key, variable.start)
+        step.factors.append(variable.prior)
+    turned = graph.turning
+    step.factors.append(vector_prior(turned.bias, np.zeros(3)))
+    for parameter in turned.parameters[1:]:
+        zeros = np.zeros(len(parameter.quantities))
+        step.initial.insert(parameter.key, zeros)
+        step.factors.append(vector_prior(parameter, zeros))
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, _ANY_ATTITUDE)
+    first = so3.to_gtsam(turned.chain.initial[0])
+    step.factors.append(Factor("prior", gtsam.PriorFactorRot3(turned.chain.state(0), first, noise)))
+
+
+def _field(graph: _Graph, keyframes: range) -> list[Factor]:
+    turned, chain = graph.turning, graph.turning.chain
+    seen, sensor = turned.mag.of(keyframes), graph.sensors["mag"]
+    if not len(seen.row):
+        return []
+    factor = FieldFactor(*_measured(turned, sensor, seen), chain.gyro, turned.errors)
+    keys = TRIAD_KEYS["mag"], STRENGTH_KEYS["mag"], DIP_KEY, DELAY_KEY, *chain.error_keys
+    states = [chain.state(int(k)) for k in seen.keyframe]
+    return [Factor.of(FAMILIES["mag"], factor.on(states, chain.bias_keys(seen.keyframe), *keys, loss=graph.loss))]
+
+
+def _up(graph: _Graph, keyframes: range) -> list[Factor]:
+    turned, chain = graph.turning, graph.turning.chain
+    seen = turned.accel.of(keyframes)
+    if not len(seen.row):
+        return []
+    sensor = graph.sensors["accel"]
+    measured = _measured(turned, sensor, seen)
+    factor = UpFactor(*measured, chain.gyro, turned.errors, None if turned.arm is None else sensor.strength)
+    arm = [] if turned.arm is None else [turned.arm.key]
+    keys = TRIAD_KEYS["accel"], STRENGTH_KEYS["accel"], *chain.error_keys, *arm
+    states = [chain.state(int(k)) for k in seen.keyframe]
+    return [Factor.of(FAMILIES["accel"], factor.on(states, chain.bias_keys(seen.keyframe), *keys, loss=graph.loss))]
+
+
+def _measured(turned: Turning, sensor: Sensor, seen: Rows) -> tuple[Array, Array, Array, Array, Array]:
+    """Stamps, times of the keyframes, readings and their sigmas without unit, and how the earth has turned."""
+    time = sensor.time[seen.row]
+    return (
+        time,
+        turned.chain.time[seen.keyframe],
+        sensor.scaled[seen.row],
+        sensor.sigma[seen.row],
+        turned.aRn(time),
+    )
+
+
+def _trajectory(graph: _Graph, keyframes: Sequence[int], values: gtsam.Values) -> Attitudes:
+    """nRb, n along the field."""
+    chain, rows = graph.turning.chain, list(keyframes)
+    aRb = so3.from_gtsam([values.atRot3(chain.state(k)) for k in rows])
+    time = chain.time[rows]
+    return Attitudes(time, so3.multiply(so3.inverse(graph.turning.aRn(time)), aRb))
+
+
+def advice(weights: Mapping[str, float]) -> Motion:
+    """The motion that would make a weak direction observable."""
+    strong = [name for name, weight in weights.items() if abs(weight) > 0.3] or list(weights)
+    if any(name.startswith("accel") for name in strong):
+        return Motion("rest the device for a second or two in each of twenty and more attitudes, every side up")
+    return Motion(
+        "turn the device through more attitudes, each end of each axis up, down, north and south, away from iron",
+        swaying("xyz", "device"),
+    )
