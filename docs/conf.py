@@ -30,6 +30,7 @@ html_theme = "furo"
 html_title = f"alidade {version}"
 html_copy_source = False
 html_show_sphinx = False
+html_show_copyright = False
 html_static_path = ["_static"]
 html_css_files = ["tables.css"]
 # MathML is part of HTML: no script, no font, nothing from a network.
