@@ -40,7 +40,8 @@ class _Page(SphinxDirective):
     optional_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        """The text, read as the page is."""
+        """The text, read as the page is, anew each time: the program may have changed."""
+        self.env.note_reread()
         return self.parse_text_to_nodes("\n".join(self.lines()), allow_section_headings=True)
 
     def lines(self) -> Iterator[str]:
@@ -69,7 +70,7 @@ class ScenarioKeys(_Page):
 
     def lines(self) -> Iterator[str]:
         """A table a section."""
-        return _tables(methods.method(self.arguments[0]).scenario, "")
+        return _tables(methods.method(self.arguments[0]).scenario, "", level=4)
 
 
 class Scenarios(_Page):
@@ -95,23 +96,27 @@ class Commands(_Page):
             yield from ("", f"## alidade {name}", "", "```text", *help_.splitlines(), "```")
 
 
-def _tables(kind: type[BaseModel], path: str) -> Iterator[str]:
+def _tables(kind: type[BaseModel], path: str, level: int = 2) -> Iterator[str]:
     """A table of a model's keys, then those of the models inside it."""
     schema = kind.model_json_schema(by_alias=True)
     required, meanings = schema.get("required", []), _meanings(kind)
     heading = f"`{path.removesuffix('.')}`" if path else "Top level"
-    yield from ("", f"## {heading}", "", _about(kind), "")
-    yield from ("| key | value | default | meaning |", "| --- | --- | --- | --- |")
-    inside = []
+    yield from ("", f"{'#' * level} {heading}", "", _about(kind), "")
+    rows: list[list[str]] = []
+    inside: list[tuple[type[BaseModel], str]] = []
     for name, field in kind.model_fields.items():
         key = field.alias or name
-        described = schema["properties"][key]
+        described, models = schema["properties"][key], _models(field.annotation)
         default = "required" if key in required else _default(field.get_default(call_default_factory=True))
-        yield f"| `{key}` | {_cell(_words(described))} | {default} | {_cell(meanings.get(name, ''))} |"
-        many = "[]." if described.get("type") == "array" else ".NAME." if "additionalProperties" in described else "."
-        inside += [(found, f"{path}{key}{many}") for found in _models(field.annotation)]
+        meaning = meanings.get(name) or (_about(models[0]).partition("\n")[0] if models else "")
+        rows.append([f"`{key}`", _cell(_words(described)), default, _cell(meaning)])
+        shape = next((part for part in described.get("anyOf", ()) if part.get("type") != "null"), described)
+        many = "[]." if shape.get("type") == "array" else ".NAME." if "additionalProperties" in shape else "."
+        inside += [(found, f"{path}{key}{many}") for found in models]
+    yield from ("| key | value | default | meaning |", "| --- | --- | --- | --- |")
+    yield from (f"| {' | '.join(row)} |" for row in rows)
     for found, where in inside:
-        yield from _tables(found, where)
+        yield from _tables(found, where, level)
 
 
 def _about(kind: type[BaseModel]) -> str:

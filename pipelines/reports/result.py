@@ -367,16 +367,16 @@ class ParameterResult(_Record):
     """One parameter; SI."""
 
     name: str
-    value: float
-    sigma: float
-    unit: str
-    prior_sigma: float | None
-    prior_mean: float = 0.0
-    require: float | None
-    observability: Verdict | None
-    group: Literal["assumption"] | None = None
-    pull: float | None = None
-    inflation: float = 1.0
+    value: float  # of the estimate
+    sigma: float  # one standard deviation, all else marginalised out
+    unit: str  # SI
+    prior_sigma: float | None  # null: free
+    prior_mean: float = 0.0  # left out where it is 0
+    require: float | None  # sigma wanted; null: none
+    observability: Verdict | None  # verdict; null of an assumption that nothing is required of
+    group: Literal["assumption"] | None = None  # assumption, or left out
+    pull: float | None = None  # of an assumption: how far from its prior, in sigmas of what the recording could
+    inflation: float = 1.0  # of sigma, by noise that is correlated in time
 
     @model_serializer(mode="wrap")
     def _without_group(self, handler: SerializerFunctionWrapHandler) -> dict[str, object]:
@@ -394,95 +394,95 @@ class NoiseResult(_Record):
 
     name: str
     unit: str
-    source: Source
-    stated: float
-    estimated: float | None
-    sigma: float | None
-    used: float
-    inflation: float
+    source: Source  # who stated it: config, message or default
+    stated: float  # where the search began
+    estimated: float | None  # what the recording alone says; null: it was not asked
+    sigma: float | None  # of estimated
+    used: float  # what all sigmas reckon with
+    inflation: float  # by what a mean of such measurements is less certain than of independent ones
 
 
 class CovarianceResult(_Record):
     """Joint covariance of the parameters, in the order given."""
 
-    order: list[str]
-    matrix: list[list[float]]
+    order: list[str]  # names of parameters
+    matrix: list[list[float]]  # row by row, SI
 
 
 class DirectionResult(_Record):
     """A direction that is weak or unobservable."""
 
-    sigma_ratio: float
-    weights: dict[str, float]
-    advice: str
+    sigma_ratio: float  # its sigma after over before the recording
+    weights: dict[str, float]  # parameter: its part in the direction
+    advice: str  # the motion that would determine it
 
 
 class FitResult(_Record):
     """Chi-square of a family with its 99.9 % interval; null where there is none."""
 
-    value: float | None
-    dof: float | None
-    low: float | None
-    high: float | None
+    value: float | None  # chi-square
+    dof: float | None  # degrees of freedom
+    low: float | None  # of the interval
+    high: float | None  # of the interval
 
 
 class ChiSquareResult(FitResult):
     """Chi-square of the whole."""
 
-    families: dict[str, FitResult]
+    families: dict[str, FitResult]  # the same of each family of measurements
 
 
 class CauseResult(_Record):
     """Why the residuals may not fit, tried by solving again."""
 
-    label: str
-    evidence: str
+    label: str  # what it is
+    evidence: str  # what it does to chi-square
 
 
 class InnovationsResult(_Record):
     """Whether the innovations of a family are white, and the mean of their squares (NIS) with its 99.9 % interval."""
 
-    autocorrelation: list[float]
-    bound: float
-    nis: float
-    low: float
-    high: float
-    rows: int
+    autocorrelation: list[float]  # by lag, from 1
+    bound: float  # of the autocorrelation of white noise
+    nis: float  # mean of the squared norms; as large as rows if sigmas are true
+    low: float  # of nis
+    high: float  # of nis
+    rows: int  # numbers in a measurement
 
 
 class LearningResult(_Record):
     """From when on a parameter was as accurate as required, s, and the tenth of the recording that said most of it."""
 
-    met_s: float | None
-    stretch: tuple[float, float]
-    share: float
+    met_s: float | None  # s from the start; null: never
+    stretch: tuple[float, float]  # beginning and end, s
+    share: float  # of the information
 
 
 class StabilityResult(_Record):
     """The largest difference between an estimate on the way and the final one, and how often chance makes it."""
 
-    statistic: float
-    level: float
-    time_s: float
-    change: dict[str, float]
+    statistic: float  # its size as a standard normal number
+    level: float  # how often chance makes as much
+    time_s: float  # when, from the start
+    change: dict[str, float]  # parameter: the step, SI
 
 
 class SessionResult(_Record):
     """What went in; it starts at `start`, ISO 8601."""
 
-    sha256: str
-    start: str
-    duration_s: float
-    counts: dict[str, int]
-    dropped: dict[str, int]
+    sha256: str  # of the file
+    start: str  # ISO 8601
+    duration_s: float  # s
+    counts: dict[str, int]  # messages by topic, measurements used by family
+    dropped: dict[str, int]  # reason: how many were left out
 
 
 class TruthResult(_Record):
     """A parameter's true value and the error of the estimate; in sigmas unless it is fixed."""
 
-    value: float
-    error: float
-    error_sigmas: float | None
+    value: float  # the truth
+    error: float  # estimate less truth
+    error_sigmas: float | None  # null: fixed
 
 
 class SensitivityResult(_Record):
@@ -491,26 +491,26 @@ class SensitivityResult(_Record):
     `step` is what the input is usually off by, one sigma; unit "1" is a share of the input itself.
     """
 
-    unit: str
-    step: float
-    parameters: dict[str, float]
+    unit: str  # of the input; 1: a share of itself
+    step: float  # what it is usually off by
+    parameters: dict[str, float]  # parameter: change per unit, SI
 
 
 class MeasurementResult(_Record):
     """A measurement and the parameter that it moves most: by `pull` of its sigmas."""
 
-    family: str
-    time_s: float
-    parameter: str
-    pull: float
+    family: str  # of measurements
+    time_s: float  # s from the start
+    parameter: str  # that it moves most
+    pull: float  # by how many of its sigmas
 
 
 class SelfCheckResult(_Record):
     """An incremental estimate beside batch's, in sigmas."""
 
-    parameter: str
-    difference: float
-    sigma_ratio: float
+    parameter: str  # the one that differs most
+    difference: float  # incremental less batch, in sigmas
+    sigma_ratio: float  # the smallest of incremental over batch
 
 
 class PartParameter(_Record):
@@ -530,73 +530,73 @@ class PartResult(_Record):
     null where that was stated.
     """
 
-    recording: str
+    recording: str  # name of the file
     sha256: str
-    start: str
+    start: str  # ISO 8601
     duration_s: float
     status: Status
     headline: str
-    dof: float | None
-    parameters: list[PartParameter]
-    alone: list[PartParameter]
+    dof: float | None  # by which it tells its noise
+    parameters: list[PartParameter]  # its own, and the device's that walk
+    alone: list[PartParameter]  # what it says of the device by itself
 
 
 class ChangeResult(_Record):
     """A step of a number, SI, between two recordings; it is `found` where it is more than chance."""
 
     parameter: str
-    before: str
-    after: str
-    step: float
+    before: str  # recording
+    after: str  # recording
+    step: float  # SI
     sigma: float
-    found: bool
+    found: bool  # more than chance
 
 
 class RateResult(_Record):
     """How far numbers of a kind walk in the root of a day, SI; `upper` is the 95 % bound, null: there is none."""
 
-    rate: float
-    upper: float | None
+    rate: float  # SI in the root of a day
+    upper: float | None  # 95 % bound; null: there is none
 
 
 class ChangesResult(_Record):
     """Changes of the device between recordings; chance makes any found one in a history with this level."""
 
-    level: float
-    steps: list[ChangeResult]
-    rates: dict[str, RateResult]
+    level: float  # how often chance makes any found one
+    steps: list[ChangeResult]  # from recording to recording
+    rates: dict[str, RateResult]  # kind of parameter: how far it walks
 
 
 class Result(_Record):
-    """result.json."""
+    """result.json; null where the solver does not tell."""
 
     schema_name: Annotated[Literal["alidade.result/1"], Field(alias="schema")] = "alidade.result/1"
-    method: str
-    solver: str
-    status: Status
+    method: str  # of calibration
+    solver: str  # batch, incremental or published
+    status: Status  # the verdict on the whole
     parameters: list[ParameterResult]
     covariance: CovarianceResult
     null_directions: list[DirectionResult]
     chi_square: ChiSquareResult
     noise: list[NoiseResult]
     session: SessionResult
-    software: dict[str, str]
-    timing_s: dict[str, float]
-    headline: str
-    notes: list[str]
+    software: dict[str, str]  # package: version
+    timing_s: dict[str, float]  # phase: s of wall time
+    headline: str  # the verdict in one sentence
+    notes: list[str]  # what a reader has to know beside it
     causes: list[CauseResult]
-    innovations: dict[str, InnovationsResult]
-    learning: dict[str, LearningResult]
+    innovations: dict[str, InnovationsResult]  # by family; of the incremental solver
+    learning: dict[str, LearningResult]  # by parameter
     stability: StabilityResult | None
     self_check: SelfCheckResult | None
-    budget: dict[str, dict[str, float]] | None
-    sensitivity: dict[str, SensitivityResult] | None
-    measurements: list[MeasurementResult] | None
-    findings: dict[str, list[dict[str, object]]]
-    constants: dict[str, float] | None = None
-    recordings: list[PartResult] | None = None
-    changes: ChangesResult | None = None
-    truth: dict[str, TruthResult] | None = None
+    budget: dict[str, dict[str, float]] | None  # parameter: source: its share of the variance
+    sensitivity: dict[str, SensitivityResult] | None  # input taken for exact: what it does
+    measurements: list[MeasurementResult] | None  # the twenty that matter most
+    findings: dict[str, list[dict[str, object]]]  # the method's own tables
+    constants: dict[str, float] | None = None  # that formulas need beside the parameters
+    recordings: list[PartResult] | None = None  # of a joint calibration
+    changes: ChangesResult | None = None  # of a joint calibration
+    truth: dict[str, TruthResult] | None = None  # where the recording brings it
 
 
 def result(calibration: Calibration) -> Result:
