@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from pipelines import methods
+from pipelines.errors import InputError
 from pipelines.graph.assumptions import kind
 from pipelines.session import Session
 
@@ -49,7 +50,7 @@ class Found:
 
     Attributes:
         case: of which.
-        status: of the calibration.
+        status: of the calibration; "refused" where there is none.
         sigmas: the largest error of a parameter that is no assumption, in its sigmas.
         required: likewise, in what is required.
         determined: whether the recording told a number of the effect to better than half of its prior.
@@ -86,7 +87,10 @@ def run(case: Case, numbers: Mapping[str, float]) -> Found:
     values = {name: float(s * case.size * p) for s, (name, p) in zip(signs, numbers.items(), strict=True)}
     settings = chosen.settings(case.scenario)
     settings = type(settings).model_validate(settings.model_dump() | {"effects": values})
-    calibration = Session.of(chosen, chosen.simulate(settings, case.seed)).calibrate(case.solver)
+    try:
+        calibration = Session.of(chosen, chosen.simulate(settings, case.seed)).calibrate(case.solver)
+    except InputError as error:
+        return Found(case, "refused", 0.0, 0.0, False, False, False, str(error))
     truth = calibration.truth or {}
     parameters = calibration.parameters
     off = [
@@ -111,11 +115,11 @@ def run(case: Case, numbers: Mapping[str, float]) -> Found:
 
 def report(found: Sequence[Found]) -> Iterator[str]:
     """The figures, a table by effect and size and their sums."""
-    yield "| effect | size | calibrated | weak | inconsistent | worst, sigmas | of it calibrated | named first |"
-    yield "| --- | --- | --- | --- | --- | --- | --- | --- |"
+    yield "| effect | size | calibrated | weak | inconsistent | refused | worst, sigmas | if calibrated | named first |"
+    yield "| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
     for effect, size in dict.fromkeys((f.case.effect, f.case.size) for f in found):
         of = [f for f in found if (f.case.effect, f.case.size) == (effect, size)]
-        count = {s: sum(f.status == s for f in of) for s in ("calibrated", "weak", "inconsistent")}
+        count = {s: sum(f.status == s for f in of) for s in ("calibrated", "weak", "inconsistent", "refused")}
         trusted = max((f.sigmas for f in of if f.status == "calibrated"), default=0.0)
         yield (
             f"| {effect} | {size:g} | {' | '.join(str(n) for n in count.values())} | "

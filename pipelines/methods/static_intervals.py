@@ -44,7 +44,14 @@ def find_static_intervals(t: Array, gyro: Array, accel: Array, gyro_sigma: float
         InputError: there is none.
     """
     runs, scatter, floor = _quiet_runs(t, [(gyro, gyro_sigma), (accel, accel_sigma)])
-    runs = runs[_turns_not(gyro, runs, floor[0])]
+    means = np.array([gyro[a : b + 1].mean(axis=0) for a, b in runs]).reshape(-1, 3)
+    still = _turns_not(means, runs[:, 1] - runs[:, 0] + 1, floor[0])
+    if len(runs) and not still.any():
+        raise InputError(
+            f"no static pose: the device is quiet in {len(runs)} stretches, but the gyro's mean rates in them lie up "
+            f"to {np.ptp(means, axis=0).max():.2g} rad/s apart: either it turns steadily in them, or gravity shifts "
+            "its gyro by far more than a usual one's (g-sensitivity)"
+        )
     if not len(runs):
         least = scatter.min(axis=1)
         raise InputError(
@@ -52,7 +59,7 @@ def find_static_intervals(t: Array, gyro: Array, accel: Array, gyro_sigma: float
             f"accelerometer by {least[1]:.2g} m/s^2, noise stated is {gyro_sigma:.2g} and {accel_sigma:.2g}; let the "
             "cube stand still for a few seconds in each pose, or state the device's noise in the config"
         )
-    return t[runs]
+    return t[runs[still]]
 
 
 def quiet_intervals(t: Array, streams: Sequence[tuple[Array, float]]) -> Array:
@@ -101,11 +108,9 @@ def _scatter(values: Array, half: int) -> Array:
     return out
 
 
-def _turns_not(gyro: Array, runs: NDArray[np.intp], sigma: float) -> NDArray[np.bool_]:
-    """Which runs have the mean rate that most of the quiet time has."""
-    means = np.array([gyro[a : b + 1].mean(axis=0) for a, b in runs]).reshape(-1, 3)
-    lengths = runs[:, 1] - runs[:, 0] + 1
-    if not len(runs):
+def _turns_not(means: Array, lengths: NDArray[np.intp], sigma: float) -> NDArray[np.bool_]:
+    """Which runs, of so many samples, have the mean rate (n, 3) that most of the quiet time has."""
+    if not len(means):
         return np.zeros(0, dtype=bool)
     middle = np.quantile(means, 0.5, axis=0, weights=lengths, method="inverted_cdf")
     allowed = _STEADY + 5.0 * sigma / np.sqrt(lengths)

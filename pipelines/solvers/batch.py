@@ -21,6 +21,7 @@ from pipelines.graph.noise import Level
 from pipelines.graph.problem import Array, Estimate, Factor, Problem, Residuals, Told
 from pipelines.solvers.assembly import Assembly
 from pipelines.solvers.coloured import added_variance, coloured, inflations
+from pipelines.solvers.curvature import second_order
 from pipelines.solvers.history import sequential_history
 from pipelines.solvers.influence import Influence, influence, strongest, uncertainty_budget
 from pipelines.solvers.marginals import (
@@ -120,6 +121,11 @@ class System:
         """The linear system about the values in which the shared variables stay where they are."""
         return held(self.linearize(values), HELD, {key: np.zeros(values.dims()[key]) for key in self.shared})
 
+    def without_rejected(self, values: gtsam.Values) -> System:
+        """The same system with the measurements alone that count at the values, wherever it is asked from then on."""
+        with self.at(values):
+            return self.made_of([_without_rejected(f, f, values) for f in self.factors]).under(None)
+
     def residuals(self, values: gtsam.Values) -> dict[str, Residuals]:
         """Residuals of all measurements, by family."""
         with self.at(values):
@@ -209,6 +215,9 @@ def solve_batch(
     noise = information_of_noise(problem, system.linearize, ordering, values, marginal, whole.current_keys)
     if noise is not None:
         marginal = joint_covariance(problem, linear, ordering, values, whole.current_keys, noise)
+    bent = second_order(problem, system, values, marginal, whole.current_keys)
+    if bent is not None:
+        marginal = marginal + bent
     residuals = system.residuals(values)
     with system.at(values):
         summary = chi_square(problem, factors, values, marginal, about.expected)

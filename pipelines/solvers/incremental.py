@@ -23,6 +23,7 @@ from pipelines.solvers.assembly import Assembly
 from pipelines.solvers.batch import CHUNK, Solution, optimize, with_levels
 from pipelines.solvers.coloured import growth, inflated_by_innovations
 from pipelines.solvers.course import Way
+from pipelines.solvers.curvature import second_order
 from pipelines.solvers.history import sequential_history
 from pipelines.solvers.innovations import Innovations, Prediction
 from pipelines.solvers.linearity import is_linear
@@ -134,7 +135,9 @@ class Run:
         self._solved: _Solved | None = None  # the last batch solution while young
         self._looked = 0.0  # from so many s on it is to be seen again whether the past may be folded
         self._trouble = ""
-        self._noise: Array | None = None  # information of a young run that is its states' noise
+        # Of a young run: information that is its states' noise, and covariance that linear systems do not know of.
+        self._noise: Array | None = None
+        self._bent: Array | None = None
         self._course: Callable[[], Course | None] = cache(lambda: None)  # of the last batch solution while young
 
     @classmethod
@@ -207,7 +210,8 @@ class Run:
             raise IndeterminateError(f"the parameters' covariance at {self.time:.3f} s is singular: {error}") from error
         if not np.isfinite(information).all():
             raise IndeterminateError(f"the parameters' covariance at {self.time:.3f} s is not finite")
-        return reported_covariance(self.problem.parameters, information, self._estimate(), self.keys, self._noise)
+        found = reported_covariance(self.problem.parameters, information, self._estimate(), self.keys, self._noise)
+        return found if self._bent is None else found + self._bent
 
     def course(self) -> Course | None:
         """What was known at some moments, weighed as it is now; of a young run, until its last batch solution."""
@@ -355,12 +359,13 @@ class Run:
             foldable = self.window is None or since >= _OLDEST
             self._young = not (foldable or is_linear(self.problem, solution, self.keys))
         self._restart(solution, whole.timestamps)
-        self._noise = None
+        self._noise = self._bent = None
         system, current = solution.system, self.current_keys
         if self._young:
             self._noise = information_of_noise(
                 self.problem, system.linearize, system.ordering, values, self.covariance(), current
             )
+            self._bent = second_order(self.problem, system, values, self.covariance(), current)
         if from_start:
             self.moments += 1
             linear = partial(system.linearize, values)
@@ -425,7 +430,7 @@ class Run:
 
     def _continue_from(self, state: State) -> None:
         """Go on from a state alone."""
-        self.base, self.past, self._noise = state, [], None
+        self.base, self.past, self._noise, self._bent = state, [], None, None
         self._start([state.factor], state.estimate, state.stamps)
 
     def _start(self, factors: Sequence[Factor], values: gtsam.Values, stamps: Mapping[int, float]) -> None:

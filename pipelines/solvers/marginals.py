@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import gtsam
 import numpy as np
@@ -62,6 +62,15 @@ def joint_information(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Orderin
     Raises:
         IndeterminateError: another variable is undetermined.
     """
+    return reduced(linear, ordering, keys)[0]
+
+
+def reduced(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, keys: Sequence[int]) -> tuple[Array, Array]:
+    """The normal equations (d, d), (d,) of some variables, in their order, everything else marginalised out.
+
+    Raises:
+        IndeterminateError: another variable is undetermined.
+    """
     rest = [ordering.at(i) for i in range(ordering.size()) if ordering.at(i) not in set(keys)]
     remaining = linear
     if rest:
@@ -69,7 +78,8 @@ def joint_information(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Orderin
             remaining = linear.eliminatePartialMultifrontal(ordering_of(rest), gtsam.EliminateQR)[1]
         except RuntimeError as error:
             raise IndeterminateError(explain(str(error))) from None
-    return np.asarray(remaining.hessian(ordering_of(keys))[0])
+    information, slope = remaining.hessian(ordering_of(keys))
+    return np.asarray(information), np.asarray(slope)
 
 
 def smoothed(
@@ -176,6 +186,22 @@ def eliminated(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> g
         return bayes_net
     except RuntimeError as error:
         raise IndeterminateError(explain(str(error))) from None
+
+
+def drawn(
+    bayes_net: gtsam.GaussianBayesNet, values: gtsam.Values, keys: Collection[int], count: int
+) -> list[gtsam.Values]:
+    """Values drawn from their covariance about the estimate, by what some variables add to it."""
+    generator = np.random.default_rng(0)
+    zero = gtsam.VectorValues.Zero(bayes_net.optimize())
+    found = []
+    for _ in range(count):
+        unit = gtsam.VectorValues()
+        for key in values.keys():
+            size = len(zero.at(key))
+            unit.insert(key, generator.standard_normal(size) if key in keys else np.zeros(size))
+        found.append(values.retract(bayes_net.backSubstitute(unit)))
+    return found
 
 
 def chi_square(

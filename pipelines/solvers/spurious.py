@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from pipelines.graph.problem import Array, Problem
-from pipelines.solvers.marginals import IndeterminateError, eliminated, joint_information, prior_units
+from pipelines.solvers.marginals import IndeterminateError, drawn, eliminated, joint_information, prior_units
 
 # Directions in which sigma is beyond this share of the prior are looked at; in others noise adds next to nothing.
 _WEAK = 0.3
@@ -53,11 +53,11 @@ def information_of_noise(
         return None
     linear = linearize(values)
     try:
-        moved = _moved(eliminated(linear, ordering), values, doubtful)
-        own, *drawn = (joint_information(graph, ordering, keys) for graph in (linear, *map(linearize, moved)))
+        moved = drawn(eliminated(linear, ordering), values, set(values.keys()) - set(doubtful), _DRAWS)
+        own, *elsewhere = (joint_information(graph, ordering, keys) for graph in (linear, *map(linearize, moved)))
     except (RuntimeError, IndeterminateError):
         return None
-    noise = np.mean(drawn, axis=0) - own
+    noise = np.mean(elsewhere, axis=0) - own
     free, scale, unit = prior_units(problem.parameters, values, keys)
     own, noise = unit.T @ own @ unit, unit.T @ noise @ unit
     priors = [problem.quantities[i].prior_sigma for i in free]
@@ -77,20 +77,6 @@ def _doubtful(problem: Problem, keys: Sequence[int], covariance: Array) -> list[
         widest = np.linalg.eigvalsh(covariance[np.ix_(of, of)] / np.outer(scale, scale))
         if ((widest > _WEAK**2) & (widest < 1.0 / (1.0 + _TOLD))).any():
             found.append(key)
-    return found
-
-
-def _moved(bayes_net: gtsam.GaussianBayesNet, values: gtsam.Values, but: Sequence[int]) -> list[gtsam.Values]:
-    """Values drawn from their covariance about the estimate but for what some variables add to it."""
-    generator = np.random.default_rng(0)
-    zero = gtsam.VectorValues.Zero(bayes_net.optimize())
-    found = []
-    for _ in range(_DRAWS):
-        drawn = gtsam.VectorValues()
-        for key in values.keys():
-            size = len(zero.at(key))
-            drawn.insert(key, np.zeros(size) if key in but else generator.standard_normal(size))
-        found.append(values.retract(bayes_net.backSubstitute(drawn)))
     return found
 
 

@@ -1,0 +1,82 @@
+"""What a linearised graph leaves out of the covariance where parameters may still move far.
+
+A sensor at rest tells a sum of bias and mounting angle times rate to the last digit, and neither of both. The linear
+system knows the sum along the tangent at the estimate alone: at the true values, a tenth of a radian off, it differs by
+what is of second order, which is thousands of its sigmas. So the directions that are known have, beside the variance
+that the linear system gives them, that of how far they follow the ones that are not: of the way from the tangent back
+to the floor of the error, at values drawn from their covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import gtsam
+import numpy as np
+
+from pipelines.graph.problem import Array, Problem
+from pipelines.solvers.marginals import IndeterminateError, drawn, eliminated, joint_information, prior_units, reduced
+
+if TYPE_CHECKING:
+    from pipelines.solvers.batch import System
+
+# Directions of which sigma is beyond this share of the prior are drawn, the others follow.
+_WEAK = 0.1
+_DRAWS = 16
+# The first few suffice to see that none makes up this much of a squared sigma in all.
+_TRIED, _SLIGHT = 3, 0.1
+# Information in units of the priors' with which there is no prior.
+_ANYWHERE = 0.5
+
+
+def second_order(
+    problem: Problem,
+    system: System,
+    values: gtsam.Values,
+    covariance: Array,
+    current_keys: Mapping[int, int],
+) -> Array | None:
+    """Covariance (n, n) of the reported numbers that the linear system does not know of.
+
+    None where nothing may move far, or where what moves has neither prior nor measurements, and may be anywhere.
+
+    Args:
+        problem: the graph's.
+        system: of the same.
+        values: its solution.
+        covariance: (n, n) of the reported numbers as the linearised graph has it.
+        current_keys: parameter key -> variable that holds its value.
+    """
+    calibrated = [q.prior_sigma != 0.0 and not q.assumed for q in problem.quantities]
+    scales = np.array([q.scale for q in problem.quantities])
+    scaled = (covariance / np.outer(scales, scales))[np.ix_(calibrated, calibrated)]
+    if not len(scaled) or np.linalg.eigvalsh(scaled)[-1] < _WEAK**2:
+        return None
+    keys = [current_keys.get(p.key, p.key) for p in problem.parameters]
+    free, scale, unit = prior_units(problem.parameters, values, keys)
+    # Far from the solution the loss would reject what is good.
+    system, ordering = system.without_rejected(values), system.ordering
+    linear = system.linearize(values)
+    try:
+        eigenvalues, vectors = np.linalg.eigh(unit.T @ joint_information(linear, ordering, keys) @ unit)
+        if eigenvalues[0] < _ANYWHERE:
+            return None
+        moved = drawn(eliminated(linear, ordering), values, keys, _DRAWS)
+        told = eigenvalues >= _WEAK**-2.0
+        steps: list[Array] = []
+        for each in moved:
+            steps.append(_back(*reduced(system.linearize(each), ordering, keys), unit @ vectors[:, told]))
+            if len(steps) == _TRIED and (eigenvalues[told] * np.square(steps)).sum(axis=1).max() < _SLIGHT:
+                return None
+    except (RuntimeError, IndeterminateError, np.linalg.LinAlgError):
+        return None
+    moves = np.array(steps) @ vectors[:, told].T * scale
+    found = np.zeros_like(covariance)
+    found[np.ix_(free, free)] = moves.T @ moves / _DRAWS
+    return found
+
+
+def _back(information: Array, slope: Array, known: Array) -> Array:
+    """The step (k,) to the floor along some directions, by columns, of parameters with these normal equations."""
+    return np.asarray(np.linalg.solve(known.T @ information @ known, known.T @ slope))
