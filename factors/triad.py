@@ -11,6 +11,7 @@ sensor with an AprilTag hexahedron.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,9 +73,10 @@ class TriadPriorFactor(Model):
 
 @dataclass(frozen=True)
 class AccelFactor(Model):
-    """Mean of an accelerometer at rest: u = A bRn (0, 0, g) + c, raw = u + square u^2 + cube u^3, axis by axis.
+    """Mean of an accelerometer at rest: u = A bRn (0, 0, g) + c + s warmth, raw = u + square u^2 + cube u^3, by axis.
 
-    Blocks: nRb (rotations), triad (12) and, of one that is curved, its terms (3 square, s^2/m, and 3 cube, (s^2/m)^2).
+    Blocks: nRb (rotations), triad (12); of one that is curved its terms (3 square, s^2/m, and 3 cube, (s^2/m)^2); of
+    one whose temperature is known s (3, in the unit of raw per K).
 
     Attributes:
         time: (n,) s.
@@ -82,6 +84,7 @@ class AccelFactor(Model):
         sigma: (n,) per axis, in the unit of raw.
         gravity: g, m/s^2.
         curved: whether it has square and cube terms.
+        warmth: (n,) K, its temperature above that at which c is the offset; None: not known.
     """
 
     time: Array
@@ -89,19 +92,21 @@ class AccelFactor(Model):
     sigma: Array
     gravity: float
     curved: bool = False
+    warmth: Array | None = None
     rows: int = 3
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Attitude, triad and, of a curved one, its terms."""
-        return (ROT3, 12, 6) if self.curved else (ROT3, 12)
+        """Attitude, triad and, where there are such, curvature and slope over temperature."""
+        return (ROT3, 12, *([6] if self.curved else []), *([] if self.warmth is None else [3]))
 
-    def __call__(self, nRb: Array, triads: Array, *curvature: Array) -> Residuals:
+    def __call__(self, nRb: Array, triads: Array, *terms: Array) -> Residuals:
         """Residual (predicted - raw) / sigma, (n, 3)."""
-        error, jacobians = _at_rest(self.raw, self.sigma, nRb, triads, self.gravity * _UP)
-        if not curvature:
-            return error, lambda: jacobians()[:2]
-        square, cube = curvature[0][:, :3], curvature[0][:, 3:]
+        drift, by_slope = _drift(self.warmth, self.sigma, terms)
+        error, jacobians = _at_rest(self.raw - drift, self.sigma, nRb, triads, self.gravity * _UP)
+        if not self.curved:
+            return error, lambda: (*jacobians()[:2], *by_slope)
+        square, cube = terms[0][:, :3], terms[0][:, 3:]
         weight = 1.0 / self.sigma[:, None]
         u = error / weight + self.raw
         bent = (square * u**2 + cube * u**3) * weight
@@ -110,17 +115,18 @@ class AccelFactor(Model):
             slope = (1.0 + 2.0 * square * u + 3.0 * cube * u**2)[..., None]
             powers = np.concatenate([(u**2 * weight)[..., None] * np.eye(3), (u**3 * weight)[..., None] * np.eye(3)], 2)
             by_attitude, by_triad, _ = jacobians()
-            return slope * by_attitude, slope * by_triad, powers
+            return slope * by_attitude, slope * by_triad, powers, *(slope * each for each in by_slope)
 
         return error + bent, with_terms
 
 
 @dataclass(frozen=True)
 class GyroStaticFactor(Model):
-    """Mean of a gyro at rest on the turning earth: raw = A bRn w_ie + c + d + G bRn (0, 0, g).
+    """Mean of a gyro at rest on the turning earth: raw = A bRn w_ie + c + d + G bRn (0, 0, g) + s warmth.
 
     Blocks: nRb (rotations), triad (12), d (3; how far the gyro's offset has wandered, in the unit of raw) and, of one
-    that feels gravity, G by rows (9, rad/s per m/s^2).
+    that feels gravity, G by rows (9, rad/s per m/s^2), of one whose temperature is known s (3, in the unit of raw per
+    K).
 
     Attributes:
         time: (n,) s.
@@ -128,6 +134,7 @@ class GyroStaticFactor(Model):
         sigma: (n,) per axis, in the unit of raw.
         earth_rate: (3,) w_ie in n, rad/s.
         gravity: g, m/s^2, of a gyro that feels it; None: it does not.
+        warmth: (n,) K, its temperature above that at which c is the offset; None: not known.
     """
 
     time: Array
@@ -135,26 +142,29 @@ class GyroStaticFactor(Model):
     sigma: Array
     earth_rate: Array
     gravity: float | None = None
+    warmth: Array | None = None
     rows: int = 3
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Attitude, triad, wandered offset and, of one that feels gravity, G."""
-        return (ROT3, 12, 3) if self.gravity is None else (ROT3, 12, 3, 9)
+        """Attitude, triad, wandered offset and, where there are such, G and slope over temperature."""
+        return (ROT3, 12, 3, *([] if self.gravity is None else [9]), *([] if self.warmth is None else [3]))
 
-    def __call__(self, nRb: Array, triads: Array, wandered: Array, *sensitivity: Array) -> Residuals:
+    def __call__(self, nRb: Array, triads: Array, wandered: Array, *terms: Array) -> Residuals:
         """Residual (predicted - raw) / sigma, (n, 3)."""
-        error, jacobians = _at_rest(self.raw - wandered, self.sigma, nRb, triads, self.earth_rate)
+        drift, by_slope = _drift(self.warmth, self.sigma, terms)
+        error, jacobians = _at_rest(self.raw - wandered - drift, self.sigma, nRb, triads, self.earth_rate)
         weight = 1.0 / self.sigma
         by_wandered = np.eye(3) * weight[:, None, None]
         if self.gravity is None:
-            return error, lambda: (*jacobians()[:2], by_wandered)
+            return error, lambda: (*jacobians()[:2], by_wandered, *by_slope)
         force = so3.rotate(so3.inverse(nRb), self.gravity * _UP)
-        G = sensitivity[0].reshape(-1, 3, 3) * weight[:, None, None]
+        G = terms[0].reshape(-1, 3, 3) * weight[:, None, None]
 
         def with_force() -> tuple[Array, ...]:
             by_attitude, by_triad, _ = jacobians()
-            return by_attitude + G @ so3.hat(force), by_triad, by_wandered, _by_triad(force, weight)[..., :9]
+            by_g = _by_triad(force, weight)[..., :9]
+            return by_attitude + G @ so3.hat(force), by_triad, by_wandered, by_g, *by_slope
 
         return error + np.einsum("nij,nj->ni", G, force), with_force
 
@@ -178,6 +188,13 @@ class MagFactor(Model):
     def __call__(self, nRb: Array, triads: Array, field: Array) -> Residuals:
         """Residual (predicted - raw) / sigma, (n, 3)."""
         return _at_rest(self.raw, self.sigma, nRb, triads, field)
+
+
+def _drift(warmth: Array | None, sigma: Array, terms: Sequence[Array]) -> tuple[Array, tuple[Array, ...]]:
+    """What an offset has drifted by, (n or 1, 3), where its slope is the last of a model's terms, and its Jacobian."""
+    if warmth is None:
+        return np.zeros((1, 3)), ()
+    return warmth[:, None] * terms[-1], ((warmth / sigma)[:, None, None] * np.eye(3),)
 
 
 def _at_rest(raw: Array, sigma: Array, nRb: Array, triads: Array, vector: Array) -> Residuals:

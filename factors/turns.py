@@ -23,9 +23,10 @@ class GyroRotationFactor(Model):
 
     Blocks: nRb_i, nRb_j (rotations), triad (12), d_i, d_j (3 each; how far the gyro's offset has wandered at both ends,
     in the unit of raw: their mean adds to c). Of a gyro that feels specific force also G by rows (9, rad/s per m/s^2)
-    and the accelerometer's triad (12): raw = A w + c + d + G f, with the f of that accelerometer, its curvature left
-    out. Samples are mean rates centred on their stamps, integrated as factors.preintegration does: the arc between
-    point rates w0 and w1 is T (w0 + w1) / 2 + T^2 (w0 x w1) / 12.
+    and the accelerometer's triad (12): raw = A w + c + d + G f, with the f of that accelerometer, its curvature and its
+    drift left out. Of one whose temperature is known also s (3, in the unit of raw per K): s warmth adds to c. Samples
+    are mean rates centred on their stamps, integrated as factors.preintegration does: the arc between point rates w0
+    and w1 is T (w0 + w1) / 2 + T^2 (w0 x w1) / 12.
 
     Attributes:
         time: (n,) ends of the turns, s.
@@ -34,6 +35,7 @@ class GyroRotationFactor(Model):
         earth_rate: (3,) w_ie in n, rad/s.
         sigma: (n,) rad per axis.
         accel: n times (N, 3), what the accelerometer says at the stamps; None: the gyro does not feel force.
+        warmth: (n,) K, mean temperature over a turn above that at which c is the offset; None: not known.
     """
 
     time: Array
@@ -42,22 +44,25 @@ class GyroRotationFactor(Model):
     earth_rate: Array
     sigma: Array
     accel: Sequence[Array] | None = None
+    warmth: Array | None = None
     rows: int = 3
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Attitudes, triad, wandered offsets and, of a gyro that feels force, G and the accelerometer's triad."""
-        own: tuple[Block, ...] = (ROT3, ROT3, 12, 3, 3)
-        return own if self.accel is None else (*own, 9, 12)
+        """Attitudes, triad, wandered offsets and, where there are such, G with the accelerometer's triad and slope."""
+        of_force = [] if self.accel is None else [9, 12]
+        return (ROT3, ROT3, 12, 3, 3, *of_force, *([] if self.warmth is None else [3]))
 
     def __call__(
-        self, nRb_i: Array, nRb_j: Array, triads: Array, wandered_i: Array, wandered_j: Array, *of_force: Array
+        self, nRb_i: Array, nRb_j: Array, triads: Array, wandered_i: Array, wandered_j: Array, *terms: Array
     ) -> Residuals:
         """Residual Log(predicted^T nRb_j) / sigma, (n, 3)."""
-        offsets = np.concatenate([triads[:, :9], triads[:, 9:] + 0.5 * (wandered_i + wandered_j)], axis=1)
-        of_each = zip(
-            self.stamps, self.raw, offsets, *of_force, *([] if self.accel is None else [self.accel]), strict=True
-        )
+        added = 0.5 * (wandered_i + wandered_j)
+        if self.warmth is not None:
+            added = added + self.warmth[:, None] * terms[-1]
+        offsets = np.concatenate([triads[:, :9], triads[:, 9:] + added], axis=1)
+        of_force = () if self.accel is None else (*terms[:2], self.accel)
+        of_each = zip(self.stamps, self.raw, offsets, *of_force, strict=True)
         turned = list(starmap(Turn.of, of_each))
         dR = np.array([each.rotation for each in turned])
         earth = np.array([t[-1] - t[0] for t in self.stamps])[:, None] * self.earth_rate
@@ -69,8 +74,10 @@ class GyroRotationFactor(Model):
             left = -so3.right_jacobian_inverse(-error) * weight[:, None, None]
             right = so3.right_jacobian_inverse(error) * weight[:, None, None]
             by = [left @ np.array(each) for each in zip(*(turn.derivatives() for turn in turned), strict=True)]
-            by_wandered = 0.5 * by[0][..., 9:]
-            return left @ so3.matrix(so3.inverse(dR)), right, by[0], by_wandered, by_wandered, *by[1:]
+            by_offset = by[0][..., 9:]
+            by_slope = () if self.warmth is None else (self.warmth[:, None, None] * by_offset,)
+            ends = left @ so3.matrix(so3.inverse(dR)), right
+            return *ends, by[0], 0.5 * by_offset, 0.5 * by_offset, *by[1:], *by_slope
 
         return error * weight[:, None], jacobians
 

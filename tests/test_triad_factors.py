@@ -47,15 +47,18 @@ def _sigma(rows: np.ndarray) -> Array:
     return np.linspace(0.5, 2.0, N)[rows]
 
 
+# K above that at which offsets are what they are.
+WARMTH = np.linspace(-2.0, 6.0, N)
+
+
 def _static(kind: str, rows: np.ndarray) -> Model:
     raw = _rng(5).normal(size=(N, 3))[rows]
-    if kind == "accel":
-        return AccelFactor(TIMES[rows], raw, _sigma(rows), 9.8)
-    if kind == "curved accel":
-        return AccelFactor(TIMES[rows], raw, _sigma(rows), 9.8, curved=True)
-    if kind.startswith("gyro"):
-        gravity = 9.8 if kind == "gyro that feels gravity" else None
-        return GyroStaticFactor(TIMES[rows], raw, _sigma(rows), EARTH * 1e4, gravity)
+    warmth = WARMTH[rows] if kind.startswith("warm") else None
+    if "accel" in kind:
+        return AccelFactor(TIMES[rows], raw, _sigma(rows), 9.8, "curved" in kind, warmth)
+    if "gyro" in kind:
+        gravity = 9.8 if kind.endswith("gyro that feels gravity") else None
+        return GyroStaticFactor(TIMES[rows], raw, _sigma(rows), EARTH * 1e4, gravity, warmth)
     return MagFactor(TIMES[rows], raw, _sigma(rows))
 
 
@@ -64,16 +67,21 @@ def _static_blocks(kind: str) -> list[Array]:
     blocks: list[Array] = [_rotations(rng), _triads(rng)]
     if kind == "mag":
         return [*blocks, rng.normal(size=(N, 3))]
-    if kind.startswith("gyro"):
+    if "gyro" in kind:
         blocks.append(0.1 * rng.normal(size=(N, 3)))
-    if kind == "gyro that feels gravity":
+    if kind.endswith("gyro that feels gravity"):
         blocks.append(0.1 * rng.normal(size=(N, 9)))
-    if kind == "curved accel":
+    if "curved" in kind:
         blocks.append(np.repeat([1e-2, 1e-3], 3) * rng.normal(size=(N, 6)))
+    if kind.startswith("warm"):
+        blocks.append(0.1 * rng.normal(size=(N, 3)))
     return blocks
 
 
-@pytest.mark.parametrize("kind", ["accel", "curved accel", "gyro", "gyro that feels gravity", "mag"])
+KINDS = ("accel", "curved accel", "gyro", "gyro that feels gravity")
+
+
+@pytest.mark.parametrize("kind", [*KINDS, *(f"warm {kind}" for kind in KINDS), "mag"])
 def test_static_jacobians(kind: str) -> None:
     blocks = _static_blocks(kind)
     assert_jacobians(_static(kind, np.arange(N)), blocks)
@@ -81,8 +89,10 @@ def test_static_jacobians(kind: str) -> None:
 
 
 def test_static_models_are_what_they_say() -> None:
-    """Axis by axis, from the attitude's matrix."""
+    """Axis by axis, from the attitude's matrix; at another temperature the readings are off by the slope times that."""
     rng = _rng(13)
+    slope = 0.1 * rng.normal(size=(N, 3))
+    drift = WARMTH[:, None] * slope
     (nRb, triads, wandered, G), terms = _static_blocks("gyro that feels gravity"), 1e-3 * rng.normal(size=(N, 6))
     A, c = parts(triads)
     up = so3.matrix(nRb)[:, 2]
@@ -92,12 +102,18 @@ def test_static_models_are_what_they_say() -> None:
     np.testing.assert_allclose(
         GyroStaticFactor(TIMES, raw, sigma, EARTH, 9.8)(nRb, triads, wandered, G)[0], 0, atol=1e-13
     )
+    warm = GyroStaticFactor(TIMES, raw + drift, sigma, EARTH, 9.8, WARMTH)
+    np.testing.assert_allclose(warm(nRb, triads, wandered, G, slope)[0], 0, atol=1e-13)
     u = 9.8 * np.einsum("nij,nj->ni", A, up) + c
     raw = u + terms[:, :3] * u**2 + terms[:, 3:] * u**3
     np.testing.assert_allclose(AccelFactor(TIMES, raw, sigma, 9.8, curved=True)(nRb, triads, terms)[0], 0, atol=1e-12)
+    u += drift
+    raw = u + terms[:, :3] * u**2 + terms[:, 3:] * u**3
+    bent = AccelFactor(TIMES, raw, sigma, 9.8, curved=True, warmth=WARMTH)
+    np.testing.assert_allclose(bent(nRb, triads, terms, slope)[0], 0, atol=1e-12)
 
 
-def _turns(rows: np.ndarray, angle: float, feels: bool = False) -> GyroRotationFactor:
+def _turns(rows: np.ndarray, angle: float, feels: bool = False, warm: bool = False) -> GyroRotationFactor:
     """Turns of different length and number of samples, at rates and forces that change direction."""
     stamps, raw, accel = [], [], []
     for i in rows:
@@ -106,19 +122,22 @@ def _turns(rows: np.ndarray, angle: float, feels: bool = False) -> GyroRotationF
         stamps.append(t)
         raw.append(angle * np.sin(rng.uniform(0.5, 3, size=3) * t[:, None] + rng.uniform(0, 6, size=3)))
         accel.append(9.8 * np.sin(rng.uniform(0.5, 3, size=3) * t[:, None] + rng.uniform(0, 6, size=3)))
-    return GyroRotationFactor(TIMES[rows], stamps, raw, EARTH * 1e3, _sigma(rows), accel if feels else None)
+    felt, warmth = accel if feels else None, WARMTH[rows] if warm else None
+    return GyroRotationFactor(TIMES[rows], stamps, raw, EARTH * 1e3, _sigma(rows), felt, warmth)
 
 
-@pytest.mark.parametrize("feels", [False, True], ids=["plain", "feels force"])
+@pytest.mark.parametrize(("feels", "warm"), [(False, False), (True, False), (False, True), (True, True)])
 @pytest.mark.parametrize("angle", [2.0, 1e-6], ids=["turning", "at rest"])
 @pytest.mark.parametrize("miss", [1.0, 1e-7, 3.0], ids=["far off", "agreeing", "near half a turn"])
-def test_turn_jacobians(angle: float, miss: float, feels: bool) -> None:
+def test_turn_jacobians(angle: float, miss: float, feels: bool, warm: bool) -> None:
     rng = _rng(2)
-    model = _turns(np.arange(N), angle, feels)
+    model = _turns(np.arange(N), angle, feels, warm)
     start, triads = _rotations(rng), _triads(rng, 0.05)
     others = list(0.01 * rng.normal(size=(2, N, 3)))
     if feels:
         others += [1e-2 * rng.normal(size=(N, 9)), _triads(rng, 0.05)]
+    if warm:
+        others.append(1e-2 * rng.normal(size=(N, 3)))
     # Attitudes at the end that miss the prediction by `miss` rad.
     error = model(start, so3.identity(N), triads, *others)[0] * _sigma(np.arange(N))[:, None]
     predicted = so3.inverse(so3.exp(error))
@@ -127,7 +146,7 @@ def test_turn_jacobians(angle: float, miss: float, feels: bool) -> None:
     blocks = [start, so3.multiply(predicted, so3.exp(delta)), triads, *others]
     tolerance = 2e-5 if miss > 2.0 else 2e-6
     assert_jacobians(model, blocks, rtol=tolerance)
-    assert_rows_are_independent(lambda rows: _turns(rows, angle, feels), blocks)
+    assert_rows_are_independent(lambda rows: _turns(rows, angle, feels, warm), blocks)
 
 
 def test_turn_of_a_miscalibrated_gyro_on_the_turning_earth() -> None:
@@ -148,6 +167,9 @@ def test_turn_of_a_miscalibrated_gyro_on_the_turning_earth() -> None:
     feels = GyroRotationFactor(t[-1:], [t], [raw + force @ G.T], EARTH, np.ones(1), [accel])
     of_force = G.reshape(1, 9), triad(accel_K, accel_b)[None]
     np.testing.assert_allclose(feels(iRb0, nRb1, triad(K, b)[None], *wandered, *of_force)[0], 0.0, atol=1e-12)
+    slope = 1e-3 * rng.normal(size=(1, 3))
+    warm = GyroRotationFactor(t[-1:], [t], [raw + 8.0 * slope], EARTH, np.ones(1), warmth=np.array([8.0]))
+    np.testing.assert_allclose(warm(iRb0, nRb1, triad(K, b)[None], *wandered, slope)[0], 0.0, atol=1e-12)
 
 
 def _tags(rows: np.ndarray, blocks: list[Array] | None) -> TagAttitudeFactor:

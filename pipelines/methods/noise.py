@@ -96,21 +96,22 @@ def sampled(noise: Noise, time: Array, samples: Array) -> Level:
     return level
 
 
-def walked(noise: Noise, time: Array, means: Array, force: Array) -> Level:
+def walked(noise: Noise, time: Array, means: Array, causes: Array) -> Level:
     """The level of a bias's random walk from what was stated and from the bias itself, seen at some times.
 
-    By restricted maximum likelihood: the walk beside an error that is new every time, the mean and what follows the
-    specific force (g-sensitivity, the vertical part of the earth's rate) free.
+    By restricted maximum likelihood: the walk beside an error that is new every time, the mean and what follows its
+    causes (g-sensitivity, the vertical part of the earth's rate, a slope over temperature) free.
 
     Args:
         noise: the walk.
         time: (n,) s.
         means: (n, k) the bias as measured then.
-        force: (n, 3) specific force then, in any unit.
+        causes: (n, d) specific force and, where it is known, temperature then, in any unit.
     """
     if noise.known == 0.0 or noise.stated == 0.0 or len(time) < _FEWEST_MEANS:
         return Level(noise)
-    follows = np.column_stack([np.ones(len(time)), force / np.abs(force).max()])
+    causes = causes[:, np.ptp(causes, axis=0) > 0.0]
+    follows = np.column_stack([np.ones(len(time)), causes / np.abs(causes).max(axis=0)])
     left = means - follows @ np.linalg.lstsq(follows, means)[0]
     size = float(np.std(left, axis=0).max())
     tried = size / float(np.ptp(time)) ** 0.5 * np.exp(np.arange(-5.0, 3.0, _STEP))

@@ -8,16 +8,22 @@ import numpy as np
 
 from pipelines.graph.problem import Array
 from pipelines.methods.cube.data import CubeData, nominal, recorded
-from pipelines.methods.cube.parameters import CUBE, SENSITIVITY, SQUARE
+from pipelines.methods.cube.parameters import CUBE, SENSITIVITY, SQUARE, TEMPERATURE
 from pipelines.methods.cube.topics import CubeConfig
+from pipelines.methods.temperature import FIRST
 from pipelines.methods.triads import triad_of
 from pipelines.settings import Config
 
 
 def calibrated(
-    name: str, vectors: Array, config: Config, values: Mapping[str, float], force: Array | None = None
+    name: str,
+    vectors: Array,
+    config: Config,
+    values: Mapping[str, float],
+    force: Array | None = None,
+    celsius: Array | None = None,
 ) -> Array:
-    """K raw + b of vectors (n, 3) given in nominal units, an accelerometer's curvature and a gyro's G f taken off.
+    """K raw + b of vectors (n, 3) given in nominal units, less an accelerometer's curvature, a gyro's G f and drifts.
 
     Args:
         name: of the sensor.
@@ -25,6 +31,7 @@ def calibrated(
         config: of the recording.
         values: parameters by name; assumptions that are not among them are 0.
         force: (n, 3) specific force in b, m/s^2, that a gyro felt; None: none.
+        celsius: (n,) temperatures, degrees Celsius; None: not known.
     """
     if name == "accel":
         vectors = straightened(
@@ -32,6 +39,9 @@ def calibrated(
         )
     if name == "gyro" and force is not None:
         vectors = vectors - force @ np.array([values.get(n, 0.0) for n in SENSITIVITY.names]).reshape(3, 3).T
+    if name in TEMPERATURE and celsius is not None and FIRST in values:
+        slope = np.array([values.get(n, 0.0) for n in TEMPERATURE[name].names])
+        vectors = vectors - np.outer(celsius - values[FIRST], slope)
     raw = recorded(vectors, getattr(config.section(CubeConfig).raw, name))
     K, b = triad_of(name, values)
     return np.asarray(raw @ K.T + b)
@@ -41,9 +51,10 @@ def calibrated_rates(data: CubeData, config: Config, values: Mapping[str, float]
     """All of the gyro's samples calibrated, (N, 3) rad/s in b."""
     raw = config.section(CubeConfig).raw
     force = None
+    celsius = None if data.temperature is None else data.temperature.above(0.0, data.imu_t)
     if "accel_k11" in values:
-        force = calibrated("accel", nominal(data.accel, raw.accel), config, values)
-    return calibrated("gyro", nominal(data.gyro, raw.gyro), config, values, force)
+        force = calibrated("accel", nominal(data.accel, raw.accel), config, values, celsius=celsius)
+    return calibrated("gyro", nominal(data.gyro, raw.gyro), config, values, force, celsius)
 
 
 def straightened(read: Array, square: Array, cube: Array) -> Array:

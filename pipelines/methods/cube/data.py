@@ -14,6 +14,7 @@ from pipelines.graph.noise import Noise
 from pipelines.methods.cube.topics import CubeConfig, RawConversion, field_date
 from pipelines.methods.noise import stated
 from pipelines.methods.place import field_at
+from pipelines.recording.temperature import Temperature
 from pipelines.settings import Config
 
 if TYPE_CHECKING:
@@ -55,7 +56,8 @@ class CubeData:
     East-North-Up, unit; None without one. reference_cov (R, 3, 3) rad^2, about the axes of n; None if unknown.
     latitude, longitude, rad, height, m above the ellipsoid: of the reference; None if unknown. camera, sightings: None
     without a camera. gyro_density, accel_density, mag_density: from the covariances of the messages, in the unit
-    recorded per sqrt(Hz), None if they say nothing. dropped: reason -> messages.
+    recorded per sqrt(Hz), None if they say nothing. dropped: reason -> messages. temperature: of gyro and
+    accelerometer, None where nobody measures it.
     """
 
     epoch_ns: int
@@ -76,6 +78,7 @@ class CubeData:
     accel_density: float | None = None
     mag_density: float | None = None
     dropped: dict[str, int] = field(default_factory=dict)
+    temperature: Temperature | None = None
 
     @cached_property
     def computed(self) -> dict[tuple[str, str], object]:

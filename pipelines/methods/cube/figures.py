@@ -27,7 +27,8 @@ _ERRORS = {"accel": ("mg", 1e3 / 9.80665), "gyro": ("deg", np.rad2deg(1.0)), "ma
 def cube_plots(data: CubeData, calibration: Calibration) -> list[Plot | Table]:
     """The method's own figures and tables; those that the recording has no data for are left out."""
     config = calibration.config
-    values = dict(zip(calibration.estimate.names, calibration.estimate.values.tolist(), strict=True))
+    estimate = calibration.estimate
+    values = {**calibration.problem.constants, **dict(zip(estimate.names, estimate.values.tolist(), strict=True))}
     poses = static_poses(data, config)
     found: list[Plot | Table | None] = [*cube_tables(calibration)]
     found += [_before_and_after(*rows) for rows in _errors(data, config, poses, calibration, values)]
@@ -55,7 +56,9 @@ def _errors(
         if f"{name}_k11" in values and means is not None:
             good = np.isfinite(means[k]).all(axis=1)
             expected, raw = so3.rotate(bRn[good], vector), means[k][good]
-            found.append((name, middle[k][good], raw - expected, calibrated(name, raw, config, values) - expected))
+            celsius = None if poses.celsius is None else poses.celsius[k][good]
+            compensated = calibrated(name, raw, config, values, celsius=celsius)
+            found.append((name, middle[k][good], raw - expected, compensated - expected))
     if "gyro_k11" in values and len(k) > 1:
         found.insert(1, ("gyro", *_turns(data, config, poses.span[k], attitudes.wxyz, values)))
     return found
@@ -120,7 +123,9 @@ def _sphere(
     means = poses.accel if name == "accel" else poses.mag
     assert means is not None
     good = np.isfinite(means).all(axis=1)
-    vectors = [v / strength for v in (means[good], calibrated(name, means[good], config, values))]
+    celsius = None if poses.celsius is None else poses.celsius[good]
+    compensated = calibrated(name, means[good], config, values, celsius=celsius)
+    vectors = [v / strength for v in (means[good], compensated)]
     angle = np.linspace(0.0, 2.0 * np.pi, 91)
     views = []
     for i, j in ((0, 1), (0, 2)):

@@ -8,6 +8,7 @@ import numpy as np
 
 from factors import so3
 from pipelines.graph.problem import Array, Estimate, Findings
+from pipelines.methods import temperature
 from pipelines.methods.cube.compensation import calibrated
 from pipelines.methods.cube.data import CubeData, local_field, noise_densities, nominal
 from pipelines.methods.cube.noises import noises
@@ -36,6 +37,7 @@ def findings(data: CubeData, config: Config, estimate: Estimate) -> Findings:
     and how much the field was off there.
     """
     values = dict(zip(estimate.names, estimate.values.tolist(), strict=True))
+    values |= temperature.constants(temperature.reference(data.temperature))
     poses = static_poses(data, config)
     known = [name for name in TRIADS if f"{name}_k11" in values]
     return {
@@ -128,7 +130,11 @@ def white_noise(t: Array, vectors: Array, spans: Array, rate: float) -> Array:
 def _poses(
     poses: StaticPoses, config: Config, estimate: Estimate, values: Mapping[str, float]
 ) -> list[dict[str, object]]:
-    up = calibrated("accel", poses.accel, config, values) if "accel_k11" in values else poses.accel
+    up = (
+        calibrated("accel", poses.accel, config, values, celsius=poses.celsius)
+        if "accel_k11" in values
+        else poses.accel
+    )
     up = up / np.linalg.norm(up, axis=1, keepdims=True)
     used = {family: r.time[r.used] for family, r in estimate.residuals.items()}
     return [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,9 +10,16 @@ import numpy as np
 from factors import so3
 from pipelines.methods.cube.compensation import straightened
 from pipelines.methods.cube.data import nominal, recorded
-from pipelines.methods.cube.parameters import CUBE, SENSITIVITY, SQUARE, TILT
+from pipelines.methods.cube.parameters import CUBE, SENSITIVITY, SQUARE, TEMPERATURE, TILT
 from pipelines.methods.cube.topics import CubeConfig, RawConversion
-from pipelines.methods.formula import Formula, matrix_text, numbers_of, vector_text
+from pipelines.methods.formula import (
+    Formula,
+    matrix_text,
+    numbers_of,
+    over_temperature,
+    temperature_text,
+    vector_text,
+)
 from pipelines.methods.triads import triad_formula
 from pipelines.settings import Config
 
@@ -20,7 +27,8 @@ from pipelines.settings import Config
 def formulas(parameters: Collection[str], config: Config) -> list[Formula]:
     """Of the sensors, mounts and tags that are among the parameters; raw numbers are as recorded.
 
-    The accelerometer's curvature and the gyro's g-sensitivity, which are about nominal units, where they are known.
+    The accelerometer's curvature, the gyro's g-sensitivity and their slopes over temperature, which are about nominal
+    units, where they are known.
     """
     raw = config.section(CubeConfig).raw
     found: list[Formula] = []
@@ -74,12 +82,16 @@ def stated(config: Config) -> dict[str, so3.Array]:
 
 
 def _accelerometer(parameters: Collection[str], conversion: RawConversion | None) -> list[Formula]:
-    """With its curvature taken off, in nominal units, if any of it is known."""
+    """With its curvature and its drift taken off, in nominal units, as far as they are known."""
+    drift, off = _drift("accel", parameters)
+    needs = ("accel", *(["temperature"] if drift else []))
     if not any(name in parameters for each in (SQUARE, CUBE) for name in each.names):
-        return [triad_formula("accel", parameters, "accel", ("accel",), lambda v: v.accel)]
+        text, scale = _less("accel", [drift], conversion)
+        return [triad_formula("accel", parameters, text, needs, lambda v: v.accel - off(v) / scale)]
     square, cube = (vector_text(each.names, parameters) for each in (SQUARE, CUBE))
     said = "accel" if conversion is None else f"(accel - {conversion.offset!r}) * {conversion.scale!r}"
-    back = "accel_u" if conversion is None else f"(accel_u / {conversion.scale!r} + {conversion.offset!r})"
+    unbent = f"(accel_u - {drift})" if drift else "accel_u"
+    back = unbent if conversion is None else f"({unbent} / {conversion.scale!r} + {conversion.offset!r})"
 
     def bent(by: str) -> str:
         return f"{said} - {square} * {by}**2 - {cube} * {by}**3"
@@ -96,24 +108,40 @@ def _accelerometer(parameters: Collection[str], conversion: RawConversion | None
     return [
         Formula(f"{meaning}, nearly", "accel_near", bent(first), ("accel",), once),
         Formula(meaning, "accel_u", bent("accel_near"), ("accel",), straight),
-        triad_formula("accel", parameters, back, ("accel",), lambda v: recorded(v.accel_u, conversion)),
+        triad_formula("accel", parameters, back, needs, lambda v: recorded(v.accel_u - off(v), conversion)),
     ]
 
 
 def _gyro(parameters: Collection[str], conversion: RawConversion | None) -> Formula:
-    """With what it says for the specific force taken off, if that is known."""
-    if not any(name in parameters for name in SENSITIVITY.names):
-        return triad_formula("gyro", parameters, "gyro", ("gyro",), lambda v: v.gyro)
-    felt = f"{matrix_text([SENSITIVITY.names[i : i + 3] for i in (0, 3, 6)], parameters)} * f_b"
-    text = f"(gyro - {felt})" if conversion is None else f"(gyro - {felt} / {conversion.scale!r})"
+    """With what it says for the specific force and for its temperature taken off, as far as that is known."""
+    feels = any(name in parameters for name in SENSITIVITY.names)
+    felt = f"{matrix_text([SENSITIVITY.names[i : i + 3] for i in (0, 3, 6)], parameters)} * f_b" if feels else ""
+    drift, off = _drift("gyro", parameters)
+    text, scale = _less("gyro", [felt, drift], conversion)
+
+    def read(v: Any) -> so3.Array:
+        excess = off(v)
+        if feels:
+            excess = excess + v.f_b @ numbers_of(v, SENSITIVITY.names).reshape(3, 3).T
+        return np.asarray(v.gyro - excess / scale)
+
+    needs = "gyro", *(["accel"] if feels else []), *(["temperature"] if drift else [])
+    return triad_formula("gyro", parameters, text, needs, read)
+
+
+def _drift(sensor: str, parameters: Collection[str]) -> tuple[str, Callable[[Any], so3.Array]]:
+    """What a sensor reads too much at its temperature, in nominal units: as text, empty where unknown, and as code."""
+    names = TEMPERATURE[sensor].names
+    if not any(name in parameters for name in names):
+        return "", lambda _: np.zeros(3)
+    return temperature_text(names, parameters), lambda v: over_temperature(v, names)
+
+
+def _less(reading: str, excesses: Sequence[str], conversion: RawConversion | None) -> tuple[str, float]:
+    """A reading less what is in it too much, in nominal units, as text, and how much of these its unit is."""
     scale = 1.0 if conversion is None else conversion.scale
-    return triad_formula(
-        "gyro",
-        parameters,
-        text,
-        ("gyro", "accel"),
-        lambda v: v.gyro - v.f_b @ numbers_of(v, SENSITIVITY.names).reshape(3, 3).T / scale,
-    )
+    each = [f" - {excess}" if conversion is None else f" - {excess} / {scale!r}" for excess in excesses if excess]
+    return f"({reading}{''.join(each)})" if each else reading, scale
 
 
 def _tag(tag: int) -> Formula:

@@ -22,6 +22,7 @@ from factors import so3
 from factors.turns import Turn
 from pipelines.graph.believing import believing
 from pipelines.graph.problem import Attitudes, Factor, Problem, Step
+from pipelines.methods import temperature
 from pipelines.methods.cube.advice import advice
 from pipelines.methods.cube.data import CubeData
 from pipelines.methods.cube.measurements import (
@@ -34,7 +35,7 @@ from pipelines.methods.cube.measurements import (
 )
 from pipelines.methods.cube.model import Model, prepare
 from pipelines.methods.cube.noises import noises
-from pipelines.methods.cube.parameters import SENSITIVITY_KEY, TRIAD_KEYS, first_priors
+from pipelines.methods.cube.parameters import SENSITIVITY_KEY, SLOPE_KEYS, TRIAD_KEYS, first_priors
 from pipelines.methods.cube.tag_places import layout_belief
 from pipelines.methods.cube.wandering import deviation_key
 from pipelines.settings import Config
@@ -67,6 +68,7 @@ def problem(data: CubeData, config: Config) -> Problem:
         dropped=model.dropped,
         premises=(_NO_FIELD,) if model.poses.mag is not None and model.field is None else (),
         noises=tuple(noises(data, config).values()),
+        constants=temperature.constants(temperature.reference(data.temperature)),
     )
     return graph if layout is None or data.camera is None else believing(graph, [layout])
 
@@ -130,7 +132,10 @@ def _predict(model: Model, k: int, initial: gtsam.Values, current: gtsam.Values)
     """The attitude of pose k carried on by the gyro as calibrated so far; the rest as measured."""
     out = gtsam.Values(initial)
     samples, deviation = model.samples(k), current.atVector(deviation_key(k - 1))
-    own = current.atVector(TRIAD_KEYS["gyro"]) + np.append(np.zeros(9), deviation)
+    offset = deviation
+    if "gyro" in model.parameters.slopes:
+        offset = deviation + samples.warmth * current.atVector(SLOPE_KEYS["gyro"])
+    own = current.atVector(TRIAD_KEYS["gyro"]) + np.append(np.zeros(9), offset)
     of_force = []
     if model.parameters.sensitivity is not None:
         of_force = [current.atVector(SENSITIVITY_KEY), current.atVector(TRIAD_KEYS["accel"]), samples.accel]

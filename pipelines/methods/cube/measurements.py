@@ -20,6 +20,7 @@ from pipelines.methods.cube.parameters import (
     MOUNT_KEY,
     SAID_KEY,
     SENSITIVITY_KEY,
+    SLOPE_KEYS,
     TRIAD_KEYS,
     tag_key,
 )
@@ -58,13 +59,19 @@ def sensor_factors(model: Model, k: int) -> list[Factor]:
     gyro_density, accel_density, mag_density = model.density
     duration = poses.duration[row]
     curved, feels = model.parameters.curvature is not None, model.parameters.sensitivity is not None
-    accel = AccelFactor(time, poses.accel[row], accel_density / np.sqrt(duration), model.gravity, curved)
+    warmths = {name: model.warmth(name, k) for name in SLOPE_KEYS}
+    slopes = {name: [] if warmths[name] is None else [key] for name, key in SLOPE_KEYS.items()}
+    accel_sigma = accel_density / np.sqrt(duration)
+    accel = AccelFactor(time, poses.accel[row], accel_sigma, model.gravity, curved, warmths["accel"])
     gyro_sigma = np.sqrt(gyro_density**2 / duration + model.unknown_rate**2)
-    gyro = GyroStaticFactor(time, poses.gyro[row], gyro_sigma, model.earth_rate, model.gravity if feels else None)
+    gravity = model.gravity if feels else None
+    gyro = GyroStaticFactor(time, poses.gyro[row], gyro_sigma, model.earth_rate, gravity, warmths["gyro"])
     terms, G = [CURVATURE_KEY] if curved else [], [SENSITIVITY_KEY] if feels else []
+    of_accel = accel.on(pose_key(k), TRIAD_KEYS["accel"], *terms, *slopes["accel"])
+    of_gyro = gyro.on(pose_key(k), TRIAD_KEYS["gyro"], deviation_key(k), *G, *slopes["gyro"])
     factors = [
-        Factor.of("accelerometer", accel.on(pose_key(k), TRIAD_KEYS["accel"], *terms), 1.0 / accel.sigma),
-        Factor.of("gyro at rest", gyro.on(pose_key(k), TRIAD_KEYS["gyro"], deviation_key(k), *G), 1.0 / gyro.sigma),
+        Factor.of("accelerometer", of_accel, 1.0 / accel.sigma),
+        Factor.of("gyro at rest", of_gyro, 1.0 / gyro.sigma),
     ]
     if model.field is not None and poses.mag is not None and poses.mag_duration[k] > 0.0:
         mag = MagFactor(time, poses.mag[row], mag_density / np.sqrt(poses.mag_duration[row]))
@@ -134,9 +141,13 @@ def turn_factor(model: Model, k: int) -> Factor:
     duration = float(t[-1] - t[0])
     sigma = np.sqrt([model.density[0] ** 2 * duration + (model.unknown_rate * duration) ** 2])
     accel = [samples.accel] if feels else None
-    rotation = GyroRotationFactor(t[-1:], [t], [samples.gyro], model.earth_rate, sigma, accel)
+    drifts = "gyro" in model.parameters.slopes
+    warmth = np.array([samples.warmth]) if drifts else None
+    rotation = GyroRotationFactor(t[-1:], [t], [samples.gyro], model.earth_rate, sigma, accel, warmth)
     of_force = [SENSITIVITY_KEY, TRIAD_KEYS["accel"]] if feels else []
     gyro = TRIAD_KEYS["gyro"]
-    measured = rotation.on(pose_key(k - 1), pose_key(k), gyro, deviation_key(k - 1), deviation_key(k), *of_force)
+    slope = [SLOPE_KEYS["gyro"]] if drifts else []
+    ends = pose_key(k - 1), pose_key(k)
+    measured = rotation.on(*ends, gyro, deviation_key(k - 1), deviation_key(k), *of_force, *slope)
     angle = float(np.sum(np.linalg.norm(samples.gyro[1:], axis=1) * np.diff(t)))
     return Factor.process_of("gyro turns", measured, angle / sigma)

@@ -29,11 +29,15 @@ _LONGEST_GAP = 0.1
 
 @dataclass(frozen=True)
 class Turning:
-    """A turn's samples: stamps (N,), s, and gyro and accelerometer (N, 3) in nominal units."""
+    """A turn's samples: stamps (N,), s, and gyro and accelerometer (N, 3) in nominal units.
+
+    warmth, K: its mean temperature above the recording's first; 0 where nobody measures it.
+    """
 
     t: Array
     gyro: Array
     accel: Array
+    warmth: float
 
     @property
     def whole(self) -> bool:
@@ -66,7 +70,15 @@ class Model:
         rows = turn(self.data, self.poses.span[k - 1, 1], self.poses.span[k, 0])
         raw = self.config.section(CubeConfig).raw
         gyro, accel = nominal(self.data.gyro[rows], raw.gyro), nominal(self.data.accel[rows], raw.accel)
-        return Turning(self.data.imu_t[rows], gyro, accel)
+        t, warming = self.data.imu_t[rows], self.data.temperature
+        return Turning(t, gyro, accel, 0.0 if warming is None else float(warming.above(warming.first, t).mean()))
+
+    def warmth(self, sensor: str, k: int) -> Array | None:
+        """(1,) K, mean temperature in pose k above the recording's first; None where a sensor's offset ignores it."""
+        warming, celsius = self.data.temperature, self.poses.celsius
+        if warming is None or celsius is None or sensor not in self.parameters.slopes:
+            return None
+        return np.asarray(celsius[k : k + 1] - warming.first)
 
 
 def prepare(data: CubeData, config: Config) -> Model:
@@ -95,6 +107,7 @@ def prepare(data: CubeData, config: Config) -> Model:
             camera=data.camera is not None,
             reference=data.reference_t is not None,
             field=field,
+            thermometer=data.temperature is not None,
         ),
         gravity=float(gravity(data.latitude, data.height)),
         earth_rate=earth * np.array([1.0, 1.0, 1.0] if heading_known else [0.0, 0.0, 1.0]),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from pipelines.graph.noise import Level
 from pipelines.methods.cube.data import CubeData, computed_once, nominal, stated_density
 from pipelines.methods.cube.poses import static_poses
@@ -16,10 +18,11 @@ def noises(data: CubeData, config: Config) -> dict[str, Level]:
     raw, poses = config.section(CubeConfig).raw, static_poses(data, config)
     gyro = stated_density("gyro_density", data, config, "gyro turns", "gyro at rest")
     accel = stated_density("accel_density", data, config)
+    causes = poses.accel if poses.celsius is None else np.column_stack([poses.accel, poses.celsius])
     found = [
         sampled(gyro, data.imu_t, nominal(data.gyro, raw.gyro)),
         sampled(accel, data.imu_t, nominal(data.accel, raw.accel)),
-        walked(stated("gyro_bias_walk", config), poses.span.mean(axis=1), poses.gyro, poses.accel),
+        walked(stated("gyro_bias_walk", config), poses.span.mean(axis=1), poses.gyro, causes),
         repeatability("gyro", config, "gyro at rest"),
         repeatability("turn", config, "gyro turns"),
         repeatability("accel", config, "accelerometer"),

@@ -13,7 +13,7 @@ from factors import so3
 from factors.triad import TriadPriorFactor, calibration, triad
 from pipelines.errors import InputError
 from pipelines.graph import assumptions
-from pipelines.graph.assumptions import Assumption, quantities, sensitivity_assumption, stated
+from pipelines.graph.assumptions import Assumption, quantities, sensitivity_assumption, stated, temperature_assumption
 from pipelines.graph.linear import linear_factor
 from pipelines.graph.priors import prior_sigmas, rotation_prior, vector_prior
 from pipelines.graph.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
@@ -25,16 +25,22 @@ from pipelines.settings import Config, check_names
 
 TRIAD_KEYS: dict[str, int] = {name: int(gtsam.symbol(c, 0)) for name, c in zip(TRIADS, "AGM", strict=True)}
 MOUNT_KEY, SAID_KEY, FIELD_KEY, SENSITIVITY_KEY, CURVATURE_KEY, LENS_KEY = (int(gtsam.symbol(c, 0)) for c in "CHFSQL")
+# Sensor -> variable of its slope over temperature.
+SLOPE_KEYS: dict[str, int] = {"gyro": int(gtsam.symbol("K", 0)), "accel": int(gtsam.symbol("J", 0))}
 
 # The grades of consumer MEMS sensors and of a dual-antenna reference, one sigma.
 SENSITIVITY = sensitivity_assumption("gyro", "gyro", 2e-4)
 SQUARE = Assumption(tuple(f"accel_square_{i}" for i in "123"), "s^2/m", "accel", "square", 1e-5)
 CUBE = Assumption(tuple(f"accel_cube_{i}" for i in "123"), "s^4/m^2", "accel", "cube", 1e-6)
+TEMPERATURE = {
+    "gyro": temperature_assumption("gyro", "rad/s", 1e-4),
+    "accel": temperature_assumption("accel", "m/s^2", 1e-2),
+}
 TILT = Assumption(("reference_tilt_e", "reference_tilt_n"), "rad", "reference", "tilt", 1e-3)
 # What CameraInfo is off by; taken for exact unless the config says something of it.
 FOCAL = Assumption(("camera_focal",), "", "camera", "focal", 5e-3)
 CENTRE = Assumption(("camera_centre_x", "camera_centre_y"), "px", "camera", "centre", 3.0)
-ASSUMPTIONS = (SENSITIVITY, SQUARE, CUBE, TILT, FOCAL, CENTRE)
+ASSUMPTIONS = (SENSITIVITY, SQUARE, CUBE, TILT, FOCAL, CENTRE, *TEMPERATURE.values())
 
 # Triad -> unit of its nominal value, default prior sigma and accuracy wanted of its bias.
 _BIAS: Mapping[str, tuple[str, float, float]] = {
@@ -66,6 +72,7 @@ class Parameters:
         field_model: (3,) T.
         sensitivity: G of the gyro, None where it does not feel force.
         curvature: square and cube terms of the accelerometer, None where it has none.
+        slopes: sensor -> what its offset does with its temperature, where that is known.
         lens: what the camera's focal length and centre are off by, None where they are exact.
     """
 
@@ -78,6 +85,7 @@ class Parameters:
     field_model: Array | None
     sensitivity: Parameter | None
     curvature: Parameter | None
+    slopes: Mapping[str, Parameter]
     lens: Parameter | None = None
 
     @property
@@ -96,7 +104,7 @@ class Parameters:
     @property
     def assumed(self) -> tuple[Parameter | None, ...]:
         """Assumptions alone."""
-        return (self.sensitivity, self.curvature, self.lens)
+        return (self.sensitivity, self.curvature, self.lens, *self.slopes.values())
 
     @property
     def zeros(self) -> tuple[Parameter, ...]:
@@ -144,7 +152,9 @@ def _strength(key: int, model: Array) -> Factor:
     return Factor("prior", linear_factor({key: along}, {key: model}, STRENGTH_SIGMA))
 
 
-def cube_parameters(config: Config, camera: bool, reference: bool, field: Array | None) -> Parameters:
+def cube_parameters(
+    config: Config, camera: bool, reference: bool, field: Array | None, thermometer: bool = False
+) -> Parameters:
     """The parameters of a recording, with the config's priors and requirements.
 
     Args:
@@ -152,6 +162,7 @@ def cube_parameters(config: Config, camera: bool, reference: bool, field: Array 
         camera: whether the cube is seen; without, its body frame is the accelerometer's.
         reference: whether the camera's attitude is measured; without, mount and heading mean nothing and are fixed.
         field: (3,) T, the field model in n; None without a magnetometer.
+        thermometer: whether the temperature of gyro and accelerometer is measured.
 
     Raises:
         InputError: the config names a parameter that the method does not know, or states noise.gyro_scale.
@@ -210,6 +221,7 @@ def cube_parameters(config: Config, camera: bool, reference: bool, field: Array 
         sensitivity=assumptions.parameter(SENSITIVITY_KEY, (SENSITIVITY,), config),
         curvature=assumptions.parameter(CURVATURE_KEY, (SQUARE, CUBE), config),
         lens=_lens(config) if camera else None,
+        slopes=_slopes(config) if thermometer else {},
     )
 
 
@@ -220,6 +232,12 @@ def is_stated(assumption: Assumption, config: Config) -> bool:
         return True
     sheet = getattr(config.sensors, assumption.sheet)
     return assumption.figure in sheet.model_fields_set or any(name in config.priors for name in assumption.names)
+
+
+def _slopes(config: Config) -> dict[str, Parameter]:
+    """Those over temperature that are not all fixed."""
+    found = {name: assumptions.parameter(SLOPE_KEYS[name], (each,), config) for name, each in TEMPERATURE.items()}
+    return {name: parameter for name, parameter in found.items() if parameter is not None}
 
 
 def _lens(config: Config) -> Parameter | None:

@@ -58,6 +58,7 @@ class StaticPoses:
         duration: (P,) s, time that gyro and accelerometer are averaged over.
         mag: (P, 3) T, NaN for a pose without samples, or None.
         mag_duration: (P,) s.
+        celsius: (P,) mean temperatures, degrees Celsius; None where nobody measures them.
         tags: one a pose, None where no tag of the cube is seen well.
         dropped: reason -> number of tags or poses.
     """
@@ -68,6 +69,7 @@ class StaticPoses:
     duration: Array
     mag: Array | None
     mag_duration: Array
+    celsius: Array | None
     tags: tuple[SeenTags | None, ...]
     dropped: dict[str, int]
 
@@ -94,7 +96,10 @@ def static_poses(data: CubeData, config: Config) -> StaticPoses:
     tags: tuple[SeenTags | None, ...] = (None,) * len(span)
     if data.camera is not None:
         tags = _seen_tags(data, config, span, gyro, dropped)
-    return StaticPoses(span, gyro, accel, duration, mag, mag_duration, tags, dropped)
+    celsius = None
+    if data.temperature is not None:
+        celsius = _means(data.imu_t, data.temperature.above(0.0, data.imu_t)[:, None], span)[0][:, 0]
+    return StaticPoses(span, gyro, accel, duration, mag, mag_duration, celsius, tags, dropped)
 
 
 def turn(data: CubeData, start: float, stop: float) -> slice:
@@ -103,12 +108,12 @@ def turn(data: CubeData, start: float, stop: float) -> slice:
 
 
 def _means(t: Array, values: Array, span: Array) -> tuple[Array, Array]:
-    """Means (P, 3) over the spans, NaN over empty ones, and the time they are taken over (P,), s."""
+    """Means (P, d) over the spans, NaN over empty ones, and the time they are taken over (P,), s."""
     first, last = np.searchsorted(t, span[:, 0]), np.searchsorted(t, span[:, 1], side="right")
     number = last - first
     # About the whole mean, so that cumulative sums of counts keep their digits.
     centre = values.mean(axis=0)
-    sums = np.concatenate([np.zeros((1, 3)), np.cumsum(values - centre, axis=0)])
+    sums = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values - centre, axis=0)])
     means: Array = (sums[last] - sums[first]) / np.maximum(number, 1)[:, None] + centre
     means[number == 0] = np.nan
     return means, np.asarray(number * np.median(np.diff(t)))

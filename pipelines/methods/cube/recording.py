@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from pipelines.errors import InputError
+from pipelines.methods import temperature
 from pipelines.methods.cube.data import Array, CubeData
+from pipelines.methods.cube.parameters import TEMPERATURE
 from pipelines.methods.cube.sightings import read_camera, read_sightings
 from pipelines.methods.cube.topics import REFERENCE_FIX, REFERENCE_IMU, TAG_DETECTIONS, CubeConfig
 from pipelines.methods.cube.units import Readings, check_units
@@ -98,6 +100,7 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
         accel_density=accel_density,
         mag_density=mag_density,
         dropped=dropped,
+        temperature=temperature.read(recording, config, tuple(TEMPERATURE.values()), imu_t, dropped),
     )
     if data.camera is None:
         return data

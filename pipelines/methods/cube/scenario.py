@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from pipelines.methods.cube.faces import FACES, Resting
 from pipelines.settings import SensorSheets
+from pipelines.simulation.temperature import Warming
 
 # 2026-11-20 12:00 UTC, and the year of that day for the field model.
 EPOCH_NS, YEAR = 1_795_176_000_000_000_000, 2026.8849315068493
@@ -122,6 +123,7 @@ class CubeScenario(_Part):
     camera: CubeCamera | None = CubeCamera()
     magnetometer: Magnetometer | None = Magnetometer()
     reference: ReferenceAttitude | None = ReferenceAttitude()
+    temperature: Warming | None = None  # of gyro and accelerometer; null: nobody measures it
     # Data sheets that errors of sensors and field are drawn from, passed on to the config; ideal: there are none but
     # those of the field; null: none either, but the config does not know.
     sensors: SensorSheets | None = None

@@ -28,6 +28,7 @@ from pipelines.methods.cube.parameters import (
     FOCAL,
     SENSITIVITY,
     SQUARE,
+    TEMPERATURE,
     TILT,
     is_stated,
 )
@@ -48,6 +49,7 @@ from pipelines.simulation.motion import sample_times
 from pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
 from pipelines.simulation.sensors import true_values
 from pipelines.simulation.simulated import Simulated
+from pipelines.simulation.temperature import drift, known, measured
 from pipelines.vision.camera import Camera
 
 Array = NDArray[np.float64]
@@ -88,7 +90,8 @@ class _World:
         self.scenario = scenario
         # What sensors with errors add is drawn apart: a seed gives the same noise whatever they do.
         self.rng, rng_of_sensors = np.random.default_rng(seed), np.random.default_rng([seed, 1])
-        self.effects = true_values(ASSUMPTIONS, scenario.sensors, scenario.effects, rng_of_sensors)
+        assumed = known(ASSUMPTIONS, scenario.temperature)
+        self.effects = true_values(assumed, scenario.sensors, scenario.effects, rng_of_sensors)
         config = Config(sensors=scenario.sensors or Sensors())
         for assumption in (FOCAL, CENTRE):
             if not is_stated(assumption, config):
@@ -161,6 +164,7 @@ class _World:
             height=s.place.height,
             gyro_density=s.noise.gyro_density,
             accel_density=s.noise.accel_density,
+            temperature=measured(s.temperature, self.duration),
         )
         if s.magnetometer is not None:
             mag_t, mag = self._mag(s.magnetometer)
@@ -180,11 +184,11 @@ class _World:
 
     def _raw(self, name: str, nominal: Array, density: float, rate_hz: float, walk: Array | float = 0.0) -> Array:
         noise = density * np.sqrt(rate_hz) * self.rng.standard_normal(nominal.shape)
-        said = (nominal - self.b[name]) @ np.linalg.inv(self.K[name]).T
+        said = (nominal - self.b[name]) @ np.linalg.inv(self.K[name]).T + walk
         if name == "accel":
             square, cube = ([self.effects[f"accel_{term}_{i}"] for i in "123"] for term in ("square", "cube"))
             said = said + square * said**2 + cube * said**3
-        return np.asarray(said + walk + noise)
+        return np.asarray(said + noise)
 
     def _imu(self) -> tuple[Array, Array, Array]:
         s, rate = self.scenario, self.scenario.imu_rate_hz
@@ -200,9 +204,10 @@ class _World:
         accel = so3.rotate(so3.inverse(self.motion.attitude(moments)), force).reshape(-1, _PARTS, 3).mean(axis=1)
         walk = np.cumsum(s.noise.gyro_bias_walk / np.sqrt(rate) * self.rng.standard_normal(rates.shape), axis=0)
         felt = accel @ np.array([[self.effects[f"gyro_g_{i}{j}"] for i in "xyz"] for j in "xyz"])
-        gyro = self._raw("gyro", rates, s.noise.gyro_density, rate, walk + felt)
+        drifts = {name: drift(s.temperature, name, self.effects, t) for name in ("gyro", "accel")}
+        gyro = self._raw("gyro", rates, s.noise.gyro_density, rate, walk + felt + drifts["gyro"])
         self.b["gyro"] = self.b["gyro"] - self.K["gyro"] @ walk.mean(axis=0)
-        return t, gyro, self._raw("accel", accel, s.noise.accel_density, rate)
+        return t, gyro, self._raw("accel", accel, s.noise.accel_density, rate, drifts["accel"])
 
     def _mag(self, sensor: Magnetometer) -> tuple[Array, Array]:
         rate = sensor.rate_hz
@@ -278,7 +283,8 @@ class _World:
         return [Quad(np.full((1, 1), 120.0), (0.05, 0.018), cRt, (centre + on_edge) * 0.99)]
 
     def _truth(self) -> dict[str, float]:
-        truth = {name: self.effects[name] for each in (SENSITIVITY, SQUARE, CUBE) for name in each.names}
+        slopes = TEMPERATURE.values() if self.scenario.temperature else ()
+        truth = {name: self.effects[name] for each in (SENSITIVITY, SQUARE, CUBE, *slopes) for name in each.names}
         for name in ("accel", "gyro", *(("mag",) if self.scenario.magnetometer else ())):
             truth |= {f"{name}_k{i + 1}{j + 1}": float(self.K[name][i, j]) for i in range(3) for j in range(3)}
             truth |= {f"{name}_b{i + 1}": float(self.b[name][i]) for i in range(3)}

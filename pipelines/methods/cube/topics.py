@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from pipelines.recording import messages
-from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, MAG, Need, Setting, Topic
+from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, MAG, TEMPERATURE, Need, Setting, Topic
 from pipelines.settings import Board, Config, Date, MethodSection, Quaternion, Section, Sigma
 
 REFERENCE_FIX = Topic("reference_fix", "/reference/fix", (messages.NAV_SAT_FIX,))
@@ -93,7 +93,7 @@ def field_date(config: Config) -> datetime.date | None:
     return config.date or config.section(CubeConfig).date
 
 
-TOPICS = (IMU, MAG, REFERENCE_FIX, REFERENCE_IMU, TAG_DETECTIONS, IMAGE, CAMERA_INFO)
+TOPICS = (IMU, MAG, REFERENCE_FIX, REFERENCE_IMU, TAG_DETECTIONS, IMAGE, CAMERA_INFO, TEMPERATURE)
 _TAGS = Setting("cube.tags in the config", lambda config: bool(config.section(CubeConfig).tags))
 _METHOD = Setting("`method: cube` in the config", lambda config: config.method == "cube")
 NEEDS: tuple[Need, ...] = (

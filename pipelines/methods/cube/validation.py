@@ -45,7 +45,7 @@ def validate(data: CubeData, config: Config, values: Mapping[str, float]) -> lis
             good = np.isfinite(means[name]).all(axis=1)
             errors = [
                 np.linalg.norm(vectors[good], axis=1)[:, None] - strength[name]
-                for vectors in (means[name], calibrated(name, means[name], config, values))
+                for vectors in (means[name], calibrated(name, means[name], config, values, celsius=poses.celsius))
             ]
             found.append(Validation(f"{what} at rest, its strength", unit, time[good], *errors))
     if "gyro_k11" in values and sum(tags is not None for tags in poses.tags) > 1:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipelines.methods import temperature
 from pipelines.methods.cube.data import Array, CubeData, Sightings
 from pipelines.methods.cube.topics import REFERENCE_FIX, REFERENCE_IMU, TAG_DETECTIONS
 from pipelines.recording import series
@@ -69,6 +70,7 @@ def write_cube(
     if data.camera is not None and data.sightings is not None:
         topics[CAMERA_INFO.name] = _info_message(data.camera, epoch)
         topics |= _pictures_or_tags(data.sightings, epoch, pictures)
+    topics |= temperature.topics(data.temperature, epoch)
     write_session(path, topics, attached(truth, config_yaml))
 
 
