@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import textwrap
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -121,10 +122,10 @@ def test_defaults_of_the_noise_are_those_of_the_program() -> None:
 
 
 def test_every_dependency_is_named() -> None:
-    """The Dependencies section and pyproject.toml say the same."""
-    import tomllib
-
+    """The Dependencies section and pyproject.toml say the same, but for what only development needs."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     section = (DOCS / "limits.md").read_text(encoding="utf-8").split("## Dependencies")[1]
-    for requirement in project["dependencies"]:
+    extras = {name: needed for name, needed in project["optional-dependencies"].items() if name != "dev"}
+    assert set(re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE)) == extras.keys()
+    for requirement in [*project["dependencies"], *(each for needed in extras.values() for each in needed)]:
         assert re.split(r"[\[<>=]", requirement)[0] in section
