@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+import alidade as door
 from pipelines.config import load_config
 from pipelines.settings import DEFAULT_NOISE
 from tests.command import Command, Run
@@ -30,7 +31,8 @@ _CLUSTER = "docs/fleet.md"
 # Their commands need a process of their own.
 _APART = ("docs/fleet.md", "docs/write-your-own-method.md")
 # Their commands are those of other tests, on longer recordings; `make dist` walks all tutorials.
-_LONG = (*_APART, "docs/cube.md", "docs/trust.md", "docs/tutorials/cube.md", "docs/tutorials/los.md")
+_TUTORIALS = ("docs/tutorials/cube.md", "docs/tutorials/indexer.md", "docs/tutorials/los.md")
+_LONG = (*_APART, *_TUTORIALS, "docs/cube.md", "docs/trust.md")
 
 
 def _name(page: Path) -> str:
@@ -98,6 +100,12 @@ def test_outputs_are_compared(documented: str, printed: str, agree: bool) -> Non
 def test_links_lead_somewhere(page: Path) -> None:
     for target in _LINK.findall(page.read_text(encoding="utf-8")):
         assert (page.parent / target).exists(), target
+
+
+def test_the_reference_has_every_name_of_the_public_door() -> None:
+    page = (DOCS / "reference" / "api.md").read_text(encoding="utf-8")
+    for name in set(door.__all__) - {"__version__"}:
+        assert re.search(rf"^\.\. auto\w+:: alidade\.{name}\b", page, re.MULTILINE), name
 
 
 def test_code_of_the_example_is_that_of_its_files() -> None:
