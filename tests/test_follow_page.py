@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+import io
+import socket
 import sys
 import threading
 import time
 import urllib.error
 import urllib.request
+from contextlib import suppress
 from dataclasses import replace
 from http.cookiejar import CookieJar
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from rich.console import Console
 
 from pipelines.errors import InputError
 from pipelines.follow.follower import Follower, Settings
 from pipelines.follow.guidance import View
 from pipelines.follow.page import LivePage
+from pipelines.follow.screen import Screen
 from pipelines.follow.sources import Source
 from pipelines.graph.motion import Motion
 from pipelines.graph.problem import Quantity
@@ -108,6 +114,67 @@ def test_the_address_on_the_network_serves_once() -> None:
         assert _asked(first)[0] == 403, "used before"
         assert page.url in said[-1]
         assert page.url.partition("?")[2] != first.partition("?")[2]
+
+
+def test_a_phone_reads_the_address_from_the_terminal() -> None:
+    console = Console(force_terminal=True, width=100, record=True, file=io.StringIO())
+    address = "http://192.168.100.200:8766/?token=ed9855c552"
+    Screen(console).show_address(address)
+    rows = [list(line.ljust(37)) for line in console.export_text().splitlines()]
+    cells = np.array(rows)
+    dark = np.stack([np.isin(cells, ["▀", "█"]), np.isin(cells, ["▄", "█"])], axis=1).reshape(-1, cells.shape[1])
+    picture = cv2.resize(np.where(dark, 0, 255).astype(np.uint8), None, fx=8, fy=8, interpolation=cv2.INTER_NEAREST)
+    assert cv2.QRCodeDetector().detectAndDecode(picture)[0] == address
+
+
+class Link:
+    """A network between a browser and a server: what goes through it can be held up without anybody being told."""
+
+    def __init__(self, port: int) -> None:
+        self._to = port
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listening.getsockname()[1]
+        self._held: list[threading.Event] = []
+        threading.Thread(target=self._accept, daemon=True).start()
+
+    def hold(self) -> None:
+        """Whatever is connected by now gets nothing any more."""
+        for event in self._held:
+            event.set()
+
+    def _accept(self) -> None:
+        while True:
+            near = self._listening.accept()[0]
+            far = socket.create_connection(("127.0.0.1", self._to))
+            held = threading.Event()
+            self._held.append(held)
+            for a, b in ((near, far), (far, near)):
+                threading.Thread(target=self._pass, args=(a, b, held), daemon=True).start()
+
+    def _pass(self, a: socket.socket, b: socket.socket, held: threading.Event) -> None:
+        with suppress(OSError):
+            while data := a.recv(1 << 16):
+                if held.is_set():
+                    return
+                b.sendall(data)
+            b.shutdown(socket.SHUT_WR)
+
+
+@needs_browser
+@pytest.mark.slow
+def test_a_connection_on_which_nothing_comes_is_made_anew(tmp_path: Path) -> None:
+    with LivePage(print, port=0) as page, Tab(tmp_path) as tab:
+        link = Link(int(urlsplit(page.url).port or 0))
+        page.show(_view(1.0, 1e-2))
+        tab.open(f"http://127.0.0.1:{link.port}/")
+        tab.wait(f"{WORDS} === 'Sway the carrier about its x'")
+        time.sleep(10.0)
+        assert not tab.value(LOST), "the server says that it is there"
+        link.hold()
+        page.show(_view(2.0, 1e-4))
+        began = time.monotonic()
+        tab.wait(f"{WORDS} === 'You may stop'", 15.0)
+        assert 5.0 < time.monotonic() - began < 12.0
 
 
 def test_on_this_machine_other_names_are_refused() -> None:

@@ -51,6 +51,8 @@ def follow(
         page = None if page_at is None else stack.enter_context(LivePage(screen.say, *page_at, name=what))
         if page is not None:
             screen.say(f"page at {page.url}")
+            if page.is_open:
+                screen.show_address(page.url)
 
         def show(view: View) -> None:
             screen.show(view)

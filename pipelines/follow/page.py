@@ -52,6 +52,8 @@ _HEADERS = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
     "Cache-Control": "no-store",
+    # A browser that has lost the network would try the idle connections that it kept first, one every few seconds.
+    "Connection": "close",
 }
 
 
@@ -60,8 +62,11 @@ class LivePage:
 
     Raises InputError when starlette or uvicorn is not installed, or there is no such address or no port free there.
 
+    Attributes:
+        is_open: to others than this machine, by a token.
+
     Args:
-        say: is told where the page is, and where the next device finds it once a token has been used.
+        say: is told where the next device finds the page once a token has been used.
         host: address of this machine to be reached by; the loopback one is for this machine alone.
         port: 0: any that is free.
         name: of the recording.
@@ -79,7 +84,7 @@ class LivePage:
         self._say, self._host = say, host
         self._socket = _listening(host, port)
         self._port = self._socket.getsockname()[1]
-        self._is_open = not _is_loopback(self._socket.getsockname()[0])
+        self.is_open = not _is_loopback(self._socket.getsockname()[0])
         self._token, self._key = _token(), secrets.token_urlsafe(32)
         self._histories: dict[str, list[tuple[float, float]]] = {}
         self._state: dict[str, Any] = {"name": name, "notes": [], "over": None}
@@ -106,10 +111,10 @@ class LivePage:
     def url(self) -> str:
         """What to open in a browser."""
         host = self._host
-        if self._is_open and ipaddress.ip_address(self._socket.getsockname()[0]).is_unspecified:
+        if self.is_open and ipaddress.ip_address(self._socket.getsockname()[0]).is_unspecified:
             host = _outward()
         address = f"http://{f'[{host}]' if ':' in host else host}:{self._port}/"
-        return f"{address}?token={self._token}" if self._is_open else address
+        return f"{address}?token={self._token}" if self.is_open else address
 
     def __enter__(self) -> LivePage:
         self._thread.start()
@@ -206,7 +211,7 @@ class LivePage:
 
     def _may(self, request: Request) -> bool:
         """Whether whoever asks is to be answered."""
-        if self._is_open:
+        if self.is_open:
             return secrets.compare_digest(request.cookies.get(self._cookie, ""), self._key)
         return request.url.hostname in {"localhost", self._host, self._socket.getsockname()[0]}
 
@@ -220,7 +225,7 @@ class LivePage:
 
         if self._may(request):
             return HTMLResponse(_html(), headers=_HEADERS)
-        if self._is_open and secrets.compare_digest(request.query_params.get("token", ""), self._token):
+        if self.is_open and secrets.compare_digest(request.query_params.get("token", ""), self._token):
             self._token = _token()
             self._say(f"page opened from {request.client.host if request.client else '?'}; next device: {self.url}")
             answer = RedirectResponse("/", 303)

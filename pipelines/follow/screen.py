@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pipelines.follow.guidance import View
+from pipelines.follow.qr import qr
 from pipelines.reports.units import human_unit, to_digits_of
 from pipelines.terminal import COLOURS
 
@@ -42,6 +43,11 @@ class Screen:
     def say(self, text: str) -> None:
         """One line that stays."""
         self._console.print(escape(text), soft_wrap=True)
+
+    def show_address(self, address: str) -> None:
+        """A QR code, where there is a terminal to show it to a phone."""
+        if self._console.is_terminal:
+            self._console.print(qr(address))
 
     def show(self, view: View) -> None:
         """The state by now."""
