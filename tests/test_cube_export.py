@@ -136,6 +136,26 @@ def test_kalibr_loads_and_holds_the_noise_measured() -> None:
         exported(_calibration(eye, zero), "kalibr")
 
 
+def test_openvins_holds_all_of_accelerometer_and_gyro() -> None:
+    full = {name: np.eye(3) + 0.05 * RNG.normal(size=(3, 3)) for name in ("accel", "gyro")}
+    saved, raw, nominal = _fits(full)
+    row: dict[str, object] = {"topic": "/imu", "rate_hz": 200.0, "density": [1e-3] * 3, "walk": 1e-5, "walk_source": ""}
+    saved.findings["noise"] = [{"sensor": name, **row} for name in full]
+    text = exported(saved, "openvins")
+    assert text.startswith("%YAML:1.0\n")
+    imu = YAML(typ="safe", pure=True).load(text.split("\n", 1)[1])["imu0"]
+    assert imu["model"] == "kalibr"
+    assert imu["gyroscope_noise_density"] == 1e-3
+    for name, T, R in (("accel", "Ta", "R_IMUtoACC"), ("gyro", "Tw", "R_IMUtoGYRO")):
+        D = np.linalg.inv(imu[T])
+        # OpenVINS takes nothing above the diagonal.
+        np.testing.assert_allclose(np.triu(D, 1), 0.0, atol=1e-11)
+        b = -np.linalg.solve(full[name], nominal[name][0] - full[name] @ raw[name][0])
+        applied = (raw[name] - b) @ (np.transpose(imu[R]) @ np.tril(D)).T
+        np.testing.assert_allclose(applied, nominal[name], rtol=1e-9, atol=1e-10)
+    np.testing.assert_array_equal(imu["Tg"], np.zeros((3, 3)))
+
+
 @pytest.mark.parametrize("form", ["px4", "ardupilot"])
 def test_counts_are_no_autopilots_units(form: str) -> None:
     counts = _calibration({"accel": 2e-3 * np.eye(3)}, {"accel": np.zeros(3)}, unit="m/s^2/count")

@@ -160,6 +160,10 @@ def _kalibr(saved: SavedCalibration) -> str:
 
     Raises InputError when the calibration does not hold the noise.
     """
+    return "\n".join([*_noise_lines(saved), ""])
+
+
+def _noise_lines(saved: SavedCalibration) -> list[str]:
     noise: dict[str, Any] = {str(row.get("sensor")): row for row in saved.findings.get("noise", [])}
     if not all(min(noise.get(name, {}).get("density", [0.0])) > 0.0 for name in ("accel", "gyro")):
         raise InputError(
@@ -176,8 +180,46 @@ def _kalibr(saved: SavedCalibration) -> str:
         # With a point in it, else YAML 1.1 takes it for a word.
         lines.append(f"{word}_noise_density: {density:.4e} # {unit}/sqrt(Hz), measured")
         lines.append(f"{word}_random_walk: {row['walk']:.4e} # {unit}/s/sqrt(Hz), {row['walk_source']}")
-    lines += [f"rostopic: {noise['gyro']['topic']}", f"update_rate: {noise['gyro']['rate_hz']:.6g}"]
-    return "\n".join([*lines, ""])
+    return [*lines, f"rostopic: {noise['gyro']['topic']}", f"update_rate: {noise['gyro']['rate_hz']:.6g}"]
+
+
+def _openvins(saved: SavedCalibration) -> str:
+    """OpenVINS's kalibr_imu_chain.yaml: noise, and K of accelerometer and gyro whole.
+
+    It applies R_IMUtoACC' Ta^-1 (raw - bias) and R_IMUtoGYRO' Tw^-1 (raw - bias - Tg a), the inverses lower triangular;
+    biases it finds by itself.
+
+    Raises InputError when the calibration holds no noise, a sensor was recorded in counts, or its axes are left-handed.
+    """
+    noise = _noise_lines(saved)
+    triads, _ = _in_si(saved)
+    lines = ["%YAML:1.0", "", "imu0:", *_matrix("T_i_b", np.eye(4)), *(f"  {line}" for line in noise)]
+    lines += ["  time_offset: 0.0", '  model: "kalibr"']
+    for name, T, rotation, what in (
+        ("gyro", "Tw", "R_IMUtoGYRO", "rad/s"),
+        ("accel", "Ta", "R_IMUtoACC", "m/s^2"),
+    ):
+        K, b = triads[name]
+        R, D = lower_triangular_part(K)
+        if np.linalg.det(R) < 0.0:
+            raise InputError(f"the axes of {name} are left-handed, and OpenVINS has no place for that")
+        offset = ", ".join(f"{x:.6g}" for x in zero_offset(K, b))
+        lines += [f"  # {name}: its bias was {offset} {what}; OpenVINS finds it anew", *_matrix(T, np.linalg.inv(D))]
+        lines += _matrix(rotation, R.T)
+    names = [f"gyro_g_{row}{column}" for row in "xyz" for column in "xyz"]
+    held = [saved.parameters[name].value if name in saved.parameters else 0.0 for name in names]
+    return "\n".join([*lines, *_matrix("Tg", np.reshape(held, (3, 3))), ""])
+
+
+def lower_triangular_part(K: Array) -> tuple[Array, Array]:
+    """R orthogonal and D lower triangular, positive on its diagonal, with K = R D."""
+    q, r = np.linalg.qr(K[::-1, ::-1])
+    signs = np.sign(np.diag(r))
+    return (q * signs)[::-1, ::-1], (signs[:, None] * r)[::-1, ::-1]
+
+
+def _matrix(name: str, rows: Array) -> list[str]:
+    return [f"  {name}:", *(f"    - [{', '.join(f'{x:.12g}' for x in row)}]" for row in rows)]
 
 
 FORMATS: Mapping[str, Callable[[SavedCalibration], str]] = {
@@ -185,6 +227,7 @@ FORMATS: Mapping[str, Callable[[SavedCalibration], str]] = {
     "ardupilot": _ardupilot,
     "ros2": _ros2,
     "kalibr": _kalibr,
+    "openvins": _openvins,
 }
 
 
