@@ -204,7 +204,10 @@ def _openvins(saved: SavedCalibration) -> str:
         if np.linalg.det(R) < 0.0:
             raise InputError(f"the axes of {name} are left-handed, and OpenVINS has no place for that")
         offset = ", ".join(f"{x:.6g}" for x in zero_offset(K, b))
-        lines += [f"  # {name}: its bias was {offset} {what}; OpenVINS finds it anew", *_matrix(T, np.linalg.inv(D))]
+        lines += [
+            f"  # {name}: its bias was {offset} {what}; OpenVINS finds it anew",
+            *_matrix(T, np.asarray(np.linalg.inv(D), dtype=float)),
+        ]
         lines += _matrix(rotation, R.T)
     names = [f"gyro_g_{row}{column}" for row in "xyz" for column in "xyz"]
     held = [saved.parameters[name].value if name in saved.parameters else 0.0 for name in names]
