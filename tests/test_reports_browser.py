@@ -19,10 +19,9 @@ SCENARIOS = {
 }
 
 
+@pytest.mark.slow
 @needs_browser
-@pytest.mark.parametrize(
-    "name", ["los", "cube", *(pytest.param(name, marks=pytest.mark.slow) for name in ("indexer", "head"))]
-)
+@pytest.mark.parametrize("name", SCENARIOS)
 def test_a_browser_draws_the_report_at_the_width_of_a_desktop_and_of_a_phone(name: str, tmp_path: Path) -> None:
     (tmp_path / "scenario.yaml").write_text(SCENARIOS[name])
     simulate(name, str(tmp_path / "scenario.yaml"), 1, tmp_path / "s.mcap")
@@ -34,5 +33,7 @@ def test_a_browser_draws_the_report_at_the_width_of_a_desktop_and_of_a_phone(nam
 
 @needs_browser
 def test_a_page_too_wide_for_a_phone_is_caught(tmp_path: Path) -> None:
-    with pytest.raises(AssertionError, match="at 390 px: too wide"):
-        drawn('<!doctype html><div style="width: 600px">wide</div>', tmp_path)
+    wide = '<!doctype html><meta name="viewport" content="width=device-width"><div style="width: {}px">wide</div>'
+    for width, where in ((600, "at 390 px"), (1000, "on paper"), (1400, "at 1280 px")):
+        with pytest.raises(AssertionError, match=f"{where}: too wide"):
+            drawn(wide.format(width), tmp_path)

@@ -31,16 +31,24 @@ def test_differences_are_in_sigmas_of_batch() -> None:
     assert page.loaded == []
     estimated = [q for q in solvers()[0].problem.quantities if q.prior_sigma != 0.0]
     assert page.text.count("+2.0") == len(estimated)
-    assert "error, σ" not in page.text
-    assert "agree with itself" not in page.text
+    assert "error of" not in page.text
+    assert "cannot say Neither half determines a parameter" in page.text
 
 
 def test_truth_halves_and_held_out_measurements_are_told() -> None:
     halves = {"time_offset": Halves(0.010, 0.003, 0.020, 0.004)}
     page = Page(compare_html(solvers({"time_offset": 0.0125}), halves, {"vision": 1.06}))
-    assert "error, σ" in page.text
+    assert "error of batch, sigmas" in page.text
+    assert "Does the recording agree with itself? yes Its two halves" in page.text
     assert "10.0 ± 3.0 20.0 ± 4.0 +2.0" in page.text
     assert "1.06 sigmas (vision)" in page.text
+
+
+def test_halves_that_differ_by_more_than_chance_are_told() -> None:
+    halves = {"time_offset": Halves(0.010, 0.003, 0.040, 0.004), "gyro_bias_x": Halves(0.0, 1e-3, 1e-4, 1e-3)}
+    page = Page(compare_html(solvers(), halves, {}))
+    assert "Does the recording agree with itself? no" in page.text
+    assert "time_offset (+6.0)" in page.text
 
 
 def test_ellipses_are_drawn_of_correlated_pairs_only() -> None:

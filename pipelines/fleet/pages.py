@@ -12,14 +12,15 @@ from numpy.typing import NDArray
 
 from pipelines.fleet import statistics
 from pipelines.fleet.analysis import Population, iso
-from pipelines.fleet.attention import readable, sentence, units_of_interest
+from pipelines.fleet.attention import Unit, readable, sentence, units_of_interest
 from pipelines.fleet.histories import History
 from pipelines.fleet.statistics import Component
 from pipelines.graph.problem import Array, Quantity
+from pipelines.reports.answer import Answer
 from pipelines.reports.figure import COLORS, REJECTED, Figure, Shape, milliseconds, thin
 from pipelines.reports.result import Plot
 from pipelines.reports.templating import page
-from pipelines.reports.units import human_unit, to_digits_of
+from pipelines.reports.units import human_unit, rounded, to_digits_of
 
 if TYPE_CHECKING:
     from pipelines.fleet.fleet import Outcome
@@ -48,11 +49,25 @@ def fleet_html(outcome: Outcome, fleet: Sequence[Population], found: Sequence[Hi
         first=iso(min(dates, default=None)),
         last=iso(max(dates, default=None)),
         several=len(found),
-        sentence=sentence(attention),
+        answer=_attention(attention, len({r["unit"] for r in results.values()}), bool(fleet)),
         attention=attention[:_MOST_LISTED],
         hidden=max(len(attention) - _MOST_LISTED, 0),
         parameters=[_parameter_row(p) for p in fleet],
     )
+
+
+def _attention(found: Sequence[Unit], units: int, parameters: bool) -> Answer:
+    """Which units need attention."""
+    question = "Which units need attention?"
+    if not found:
+        word = "none" if parameters else "cannot say"
+        said = f"None of {units} units stands out." if parameters else "No recording gave a calibration to compare."
+        return Answer(question, word, "good" if parameters else "fixed", said)
+    steps = (
+        "Start with the first in the table: units that changed, then those unlike the others.",
+        "Record a unit again before it is sent back: what stands out twice is the unit, not the recording.",
+    )
+    return Answer(question, f"{len(found)} of {units}", "warn", f"Of {units} units, {sentence(found)}.", (), steps)
 
 
 def study_html(study: Study) -> str:
@@ -63,6 +78,7 @@ def study_html(study: Study) -> str:
         "montecarlo.html",
         [plot for solver in solvers for plot in (_nees_plot(study, solver), _errors_plot(study, solver))],
         study=study,
+        answer=_truth(study, solvers),
         finished=len(study.results),
         rows=[_consistency_row(study, solver) for solver in solvers],
         failures={solver: study.failures(solver) for solver in study.solvers},
@@ -77,7 +93,8 @@ def _parameter_row(p: Population) -> dict[str, Any]:
     """The cells of a parameter, in the unit people read."""
     unit, factor = readable(p)
     sigma = factor * float(np.median(p.sigmas))
-    row: dict[str, Any] = {"name": p.name, "method": p.method, "unit": unit, "count": len(p.values), "sigma": sigma}
+    row: dict[str, Any] = {"name": p.name, "method": p.method, "unit": unit.removeprefix("1"), "count": len(p.values)}
+    row |= {"sigma": rounded(sigma)}
     row |= {"centre": "", "low": "", "high": "", "beyond": "", "drift": "", "drifts": p.drifts}
     row |= {"outlying": int(p.outlying.sum()), "changed": len({p.units[i] for i in np.flatnonzero(p.changed)})}
     row |= {"of": "device" if p.of_device else "recording"}
@@ -89,7 +106,7 @@ def _parameter_row(p: Population) -> dict[str, Any]:
         row |= {"low": low, "high": high, "beyond": p.beyond}
     if p.drift:
         slope, slope_sigma = (_MONTH * factor * number for number in (p.drift.slope, p.drift.sigma))
-        row["drift"] = f"{to_digits_of(slope, slope_sigma)} ± {slope_sigma:.2g}"
+        row["drift"] = f"{to_digits_of(slope, slope_sigma)} ± {rounded(slope_sigma)}"
     return row
 
 
@@ -98,7 +115,7 @@ def _component(component: Component | None, factor: float) -> str:
     if component is None:
         return ""
     if component.value == 0.0:
-        return f"< {factor * component.upper:.2g}"
+        return f"< {rounded(factor * component.upper)}"
     value, sigma = (to_digits_of(factor * x, factor * component.sigma) for x in (component.value, component.sigma))
     return f"{value} ± {sigma}"
 
@@ -143,6 +160,26 @@ def _add_counts(
 # -- studies
 
 
+def _truth(study: Study, solvers: Sequence[str]) -> Answer:
+    """Whether the sigmas are true; of the published solver, whose are not its own, nothing is promised."""
+    question = "Are the sigmas true?"
+    judged = {solver: study.nees(solver) for solver in solvers if solver != "published"} or {
+        solver: study.nees(solver) for solver in solvers
+    }
+    if not judged:
+        return Answer(question, "cannot say", "fixed", "No run gave an estimate.")
+    said = ", ".join(
+        f"{solver} has a mean NEES of {nees.mean:.3g} where {nees.dof:g} is right and chance makes {nees.low:.3g} to "
+        f"{nees.high:.3g}"
+        for solver, nees in judged.items()
+    )
+    wrong = [solver for solver, nees in judged.items() if not nees.consistent]
+    if not wrong:
+        return Answer(question, "yes", "good", f"Errors are as large as the sigmas say: {said}.")
+    steps = ("See below which parameters' ratio of error to sigma is far from 1, and which are biased.",)
+    return Answer(question, "no", "bad", f"Not those of {', '.join(wrong)}: {said}.", (), steps)
+
+
 def _consistency_row(study: Study, solver: str) -> dict[str, Any]:
     nees = study.nees(solver)
     return {
@@ -161,10 +198,10 @@ def _accuracy_row(solver: str, name: str, row: tuple[statistics.Accuracy, Result
         "solver": solver,
         "name": name,
         "unit": unit,
-        "bias": f"{to_digits_of(factor * a.bias, factor * a.bias_sigma)} ± {factor * a.bias_sigma:.2g}",
+        "bias": f"{to_digits_of(factor * a.bias, factor * a.bias_sigma)} ± {rounded(factor * a.bias_sigma)}",
         "biased": abs(a.bias) > 3.0 * a.bias_sigma,
-        "rms": f"{factor * a.rms:.3g}",
-        "sigma": f"{factor * a.sigma:.3g}",
+        "rms": rounded(factor * a.rms, 3),
+        "sigma": rounded(factor * a.sigma, 3),
         "ratio": a.rms / a.sigma,
         "coverage": a.coverage,
     }

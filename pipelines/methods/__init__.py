@@ -55,6 +55,10 @@ class Method(ABC):
         sheets: the data sheets it uses, as under `sensors` in the config.
         of_recording: patterns of the parameters that belong to a recording; the others are the device's.
         rotations: parameters that are rotation vectors, without their _x, _y, _z -> the rotation each is.
+        meanings: pattern of parameters' names -> what they are, a sentence with {0}, {1} for the pattern's groups; what
+            `pipelines.methods.meanings` says of all methods need not stand there.
+        components: family of measurements -> what its residuals are, one by one, where they are not x, y and z.
+        sketch: picture of the frames, SVG, if there is one; `pipelines.reports.sketch` says what it may have.
         scenarios: folder with scenarios that come with the method, if it brings its own.
         drawn: whether its simulator draws motions, or sensors far from nominal, from the seed, so that one recording of
             a scenario determines more than another.
@@ -70,6 +74,9 @@ class Method(ABC):
     sheets: ClassVar[tuple[str, ...]] = ()
     of_recording: ClassVar[tuple[str, ...]] = ()
     rotations: ClassVar[Mapping[str, str]] = {}
+    meanings: ClassVar[Mapping[str, str]] = {}
+    components: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    sketch: ClassVar[Path | None] = None
     scenarios: ClassVar[Path | None] = None
     drawn: ClassVar[bool] = False
     yields: ClassVar[bool] = False

@@ -3,35 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from statistics import NormalDist
 
 import numpy as np
 
 from pipelines.graph.problem import Quantity
 from pipelines.judgement.halves import Halves
+from pipelines.reports.answer import Answer
 from pipelines.reports.figure import COLORS, Dash, Figure
 from pipelines.reports.result import Calibration, Plot, truth_errors
 from pipelines.reports.templating import page
-from pipelines.reports.units import human_unit, to_digits_of
+from pipelines.reports.units import human_unit, signed, to_digits_of
 from pipelines.reports.whole import write_page
 
 FILE = "compare.html"
+# How often chance alone may take any parameter of the halves apart.
+_CHANCE = 1e-3
 # Lines of the solvers, the exact ones over the published.
 _STYLES: dict[str, tuple[str, Dash]] = {
     "published": (COLORS[1], "dotted"),
     "batch": (COLORS[2], "dashed"),
     "incremental": (COLORS[0], "solid"),
 }
-
-
-@dataclass(frozen=True)
-class _Cell:
-    """What one solver says of a parameter."""
-
-    value: str  # with its sigma
-    from_batch: str
-    error: str
 
 
 def compare_html(
@@ -44,8 +38,8 @@ def compare_html(
         halves: of the recording, see pipelines.judgement.halves.
         predicted: family -> size of the errors of held-out measurements, sigmas.
     """
-
     quantities = [q for q in calibrations[0].problem.quantities if q.prior_sigma != 0.0]
+    known = calibrations[0].truth is not None
     plots = [*_differences(calibrations, quantities), *_convergence(calibrations, quantities)]
     return page(
         "pipelines.reports",
@@ -54,8 +48,18 @@ def compare_html(
         calibrations=calibrations,
         recording=calibrations[0].recording,
         method=calibrations[0].problem.method,
-        truth_known=calibrations[0].truth is not None,
-        rows=[(q.name, human_unit(q)[0], [_cell(c, calibrations, q) for c in calibrations]) for q in quantities],
+        answer=_answer(halves, predicted),
+        truth_known=known,
+        several=len(calibrations) > 1 and _batch(calibrations) is not None,
+        columns=["parameter", "unit", *(head for c in calibrations for head in _heads(c, calibrations, known))],
+        rows=[
+            [
+                q.name,
+                human_unit(q)[0].removeprefix("1"),
+                *(cell for c in calibrations for cell in _cells(c, calibrations, q, known)),
+            ]
+            for q in quantities
+        ],
         halves=[_half(q, halves[q.name]) for q in quantities if q.name in halves],
         predicted=predicted,
     )
@@ -89,19 +93,52 @@ def _from_batch(calibration: Calibration, calibrations: Sequence[Calibration], n
     return (mine[0] - reference[0]) / reference[1]
 
 
-def _cell(calibration: Calibration, calibrations: Sequence[Calibration], quantity: Quantity) -> _Cell | None:
+def _heads(calibration: Calibration, calibrations: Sequence[Calibration], known: bool) -> list[str]:
+    """Of a solver's columns."""
+    solver, batch = calibration.estimate.solver, _batch(calibrations)
+    apart = [f"{solver} from batch, sigmas"] if batch is not None and batch is not calibration else []
+    return [solver, *apart, *([f"error of {solver}, sigmas"] if known else [])]
+
+
+def _cells(calibration: Calibration, calibrations: Sequence[Calibration], quantity: Quantity, known: bool) -> list[str]:
+    """What a solver says of a parameter; a dash and nothing where it does not know it."""
     found = _found(calibration, quantity.name)
+    columns = len(_heads(calibration, calibrations, known))
     if found is None:
-        return None
+        return ["-", *[""] * (columns - 1)]
     _, factor = human_unit(quantity)
-    value, sigma = (factor * number for number in found)
     far = _from_batch(calibration, calibrations, quantity.name)
     error = truth_errors(calibration).get(quantity.name)
-    return _Cell(
-        _with_sigma(value, sigma),
-        "" if far is None else f"{far:+.1f}",
-        "" if error is None or error.error_sigmas is None else f"{error.error_sigmas:+.1f}",
+    apart = ["" if far is None else signed(far)] if columns - known == 2 else []
+    off = ["" if error is None or error.error_sigmas is None else signed(error.error_sigmas)] if known else []
+    return [_with_sigma(factor * found[0], factor * found[1]), *apart, *off]
+
+
+def _answer(halves: Mapping[str, Halves], predicted: Mapping[str, float]) -> Answer:
+    """Whether the recording agrees with itself."""
+    question = "Does the recording agree with itself?"
+    held_out = ", ".join(f"{size:.2f} ({family})" for family, size in predicted.items())
+    said = f" Measurements held out are predicted to {held_out} of their sigmas." if held_out else ""
+    if not halves:
+        sentence = "Neither half determines a parameter by itself, so they cannot be held against each other."
+        return Answer(question, "cannot say", "fixed", sentence + said, (), ("Record about twice as long.",))
+    limit = NormalDist().inv_cdf(1.0 - 0.5 * _CHANCE / len(halves))
+    far = {name: half.difference_sigmas for name, half in halves.items() if abs(half.difference_sigmas) > limit}
+    if not far:
+        most = max(abs(half.difference_sigmas) for half in halves.values())
+        sentence = (
+            f"Its two halves, each solved by itself, agree in all {len(halves)} parameters that both determine: they "
+            f"differ by {most:.1f} sigmas at most, and chance makes {limit:.1f} in one recording of a thousand."
+        )
+        return Answer(question, "yes", "good", sentence + said, (), ("Go by the batch solver's result, and apply it.",))
+    named = ", ".join(f"{name} ({signed(z)})" for name, z in sorted(far.items(), key=lambda item: -abs(item[1])))
+    sentence = f"Its two halves differ by more than the {limit:.1f} sigmas that chance explains: {named}."
+    steps = (
+        "Ask what happened in between: a knock, a cable, warming up; a gyro's bias walks, and may differ for that.",
+        "If something moved, calibrate the two parts each by itself; if nothing did, look at the residuals in the "
+        "report of `alidade calibrate`, which tries causes.",
     )
+    return Answer(question, "no", "bad", sentence + said, (), steps)
 
 
 def _with_sigma(value: float, sigma: float) -> str:
@@ -112,7 +149,7 @@ def _half(quantity: Quantity, halves: Halves) -> tuple[str, str, str, str, str]:
     unit, factor = human_unit(quantity)
     first = _with_sigma(factor * halves.first, factor * halves.first_sigma)
     second = _with_sigma(factor * halves.second, factor * halves.second_sigma)
-    return quantity.name, unit, first, second, f"{halves.difference_sigmas:+.1f}"
+    return quantity.name, unit.removeprefix("1"), first, second, signed(halves.difference_sigmas)
 
 
 def _differences(calibrations: Sequence[Calibration], quantities: Sequence[Quantity]) -> list[Plot]:

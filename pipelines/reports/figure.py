@@ -106,7 +106,7 @@ class Figure:
 
     y_title: str = ""
     x_title: str = "time, s"
-    height: int = 320
+    height: int = 270
     share: float = 1.0
     x_scale: Scale = "linear"
     y_scale: Scale = "linear"

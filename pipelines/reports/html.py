@@ -7,15 +7,22 @@ shows here.
 from __future__ import annotations
 
 import datetime
+from contextlib import suppress
 from dataclasses import dataclass
 
 from pipelines.graph.problem import Quantity
 from pipelines.judgement.observability import by_advice
+from pipelines.methods.meanings import meaning
+from pipelines.reports.answer import Answer, Tone
 from pipelines.reports.budget import Limit, limits
+from pipelines.reports.calibration import SavedCalibration, saved
 from pipelines.reports.plots import common_plots
 from pipelines.reports.result import Calibration, Plot, Table, quantities_of, truth_errors
+from pipelines.reports.ros import ros_parameters
+from pipelines.reports.sketch import enlarged, sketch_with, told
+from pipelines.reports.snippets import c_code, python_code
 from pipelines.reports.templating import environment, page
-from pipelines.reports.units import human_unit, to_digits_of
+from pipelines.reports.units import human_unit, rounded, signed, to_digits_of
 
 # Beyond so many sigmas of its prior a number says nothing.
 _MEANINGLESS = 10.0
@@ -30,6 +37,7 @@ class _Row:
     """A parameter as people read it."""
 
     name: str
+    meaning: str
     value: str
     sigma: str
     unit: str
@@ -55,6 +63,10 @@ def report_html(calibration: Calibration) -> str:
     own = list(calibration.plots(calibration)) if calibration.plots else []
     plots = [*(each for each in own if isinstance(each, Plot)), *common_plots(calibration)]
     facts, rows = calibration.facts, _rows(calibration)
+    kept = saved(calibration)
+    svg = "" if calibration.method.sketch is None else calibration.method.sketch.read_text(encoding="utf-8")
+    shown = {name: each for name, each in kept.transforms.items() if f'data-turn="{name}"' in svg}
+    sketch = sketch_with(svg, shown)
     found = limits(calibration.budget or {}, calibration.problem.quantities)
     return page(
         "pipelines.reports",
@@ -71,6 +83,12 @@ def report_html(calibration: Calibration) -> str:
         advised=_short_of(calibration, found),
         exact=_exact(calibration),
         formulas=[*(formula.text for formula in calibration.formulas), *_constants(calibration)],
+        snippets=_snippets(calibration, kept),
+        answer=_answer(calibration),
+        sketch=sketch,
+        turns=[(name, f"{each.child} to {each.parent}", told(each), enlarged(each)) for name, each in shown.items()],
+        stability=_stability(calibration),
+        signed=signed,
         tables=[each for each in own if isinstance(each, Table)],
     )
 
@@ -79,6 +97,65 @@ def _constants(calibration: Calibration) -> list[str]:
     """The numbers of the recording that formulas need, as formulas; those that are in none left out."""
     needed = " ".join(formula.expression for formula in calibration.formulas)
     return [f"{name} = {value:.6g}" for name, value in calibration.problem.constants.items() if name in needed]
+
+
+_NEXT = {
+    "calibrated": (
+        "Apply it: formulas, Python, C and ROS parameters are below, under How to apply it.",
+        "Later, `alidade validate RECORDING --calibration calibration.yaml` says whether it still holds.",
+    ),
+    "weak": ("Parameters that are observable can be applied as they are; for the others record again.",),
+    "unobservable": ("Record again with that; do not apply what is not determined.",),
+    "inconsistent": ("Do not apply it before the cause is found: see Do the residuals fit the noise? below.",),
+}
+_TONES: dict[str, Tone] = {"calibrated": "good", "weak": "warn", "unobservable": "bad", "inconsistent": "bad"}
+
+
+def _answer(calibration: Calibration) -> Answer:
+    """The verdict, and what follows from it."""
+    found = calibration.assessment
+    advice = [
+        f"{what[:1].upper()}{what[1:]} ({labels})."
+        for verdict in ("unobservable", "weak")
+        for labels, what in by_advice(found.directions, verdict)
+    ]
+    causes = [f"{cause.label[:1].upper()}{cause.label[1:]}: {cause.evidence}." for cause in found.causes[:2]]
+    steps = (*causes, *advice, *_NEXT[found.status])
+    question = "Is it as accurate as required, and does it fit what was recorded?"
+    return Answer(question, found.status, _TONES[found.status], found.headline, tuple(calibration.notes), steps)
+
+
+def _snippets(calibration: Calibration, kept: SavedCalibration) -> list[tuple[str, str]]:
+    """Language -> what to copy; of formulas that only a person can read, none."""
+    parameters = calibration.parameters
+    values = {name: parameters[name].value for name in calibration.applied if name in parameters}
+    numbers = {**calibration.problem.constants, **values}
+    code: list[tuple[str, str]] = []
+    # A method that is installed may have its own way of writing formulas.
+    with suppress(ValueError, KeyError, SyntaxError):
+        code = [(name, make(calibration.formulas, numbers)) for name, make in _LANGUAGES.items()]
+    return [*code, ("ROS 2 parameters", ros_parameters(kept, list(values)))]
+
+
+_LANGUAGES = {"Python": python_code, "C": c_code}
+
+
+def _stability(calibration: Calibration) -> list[str]:
+    """Whether what was calibrated stayed as it was, and what an incremental estimate is worth beside batch's."""
+    said = []
+    found = calibration.stability
+    if found is not None and found.changed:
+        said.append(found.sentence)
+    elif found is not None:
+        name = next(iter(found.departures), "")
+        said.append(
+            "Yes: estimates on the way agree with the final one. Their largest difference, at "
+            f"{found.time_s:.0f} s and mostly of {name}, is one that chance alone makes in "
+            f"{100.0 * min(found.level, 1.0):.0f} of 100 recordings."
+        )
+    if calibration.self_check is not None:
+        said.append(calibration.self_check.sentence)
+    return said
 
 
 def _short_of(calibration: Calibration, found: list[Limit]) -> list[str]:
@@ -110,7 +187,7 @@ def _exact(calibration: Calibration) -> list[_Exact]:
 def _moved(quantity: Quantity, move: float, sigma: float) -> str:
     unit, factor = human_unit(quantity)
     size = f"{to_digits_of(factor * move, factor * sigma)} {unit.removeprefix('1')}".strip()
-    return f"{quantity.name} {move / sigma:+.1f} σ ({size})"
+    return f"{quantity.name} {signed(move / sigma)} σ ({size})"
 
 
 def notebook_html(calibration: Calibration) -> str:
@@ -127,18 +204,19 @@ def _rows(calibration: Calibration) -> list[_Row]:
         unit, factor = human_unit(q)
         known = p.sigma < _MEANINGLESS * q.scale
         error = errors.get(p.name)
-        in_sigmas = f" ({error.error_sigmas:+.1f} σ)" if error and error.error_sigmas is not None and known else ""
+        in_sigmas = f" ({signed(error.error_sigmas)} σ)" if error and error.error_sigmas is not None and known else ""
         rows.append(
             _Row(
                 name=p.name,
+                meaning=meaning(calibration.method, p.name),
                 value=to_digits_of(factor * p.value, factor * p.sigma) if known else "unknown",
                 sigma=to_digits_of(factor * p.sigma, factor * p.sigma) if known else "unknown",
-                unit=unit,
-                prior="free" if p.prior_sigma is None else f"{factor * p.prior_sigma:.3g}",
-                require="" if p.require is None else f"{factor * p.require:.3g}",
+                unit=unit.removeprefix("1"),
+                prior="free" if p.prior_sigma is None else rounded(factor * p.prior_sigma, 3),
+                require="" if p.require is None else rounded(factor * p.require, 3),
                 verdict=p.observability or "",
                 assumed=p.group is not None,
-                pull="" if p.pull is None else f"{p.pull:+.1f}",
+                pull="" if p.pull is None else signed(p.pull),
                 error=to_digits_of(factor * error.error, factor * p.sigma) + in_sigmas if error and known else "",
             )
         )

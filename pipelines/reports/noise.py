@@ -16,6 +16,7 @@ import numpy as np
 from pipelines.judgement.allan import allan_variance
 from pipelines.judgement.noise_fit import Coefficient
 from pipelines.noise import NoiseStudy, SensorNoise
+from pipelines.reports.answer import Answer
 from pipelines.reports.figure import COLORS, Figure
 from pipelines.reports.result import Plot, software_versions
 from pipelines.reports.templating import page
@@ -163,11 +164,30 @@ def noise_html(study: NoiseStudy) -> str:
         "pipelines.reports",
         "noise.html",
         [_plot(sensor) for sensor in study.sensors],
+        answer=_answer(study),
         recording=study.recording,
         section=section(study)[1],
         sensors=[(list(sensor.axes), rows(sensor), remarks(sensor)) for sensor in study.sensors],
-        notes=study.notes,
     )
+
+
+def _answer(study: NoiseStudy) -> Answer:
+    """Which coefficients the time at rest tells."""
+    silent = sum(
+        _of(sensor, axis, name).value is None for sensor in study.sensors for axis in sensor.axes for name in "NBK"
+    )
+    asked = 3 * sum(len(sensor.axes) for sensor in study.sensors)
+    question, notes = "What is the noise of the sensors?", tuple(note.removesuffix(".") for note in study.notes)
+    steps = ("Paste the section below into the config of your recordings.",)
+    if not silent:
+        sentence = "White noise, bias instability and random walk are told of every axis."
+        return Answer(question, "known", "good", sentence, notes, steps)
+    sentence = (
+        f"{asked - silent} of {asked} coefficients (white noise, bias instability and random walk of each axis) are "
+        "told; of the others there are bounds."
+    )
+    longer = "Leave the sensors at rest for longer where the remarks ask for it, if you need the others."
+    return Answer(question, "known in part", "warn", sentence, notes, (*steps, longer))
 
 
 def write_noise(out_dir: Path, study: NoiseStudy) -> tuple[Path, ...]:

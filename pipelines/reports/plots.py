@@ -30,20 +30,30 @@ def common_plots(calibration: Calibration) -> list[Plot]:
         plots.append(_learning(calibration, history))
     for family, residuals in estimate.residuals.items():
         if len(residuals.time):
-            plots.append(_residuals(family, residuals, estimate.solver == "incremental"))
+            names = components(calibration.method.components.get(family), residuals)
+            plots.append(_residuals(family, residuals, names, estimate.solver == "incremental"))
             if estimate.solver == "incremental":
                 plots.append(_squares(family, residuals))
     correlation, ellipses = _correlation(calibration), _ellipses(calibration)
     return [*plots, *([correlation] if correlation else []), *([ellipses] if ellipses else [])]
 
 
-def _residuals(family: str, residuals: Residuals, innovations: bool) -> Plot:
+def components(told: Sequence[str] | None, residuals: Residuals) -> list[str]:
+    """What each number of residuals is; where the method does not say, three are x, y, z, eight a tag's corners."""
+    width = residuals.whitened.shape[1]
+    if told is not None:
+        return list(told[:width])
+    if width == 8:
+        return [f"corner {i // 2 + 1} {'down' if i % 2 else 'across'}" for i in range(width)]
+    return ["x", "y", "z"] if width == 3 else [f"number {i + 1} of {width}" for i in range(width)]
+
+
+def _residuals(family: str, residuals: Residuals, names: Sequence[str], innovations: bool) -> Plot:
     what = "innovation" if innovations else "residual"
     out = Figure(f"{what}, sigmas")
     used = residuals.used
-    width = residuals.whitened.shape[1]
-    for i, color in zip(range(width), cycle(COLORS)):
-        out.points(residuals.time[used], residuals.whitened[used, i], f"component {i + 1}", color, 3)
+    for i, (name, color) in enumerate(zip(names, cycle(COLORS))):
+        out.points(residuals.time[used], residuals.whitened[used, i], name, color, 3)
     if not used.all():
         low, high = _view(residuals.whitened[used])
         far = np.minimum(np.linalg.norm(residuals.whitened[~used], axis=1), 0.97 * high)
@@ -155,13 +165,16 @@ def _learning(calibration: Calibration, history: History) -> Plot:
     column = {name: i for i, name in enumerate(calibration.estimate.names)}
     out = Figure("sigma / required", y_scale="log")
     require = {q.name: q.require for q in calibration.problem.quantities}
-    for name, color in zip(calibration.learning, cycle(COLORS)):
+    last = {name: history.sigmas[-1, column[name]] / require[name] for name in calibration.learning}
+    slowest = sorted(last, key=lambda name: -last[name])[: len(COLORS)]
+    for name, color in zip([name for name in last if name in slowest], COLORS, strict=False):
         out.line(history.time, history.sigmas[:, column[name]] / require[name], name, color)
     out.levels(1.0)
     return Plot(
         "What was known when",
         "Sigma of each parameter over the one required, as the recording went on; below the dotted line it is as "
-        "accurate as required. Where a line falls steeply the motion said much.",
+        "accurate as required. Where a line falls steeply the motion said much."
+        + (f" The {len(slowest)} of {len(last)} that are known least." if len(last) > len(slowest) else ""),
         out,
     )
 
@@ -186,7 +199,8 @@ def _correlation(calibration: Calibration) -> Plot | None:
     correlation = np.clip(covariance / np.outer(sigmas[shown], sigmas[shown]), -1.0, 1.0)
     names = tuple(quantities[i].name for i in shown)
     ends = (-0.5, len(names) - 0.5)
-    out = Figure("", "", max(320, 130 + 24 * len(names)), x_labels=names, y_labels=names, x_range=ends)
+    height = 130 + max(190, round(float(np.clip(900 / len(names), 13, 24)) * len(names)))
+    out = Figure("", "", height, x_labels=names, y_labels=names, x_range=ends)
     out.y_range = ends[::-1]
     out.heat(correlation, numbers=len(names) <= _MOST_LABELLED)
     return Plot(

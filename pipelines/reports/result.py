@@ -248,7 +248,7 @@ class Calibration:
         """
         from pipelines.methods.formula import apply
 
-        values = {name: parameter.value for name, parameter in self.parameters.items() if name in self._applied}
+        values = {name: parameter.value for name, parameter in self.parameters.items() if name in self.applied}
         unknown = dict.fromkeys((q.name for q in self.problem.quantities), 0.0)
         needed, possible = (
             {name for formula in formulas for name in formula.measured}
@@ -281,10 +281,10 @@ class Calibration:
     @property
     def formulas(self) -> Sequence[Formula]:
         """How it is applied, assumptions that the recording does not determine left out."""
-        return self.method.formulas(self._applied, self.config)
+        return self.method.formulas(self.applied, self.config)
 
     @property
-    def _applied(self) -> list[str]:
+    def applied(self) -> list[str]:
         """The parameters, of the assumptions those that the recording determines."""
         sigmas = {name: parameter.sigma for name, parameter in self.parameters.items()}
         return [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -23,6 +24,9 @@ if TYPE_CHECKING:
 
     from pipelines.reports.result import Plot
 
+# A figure of more px than this is as broad as the page.
+_TALL = 380
+_CODE = re.compile(r"`([^`]+)`")
 _SCRIPT = Path(__file__).parent / "templates" / "figures.js"
 _BOKEH = ("bokeh.min.js", "bokeh-api.min.js")
 # Of 24 bits of a number so many are as good as nothing in a picture, and pack badly.
@@ -46,6 +50,11 @@ class Drawn:
     figures: tuple[Figure, ...]
     legend: tuple[Mark, ...]
 
+    @property
+    def broad(self) -> bool:
+        """Whether it wants the whole width."""
+        return len(self.figures) > 1 or self.figures[0].height > _TALL
+
 
 def environment(package: str) -> Environment:
     """Templates of a package on top of the base of all: every string escaped, a name that is not given is an error."""
@@ -58,6 +67,7 @@ def environment(package: str) -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    made.filters["coded"] = _coded
     made.globals |= {"palette": PALETTE, "drawing": (), "drawing_script": _SCRIPT.read_text(encoding="utf-8")}
     return made
 
@@ -70,6 +80,13 @@ def page(package: str, template: str, plots: Sequence[Plot], **context: Any) -> 
         .get_template(template)
         .render(plots=drawn, drawing=_packed([each.figures for each in drawn]) if drawn else (), **context)
     )
+
+
+def _coded(text: str) -> str:
+    """A sentence as HTML, what stands between backquotes as code."""
+    from markupsafe import Markup, escape
+
+    return Markup(_CODE.sub(r"<code>\1</code>", str(escape(text))))
 
 
 def _drawn(plot: Plot, number: int) -> Drawn:

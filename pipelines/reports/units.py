@@ -22,8 +22,26 @@ def human_unit(quantity: Quantity) -> tuple[str, float]:
             return "ms", 1e3
         case "T":
             return "nT", 1e9
+        case "":
+            return "ppm", 1e6
+        case "rad/s/(m/s^2)":
+            return "deg/s/g", math.degrees(9.80665)
         case other:
             return other, 1.0
+
+
+def signed(value: float, decimals: int = 1) -> str:
+    """A number with its sign, 0 without one."""
+    text = f"{value:+.{decimals}f}"
+    return text[1:] if float(text) == 0.0 else text
+
+
+def rounded(value: float, digits: int = 2) -> str:
+    """A number to so many digits, without an exponent where people can do without."""
+    if value == 0.0 or not math.isfinite(value) or not 1e-5 < abs(value) < 1e7:
+        return f"{value:.{digits}g}"
+    decimals = digits - 1 - math.floor(math.log10(abs(value)))
+    return f"{round(value, decimals):.{max(decimals, 0)}f}"
 
 
 # What rounding leaves of a fixed parameter, in any unit people read.

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipelines.judgement.validation import Validation, peak, rms
+from pipelines.reports.answer import Answer, Tone
 from pipelines.reports.calibration import SavedCalibration
 from pipelines.reports.figure import BEFORE, COLORS, Figure
 from pipelines.reports.result import Plot
@@ -58,7 +59,7 @@ def validation_html(
         validations: what the method says.
         calibration: the one validated.
         recording: name of the file it was validated on.
-        verdict: holds, changed or unknown.
+        verdict: holds, changed, unknown or same.
         sentence: that in words.
         parameters: name, change, sigma, from what on it would be noticed, unit.
     """
@@ -68,11 +69,30 @@ def validation_html(
         [_plot(v) for v in validations],
         c=calibration,
         recording=recording,
-        verdict=verdict,
-        sentence=sentence,
+        answer=_answer(verdict, sentence),
         parameters=parameters,
         rows=rows,
     )
+
+
+_WORDS: dict[str, tuple[str, Tone, tuple[str, ...]]] = {
+    "holds": ("yes", "good", ("Go on using it.",)),
+    "changed": (
+        "no",
+        "bad",
+        (
+            "Do not go on with it: `alidade calibrate` this recording, and apply that.",
+            "If the change is larger than wear explains, look at mounts and screws first.",
+        ),
+    ),
+    "unknown": ("cannot say", "warn", ("Record a motion as for a calibration, so that the parameters can be seen.",)),
+    "same": ("cannot say", "fixed", ("Validate on a recording that the calibration was not made from.",)),
+}
+
+
+def _answer(verdict: str, sentence: str) -> Answer:
+    word, tone, steps = _WORDS[verdict]
+    return Answer("Does the calibration still hold?", word, tone, sentence, (), steps)
 
 
 def _plot(validation: Validation) -> Plot:

@@ -9,6 +9,7 @@ import numpy as np
 
 from factors import so3
 from pipelines.graph.problem import Array
+from pipelines.reports.answer import Answer, Tone
 from pipelines.reports.figure import COLORS, Figure
 from pipelines.reports.plain_json import plain_json
 from pipelines.reports.result import Plot
@@ -119,12 +120,20 @@ def layout_html(layout: Layout, recordings: Sequence[str]) -> str:
         "layout.html",
         [_picture(layout), _bars(layout)],
         recordings=", ".join(recordings),
-        headline=headline(layout) + ".",
+        answer=_answer(layout),
         unplaced=layout.unplaced,
         columns=COLUMNS,
         rows=rows(layout),
         cameras=camera_rows(layout),
     )
+
+
+def _answer(layout: Layout) -> Answer:
+    steps = tuple(f"{step[:1].upper()}{step[1:]}." for step in advice(layout))
+    word = "in part" if layout.unplaced else "here they are"
+    apply = "Use the section `cube: tags` that was written, in the config of recordings of this cube."
+    tone: Tone = "warn" if steps else "good"
+    return Answer("Where are the tags?", word, tone, headline(layout) + ".", (), (*steps, apply))
 
 
 _CAPTION = (

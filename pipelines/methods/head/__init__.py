@@ -33,6 +33,12 @@ class Head(Method):
     section = HeadConfig
     sheets = ("gyro", "platform_gyro", "camera", "clock")
     of_recording = ("gyro_bias_*", "time_offset", "clock_skew", "platform_bias_*")
+    sketch = Path(__file__).with_name("frames.svg")
+    meanings: ClassVar[Mapping[str, str]] = {
+        r"helmet_mount_([xyz])": "Markers turned against the helmet's IMU: {0} of the rotation vector of vRh.",
+        r"camera_mount_([xyz])": "Platform turned against the camera: {0} of the rotation vector of cRb.",
+        r"vision_scale": "Part by which the angles that the camera tells are too large.",
+    }
     rotations: ClassVar[Mapping[str, str]] = {"helmet_mount": "vRh", "camera_mount": "cRb"}
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from pipelines.methods import Method, Scenario
 from pipelines.methods.indexer.topics import NEEDS, TOPICS, IndexerConfig
@@ -33,6 +33,11 @@ class Indexer(Method):
     section = IndexerConfig
     sheets = ("gyro", "encoder")
     of_recording = ("gyro_bias_*",)
+    sketch = Path(__file__).with_name("frames.svg")
+    meanings: ClassVar[Mapping[str, str]] = {
+        r"theta_([xyz])": "IMU mounted turned about {0} of the platform.",
+        r"axis_nonperpendicularity": "Inner axis not square to the outer axis, by this angle.",
+    }
 
     @property
     def data(self) -> type[IndexerData]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from pipelines.methods import Method, Scenario
 from pipelines.methods.los.topics import NEEDS, TOPICS
@@ -32,6 +32,22 @@ class Los(Method):
     needs = NEEDS
     sheets = ("gyro", "camera", "encoder", "clock", "gimbal", "target")
     of_recording = ("gyro_bias_*", "time_offset", "clock_skew", "target_rate_*")
+    sketch = Path(__file__).with_name("frames.svg")
+    meanings: ClassVar[Mapping[str, str]] = {
+        r"delta_px": "Camera mounted turned about x, the elevation axis: added to what the elevation encoder reads.",
+        r"delta_g([xy])": "Gyro (IMU) mounted turned about {0} of the carrier.",
+        r"delta_z": "Camera's azimuth zero less the gyro's: the turn about z between them.",
+        r"delta_pz": "Camera's azimuth zero: added to what the azimuth encoder reads.",
+        r"delta_gz": "Gyro (IMU) mounted turned about z of the carrier.",
+        r"camera_roll": "Camera turned about its own line of sight.",
+        r"collimation": "Line of sight not square to the elevation axis, by this angle.",
+        r"axis_nonperpendicularity": "Elevation axis not square to the azimuth axis, by this angle.",
+        r"los_scale": "Part by which the line-of-sight errors measured are too large: the focal length is off.",
+        r"target_rate_([xz])": "Rate at which the direction to the target turns about {0} by itself.",
+    }
+    components: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "los": ("phx, angle to the target below", "phz, angle to the target to the right", "roll of the picture")
+    }
 
     @property
     def data(self) -> type[LosData]:

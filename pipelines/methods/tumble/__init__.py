@@ -33,6 +33,7 @@ class Tumble(Method):
     needs = NEEDS
     sheets = ("field",)
     of_recording = ("accel_b?", "gyro_bias_*", "gravity", "field_*")
+    sketch = Path(__file__).with_name("frames.svg")
     drawn = True
     yields = True
 

@@ -96,7 +96,7 @@
     const figure = Bokeh.Plotting.figure({
       height: spec.height, sizing_mode: "stretch_width", min_border_right: 12,
       x_axis_type: spec.x_scale, y_axis_type: spec.y_scale, x_axis_label: spec.x_title || null, y_axis_label: spec.y_title || null,
-      x_range: range(spec.x_range), y_range: spec.y_shared ? before.y_range : range(spec.y_range),
+      x_range: range(spec.x_range), y_range: spec.y_shared ? new Bokeh.Range1d() : range(spec.y_range),
       match_aspect: spec.square, tools: [zoom, new Bokeh.PanTool(), new Bokeh.ResetTool(), new Bokeh.SaveTool()],
       active_drag: zoom, toolbar_location: "right",
       background_fill_color: null, border_fill_color: null, outline_line_color: color("faint"),
@@ -120,7 +120,13 @@
       if (turn && Math.max(...labels.map(label => label.length)) > 3) axis.major_label_orientation = turn;
       grid.visible = false;
     }
-    if (spec.y_shared) figure.yaxes[0].visible = false;
+    if (spec.y_shared) {
+      // Figures have documents of their own, so that they cannot have one range between them.
+      const follow = () => figure.y_range.setv({ start: before.y_range.start, end: before.y_range.end });
+      for (const end of ["start", "end"]) before.y_range.properties[end].change.connect(follow);
+      follow();
+      figure.yaxes[0].visible = false;
+    }
     const renderers = spec.marks.map(mark => {
       const made = add(figure, mark, spec);
       const [across, up] = (told[mark.kind] ?? [[]])[0];

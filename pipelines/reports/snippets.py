@@ -1,0 +1,344 @@
+"""Formulas with a calibration's numbers in them, as Python and as C, to be copied.
+
+The expressions of `pipelines.methods.formula` are read with Python's own `ast`; whatever depends on nothing measured is
+computed here, so that the code holds numbers. Rotations are matrices, 3x3, in the code.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal
+
+import numpy as np
+
+from factors import so3
+from pipelines.graph.problem import Array
+from pipelines.methods.formula import Formula
+
+Kind = Literal["scalar", "vector", "matrix"]
+_RANKS: tuple[Kind, ...] = ("scalar", "vector", "matrix")
+# Measured: frames with an R between them are rotations.
+_ROTATION, _VECTOR = (
+    re.compile(r"\w*[a-zA-Z]R[a-zA-Z]\w*|\w*rotation\w*"),
+    re.compile(r"(platform_)?gyro|accel|mag|d_b"),
+)
+# `Exp(angle ez)`: a number before the name of an axis.
+_AXIS = re.compile(r"(\w+) (e[xyz])\b")
+_AXES = {"ex": np.eye(3)[0], "ey": np.eye(3)[1], "ez": np.eye(3)[2]}
+
+
+@dataclass(frozen=True)
+class _Node:
+    """A part of an expression: its kind, and its value where it is a constant, else an operation on others.
+
+    Operations: a name that is measured, "name"; a call of an earlier formula, "call"; the names in `_PYTHON`.
+    """
+
+    kind: Kind
+    value: Array | None = None
+    op: str = ""
+    parts: tuple[_Node, ...] = ()
+    name: str = ""
+    arguments: tuple[str, ...] = ()
+
+
+class _Reader:
+    """Expressions of formulas, one after the other."""
+
+    def __init__(self, values: Mapping[str, float]) -> None:
+        self._known: dict[str, Array] = {name: np.array(value) for name, value in values.items()}
+        for stem in {name[:-2] for name in values if name.endswith("_x")}:
+            if all(f"{stem}_{axis}" in values for axis in "xyz"):
+                self._known[stem] = np.array([values[f"{stem}_{axis}"] for axis in "xyz"])
+        self._earlier: dict[str, tuple[_Node, tuple[str, ...]]] = {}
+        self._measured: tuple[str, ...] = ()
+
+    def read(self, formula: Formula) -> _Node:
+        self._measured = formula.measured
+        node = self._node(ast.parse(_AXIS.sub(r"\1*\2", formula.expression), mode="eval").body)
+        self._earlier[formula.name] = node, formula.measured
+        return node
+
+    def _node(self, tree: ast.expr) -> _Node:
+        match tree:
+            case ast.Constant(value=int() | float() as number):
+                return _constant(np.array(float(number)))
+            case ast.Name(id=name):
+                return self._name(name)
+            case ast.List(elts=rows):
+                return _constant(np.array([_value(self._node(row)) for row in rows]))
+            case ast.UnaryOp(op=ast.USub(), operand=operand):
+                return _made("minus", self._node(operand))
+            case ast.BinOp(left=left, op=op, right=right):
+                return _made(_OPERATORS[type(op)], self._node(left), self._node(right))
+            case ast.Call(func=ast.Name(id=name), args=[argument]):
+                return _made(name, self._node(argument))
+        raise ValueError(f"not an expression of a formula: {ast.unparse(tree)}")
+
+    def _name(self, name: str) -> _Node:
+        if name in self._earlier:
+            node, arguments = self._earlier[name]
+            return node if node.value is not None else _Node(node.kind, None, "call", (), name, arguments)
+        if name in self._measured:
+            kind: Kind = "matrix" if _ROTATION.fullmatch(name) else "vector" if _VECTOR.fullmatch(name) else "scalar"
+            return _Node(kind, None, "name", (), name)
+        return _constant(_AXES[name] if name in _AXES else self._known.get(name, np.array(0.0)))
+
+
+_OPERATORS: Mapping[type[ast.operator], str] = {
+    ast.Add: "add",
+    ast.Sub: "sub",
+    ast.Mult: "mul",
+    ast.Div: "div",
+    ast.Pow: "pow",
+}
+
+
+def _constant(value: Array) -> _Node:
+    return _Node(_RANKS[value.ndim], value)
+
+
+def _value(node: _Node) -> Array:
+    if node.value is None:
+        raise ValueError("a matrix with something measured in it")
+    return node.value
+
+
+def _made(op: str, *parts: _Node) -> _Node:
+    """The operation, computed where its parts are constants; what is times 0, or added to 0, is left out."""
+    if op in ("add", "sub", "mul"):
+        a, b = parts
+        zero_a, zero_b = (part.value is not None and not part.value.any() for part in parts)
+        if op == "mul" and (zero_a or zero_b):
+            kind = _kind(op, parts)
+            return _constant(np.zeros((3,) * _RANKS.index(kind)))
+        if zero_b and _RANKS.index(b.kind) <= _RANKS.index(a.kind):
+            return a
+        if op == "add" and zero_a and _RANKS.index(a.kind) <= _RANKS.index(b.kind):
+            return b
+    if all(part.value is not None for part in parts):
+        return _constant(np.asarray(_COMPUTED[op](*(_value(part) for part in parts))))
+    return _Node(_kind(op, parts), None, op, parts)
+
+
+def _kind(op: str, parts: Sequence[_Node]) -> Kind:
+    kinds = [part.kind for part in parts]
+    if op in ("Exp", "Rx", "Ry", "Rz"):
+        return "matrix"
+    if op == "mul" and kinds == ["matrix", "vector"]:
+        return "vector"
+    return max(kinds, key=_RANKS.index)
+
+
+def _times(a: Array, b: Array) -> Array:
+    return np.asarray(a @ b if a.ndim == 2 and b.ndim > 0 else a * b)
+
+
+def _turned(axis: int, angle: Array) -> Array:
+    return so3.matrix(so3.exp(-angle * np.eye(3)[axis]))
+
+
+_COMPUTED: Mapping[str, Callable[..., Array]] = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": _times,
+    "div": np.divide,
+    "pow": np.power,
+    "minus": np.negative,
+    "sin": np.sin,
+    "cos": np.cos,
+    "inverse": np.linalg.inv,
+    "Exp": lambda v: so3.matrix(so3.exp(v)),
+    "Rx": partial(_turned, 0),
+    "Ry": partial(_turned, 1),
+    "Rz": partial(_turned, 2),
+}
+
+
+def python_code(formulas: Sequence[Formula], values: Mapping[str, float]) -> str:
+    """A module with a function, or a constant, for each formula; it needs numpy alone. SI."""
+    reader, lines = _Reader(values), []
+    for formula in formulas:
+        node = reader.read(formula)
+        lines += ["", "", f"# {formula.meaning}"]
+        if node.value is not None:
+            lines.append(f"{formula.name} = {_python(node)}")
+        else:
+            lines += [f"def {formula.name}({', '.join(formula.measured)}):", f"    return {_python(node)}"]
+    body = "\n".join(lines)
+    helpers = [text for name, text in _PYTHON_HELPERS.items() if re.search(rf"\b{name}\(", body)]
+    return "\n".join(["import numpy as np", *helpers]) + body + "\n"
+
+
+_PYTHON_TURN = """
+
+def {name}(a):
+    c, s = np.cos(a), np.sin(a)
+    return np.array({rows})"""
+_PYTHON_HELPERS = {
+    "Rx": _PYTHON_TURN.format(name="Rx", rows="[[1, 0, 0], [0, c, s], [0, -s, c]]"),
+    "Ry": _PYTHON_TURN.format(name="Ry", rows="[[c, 0, -s], [0, 1, 0], [s, 0, c]]"),
+    "Rz": _PYTHON_TURN.format(name="Rz", rows="[[c, s, 0], [-s, c, 0], [0, 0, 1]]"),
+}
+
+
+def _python(node: _Node) -> str:
+    if node.value is not None:
+        text = repr(np.vectorize(_digits, otypes=[float])(node.value).tolist())
+        return text if node.kind == "scalar" else f"np.array({text})"
+    turned = _axis_turn(node)
+    if turned:
+        return f"{turned[0]}({_python(turned[1])})"
+    parts = [_python(part) for part in node.parts]
+    match node.op:
+        case "name":
+            return node.name
+        case "call":
+            return f"{node.name}({', '.join(node.arguments)})"
+        case "mul" if node.parts[0].kind == "matrix" and node.parts[1].kind != "scalar":
+            return f"{_bracketed(node.parts[0], parts[0])} @ {_bracketed(node.parts[1], parts[1], right=True)}"
+        case "add" | "sub" | "mul" | "div" | "pow":
+            sign = {"add": "+", "sub": "-", "mul": "*", "div": "/", "pow": "**"}[node.op]
+            return f"{_bracketed(node.parts[0], parts[0])} {sign} {_bracketed(node.parts[1], parts[1], right=True)}"
+        case "minus":
+            return f"-{_bracketed(node.parts[0], parts[0], right=True)}"
+        case "inverse":
+            return f"{_bracketed(node.parts[0], parts[0], right=True)}.T"
+        case "sin" | "cos":
+            return f"np.{node.op}({parts[0]})"
+        case _:
+            return f"{node.op}({parts[0]})"
+
+
+def _bracketed(node: _Node, text: str, right: bool = False) -> str:
+    compound = node.value is None and node.op in ("add", "sub", "minus", "mul", "div", "pow")
+    loose = node.op in ("add", "sub", "minus") or right
+    return f"({text})" if compound and loose and not _axis_turn(node) else text
+
+
+def _axis_turn(node: _Node) -> tuple[str, _Node] | None:
+    """Exp(angle ez) as Rz(-angle)."""
+    if node.op == "Exp" and node.parts[0].op == "mul":
+        angle, axis = node.parts[0].parts
+        for name, unit in _AXES.items():
+            if axis.value is not None and np.array_equal(axis.value, unit):
+                return f"R{name[1]}", _made("minus", angle)
+    return None
+
+
+# -- C
+
+
+def c_code(formulas: Sequence[Formula], values: Mapping[str, float]) -> str:
+    """A header of C99 with a function, or a constant, for each formula; it needs math.h alone. SI."""
+    reader, lines = _Reader(values), []
+    for formula in formulas:
+        node = reader.read(formula)
+        kind = _C_TYPES[node.kind]
+        lines += ["", f"/* {formula.meaning} */"]
+        if node.value is not None:
+            lines.append(f"static const {kind} {formula.name} = {_c_numbers(node.value)};")
+        else:
+            needed = ", ".join(f"{_C_TYPES[reader._name(name).kind]} {name}" for name in formula.measured)
+            lines.append(f"static {kind} {formula.name}({needed}) {{ return {_c(node)}; }}")
+    body = "\n".join(lines)
+    needed_helpers: list[str] = []
+    for name, text in reversed(_C_HELPERS.items()):
+        if any(re.search(rf"\b{name}\(", each) for each in (body, *needed_helpers)):
+            needed_helpers.insert(0, text)
+    return "\n".join([_C_HEAD, *needed_helpers, body, ""])
+
+
+_C_TYPES = {"scalar": "double", "vector": "vec", "matrix": "mat"}
+_C_HEAD = """#include <math.h>
+
+typedef struct { double v[3]; } vec;
+typedef struct { double m[3][3]; } mat;
+"""
+_EACH = "for (int i = 0; i < 3; i++)"
+
+
+def _by_element(name: str, expression: str, second: str = "vec b") -> str:
+    return f"static vec {name}(vec a, {second}) {{ vec r; {_EACH} r.v[i] = {expression}; return r; }}"
+
+
+def _c_turn(name: str, rows: str) -> str:
+    return f"static mat {name}(double a) {{ double c = cos(a), s = sin(a); mat r = {{{rows}}}; return r; }}"
+
+
+# Those that use others come after them.
+_C_HELPERS = {
+    "add": _by_element("add", "a.v[i] + b.v[i]"),
+    "sub": _by_element("sub", "a.v[i] - b.v[i]"),
+    "each": _by_element("each", "a.v[i] * b.v[i]"),
+    "power": _by_element("power", "pow(a.v[i], n)", "double n"),
+    "scaled": _by_element("scaled", "a.v[i] * f", "double f"),
+    "shifted": _by_element("shifted", "a.v[i] + f", "double f"),
+    "turned": "static vec turned(mat a, vec b) { vec r = {{0, 0, 0}}; " + _EACH + " for (int j = 0; j < 3; j++) "
+    "r.v[i] += a.m[i][j] * b.v[j]; return r; }",
+    "product": "static mat product(mat a, mat b) { mat r = {{{0}}}; " + _EACH + " for (int j = 0; j < 3; j++) "
+    "for (int k = 0; k < 3; k++) r.m[i][j] += a.m[i][k] * b.m[k][j]; return r; }",
+    "transposed": "static mat transposed(mat a) { mat r; " + _EACH + " for (int j = 0; j < 3; j++) "
+    "r.m[i][j] = a.m[j][i]; return r; }",
+    "Rx": _c_turn("Rx", "{{1, 0, 0}, {0, c, s}, {0, -s, c}}"),
+    "Ry": _c_turn("Ry", "{{c, 0, -s}, {0, 1, 0}, {s, 0, c}}"),
+    "Rz": _c_turn("Rz", "{{c, s, 0}, {-s, c, 0}, {0, 0, 1}}"),
+}
+
+
+def _c(node: _Node) -> str:
+    if node.value is not None:
+        text = _c_numbers(node.value)
+        return text if node.kind == "scalar" else f"({_C_TYPES[node.kind]}){text}"
+    turned = _axis_turn(node)
+    if turned:
+        return f"{turned[0]}({_c(turned[1])})"
+    parts = [_c(part) for part in node.parts]
+    kinds = [part.kind for part in node.parts]
+    match node.op, kinds:
+        case "name", _:
+            return node.name
+        case "call", _:
+            return f"{node.name}({', '.join(node.arguments)})"
+        case "mul", ["matrix", "matrix"]:
+            return f"product({parts[0]}, {parts[1]})"
+        case "mul", ["matrix", "vector"]:
+            return f"turned({parts[0]}, {parts[1]})"
+        case (("add" | "sub" | "mul"), ["vector", "vector"]):
+            return f"{'each' if node.op == 'mul' else node.op}({parts[0]}, {parts[1]})"
+        case "pow", ["vector", "scalar"]:
+            return f"power({parts[0]}, {parts[1]})"
+        case "mul", ["scalar", "vector"]:
+            return f"scaled({parts[1]}, {parts[0]})"
+        case (("mul" | "div"), ["vector", "scalar"]):
+            return f"scaled({parts[0]}, {parts[1] if node.op == 'mul' else f'1.0 / ({parts[1]})'})"
+        case (("add" | "sub"), ["vector", "scalar"]):
+            return f"shifted({parts[0]}, {'' if node.op == 'add' else '-'}({parts[1]}))"
+        case (("add" | "sub" | "mul" | "div"), ["scalar", "scalar"]):
+            return f"({parts[0]} { {'add': '+', 'sub': '-', 'mul': '*', 'div': '/'}[node.op] } {parts[1]})"
+        case "minus", ["scalar"]:
+            return f"-({parts[0]})"
+        case "inverse", _:
+            return f"transposed({parts[0]})"
+        case _:
+            return f"{node.op}({', '.join(parts)})"
+
+
+def _c_numbers(value: Array) -> str:
+    if value.ndim == 0:
+        return repr(_digits(float(value)))
+    # A struct around its array.
+    inner = ", ".join(_c_numbers(each) if each.ndim == 0 else _c_row(each) for each in value)
+    return f"{{{{{inner}}}}}"
+
+
+def _c_row(row: Array) -> str:
+    return "{" + ", ".join(repr(_digits(float(x))) for x in row) + "}"
+
+
+def _digits(value: float) -> float:
+    return float(f"{value:.10g}") + 0.0
