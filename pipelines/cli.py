@@ -340,6 +340,7 @@ def plan(
     config: ConfigFile = None,
     require: Annotated[list[str] | None, typer.Option(help="NAME=SIGMA wanted, SI; may be repeated.")] = None,
     out: Annotated[Path | None, typer.Option(help="File for the better motion, as a scenario.")] = None,
+    page: Annotated[Path | None, typer.Option(help="File for the plan as a page, HTML.")] = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -347,17 +348,23 @@ def plan(
     from pipelines import progress, terminal
     from pipelines.planning import make_plan, requirements, write_scenario
     from pipelines.reports.plain_json import plan_json
+    from pipelines.reports.plan import plan_html
+    from pipelines.reports.whole import write_file
 
     with progress.shown(quiet or as_json):
         planned = make_plan(method, scenario, config, requirements(require or []))
     if out is not None:
         write_scenario(out, planned)
+    if page is not None:
+        write_file(page, plan_html(planned))
     if as_json:
         print(plan_json(planned))
     else:
         terminal.show_plan(planned)
         if out is not None:
             terminal.say(f"The better motion is in {out}")
+        if page is not None:
+            terminal.say(f"The page is {page}")
     raise typer.Exit(exit_codes.OF_STATUS[planned.now.assessment.status])
 
 

@@ -68,6 +68,21 @@ class Tab:
         """As somebody sees it who likes it dark."""
         self._call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}])
 
+    def screen(self) -> None:
+        """As on a screen, in light colours."""
+        self._call(
+            "Emulation.setEmulatedMedia", media="screen", features=[{"name": "prefers-color-scheme", "value": "light"}]
+        )
+
+    def print(self) -> None:
+        """As it is printed."""
+        self._call("Emulation.setEmulatedMedia", media="print")
+
+    def pdf(self, path: Path) -> None:
+        """What is shown, on paper."""
+        content = self._call("Page.printToPDF", preferCSSPageSize=True, printBackground=True)
+        path.write_bytes(base64.b64decode(content["data"]))
+
     def open(self, url: str) -> None:
         self._call("Page.navigate", url=url)
 

@@ -15,6 +15,7 @@ from alidade import calibrate, simulate
 from factors.chi_square import student
 from pipelines.errors import InputError
 from pipelines.reports.certificate import write_certificate
+from tests.browser import fits
 from tests.command import Command
 
 FIELDS = """\
@@ -46,6 +47,7 @@ def test_the_command_writes_a_certificate(results: Path, tmp_path: Path, alidade
     assert done.code == 0
     assert "not stated: customer, manufacturer" in done.out
     page, content = (out / "certificate.html").read_text(), json.loads((out / "certificate.json").read_text())
+    fits(page, tmp_path)
     for text in ("C-2026-017", "Laboratory of Examples", "&lt;U17&gt;", "not stated", "counter(pages)", "guard band"):
         assert text in page
     result = json.loads((results / "result.json").read_text())

@@ -18,6 +18,7 @@ from pipelines.methods.cube.simulation import simulate_cube
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.methods.cube.writing import write_cube
 from pipelines.recording.reading import open_recording
+from tests.browser import fits
 from tests.command import Command
 from tests.pages import Page
 
@@ -101,6 +102,7 @@ def test_the_command_says_what_was_found(alidade: Command, tmp_path: Path) -> No
     assert "tag 19 could not be placed: in no picture" in run.out
     assert "camera 1: fx, px" in run.out
     page = Page((tmp_path / "cube.html").read_text())
+    fits((tmp_path / "cube.html").read_text(), tmp_path)
     assert not page.loaded
     assert "5 of 6 tags placed" in page.text
     assert "Tag 19: in no picture." in page.text

@@ -13,6 +13,7 @@ import pytest
 from pipelines.fleet import consistency
 from pipelines.fleet.montecarlo import SOLVERS, run_study, simulate_and_solve
 from pipelines.methods import names
+from tests.browser import fits
 from tests.fleet_command import alidade
 
 distributed = pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
@@ -79,6 +80,7 @@ def test_study_goes_on_and_sums_up(
     assert (told["schema"], told["wanted"], told["interrupted"]) == ("alidade.montecarlo/1", 6, False)
     assert {run["seed"] for run in told["runs"]} == set(range(6))
     page = (out / "montecarlo.html").read_text()
+    fits(page, tmp_path)
     assert "default-src 'none'" in page
     for text in ("mean NEES", "gyro_bias_x", "batch: NEES", "batch: errors in sigmas"):
         assert text in page

@@ -18,6 +18,7 @@ from pipelines.fleet.fleet import Settings, calibrate_recording
 from pipelines.fleet.recordings import find
 from pipelines.methods.head.recording import write_head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from tests.browser import fits
 from tests.fleet_command import alidade
 
 distributed = pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
@@ -133,7 +134,7 @@ def test_the_table_is_complete(calibrated: Path) -> None:
         assert 0.0 < float(row["helmet_mount_x_sigma"]) < 0.01
 
 
-def test_planted_faults_are_told_apart(calibrated: Path) -> None:
+def test_planted_faults_are_told_apart(calibrated: Path, tmp_path: Path) -> None:
     rows = {row["recording"].rsplit("/")[-1]: row for row in rows_of(calibrated / "fleet.csv")}
     assert failures(rows) == {f"U20_{DATES[0]}.mcap": "2", f"U12_{DATES[0]}.mcap": "3"}
     assert "damaged" in rows[f"U20_{DATES[0]}.mcap"]["reason"]
@@ -141,6 +142,7 @@ def test_planted_faults_are_told_apart(calibrated: Path) -> None:
     changed = [row for row in rows_of(calibrated / "changes.csv") if row["changed"] == "1"]
     assert [(row["unit"], row["parameter"]) for row in changed] == [("U33", "helmet_mount_z")]
     assert float(changed[0]["difference"]) == pytest.approx(np.deg2rad(4.0), abs=5.0 * float(changed[0]["sigma"]))
+    fits((calibrated / "fleet.html").read_text(), tmp_path)
     text = page_text(calibrated / "fleet.html")
     attention = text.split("Which units need attention?")[1].split("Parameters")[0]
     assert set(re.findall(r"U\d\d(?= )", attention)) >= {"U07", "U33", "U20", "U12"}

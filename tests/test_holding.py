@@ -21,6 +21,7 @@ from pipelines.reports.known import load_known
 from pipelines.sharing import device_belief, walks
 from pipelines.simulation.simulated import Simulated
 from pipelines.solvers.batch import solve_batch
+from tests.browser import fits
 from tests.command import Command
 
 MOVED_ARCSEC = 0.5
@@ -61,6 +62,7 @@ def test_it_does_not_hold_after_a_knock(calibrated: Path, tmp_path: Path, alidad
     assert "The calibration does not hold: theta_y changed by 0." in done.out
     assert "That is less than what is required of them." in done.out
     page = (tmp_path / "june-validation" / "validation.html").read_text()
+    fits(page, tmp_path)
     assert "The calibration does not hold" in page
 
 

@@ -21,6 +21,7 @@ from pipelines.recording.writing import write_session
 from pipelines.reports.noise import length
 from tests import noises
 from tests.broad_trials import TRIALS
+from tests.browser import fits
 from tests.command import Command
 
 Array = NDArray[np.float64]
@@ -80,6 +81,7 @@ def test_table_section_and_files(static: Path, alidade: Command, tmp_path: Path)
     assert noise.mag_density == pytest.approx(MAG, rel=0.02)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["noise.html", "noise.json"]
     page = (tmp_path / "out" / "noise.html").read_text(encoding="utf-8")
+    fits(page, tmp_path)
     assert "gyro_bias_walk: " in page
     assert "random walk: 20 min at rest do not determine it" in page  # of the accelerometer
 

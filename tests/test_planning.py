@@ -20,10 +20,13 @@ from pipelines.methods.head.simulation import HeadScenario, head_config, simulat
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from pipelines.planning import Prediction, make_plan, predict, requirements, write_scenario
 from pipelines.reports.plain_json import plan_json
+from pipelines.reports.plan import plan_html
 from pipelines.settings import Sensors
 from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.simulation.scenario import load_scenario
 from pipelines.solvers.batch import solve_batch
+from tests.browser import fits
+from tests.pages import Page
 
 LOS = LosScenario(duration_s=12, image_rate_hz=10, gyro_rate_hz=100, gimbal_rate_hz=100, sensors=Sensors())
 SWAY = EulerMotion(
@@ -90,6 +93,10 @@ def test_what_is_weak_gets_advice_and_a_motion_that_mends_it(tmp_path: Path) -> 
     assert plan.now.assessment.status in ("weak", "unobservable")
     assert any("azimuth" in direction.advice for direction in plan.now.assessment.directions)
     assert plan.steps
+    page = plan_html(plan)
+    fits(page, tmp_path)
+    assert "Does the planned motion determine what is wanted? no" in Page(page).text
+    assert "delta_px Camera mounted turned about x" in Page(page).text
     assert plan.best.sigmas["delta_px"] < 0.1 * plan.now.sigmas["delta_px"]
     better = tmp_path / "better.yaml"
     write_scenario(better, plan)

@@ -25,6 +25,8 @@ COMMON: Mapping[str, str] = {
     r"gyro_skew_([xyz])([xyz])": "Part of a rate about {0} that the gyro reads about {1}, and the other way round: its "
     "axes are not square.",
     r"gyro_g_([xyz])([xyz])": "What the gyro reads about {0} for a specific force along {1} alone.",
+    r"(accel|gyro|mag)_temperature_([xyz])": "By how much the {0}'s reading of {1} at rest changes with each kelvin.",
+    r"mag_delay": "How much later than its stamp a reading of the magnetometer is true.",
     r"platform_bias_([xyz])": "What the platform's gyro reads about its {0} axis when it does not turn.",
     r"platform_scale_([xyz])": "Part of the rate by which the platform's gyro reads too much about its {0} axis.",
     r"platform_skew_([xyz])([xyz])": "Part of a rate about {0} that the platform's gyro reads about {1}, and the other "

@@ -21,6 +21,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from factors.chi_square import student
 from pipelines.errors import InputError, nearest
 from pipelines.graph.problem import Quantity
+from pipelines.reports.answer import Answer, Tone
 from pipelines.reports.known import load_known
 from pipelines.reports.templating import environment
 from pipelines.reports.units import human_unit, to_digits_of
@@ -289,8 +290,23 @@ def _html(result: _Result, stated: Fields, rows: Sequence[Row], before: Path | N
             probability=f"{100.0 * stated.coverage_probability:.4g}",
             before=None if before is None else before.name,
             limited=any(row.conformity for row in rows),
+            answer=_answer(result, rows, [name for name, value in said.items() if value == "not stated"]),
         )
     )
+
+
+def _answer(result: _Result, rows: Sequence[Row], missing: Sequence[str]) -> Answer:
+    """Whether the item is within its limits, or, where it has none, what the calibration is worth."""
+    steps = (f"State in the file of `--fields`: {', '.join(missing)}.",) if missing else ()
+    held = [row.conformity for row in rows if row.conformity]
+    tone: Tone = "good" if result.status == "calibrated" else "warn"
+    if not held:
+        said = f"The status of the calibration is {result.status}; there are no limits to hold the item against."
+        return Answer("Is the item calibrated?", result.status, tone, said, (), steps)
+    within = held.count("conforms")
+    word = "yes" if within == len(held) else "no" if "does not conform" in held else "no statement"
+    said = f"{within} of {len(held)} parameters with limits conform; the status of the calibration is {result.status}."
+    return Answer("Is the item within its limits?", word, tone if word == "yes" else "bad", said, (), steps)
 
 
 def _printed(page: str) -> bytes:

@@ -24,6 +24,8 @@ def human_unit(quantity: Quantity) -> tuple[str, float]:
             return "nT", 1e9
         case "":
             return "ppm", 1e6
+        case "rad/s/K":
+            return "deg/s/K", math.degrees(1.0)
         case "rad/s/(m/s^2)":
             return "deg/s/g", math.degrees(9.80665)
         case other:
