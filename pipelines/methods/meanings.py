@@ -33,7 +33,7 @@ COMMON: Mapping[str, str] = {
     "way round.",
     r"time_offset": "How much later a picture was taken than its stamp says, on the gyro's clock.",
     r"clock_skew": "Part of the time by which the pictures' clock runs faster than the gyro's.",
-    r"encoder_([a-z]+)_(sin|cos)": "Error of the {0} axis' encoder that comes once a turn with the {1} of its angle.",
+    r"encoder_([a-z_]+)_(sin|cos)": "Error of the {0} axis' encoder that comes once a turn with the {1} of its angle.",
     r"encoder_delay": "How much later than its stamp an encoder's reading is true.",
     r"(accel|gyro|mag)_k([123])\2": "Multiplies {1} of the {0}'s reading.",
     r"(accel|gyro|mag)_k([123])([123])": "Part of {2} of the {0}'s reading that is {1} of the body.",
@@ -50,5 +50,5 @@ def meaning(method: Method, name: str) -> str:
     for pattern, sentence in (*method.meanings.items(), *COMMON.items()):
         match = re.fullmatch(pattern, name)
         if match:
-            return sentence.format(*(_WORDS.get(group, group) for group in match.groups()))
+            return sentence.format(*(_WORDS.get(group, group.replace("_", " ")) for group in match.groups()))
     return ""
