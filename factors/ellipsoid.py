@@ -11,6 +11,7 @@ residuals are as white as the samples; of second order is that noise along a ben
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -55,7 +56,9 @@ def excess(raw: Array, sigma: Array, numbers: Array) -> Array:
 
 @dataclass(frozen=True)
 class StrengthFactor(Model):
-    """The length of a vector measured in any attitude: |K raw + b| = s. Blocks: triad (9 or 12), s (1).
+    """The length of a vector measured in any attitude: |K raw + b - c warmth| = s.
+
+    Blocks: triad (9 or 12), s (1) and, of a sensor whose temperature is known, c (3, in the unit of b per K).
 
     The residual is how far raw is from the ellipsoid (Sampson's distance, |v| - s over its slope |K' v / |v||), and not
     how far |v| is from s: that would be less for a K that is too small, down to K = 0 and |b| = s.
@@ -66,6 +69,7 @@ class StrengthFactor(Model):
         sigma: (n,) of raw, per axis.
         excess: (n,) by what the distance is more than 0 on average, see `excess`.
         symmetric: whether K is.
+        warmth: (n,) K, temperature above that at which b is the offset; None: not known.
     """
 
     time: Array
@@ -73,16 +77,18 @@ class StrengthFactor(Model):
     sigma: Array
     excess: Array
     symmetric: bool
+    warmth: Array | None = None
     rows: int = 1
-    stacked: ClassVar = ("time", "raw", "sigma", "excess")
+    stacked: ClassVar = ("time", "raw", "sigma", "excess", "warmth")
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Triad and strength."""
-        return (9 if self.symmetric else 12, 1)
+        """Triad, strength and, where the temperature is known, the slope over it."""
+        return (9 if self.symmetric else 12, 1, *([] if self.warmth is None else [3]))
 
-    def __call__(self, triads: Array, strength: Array) -> Residuals:
-        """Residual ((|v| - s) / |K' v / |v|| - excess) / sigma, (n, 1), v = K raw + b."""
+    def __call__(self, triads: Array, strength: Array, *drift: Array) -> Residuals:
+        """Residual ((|v| - s) / |K' v / |v|| - excess) / sigma, (n, 1), v = K raw + b - c warmth."""
+        triads = drifted(triads, self.warmth, drift)
         length, direction, by_triad = _polar(self.raw, triads, self.symmetric)
         K = (triads @ entries(self.symmetric).T)[:, :9].reshape(-1, 3, 3)
         gradient = np.einsum("nij,ni->nj", K, direction)
@@ -100,7 +106,8 @@ class StrengthFactor(Model):
             of_slope += np.einsum("ni,nid->nd", across, by_triad)
             of_length = np.einsum("ni,nid->nd", direction, by_triad)
             scale = (weight / slope)[:, None]
-            return ((of_length - distance[:, None] * of_slope) * scale)[:, None], -scale[..., None]
+            by_numbers = ((of_length - distance[:, None] * of_slope) * scale)[:, None]
+            return by_numbers, -scale[..., None], *by_slope(by_numbers, self.warmth)
 
         return ((distance - self.excess) * weight)[:, None], jacobians
 
@@ -110,13 +117,15 @@ class DipFactor(Model):
     """The angle between two constant vectors, up and the field, measured together in any attitude: u . f = -sin dip.
 
     u and f have the directions of K raw + b of the accelerometer and of the magnetometer. Blocks: both triads (9 or 12
-    each), dip (1; rad, the field's inclination, positive down).
+    each), dip (1; rad, the field's inclination, positive down) and, where its temperature is known, the accelerometer's
+    slope (3), as of the length.
 
     Attributes:
         time: (n,) s.
         accel, mag: (n, 3) raw.
         sigma: (n,) of the product.
         symmetric: whether the K of accelerometer and magnetometer are.
+        warmth: (n,) K, of the accelerometer, as of the length.
     """
 
     time: Array
@@ -124,16 +133,19 @@ class DipFactor(Model):
     mag: Array
     sigma: Array
     symmetric: tuple[bool, bool]
+    warmth: Array | None = None
     rows: int = 1
-    stacked: ClassVar = ("time", "accel", "mag", "sigma")
+    stacked: ClassVar = ("time", "accel", "mag", "sigma", "warmth")
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Accelerometer, magnetometer, dip."""
-        return (*(9 if symmetric else 12 for symmetric in self.symmetric), 1)
+        """Accelerometer, magnetometer, dip and, where the temperature is known, the slope over it."""
+        triads = (9 if symmetric else 12 for symmetric in self.symmetric)
+        return (*triads, 1, *([] if self.warmth is None else [3]))
 
-    def __call__(self, accel: Array, mag: Array, dip: Array) -> Residuals:
+    def __call__(self, accel: Array, mag: Array, dip: Array, *drift: Array) -> Residuals:
         """Residual (u . f + sin dip) / sigma, (n, 1)."""
+        accel = drifted(accel, self.warmth, drift)
         up_length, up, by_accel = _polar(self.accel, accel, self.symmetric[0])
         field_length, field, by_mag = _polar(self.mag, mag, self.symmetric[1])
         cosine = (up * field).sum(axis=1)
@@ -142,13 +154,27 @@ class DipFactor(Model):
         def jacobians() -> tuple[Array, ...]:
             across_up = (field - cosine[:, None] * up) / up_length[:, None] * weight
             across_field = (up - cosine[:, None] * field) / field_length[:, None] * weight
+            by_up = np.einsum("ni,nid->nd", across_up, by_accel)[:, None]
             return (
-                np.einsum("ni,nid->nd", across_up, by_accel)[:, None],
+                by_up,
                 np.einsum("ni,nid->nd", across_field, by_mag)[:, None],
                 (np.cos(dip) * weight)[..., None],
+                *by_slope(by_up, self.warmth),
             )
 
         return (cosine[:, None] + np.sin(dip)) * weight, jacobians
+
+
+def drifted(triads: Array, warmth: Array | None, slope: Sequence[Array]) -> Array:
+    """Triads (n, 9 or 12) with b as it is at a temperature, b - c warmth; as they are where that is not known."""
+    if warmth is None:
+        return triads
+    return np.concatenate([triads[:, :-3], triads[:, -3:] - warmth[:, None] * slope[-1]], axis=1)
+
+
+def by_slope(by_triad: Array, warmth: Array | None) -> tuple[Array, ...]:
+    """The Jacobian by c that goes with one by such triads, (n, d, 9 or 12); none where there is no c."""
+    return () if warmth is None else (-warmth[:, None, None] * by_triad[..., -3:],)
 
 
 def _polar(raw: Array, triads: Array, symmetric: bool) -> tuple[Array, Array, Array]:

@@ -15,6 +15,7 @@ from typing import ClassVar
 import numpy as np
 
 from factors import so3
+from factors.ellipsoid import by_slope, drifted
 from factors.gyro import SCALE, Derivatives, carried, rate_error
 from factors.model import ROT3, Array, Block, Model, Residuals
 from factors.preintegration import GyroPath
@@ -88,14 +89,16 @@ class FieldFactor(Model):
 
 @dataclass(frozen=True)
 class UpFactor(Model):
-    """Specific force: raw = K^-1 (bRa(time) aRn (0, 0, s) + (w' x arm + w x (w x arm)) / unit - b).
+    """Specific force: raw = K^-1 (bRa(time) aRn (0, 0, s) + (w' x arm + w x (w x arm)) / unit - b + c warmth).
 
     Blocks: attitude aRb at the anchor (rotations), gyro bias (3), triad (12), strength s (1), unless the gyro is
-    perfect its errors (6 to 18) and, of a sensor that is swung about a point, arm (3; in b, from there to the sensor).
+    perfect its errors (6 to 18), of a sensor that is swung about a point arm (3; in b, from there to the sensor) and,
+    where its temperature is known, c (3, in the unit of b per K).
 
     Attributes:
         time, anchor, raw, sigma, aRn, gyro, errors: as of the field.
         unit: m/s^2, of the strength, of a sensor that is swung; None: it is at rest.
+        warmth: (n,) K, temperature above that at which b is the offset; None: not known.
     """
 
     time: Array
@@ -106,21 +109,26 @@ class UpFactor(Model):
     gyro: GyroPath
     errors: int = 0
     unit: float | None = None
+    warmth: Array | None = None
     rows: int = 3
-    stacked: ClassVar = ("time", "anchor", "raw", "sigma", "aRn")
+    stacked: ClassVar = ("time", "anchor", "raw", "sigma", "aRn", "warmth")
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Attitude, bias, triad, strength, the gyro's errors and the arm."""
-        return ROT3, 3, 12, 1, *([self.errors] if self.errors else []), *([] if self.unit is None else [3])
+        """Attitude, bias, triad, strength, the gyro's errors, the arm and the slope over temperature."""
+        arm, slope = ([] if each is None else [3] for each in (self.unit, self.warmth))
+        return ROT3, 3, 12, 1, *([self.errors] if self.errors else []), *arm, *slope
 
     def __call__(self, aRb: Array, bias: Array, triads: Array, strength: Array, *others: Array) -> Residuals:
         """Residual (predicted - raw) / sigma, (n, 3)."""
         middle = 0.5 * (self.anchor + self.time)
         own = others[0] if self.errors else None
+        triads = drifted(triads, self.warmth, others)
         dV, _, by_gyro = carried(self.gyro, self.anchor, middle, self.time, bias, own)
         up = strength * so3.rotate(so3.multiply(so3.inverse(so3.multiply(aRb, dV)), self.aRn), _UP)
-        swung, by_swing = self._swung(bias, own, others[-1]) if self.unit else (np.zeros_like(up), None)
+        swung, by_swing = (
+            self._swung(bias, own, others[1 if self.errors else 0]) if self.unit else (np.zeros_like(up), None)
+        )
         error, across, by_triad = _predicted(self.raw, self.sigma, triads, up + swung)
 
         def jacobians() -> tuple[Array, ...]:
@@ -132,7 +140,9 @@ class UpFactor(Model):
                 arm, *more = (across @ each for each in by_swing())
                 by_arm = [arm]
                 by_bias, *by_errors = (a + b for a, b in zip((by_bias, *by_errors), more, strict=True))
-            return by_attitude @ so3.matrix(so3.inverse(dV)), by_bias, by_triad(), by_strength, *by_errors, *by_arm
+            numbers = by_triad()
+            shared = by_bias, numbers, by_strength, *by_errors, *by_arm, *by_slope(numbers, self.warmth)
+            return by_attitude @ so3.matrix(so3.inverse(dV)), *shared
 
         return error, jacobians
 

@@ -33,6 +33,7 @@ from pipelines.recording.writing import write_session
 from pipelines.session import Session, resolve_method
 from pipelines.settings import Config
 from pipelines.simulation.simulated import Simulated
+from pipelines.simulation.temperature import Warming
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.incremental import solve_incremental
 from tests.command import Command
@@ -113,13 +114,18 @@ def test_jacobians(symmetric: bool) -> None:
     assert_jacobians(strength, [triads(d), rng.uniform(0.5, 2.0, (N, 1))])
     dip = DipFactor(time, rng.normal(size=(N, 3)), raw, sigma, (True, symmetric))
     assert_jacobians(dip, [triads(9), triads(d), rng.uniform(-1.0, 1.0, (N, 1))])
+    warmth, slope = rng.uniform(-2.0, 8.0, N), 0.02 * rng.normal(size=(N, 3))
+    assert_jacobians(replace(strength, warmth=warmth), [triads(d), rng.uniform(0.5, 2.0, (N, 1)), slope])
+    assert_jacobians(replace(dip, warmth=warmth), [triads(9), triads(d), rng.uniform(-1.0, 1.0, (N, 1)), slope])
 
 
-@pytest.mark.parametrize("errors", [0, 6, 15])
+@pytest.mark.parametrize("errors", [0, 6, 9, 15, 18])
 def test_jacobians_beside_a_gyro(errors: int) -> None:
     rng, t = np.random.default_rng(errors), np.arange(0.0, 2.0, 0.01)
     rate = np.stack([np.sin(3.0 * t), np.cos(2.0 * t), 0.5 * np.sin(t + 1.0)], axis=1)
-    gyro = GyroPath(t, rate, [0.01, 0.02, -0.01], np.cos(rate) + [0.0, 3.0, 9.0])
+    force, warmth = np.cos(rate) + [0.0, 3.0, 9.0], (5.0 * np.sin(t))[:, None]
+    drivers = {0: None, 6: None, 9: warmth, 15: force, 18: np.column_stack([force, warmth])}
+    gyro = GyroPath(t, rate, [0.01, 0.02, -0.01], drivers[errors])
     anchor = rng.uniform(0.3, 1.5, N)
     time, sigma, raw = anchor + rng.uniform(-0.05, 0.05, N), rng.uniform(0.5, 2.0, N), rng.normal(size=(N, 3))
     aRb, aRn = so3.exp(rng.normal(size=(N, 3))), so3.exp(rng.normal(size=(N, 3)))
@@ -134,6 +140,10 @@ def test_jacobians_beside_a_gyro(errors: int) -> None:
     assert_jacobians(at_rest, [aRb, bias, triads, strength, *own], rtol=5e-5)
     swung = replace(at_rest, unit=9.8)
     assert_jacobians(swung, [aRb, bias, triads, strength, *own, rng.normal(size=(N, 3))], rtol=5e-5)
+    warm = replace(swung, warmth=rng.uniform(-2.0, 8.0, N))
+    arm, slope = rng.normal(size=(N, 3)), 0.02 * rng.normal(size=(N, 3))
+    assert_jacobians(warm, [aRb, bias, triads, strength, *own, arm, slope], rtol=5e-5)
+    assert_jacobians(replace(warm, unit=None), [aRb, bias, triads, strength, *own, slope], rtol=5e-5)
 
 
 def test_without_noise_there_is_no_error() -> None:
@@ -169,6 +179,13 @@ def test_continuous_tumbling_with_a_gyro_is_consistent() -> None:
 @pytest.mark.slow
 def test_tumbling_with_rests_and_a_gyro_is_consistent_over_many_seeds() -> None:
     _assert_consistent(replace_scenario(TURNING, rest_s=1.5), range(24))
+
+
+@pytest.mark.slow
+def test_offsets_that_follow_the_temperature_are_consistent() -> None:
+    """Of the accelerometer and of the gyro beside it."""
+    warming = TURNING.model_copy(update={"temperature": Warming(rise_k=15.0, time_constant_s=30.0)})
+    _assert_consistent(replace_scenario(warming, rest_s=1.5), range(24))
 
 
 def test_a_gyro_makes_few_attitudes_enough() -> None:

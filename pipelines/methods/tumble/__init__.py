@@ -31,7 +31,7 @@ class Tumble(Method):
     title = "Tumbled magnetometer and accelerometer"
     topics = TOPICS
     needs = NEEDS
-    sheets = ("gyro", "mag", "field")
+    sheets = ("gyro", "accel", "mag", "field")
     of_recording = ("accel_b?", "gyro_bias_*", "gravity", "field_*")
     sketch = Path(__file__).with_name("frames.svg")
     drawn = True

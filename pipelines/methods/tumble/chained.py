@@ -18,8 +18,9 @@ from pipelines.graph.noise import Level
 from pipelines.graph.priors import vector_prior
 from pipelines.graph.problem import Array, Attitudes, Factor, Problem, Step
 from pipelines.judgement.pictures import swaying
+from pipelines.methods import temperature
 from pipelines.methods.tumble.model import Model, Sensor
-from pipelines.methods.tumble.parameters import DIP_KEY, STRENGTH_KEYS, TRIAD_KEYS, Variable
+from pipelines.methods.tumble.parameters import DIP_KEY, SLOPE_KEY, STRENGTH_KEYS, TRIAD_KEYS, Variable
 from pipelines.methods.tumble.recording import TumbleData
 from pipelines.methods.tumble.turning import DELAY_KEY, Rows, Seen, Turning, turning
 from pipelines.settings import Config
@@ -66,6 +67,7 @@ def chained(data: TumbleData, config: Config, model: Model, shared: tuple[Variab
         dropped=model.dropped,
         premises=model.premises,
         noises=(*(Level(sensor.noise) for sensor in model.sensors), *turned.levels),
+        constants=temperature.constants(temperature.reference(data.temperature)),
     )
 
 
@@ -129,9 +131,11 @@ def _up(graph: _Graph, keyframes: range) -> list[Factor]:
         return []
     sensor = graph.sensors["accel"]
     measured = _measured(turned, sensor, seen)
-    factor = UpFactor(*measured, chain.gyro, turned.errors, None if turned.arm is None else sensor.strength)
+    warmth = None if sensor.warmth is None else sensor.warmth[seen.row]
+    factor = UpFactor(*measured, chain.gyro, turned.errors, None if turned.arm is None else sensor.strength, warmth)
     arm = [] if turned.arm is None else [turned.arm.key]
-    keys = TRIAD_KEYS["accel"], STRENGTH_KEYS["accel"], *chain.error_keys, *arm
+    slope = [] if warmth is None else [SLOPE_KEY]
+    keys = TRIAD_KEYS["accel"], STRENGTH_KEYS["accel"], *chain.error_keys, *arm, *slope
     states = [chain.state(int(k)) for k in seen.keyframe]
     return [Factor.of(FAMILIES["accel"], factor.on(states, chain.bias_keys(seen.keyframe), *keys, loss=graph.loss))]
 

@@ -4,9 +4,13 @@ errors, the K of the accelerometer, the magnetometer's."""
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 
-from pipelines.methods.formula import Formula, gyro_rate
+import numpy as np
+
+from pipelines.methods.formula import Formula, gyro_rate, over_temperature, temperature_text
 from pipelines.methods.triads import triad_formula
+from pipelines.methods.tumble.recording import ACCEL_SLOPE, GYRO_SLOPE
 from pipelines.methods.tumble.turning import BIAS, SCALE, SENSITIVITY
 
 
@@ -14,13 +18,31 @@ def formulas(parameters: Collection[str]) -> list[Formula]:
     """Of the sensors that there are; raw numbers are as recorded, and results in the unit of the strength."""
     found = []
     if "accel_k11" in parameters:
-        found.append(triad_formula("accel", parameters, "accel", ("accel",), lambda v: v.accel, "body's"))
+        formula = triad_formula("accel", parameters, "accel", ("accel",), lambda v: v.accel, "body's")
+        found.append(_less_drift(formula, parameters))
     if "mag_k11" in parameters:
         unit = "the unit of field_strength"
         found.append(triad_formula("mag", parameters, "mag", ("mag",), lambda v: v.mag, "body's", unit))
     if BIAS[0] in parameters:
         names = tuple(name for each in SCALE for name in each.names)
         found.append(
-            Formula("rate, rad/s along the body's axes", "w_b", *gyro_rate(parameters, names, SENSITIVITY.names))
+            Formula(
+                "rate, rad/s along the body's axes",
+                "w_b",
+                *gyro_rate(parameters, names, SENSITIVITY.names, GYRO_SLOPE.names),
+            )
         )
     return found
+
+
+def _less_drift(formula: Formula, parameters: Collection[str]) -> Formula:
+    """The accelerometer's with the drift of b taken off, which is along the body's axes, where it is known."""
+    names = ACCEL_SLOPE.names
+    if not any(name in parameters for name in names):
+        return formula
+    return replace(
+        formula,
+        expression=f"{formula.expression} - {temperature_text(names, parameters)}",
+        measured=(*formula.measured, "temperature"),
+        compute=lambda v: np.asarray(formula.compute(v) - over_temperature(v, names)),
+    )

@@ -20,9 +20,10 @@ from factors.ellipsoid import DipFactor, StrengthFactor
 from factors.loss import TruncatedLoss
 from pipelines.graph.noise import Level
 from pipelines.graph.problem import Array, Factor, Problem, Step
+from pipelines.methods import temperature
 from pipelines.methods.tumble.chained import FAMILIES, advice, chained
 from pipelines.methods.tumble.model import Model, Moments, Sensor, prepare
-from pipelines.methods.tumble.parameters import DIP_KEY, STRENGTH_KEYS, TRIAD_KEYS, Variable, variables
+from pipelines.methods.tumble.parameters import DIP_KEY, SLOPE_KEY, STRENGTH_KEYS, TRIAD_KEYS, Variable, variables
 from pipelines.methods.tumble.recording import TumbleData
 from pipelines.settings import Config
 
@@ -52,6 +53,7 @@ def problem(data: TumbleData, config: Config) -> Problem:
         dropped=model.dropped,
         premises=model.premises,
         noises=tuple(noises),
+        constants=temperature.constants(temperature.reference(data.temperature)),
     )
 
 
@@ -86,10 +88,11 @@ def _strengths(sensor: Sensor, rows: slice, loss: TruncatedLoss) -> list[Factor]
     """What a sensor says in a stretch of time."""
     if rows.start == rows.stop:
         return []
+    warmth = None if sensor.warmth is None else sensor.warmth[rows]
     factor = StrengthFactor(
-        sensor.time[rows], sensor.scaled[rows], sensor.sigma[rows], sensor.excess[rows], sensor.symmetric
+        sensor.time[rows], sensor.scaled[rows], sensor.sigma[rows], sensor.excess[rows], sensor.symmetric, warmth
     )
-    keys = TRIAD_KEYS[sensor.name], STRENGTH_KEYS[sensor.name]
+    keys = TRIAD_KEYS[sensor.name], STRENGTH_KEYS[sensor.name], *([] if warmth is None else [SLOPE_KEY])
     return [Factor.of(FAMILIES[sensor.name], factor.on(*keys, loss=loss))]
 
 
@@ -97,5 +100,9 @@ def _dips(moments: Moments, rows: slice, symmetric: tuple[bool, bool], loss: Tru
     """The angles between field and gravity in a stretch of time."""
     if rows.start == rows.stop:
         return []
-    factor = DipFactor(moments.time[rows], moments.accel[rows], moments.mag[rows], moments.sigma[rows], symmetric)
-    return [Factor.of("dip", factor.on(TRIAD_KEYS["accel"], TRIAD_KEYS["mag"], DIP_KEY, loss=loss))]
+    warmth = None if moments.warmth is None else moments.warmth[rows]
+    factor = DipFactor(
+        moments.time[rows], moments.accel[rows], moments.mag[rows], moments.sigma[rows], symmetric, warmth
+    )
+    keys = TRIAD_KEYS["accel"], TRIAD_KEYS["mag"], DIP_KEY, *([] if warmth is None else [SLOPE_KEY])
+    return [Factor.of("dip", factor.on(*keys, loss=loss))]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from factors.earth import gravity
 from factors.ellipsoid import StrengthFactor, entries, excess, nominal_of
 from pipelines.errors import InputError
+from pipelines.graph.assumptions import parameter
 from pipelines.graph.assumptions import stated as sheet
 from pipelines.graph.noise import ROUGHLY, Noise
 from pipelines.graph.problem import Array
@@ -24,7 +25,7 @@ from pipelines.methods.place import FIELD, STRENGTH_SIGMA, field_at
 from pipelines.methods.static_intervals import quiet_intervals
 from pipelines.methods.triads import triad_names
 from pipelines.methods.tumble.published import FEWEST, ellipsoid
-from pipelines.methods.tumble.recording import TumbleData
+from pipelines.methods.tumble.recording import ACCEL_SLOPE, TumbleData
 from pipelines.methods.tumble.turning import Mounted, mounted
 from pipelines.settings import Config
 
@@ -67,6 +68,7 @@ class Sensor:
         turned: (3, 3) the part of that which turns: the body's axes against those of a symmetric K.
         rested: whether the readings are means over rests.
         noise: of a sample, with its family.
+        warmth: (n,) K, temperature above the recording's first; None: not known, or nothing follows it.
     """
 
     name: str
@@ -84,6 +86,7 @@ class Sensor:
     turned: Array
     rested: bool
     noise: Noise
+    warmth: Array | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -128,6 +131,7 @@ class Moments:
         time, accel, mag: (n,) s, (n, 3) and (n, 3), without unit.
         sigma: (n,) of the cosine between them.
         noise: of the cosine.
+        warmth: (n,) K, of the accelerometer, as of a sensor.
     """
 
     time: Array
@@ -135,6 +139,7 @@ class Moments:
     mag: Array
     sigma: Array
     noise: Noise
+    warmth: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,13 +288,17 @@ def _accelerometer(data: TumbleData, config: Config, rests: Array | None) -> Sen
     known = data.latitude is not None
     strength = float(gravity(data.latitude, data.height)) if data.latitude is not None else _GRAVITY
     time, raw, number = _means(data.accel_t, data.accel, rests)
-    return _sensor(
+    found = _sensor(
         "accel",
         (data.accel_t, data.accel_density),
         (time, raw, number),
         config,
         (strength, 0.0 if known else _GRAVITY_SIGMA, "m/s^2"),
     )
+    if data.temperature is None or parameter(0, (ACCEL_SLOPE,), config) is None:
+        return found
+    warmth = data.temperature.above(data.temperature.first, data.accel_t)
+    return replace(found, warmth=_means(data.accel_t, warmth[:, None], rests)[1][:, 0])
 
 
 def _magnetometer(data: TumbleData, config: Config, field: Array | None, alone: bool) -> Sensor:
@@ -403,7 +412,7 @@ def _means(t: Array, values: Array, rests: Array | None) -> tuple[Array, Array, 
     first, last = np.searchsorted(t, rests[:, 0]), np.searchsorted(t, rests[:, 1], side="right")
     some = last > first
     means = [values[a:b].mean(axis=0) for a, b in zip(first[some], last[some], strict=True)]
-    return rests[some].mean(axis=1), np.array(means).reshape(-1, 3), (last - first)[some].astype(float)
+    return rests[some].mean(axis=1), np.array(means).reshape(-1, values.shape[1]), (last - first)[some].astype(float)
 
 
 def _together(
@@ -434,7 +443,8 @@ def _together(
     cosine2 = max(1.0 - sine**2, 1e-2)
     sigma = np.sqrt(cosine2 * (accel.sigma[rows] ** 2 + own**2))
     noise = Noise("dip", float(np.median(sigma)), "default", 0.0 if config.noise_known == 0.0 else ROUGHLY, ("dip",))
-    moments = Moments(time, accel.scaled[rows], readings / mag.radius, sigma, noise)
+    warmth = None if accel.warmth is None else accel.warmth[rows]
+    moments = Moments(time, accel.scaled[rows], readings / mag.radius, sigma, noise, warmth)
     return turned, Dip(float(np.arcsin(np.clip(sine, -0.99, 0.99))), model), moments, premises
 
 

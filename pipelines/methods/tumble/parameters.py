@@ -11,16 +11,18 @@ import gtsam
 import numpy as np
 
 from factors.ellipsoid import entries
+from pipelines.graph.assumptions import quantities
 from pipelines.graph.priors import prior_sigmas
 from pipelines.graph.problem import Array, Factor, Parameter, Quantity
 from pipelines.methods.triads import triad_names
 from pipelines.methods.tumble.model import Model, Sensor, nearest_axes
+from pipelines.methods.tumble.recording import ACCEL_SLOPE, SLOPES
 from pipelines.methods.tumble.turning import ARM, BIAS, DELAY, SCALE, SENSITIVITY
 from pipelines.settings import Config, check_names
 
 TRIAD_KEYS = {"accel": int(gtsam.symbol("A", 0)), "mag": int(gtsam.symbol("M", 0))}
 STRENGTH_KEYS = {"accel": int(gtsam.symbol("g", 0)), "mag": int(gtsam.symbol("f", 0))}
-DIP_KEY = int(gtsam.symbol("i", 0))
+DIP_KEY, SLOPE_KEY = (int(gtsam.symbol(letter, 0)) for letter in "iJ")
 STRENGTHS = {"accel": "gravity", "mag": "field_strength"}
 _DIP = "field_dip"
 
@@ -50,7 +52,7 @@ class Variable:
 
 
 def variables(model: Model, config: Config) -> tuple[Variable, ...]:
-    """Triads, strengths and dip, in reporting order; a gyro's are `turning.parameters`.
+    """Triads, strengths, dip and slopes over temperature, in reporting order; a gyro's are `turning.parameters`.
 
     Raises InputError when the config names no such parameter.
     """
@@ -63,6 +65,11 @@ def variables(model: Model, config: Config) -> tuple[Variable, ...]:
         known = config.prior(_DIP, sigma)
         quantity = Quantity(_DIP, "rad", known, sigma, wanted, prior_mean=mean, nuisance=True)
         found.append(_variable(DIP_KEY, (quantity,), np.ones(1), np.array([model.dip.start])))
+    slopes = (sensor for sensor in model.sensors if sensor.warmth is not None)
+    found += [
+        _variable(SLOPE_KEY, quantities(ACCEL_SLOPE, config), np.full(3, sensor.strength), np.zeros(3))
+        for sensor in slopes
+    ]
     return tuple(found)
 
 
@@ -78,16 +85,14 @@ def _triad(sensor: Sensor, config: Config) -> Variable:
     # An offset of many times the strength, as of counts, goes with the gain.
     wide = max(1.0, float(np.linalg.norm(sensor.start[-3:])))
     require = np.repeat([_REQUIRE_GAIN * nominal, _REQUIRE_BIAS[sensor.name] * wide], [gains, 3])
-    quantities = []
+    listed = []
     units = [_gain_unit(sensor)] * gains + [sensor.unit] * 3
     for i, (name, unit) in enumerate(zip(sensor.names, units, strict=True)):
         scale = float(sensor.scales[i])
         prior = config.prior(name, scale * float(sigma[i]))
         wanted = config.require.get(name, scale * float(require[i]))
-        quantities.append(
-            Quantity(name, unit, prior, scale * float(sigma[i]), wanted, prior_mean=scale * float(mean[i]))
-        )
-    return _variable(TRIAD_KEYS[sensor.name], tuple(quantities), sensor.scales, sensor.start)
+        listed.append(Quantity(name, unit, prior, scale * float(sigma[i]), wanted, prior_mean=scale * float(mean[i])))
+    return _variable(TRIAD_KEYS[sensor.name], tuple(listed), sensor.scales, sensor.start)
 
 
 def _gain_unit(sensor: Sensor) -> str:
@@ -131,7 +136,7 @@ def _check_names(config: Config) -> None:
         _DIP,
         *BIAS,
         *ARM,
-        *chain.from_iterable(each.names for each in (*SCALE, SENSITIVITY, DELAY)),
+        *chain.from_iterable(each.names for each in (*SCALE, SENSITIVITY, DELAY, *SLOPES)),
     ]
     check_names(config.priors, known, "priors")
     check_names(config.require, known, "require")

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.errors import InputError
+from pipelines.graph.assumptions import temperature_assumption
+from pipelines.methods import temperature
 from pipelines.methods.place import read_place
 from pipelines.recording import series
 from pipelines.recording.checks import (
@@ -24,12 +26,19 @@ from pipelines.recording.checks import (
 )
 from pipelines.recording.faults import drop_faults
 from pipelines.recording.reading import Recording
+from pipelines.recording.temperature import Temperature
 from pipelines.recording.topics import FIX, IMU, MAG, wanted
 from pipelines.recording.writing import attached, write_session
 from pipelines.settings import Config
 from pipelines.simulation.simulated import Simulated
 
 Array = NDArray[np.float64]
+
+# What a temperature does to the offsets of consumer sensors, one sigma.
+SLOPES = GYRO_SLOPE, ACCEL_SLOPE = (
+    temperature_assumption("gyro", "rad/s", 1e-4),
+    temperature_assumption("accel", "m/s^2", 1e-2),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +48,8 @@ class TumbleData:
     mag_t (N,), mag (N, 3): T, or counts; accel_t (M,), accel (M, 3): m/s^2, or counts; None for a sensor that there is
     not, but one there is. gyro_t (L,), gyro (L, 3): rad/s, where there is one beside a magnetometer. mag_density,
     accel_density, gyro_density: from the covariances of the messages, in the unit recorded per sqrt(Hz), None if they
-    say nothing. latitude, longitude, rad, height, m: None if unknown. dropped: reason -> messages.
+    say nothing. latitude, longitude, rad, height, m: None if unknown. dropped: reason -> messages. temperature: of gyro
+    and accelerometer, None where nobody measures it.
     """
 
     epoch_ns: int
@@ -56,6 +66,7 @@ class TumbleData:
     gyro_t: Array | None = None
     gyro: Array | None = None
     gyro_density: float | None = None
+    temperature: Temperature | None = None
 
 
 def read_tumble(recording: Recording, config: Config) -> TumbleData:
@@ -97,6 +108,8 @@ def read_tumble(recording: Recording, config: Config) -> TumbleData:
         )
     check_overlap(spans)
     latitude, longitude, height = read_place(recording, config, FIX)
+    imu_t = gyro_t if accel_t is None else accel_t
+    warming = None if imu_t is None else temperature.read(recording, config, SLOPES, imu_t, dropped)
     return TumbleData(
         epoch_ns=epoch,
         mag_t=mag_t,
@@ -112,6 +125,7 @@ def read_tumble(recording: Recording, config: Config) -> TumbleData:
         gyro_t=gyro_t,
         gyro=gyro,
         gyro_density=gyro_density,
+        temperature=warming,
     )
 
 
@@ -157,4 +171,5 @@ def write_tumble(path: Path, simulated: Simulated) -> None:
         topics[FIX.name] = series.FixSeries(
             np.array([epoch]), place[:1], place[1:], np.array([data.height]), frame_id="gnss"
         )
+    topics |= temperature.topics(data.temperature, epoch)
     write_session(path, topics, attached(simulated.truth, simulated.config))

@@ -7,6 +7,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from pipelines.simulation.temperature import Warming
+
 # 2026-11-20 12:00 UTC: simulated sessions start here; and the year of that day for the field model.
 EPOCH_NS, YEAR = 1_795_176_000_000_000_000, 2026.8849315068493
 
@@ -35,6 +37,7 @@ class TumbledAccelerometer(_Part):
     gain: NotNegative = 0.02  # sigma of each entry of K - 1
     bias: NotNegative = 0.3  # m/s^2
     mounting_deg: NotNegative = 3.0  # sigma of the magnetometer's rotation against it, each component
+    temperature: NotNegative = 1e-2  # m/s^2/K, sigma of each slope of b, where there is a temperature
     arm: NotNegative = 0.1  # m, from the centre that the device is turned about
 
 
@@ -46,6 +49,7 @@ class TumbledGyro(_Part):
     bias: NotNegative = 1e-2  # rad/s, sigma of each component
     scale: NotNegative = 1e-2  # sigma of each number of S
     g_sensitivity: NotNegative = 2e-4  # rad/s per m/s^2, sigma of each number of G, beside an accelerometer
+    temperature: NotNegative = 1e-4  # rad/s/K, sigma of each slope of the bias, where there is a temperature
     mounting_deg: NotNegative = 0.5  # sigma of the next sensor's rotation against it, each component
     mag_delay: NotNegative = 1e-2  # s, sigma
 
@@ -60,6 +64,7 @@ class TumbleScenario(_Part):
     magnetometer: TumbledMagnetometer | None = TumbledMagnetometer()
     accelerometer: TumbledAccelerometer | None = None
     gyro: TumbledGyro | None = None
+    temperature: Warming | None = None  # of accelerometer and gyro; null: nobody measures it
     latitude_deg: float | None = 40.0  # null: nobody knows where it was
     longitude_deg: float = 116.3
     field_error: NotNegative = 1.33e-7  # T, sigma of the strength about its model

@@ -24,6 +24,7 @@ from pipelines.methods.tumble.scenario import (
 )
 from pipelines.simulation.motion import sample_times
 from pipelines.simulation.simulated import Simulated
+from pipelines.simulation.temperature import drift, measured
 
 Array = NDArray[np.float64]
 
@@ -53,10 +54,14 @@ def simulated(scenario: TumbleScenario, seed: int, images: bool = False) -> Simu
     if place is not None:
         found |= {"latitude": float(place[0]), "longitude": float(place[1])}
     mounting, delay = so3.identity(), 0.0
+    # Drawn apart: a seed gives the same noise whatever temperatures do.
+    slopes = _slopes(scenario, np.random.default_rng([seed, 1]))
+    truth |= slopes
     g = 9.80665 if place is None else float(gravity(float(place[0]), 0.0))
     if (gyro := scenario.gyro) is not None:
         earth = np.zeros(3) if place is None else earth_rate(float(place[0]))
         t, raw, own = _gyro(motion, gyro, scenario.accelerometer, earth, g, rng)
+        raw = raw + drift(scenario.temperature, "gyro", slopes, t)
         found |= {"gyro_t": t, "gyro": raw, "gyro_density": gyro.density}
         delay = gyro.mag_delay * float(rng.standard_normal())
         truth |= own | {"mag_delay": delay}
@@ -65,6 +70,7 @@ def simulated(scenario: TumbleScenario, seed: int, images: bool = False) -> Simu
         K, b = _drawn(rng, accel.gain, accel.bias)
         K, b = so3.matrix(mounting) @ K, so3.rotate(mounting, b)
         t, raw = _accelerometer(motion, accel, g, K, b, rng)
+        raw = raw + drift(scenario.temperature, "accel", slopes, t) @ np.linalg.inv(K).T
         found |= {"accel_t": t, "accel": raw, "accel_density": accel.density}
         truth |= _truth("accel", K, b, symmetric=gyro is None) | {"gravity": g}
         truth |= {"accel_arm_x": accel.arm, "accel_arm_y": 0.0, "accel_arm_z": 0.0}
@@ -79,7 +85,19 @@ def simulated(scenario: TumbleScenario, seed: int, images: bool = False) -> Simu
         truth |= {"field_strength": float(np.linalg.norm(field)) / unit}
         if accel is not None or gyro is not None:
             truth |= {"field_dip": float(np.arcsin(-field[2] / np.linalg.norm(field)))}
+    found |= {"temperature": measured(scenario.temperature, motion.duration)}
     return Simulated(TumbleData(EPOCH_NS, **found), truth, tumble_config(scenario))  # type: ignore[arg-type]
+
+
+def _slopes(scenario: TumbleScenario, rng: np.random.Generator) -> dict[str, float]:
+    """Of the offsets of gyro and accelerometer over their temperature, where there is one."""
+    sensors = {"gyro": scenario.gyro, "accel": scenario.accelerometer}
+    there = {name: sensor for name, sensor in sensors.items() if sensor is not None and scenario.temperature}
+    return {
+        f"{name}_temperature_{axis}": sensor.temperature * float(rng.standard_normal())
+        for name, sensor in there.items()
+        for axis in "xyz"
+    }
 
 
 class _Motion:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from pipelines.recording.topics import FIX, IMU, MAG, Need, Setting
+from pipelines.recording.topics import FIX, IMU, MAG, TEMPERATURE, Need, Setting
 
-TOPICS = (MAG, IMU, FIX)
+TOPICS = (MAG, IMU, FIX, TEMPERATURE)
 _METHOD = Setting("`method: tumble` in the config", lambda config: config.method == "tumble")
 # An accelerometer by itself is in most recordings, and seldom meant.
 NEEDS: tuple[Need, ...] = (((MAG,), (IMU, _METHOD)),)

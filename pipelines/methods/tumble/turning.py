@@ -28,7 +28,7 @@ from pipelines.graph.noise import Level
 from pipelines.graph.problem import Array, Parameter, Quantity
 from pipelines.graph.walking_bias import FIRST
 from pipelines.methods.noise import sampled, stated, walking
-from pipelines.methods.tumble.recording import TumbleData
+from pipelines.methods.tumble.recording import GYRO_SLOPE, TumbleData
 from pipelines.settings import Config
 
 Index = NDArray[np.intp]
@@ -192,10 +192,12 @@ def turning(
     assert data.latitude is not None
     density = sampled(stated("gyro_density", config, data.gyro_density, ("gyro",)), data.gyro_t, data.gyro)
     walk = walking(config)
-    drivers = {}
+    drivers: dict[Assumption, Array] = {}
     if accel is not None and data.accel_t is not None:
         force = [np.interp(data.gyro_t, data.accel_t, axis) for axis in accel.whole.T]
         drivers[SENSITIVITY] = np.stack(force, axis=1)
+    if data.temperature is not None:
+        drivers[GYRO_SLOPE] = data.temperature.above(data.temperature.first, data.gyro_t)
     errors = gyro_errors(_ERRORS_KEY, SCALE, list(drivers), config)
     path = GyroPath(data.gyro_t, data.gyro, guess.bias, acting(errors, drivers))
     inside = _inside(mag.time, data.gyro_t)

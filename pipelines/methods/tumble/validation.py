@@ -8,10 +8,11 @@ import numpy as np
 
 from pipelines.errors import InputError
 from pipelines.judgement.validation import Validation
+from pipelines.methods.temperature import FIRST
 from pipelines.methods.triads import triad_of
 from pipelines.methods.tumble.model import prepare
 from pipelines.methods.tumble.parameters import STRENGTHS
-from pipelines.methods.tumble.recording import TumbleData
+from pipelines.methods.tumble.recording import ACCEL_SLOPE, TumbleData
 from pipelines.settings import Config
 
 _WHAT = {"accel": "specific force at rest, its strength", "mag": "magnetic field, its strength"}
@@ -29,7 +30,11 @@ def validate(data: TumbleData, config: Config, values: Mapping[str, float]) -> l
         K, b = triad_of(sensor.name, values)
         strength = values.get(STRENGTHS[sensor.name], sensor.strength)
         raw = np.linalg.norm(sensor.raw, axis=1)
-        after = np.linalg.norm(sensor.raw @ K.T + b, axis=1) - strength
+        drift = np.zeros((1, 3))
+        if sensor.warmth is not None and data.temperature is not None and FIRST in values:
+            warmth = sensor.warmth + (data.temperature.first - values[FIRST])
+            drift = np.outer(warmth, [values.get(name, 0.0) for name in ACCEL_SLOPE.names])
+        after = np.linalg.norm(sensor.raw @ K.T + b - drift, axis=1) - strength
         before = raw * strength / np.mean(raw) - strength
         found.append(Validation(_WHAT[sensor.name], sensor.unit, sensor.time, before[:, None], after[:, None]))
     if not found:
