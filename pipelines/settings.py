@@ -247,11 +247,11 @@ PriorEntry = Annotated[
 
 
 def _share(value: object) -> str | float:
-    if value in ("device", "recording"):
+    if value in ("device", "recording", "walks"):
         return str(value)
     if isinstance(value, int | float) and not isinstance(value, bool) and 0.0 <= value < float("inf"):
         return float(value)
-    raise ValueError("must be device, recording, or how far it walks in the root of a day")
+    raise ValueError("must be device, recording, walks, or how far it walks in the root of a day")
 
 
 Share = Annotated[str | float, PlainValidator(_share)]
@@ -275,7 +275,7 @@ class Config(Section):
     noise: Noise = Noise()  # of the sensors
     noise_known: SigmaOrZero = 0.1  # how well figures under noise are known: sigma of the logarithm; 0: exactly
     priors: dict[str, PriorEntry] = {}  # parameter: sigma, or mean and sigma; 0 fixes it, null leaves it free
-    share: dict[str, Share] = {}  # parameter or pattern: device, recording, or how far it walks in the root of a day
+    share: dict[str, Share] = {}  # parameter or pattern: device, recording, walks, or how far in the root of a day
     require: dict[str, Sigma] = {}  # parameter: sigma wanted
     sensors: SensorSheets = Sensors()  # data sheets; ideal: all figures 0
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None  # deg north; wins over fixes

@@ -29,22 +29,32 @@ def of_recording(method: Method, name: str) -> bool:
 
 
 def walks(method: Method, config: Config, names: Sequence[str]) -> dict[str, float]:
-    """Parameter of the device -> how far it walks in the root of a day, SI; 0: not at all. Those of recordings are not
-    among them.
+    """Parameter of the device -> how far it walks in the root of a day, SI; 0: not at all, or as far as several
+    recordings say. Those of recordings are not among them.
 
     Raises:
         InputError: the config's `share` names no parameter.
     """
-    rates = {name: 0.0 for name in names if not of_recording(method, name)}
-    for pattern, share in config.share.items():
-        meant = [name for name in names if fnmatchcase(name, pattern)]
-        if not meant:
+    for pattern in config.share:
+        if not any(fnmatchcase(name, pattern) for name in names):
             raise InputError(f"unknown key share.{pattern}{nearest(pattern, names)}")
-        for name in meant:
-            rates.pop(name, None)
-            if share != "recording":
-                rates[name] = 0.0 if isinstance(share, str) else share
-    return {name: rates[name] for name in names if name in rates}
+    rates = {}
+    for name in names:
+        share = _share(config, name) or ("recording" if of_recording(method, name) else "device")
+        if share != "recording":
+            rates[name] = 0.0 if isinstance(share, str) else share
+    return rates
+
+
+def walk_as_told(config: Config, names: Sequence[str]) -> list[str]:
+    """The parameters whose walk several recordings are to tell."""
+    return [name for name in names if _share(config, name) == "walks"]
+
+
+def _share(config: Config, name: str) -> str | float | None:
+    """What the config says of a parameter, the last that fits."""
+    found = [share for pattern, share in config.share.items() if fnmatchcase(name, pattern)]
+    return found[-1] if found else None
 
 
 def device_belief(known: Known, method: Method, config: Config, sha256: str, start_ns: int) -> Belief:
@@ -58,7 +68,8 @@ def device_belief(known: Known, method: Method, config: Config, sha256: str, sta
         start_ns: of the recording, Unix ns.
 
     Raises:
-        InputError: the calibration is another method's, has no sigmas worth the name, or is of this very recording.
+        InputError: the calibration is another method's, has no sigmas worth the name, or is of this very recording; or
+            how far a parameter walks is to be told.
     """
     source = known.belief.source
     known.of_method(method.name)
@@ -67,6 +78,8 @@ def device_belief(known: Known, method: Method, config: Config, sha256: str, sta
     if known.sha256 == sha256:
         raise InputError(f"{source}: was made of this very recording, which would count twice; name another one's")
     rates = walks(method, config, known.belief.names)
+    for name in walk_as_told(config, known.belief.names):
+        raise InputError(f"share: how far {name} walks, only several recordings together tell; give a number")
     told = [name for name, sigma in zip(known.belief.names, known.belief.sigmas, strict=True) if sigma > 0.0]
     belief = known.belief.of([name for name in told if name in rates])
     days = abs(start_ns - known.start_ns) * 1e-9 / DAY_S

@@ -25,10 +25,11 @@ import numpy as np
 from pipelines import progress
 from pipelines.belief import Belief
 from pipelines.errors import InputError
+from pipelines.graph.assumptions import kind
 from pipelines.graph.believing import believing
 from pipelines.graph.problem import Array, ChiSquare, Estimate, Parameter, Problem, Quantity, Step, Told
 from pipelines.judgement import noise_levels
-from pipelines.judgement.changes import changes
+from pipelines.judgement.changes import Changes, Rate, changes
 from pipelines.judgement.observability import Assessment, Fit, assess
 from pipelines.methods import Method
 from pipelines.recording.info import SessionFacts
@@ -37,7 +38,7 @@ from pipelines.recording.reading import open_recording
 from pipelines.reports.over_time import recordings_shown, sentences
 from pipelines.reports.result import Calibration, PartParameter, PartResult
 from pipelines.session import Session
-from pipelines.sharing import DAY_S, walks
+from pipelines.sharing import DAY_S, walk_as_told, walks
 from pipelines.solvers.joint import Joined, grown, join, tell
 
 # The joint estimate stays when other linearisations move it by less than this, in sigmas (what is left is about the
@@ -175,10 +176,14 @@ def calibrate_together(
         method = _one_device(alone)
         alone.sort(key=lambda each: each.day)
         rates = _rates(method, alone)
-        joined, step = _joined(method, alone, rates)
+        joined, step, told = _joined(method, alone, rates)
+        known = _walks(alone, joined, rates)
+        if any(known[kind(name)].rate != rate for name, rate in rates.items() if kind(name) in known):
+            rates = {name: known[kind(name)].rate if kind(name) in known else rate for name, rate in rates.items()}
+            joined = join(told, rates, [each.day for each in alone])
         newest = alone[-1]
         problem = method.graph(newest.loaded(), newest.calibration.config)
-        return _calibration(problem, method, alone, joined, step)
+        return _calibration(problem, method, alone, joined, step, known)
 
 
 def _one_device(alone: Sequence[Alone]) -> Method:
@@ -233,12 +238,26 @@ def _far_apart(joined: Joined) -> bool:
     return value > _FAR_APART * max(dof, 1)
 
 
-def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) -> tuple[Joined, float]:
-    """The joint estimate, and by how much it moved last, in sigmas."""
+def _walks(alone: Sequence[Alone], joined: Joined, rates: Mapping[str, float]) -> dict[str, Rate]:
+    """Kind of numbers -> how far these walk, where that is stated, or asked of the recordings and told by them."""
+    config = alone[0].calibration.config
+    asked = {kind(name) for name in walk_as_told(config, list(rates))}
+    told = _changes(alone, joined).rates if asked else {}
+    stated = {kind(name): Rate(rate, rate) for name, rate in rates.items() if rate}
+    return {**stated, **{which: rate for which, rate in told.items() if which in asked}}
+
+
+def _changes(alone: Sequence[Alone], joined: Joined) -> Changes:
+    inflations = {name: _inflation(name, alone) for name, _ in joined.unknowns}
+    return changes(joined, [each.day for each in alone], inflations)
+
+
+def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) -> tuple[Joined, float, Sequence[Told]]:
+    """The joint estimate, by how much it moved last, in sigmas, and what it is joined of."""
     told, days = [each.told for each in alone], [each.day for each in alone]
     joined, step = join(told, rates, days), np.inf
     if _far_apart(joined):
-        return joined, 0.0
+        return joined, 0.0, told
     for _ in range(_MOST_PASSES if len(alone) > 1 else 0):
         before = joined
         # What is wrong with a linearisation grows with the square of how far it is from there.
@@ -253,7 +272,7 @@ def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) 
                 break
         if step < _STAYS:
             break
-    return joined, step
+    return joined, step, told
 
 
 def _again(method: Method, alone: Alone, others: Belief, rates: Mapping[str, float]) -> Told:
@@ -262,7 +281,14 @@ def _again(method: Method, alone: Alone, others: Belief, rates: Mapping[str, flo
     return tell(problem, alone.calibration.estimate.levels, rates)
 
 
-def _calibration(problem: Problem, method: Method, alone: Sequence[Alone], joined: Joined, step: float) -> Calibration:
+def _calibration(
+    problem: Problem,
+    method: Method,
+    alone: Sequence[Alone],
+    joined: Joined,
+    step: float,
+    known: Mapping[str, Rate],
+) -> Calibration:
     """The joint estimate as a calibration: of the device as it was last, with that recording's own numbers."""
     last = len(alone) - 1
     belief = joined.all(last)
@@ -293,7 +319,8 @@ def _calibration(problem: Problem, method: Method, alone: Sequence[Alone], joine
         budget={name: _with_extra(shares[name], names.index(name), covariance, extra) for name in shares},
     )
     parts = [_part(each, joined, i) for i, each in enumerate(alone)]
-    changed = changes(joined, [each.day for each in alone], dict(zip(names, inflation.tolist(), strict=True)))
+    changed = _changes(alone, joined)
+    changed = replace(changed, rates={**changed.rates, **known})
     decides = not any(noise_levels.asked(each.calibration.estimate.levels) for each in alone)
     ordered = [quantities[name] for name in names]
     assessment = assess(ordered, covariance, estimate.chi_square, problem.advice, decides)

@@ -159,6 +159,12 @@ def test_what_walks_is_known_less_well_after_a_while(earlier: tuple[Calibration,
     assert prior == pytest.approx(np.hypot(earlier[0].parameters["theta_y"].sigma, 10.0 * rate), rel=1e-6)
 
 
+def test_how_far_it_walks_is_not_told_by_one_recording(earlier: tuple[Calibration, Path]) -> None:
+    config = load_config(b"share: {theta_*: walks}")
+    with pytest.raises(InputError, match="how far theta_x walks, only several recordings together tell"):
+        alidade.open(alidade.simulate("indexer", None, seed=2), config=config, prior=earlier[1] / "result.json")
+
+
 def test_what_the_config_says_of_a_prior_goes_before_an_earlier_calibration(earlier: tuple[Calibration, Path]) -> None:
     config = load_config(b"priors: {theta_y: 0.1, theta_z: {mean: 0.001, sigma: 0.01}}")
     session = alidade.open(alidade.simulate("indexer", None, seed=2), config=config, prior=earlier[1] / "result.json")
@@ -194,7 +200,7 @@ def test_unusable_priors_are_told_in_one_line(earlier: tuple[Calibration, Path],
             "priors: {theta_x: {meen: 0.1, sigma: 1}}",
             r"unknown key priors\.theta_x\.meen; the nearest known key is mean",
         ),
-        ("share: {theta_x: often}", r"share\.theta_x: must be device, recording, or how far it walks"),
+        ("share: {theta_x: often}", r"share\.theta_x: must be device, recording, walks, or how far it walks"),
         ("share: {theta_x: -1}", r"share\.theta_x: must be device"),
     ],
 )

@@ -20,6 +20,7 @@ from pipelines.reports.units import human_unit, to_digits_of
 _FAR_DAYS = 36_525.0
 # So many changes are told in sentences, the surest; the table has all.
 _MOST_TOLD = 3
+_DAY_MS, _STEPS = 8.64e7, 40
 _RECORDINGS = ("recording", "start", "length", "by itself")
 
 
@@ -117,7 +118,8 @@ def _figures(calibration: Calibration) -> list[Plot]:
             _add(out, calibration, q, factor, color)
         caption = (
             f"Points: each of the {len(parts)} recordings by itself, less the joint estimate, with two sigmas. Bands: "
-            "two sigmas of the joint estimate; steps that were found are lines."
+            "two sigmas of the joint estimate, after the last recording as the walk lets them grow; dotted: two of the "
+            "sigmas wanted. Steps that were found are dashed lines."
         )
         plots.append(Plot(f"{which} over time", caption, out))
     return plots
@@ -131,11 +133,30 @@ def _add(out: Figure, calibration: Calibration, q: Quantity, factor: float, colo
     spread = 2.0 * factor * np.array([n.sigma for _, n in told])
     out.segments(dates, values - spread, dates, values + spread, color, q.name)
     out.points(dates, values, q.name, color, 7)
-    band = 2.0 * factor * joint.sigma
-    out.zone(-band, band, color, q.name)
+    _band(out, calibration, q, factor, color)
+    out.levels([-2.0 * factor * q.require, 2.0 * factor * q.require], color, name=q.name)
     steps = [step for step in (calibration.changes.found if calibration.changes else ()) if step.name == q.name]
     if steps:
         out.moments(milliseconds(parts[step.after + 1].start for step in steps), color, name=q.name)
+
+
+def _band(out: Figure, calibration: Calibration, q: Quantity, factor: float, color: str) -> None:
+    """Two sigmas of the joint estimate at each recording, and after the last one as its walk lets them grow."""
+    parts, joint = calibration.recordings, calibration.parameters[q.name]
+    own = [next((n for n in p.parameters if n.name == q.name), None) for p in parts]
+    values = [0.0 if n is None else n.value - joint.value for n in own]
+    sigmas = [joint.sigma if n is None else n.sigma for n in own]
+    dates = milliseconds(p.start for p in parts)
+    rate = calibration.changes.rates.get(kind(q.name)) if calibration.changes else None
+    if rate is not None and rate.rate > 0.0:
+        # As long as it stays within what is required, at most as long as the history.
+        length = (dates[-1] - dates[0]) / _DAY_MS
+        ahead = np.linspace(0.0, min(length, _days(q.require, joint.sigma, rate.rate)), _STEPS)
+        dates = np.concatenate([dates, dates[-1] + ahead * _DAY_MS])
+        values += [0.0] * _STEPS
+        sigmas += np.sqrt(joint.sigma**2 + rate.rate**2 * ahead).tolist()
+    middle, reach = factor * np.array(values), 2.0 * factor * np.array(sigmas)
+    out.band(dates, middle - reach, middle + reach, color, q.name)
 
 
 def what(step: Change) -> str:
