@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 
 from pipelines.graph.problem import Array, Problem
-from pipelines.solvers.marginals import IndeterminateError, drawn, eliminated, joint_information, prior_units, reduced
+from pipelines.solvers.marginals import IndeterminateError, drawn, eliminated, prior_units, reduced
 
 if TYPE_CHECKING:
     from pipelines.solvers.batch import System
@@ -59,14 +59,20 @@ def second_order(
     system, ordering = system.without_rejected(values), system.ordering
     linear = system.linearize(values)
     try:
-        eigenvalues, vectors = np.linalg.eigh(unit.T @ joint_information(linear, ordering, keys) @ unit)
+        information, slope = reduced(linear, ordering, keys)
+        eigenvalues, vectors = np.linalg.eigh(unit.T @ information @ unit)
         if eigenvalues[0] < _ANYWHERE:
             return None
         moved = drawn(eliminated(linear, ordering), values, keys, _DRAWS)
         told = eigenvalues >= _WEAK**-2.0
         steps: list[Array] = []
+        known = unit @ vectors[:, told]
         for each in moved:
-            steps.append(_back(*reduced(system.linearize(each), ordering, keys), unit @ vectors[:, told]))
+            move = values.localCoordinates(each)
+            # As far as the linear system goes back itself, its covariance has it already.
+            tangent = slope - information @ np.concatenate([move.at(key) for key in keys])
+            back = _back(*reduced(system.linearize(each), ordering, keys), known)
+            steps.append(back - _back(information, tangent, known))
             if len(steps) == _TRIED and (eigenvalues[told] * np.square(steps)).sum(axis=1).max() < _SLIGHT:
                 return None
     except (RuntimeError, IndeterminateError, np.linalg.LinAlgError):
