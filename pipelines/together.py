@@ -176,11 +176,9 @@ def calibrate_together(
         method = _one_device(alone)
         alone.sort(key=lambda each: each.day)
         rates = _rates(method, alone)
-        joined, step, told = _joined(method, alone, rates)
-        known = _walks(alone, joined, rates)
-        if any(known[kind(name)].rate != rate for name, rate in rates.items() if kind(name) in known):
-            rates = {name: known[kind(name)].rate if kind(name) in known else rate for name, rate in rates.items()}
-            joined = join(told, rates, [each.day for each in alone])
+        known = _walks(alone, rates)
+        rates = {name: known[kind(name)].rate if kind(name) in known else rate for name, rate in rates.items()}
+        joined, step = _joined(method, alone, rates)
         newest = alone[-1]
         problem = method.graph(newest.loaded(), newest.calibration.config)
         return _calibration(problem, method, alone, joined, step, known)
@@ -238,11 +236,12 @@ def _far_apart(joined: Joined) -> bool:
     return value > _FAR_APART * max(dof, 1)
 
 
-def _walks(alone: Sequence[Alone], joined: Joined, rates: Mapping[str, float]) -> dict[str, Rate]:
+def _walks(alone: Sequence[Alone], rates: Mapping[str, float]) -> dict[str, Rate]:
     """Kind of numbers -> how far these walk, where that is stated, or asked of the recordings and told by them."""
     config = alone[0].calibration.config
     asked = {kind(name) for name in walk_as_told(config, list(rates))}
-    told = _changes(alone, joined).rates if asked else {}
+    days = [each.day for each in alone]
+    told = _changes(alone, join([each.told for each in alone], rates, days)).rates if asked else {}
     stated = {kind(name): Rate(rate, rate) for name, rate in rates.items() if rate}
     return {**stated, **{which: rate for which, rate in told.items() if which in asked}}
 
@@ -252,12 +251,12 @@ def _changes(alone: Sequence[Alone], joined: Joined) -> Changes:
     return changes(joined, [each.day for each in alone], inflations)
 
 
-def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) -> tuple[Joined, float, Sequence[Told]]:
-    """The joint estimate, by how much it moved last, in sigmas, and what it is joined of."""
+def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) -> tuple[Joined, float]:
+    """The joint estimate, and by how much it moved last, in sigmas."""
     told, days = [each.told for each in alone], [each.day for each in alone]
     joined, step = join(told, rates, days), np.inf
     if _far_apart(joined):
-        return joined, 0.0, told
+        return joined, 0.0
     for _ in range(_MOST_PASSES if len(alone) > 1 else 0):
         before = joined
         # What is wrong with a linearisation grows with the square of how far it is from there.
@@ -272,7 +271,7 @@ def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) 
                 break
         if step < _STAYS:
             break
-    return joined, step, told
+    return joined, step
 
 
 def _again(method: Method, alone: Alone, others: Belief, rates: Mapping[str, float]) -> Told:
