@@ -170,6 +170,15 @@ def test_wrong_heading_is_absorbed_and_reported() -> None:
     assert max(_sigmas_off(estimate, truth, "mag_k").values()) < 3.0
 
 
+def test_a_magnetometer_of_unknown_field_is_left_out_and_that_is_told() -> None:
+    data, *_ = _simulated(11, poses=14, static_s=2.0, camera=None, reference=None)
+    # Nobody states how well rests repeat, which the residuals then have to say.
+    built, estimate, _ = _solved(replace(data, longitude=None), Config(method="cube"))
+    assert "The magnetometer is not calibrated" in " ".join(built.premises)
+    assert estimate.converged
+    assert not [name for name in estimate.names if name.startswith("mag")]
+
+
 def test_poses_near_iron_are_named() -> None:
     data, _, config = _simulated(11, poses=14, static_s=2.0, camera=None, reference=None)
     assert data.mag is not None

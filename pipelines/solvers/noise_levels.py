@@ -117,7 +117,7 @@ def refined(
         redundancy = _redundancy(level.noise, expected)
         if level.least is not None and redundancy >= 1.0:
             found[i] = _within(level, factors, values, redundancy)
-        elif level.noise.estimated and level.noise.beside:
+        elif level.noise.estimated and level.noise.beside and redundancy > 0.0:
             found[i], kept = _found_beside(level, factors, values, redundancy)
             steady &= kept
             continue
