@@ -32,7 +32,7 @@ html_copy_source = False
 html_show_sphinx = False
 html_show_copyright = False
 html_static_path = ["_static"]
-html_css_files = ["tables.css"]
+html_css_files = ["site.css"]
 # MathML is part of HTML: no script, no font, nothing from a network.
 html_math_renderer = "mathml"
 

@@ -16,6 +16,7 @@ import pytest
 import alidade as door
 from pipelines.config import load_config
 from pipelines.settings import DEFAULT_NOISE
+from tests.browser import DESKTOP, PHONE, look, needs_browser, running
 from tests.command import Command, Run
 from tests.walk import Step, difference, steps
 
@@ -137,3 +138,17 @@ def test_every_dependency_is_named() -> None:
     assert set(re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE)) == extras.keys()
     for requirement in [*project["dependencies"], *(each for needed in extras.values() for each in needed)]:
         assert re.split(r"[\[<>=]", requirement)[0] in section
+
+
+@pytest.mark.slow
+@needs_browser
+def test_the_site_is_built_and_its_pages_fit(tmp_path: Path) -> None:
+    folders = ("-d", tmp_path / "doctrees", DOCS, tmp_path / "site")
+    subprocess.run([sys.executable, "-m", "sphinx", "-q", "-W", *map(str, folders)], check=True, cwd=ROOT)
+    pages = sorted(p for p in (tmp_path / "site").rglob("*.html") if "_static" not in p.parts)
+    assert len(pages) > 30
+    tab = running()
+    for page in pages:
+        for width in (DESKTOP, PHONE):
+            look(tab, page, width)
+            assert tab.value("document.documentElement.scrollWidth <= innerWidth"), f"{page.name} at {width} px"
