@@ -223,6 +223,14 @@ def test_a_gyro_that_does_not_turn_with_the_field_is_not_used() -> None:
     assert "does not turn as the field does" in " ".join(TUMBLE.problem(backwards, Config()).premises)
 
 
+def test_a_gyro_in_degrees_is_not_used_and_that_is_told(tmp_path: Path) -> None:
+    simulated = _simulated(TURNING, 0)
+    assert simulated.data.gyro is not None
+    write_tumble(tmp_path / "s.mcap", replace(simulated, data=replace(simulated.data, gyro=57.3 * simulated.data.gyro)))
+    session = Session.read(open_recording(tmp_path / "s.mcap"), "tumble", None)
+    assert "is it in deg/s, or in counts?" in " ".join(session.problem().premises)
+
+
 def test_left_handed_axes_are_told_beside_a_gyro() -> None:
     simulated = _simulated(replace_scenario(TURNING, rest_s=1.5), 2)
     assert simulated.data.mag is not None

@@ -25,7 +25,7 @@ from pipelines.methods.place import FIELD, STRENGTH_SIGMA, field_at
 from pipelines.methods.static_intervals import quiet_intervals
 from pipelines.methods.triads import triad_names
 from pipelines.methods.tumble.published import FEWEST, ellipsoid
-from pipelines.methods.tumble.recording import ACCEL_SLOPE, TumbleData
+from pipelines.methods.tumble.recording import ACCEL_SLOPE, NO_RATE, TumbleData
 from pipelines.methods.tumble.turning import Mounted, mounted
 from pipelines.settings import Config
 
@@ -209,6 +209,8 @@ def _modelled(config: Config, field: Array) -> tuple[float, float]:
 
 def _gyro(data: TumbleData, sensors: list[Sensor], field: Array | None) -> tuple[Mounted | None, list[str]]:
     """How the gyro is mounted, and why it is not used though it is there."""
+    if any(reason.endswith(NO_RATE) for reason in data.dropped):
+        return None, ["The gyro is not used: it reads more than rad/s can be; is it in deg/s, or in counts?"]
     if data.gyro is None or data.mag is None:
         return None, []
     if field is None:

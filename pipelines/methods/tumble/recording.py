@@ -34,6 +34,9 @@ from pipelines.simulation.simulated import Simulated
 
 Array = NDArray[np.float64]
 
+# Why a gyro is left out.
+NO_RATE = "gyro beyond what rad/s can be, not used"
+
 # What a temperature does to the offsets of consumer sensors, one sigma.
 SLOPES = GYRO_SLOPE, ACCEL_SLOPE = (
     temperature_assumption("gyro", "rad/s", 1e-4),
@@ -138,7 +141,7 @@ def _gyro(
         return None, None, None
     t, keep = clean(topic, imu.t_ns, epoch, imu.gyro, {})
     if too_fast(topic, t, imu.gyro[keep]):
-        count(dropped, f"{topic}: gyro beyond what rad/s can be, not used", len(t))
+        count(dropped, f"{topic}: {NO_RATE}", len(t))
         return None, None, None
     return t, imu.gyro[keep], density(topic, t, imu.gyro_cov[keep], LEAST_GYRO, dropped)
 
