@@ -90,6 +90,19 @@ def test_a_value_far_beyond_its_prior_is_no_change() -> None:
     assert taken_for_true.changed
 
 
+def test_numbers_whose_sum_is_known_far_better_are_inflated_alike() -> None:
+    """Inflated each by its own factor, the sum would no longer be what is known."""
+    estimate, quantities = walk(np.random.default_rng(4))
+    course = estimate.course
+    assert course is not None
+    mix = np.array([[1.0, 1e-3], [-1.0, 1e-3]])
+    mixed = replace(course, values=course.values @ mix.T, covariance=mix @ course.covariance @ mix.T)
+    last = {"values": mixed.values[-1], "covariance": mixed.covariance[-1], "course": mixed}
+    found = stability(replace(estimate, **last, inflation=np.array([1.0, 2.0])), quantities)
+    assert found is not None
+    assert not found.changed
+
+
 def test_what_walks_or_is_fixed_may_change() -> None:
     estimate, quantities = walk(np.random.default_rng(1), change=3.0)
     course = estimate.course

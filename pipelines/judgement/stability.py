@@ -115,7 +115,8 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
         return None
     time = course.time[late]
     values, covariance = _with_priors_as_found(estimate, quantities, course.values[late], course.covariance[late])
-    P = (covariance * np.outer(estimate.inflations, estimate.inflations))[:, kept[:, None], kept]
+    # By one factor: each by its own would turn the directions that are known well, where many are correlated.
+    P = float(estimate.inflations[kept].max()) ** 2 * covariance[:, kept[:, None], kept]
     difference = values[:-1, kept] - values[-1, kept]
     whitening = [_whitening(P[i], P[-1]) for i in range(len(P) - 1)]
     ranks = np.array([len(rows) for rows in whitening])
