@@ -23,6 +23,8 @@ _DIRECTIONS = {
     "camera": np.array([[0.95, 0.0, -0.52], [0.10, 1.0, 0.42]]),
 }
 _LENGTH = 62.0
+# What rounding leaves of a mount that is fixed straight, rad.
+_NOTHING = 1e-9
 # A turn of less than this, rad, is drawn so many times as large.
 _SMALL, _ENLARGED = math.radians(3.0), 10.0
 _PLACE = re.compile(r'<g class="found" data-turn="(\w+)" data-x="(\d+)" data-y="(\d+)"(?: data-axes="(\w+)")?>')
@@ -45,6 +47,8 @@ def angle(transform: SavedTransform) -> float:
 
 def told(transform: SavedTransform) -> str:
     """A rotation as people read it: the angle, and its rotation vector."""
+    if angle(transform) < _NOTHING:
+        return "not turned"
     vector = np.rad2deg(so3.log(np.array(transform.wxyz)))
     numbers = ", ".join(rounded(float(v), 3) for v in vector)
     return f"{rounded(math.degrees(angle(transform)), 3)} deg, rotation vector [{numbers}] deg"
@@ -52,7 +56,7 @@ def told(transform: SavedTransform) -> str:
 
 def enlarged(transform: SavedTransform) -> bool:
     """Whether it is drawn larger than it is."""
-    return 0.0 < angle(transform) < _SMALL
+    return _NOTHING < angle(transform) < _SMALL
 
 
 def _axes(transform: SavedTransform, x: float, y: float, directions: str) -> str:

@@ -1,0 +1,55 @@
+"""Reports of the four nominal scenarios: their sizes, and how long a browser takes to show one."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.measure import Cost, Ratio
+from pipelines.methods import simulate
+from pipelines.reports.html import report_html
+from pipelines.session import calibrate
+from tests.browser import CHROMIUM
+
+_METHODS = ("los", "indexer", "head", "cube")
+# A page may have so many bytes, and be shown after so many seconds.
+_BYTES, _SECONDS = 1e6, 1.5
+
+
+def run() -> Iterator[Ratio]:
+    """Bytes over a megabyte; and seconds over one and a half, where a browser is installed."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for method in _METHODS:
+            simulate(method, None, 1, folder / "session.mcap")
+            (calibration,) = calibrate(folder / "session.mcap", ["batch"])
+            page = folder / f"{method}.html"
+            page.write_text(report_html(calibration), encoding="utf-8")
+            size = page.stat().st_size
+            yield Ratio(
+                f"pages.size_{method}", f"report of {method}, {size / 1e3:.0f} kB, over 1 MB", size / _BYTES, wanted=1.0
+            )
+            if CHROMIUM is not None:
+                shown = _shown(folder, page)
+                compared = f"report of {method} until its first figure is drawn, over 1.5 s"
+                yield Ratio(f"pages.shown_{method}", compared, shown.seconds / _SECONDS, wanted=1.0, ours=shown)
+
+
+def _shown(folder: Path, page: Path, rounds: int = 5) -> Cost:
+    """Median wall time until the page and its first figure are drawn, of a browser that has seen no such page."""
+    from tests.devtools import Tab
+
+    seconds = []
+    for i in range(rounds):
+        (folder / str(i)).mkdir(exist_ok=True)
+        with Tab(folder / str(i)) as tab:
+            tab.size(1280)
+            start = time.monotonic()
+            tab.open(page.as_uri())
+            tab.wait("document.readyState == 'complete' && document.querySelector('.plot[data-drawn]') != null", 60.0)
+            seconds.append(time.monotonic() - start)
+    return Cost(float(np.median(seconds)))

@@ -1,0 +1,39 @@
+"""The rotations that were found, drawn into the sketch of the frames."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import pytest
+
+from factors import so3
+from pipelines.methods import method
+from pipelines.reports.calibration import SavedTransform
+from pipelines.reports.sketch import enlarged, sketch_with, told
+
+
+def turned(*degrees: float) -> SavedTransform:
+    w, x, y, z = so3.exp([math.radians(each) for each in degrees]).tolist()
+    return SavedTransform(parent="carrier", child="imu", wxyz=(w, x, y, z), covariance=(0.0,) * 9)
+
+
+def test_the_axes_found_are_drawn_where_the_parents_are() -> None:
+    sketch = method("los").sketch
+    assert sketch is not None
+    svg = sketch.read_text()
+    drawn = sketch_with(svg, {"M": turned(0.0, 0.0, 90.0)})
+    x, y, z = re.findall(r'd="M120 235l(\S+) (\S+)" stroke="var\(--series[012]\)"', drawn)
+    # A quarter turn about z takes x to where y is in the sketch, and leaves z upright.
+    assert float(x[0]) > 50.0
+    assert (float(z[0]), float(z[1])) == pytest.approx((0.0, -62.0), abs=0.1)
+    assert float(y[0]) > 0.0 > float(y[1])
+    assert sketch_with(svg, {}) == svg
+
+
+def test_small_turns_are_enlarged_and_told_so() -> None:
+    assert enlarged(turned(0.5, 0.0, 0.0))
+    assert not enlarged(turned(20.0, 0.0, 0.0))
+    assert told(turned(0.5, 0.0, 0.0)).startswith("0.500 deg, rotation vector [0.500, ")
+    assert told(turned(0.0, 0.0, 0.0)) == "not turned"
+    assert not enlarged(turned(0.0, 0.0, 0.0))
