@@ -88,8 +88,8 @@ class GyroPath:
             driving = np.asarray(drivers, dtype=float)
             if driving.ndim != 2 or len(driving) != len(mean):
                 raise ValueError(f"needs drivers for each rate; got {driving.shape} and {mean.shape}")
-            self._drivers = driving - _trapezoid_excess(self.t, driving)
-        self._rate = mean - self.bias_hat - _trapezoid_excess(self.t, mean)
+            self._drivers = driving - trapezoid_excess(self.t, driving)
+        self._rate = mean - self.bias_hat - trapezoid_excess(self.t, mean)
         self._slope = np.diff(self._rate, axis=0) / np.diff(self.t)[:, None]
         self._arcs = _arc(self._rate[:-1], self._slope, np.diff(self.t)[:, None])
         self._attitude = np.concatenate([so3.identity(1), _running_product(so3.exp(self._arcs))])
@@ -183,7 +183,7 @@ class GyroPath:
         return i, (at - self.t[i])[:, None]
 
 
-def _trapezoid_excess(t: Array, mean: Array) -> Array:
+def trapezoid_excess(t: Array, mean: Array) -> Array:
     """What trapezoids on interval means count too much, as a rate: an eighth of the second difference.
 
     Zero at the ends and where the stamps are not even, as beside a gap.

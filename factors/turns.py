@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import starmap
 
 import numpy as np
 
 from factors import so3
 from factors.model import ROT3, Array, Block, Model, Residuals
-from factors.preintegration import GyroPath
+from factors.preintegration import GyroPath, trapezoid_excess
 from factors.triad import parts
 
 
@@ -23,10 +24,10 @@ class GyroRotationFactor(Model):
 
     Blocks: nRb_i, nRb_j (rotations), triad (12), d_i, d_j (3 each; how far the gyro's offset has wandered at both ends,
     in the unit of raw: their mean adds to c). Of a gyro that feels specific force also G by rows (9, rad/s per m/s^2)
-    and the accelerometer's triad (12): raw = A w + c + d + G f, with the f of that accelerometer, its curvature and its
-    drift left out. Of one whose temperature is known also s (3, in the unit of raw per K): s warmth adds to c. Samples
-    are mean rates centred on their stamps, integrated as factors.preintegration does: the arc between point rates w0
-    and w1 is T (w0 + w1) / 2 + T^2 (w0 x w1) / 12.
+    and the accelerometer's triad (12): raw = A w + c + d + G f, with the f of that accelerometer, its curvature left
+    out. Where the temperature is known also s (3, in the unit of raw per K), and that of an accelerometer that drifts
+    too (3): s warmth adds to c. Samples are mean rates centred on their stamps, integrated as factors.preintegration
+    does: the arc between point rates w0 and w1 is T (w0 + w1) / 2 + T^2 (w0 x w1) / 12.
 
     Attributes:
         time: (n,) ends of the turns, s.
@@ -35,7 +36,8 @@ class GyroRotationFactor(Model):
         earth_rate: (3,) w_ie in n, rad/s.
         sigma: (n,) rad per axis.
         accel: n times (N, 3), what the accelerometer says at the stamps; None: the gyro does not feel force.
-        warmth: (n,) K, mean temperature over a turn above that at which c is the offset; None: not known.
+        warmth: n times (N,) K, temperature at the stamps above that at which c is the offset; None: not known.
+        drifts: whether the accelerometer has a slope over temperature too.
     """
 
     time: Array
@@ -44,25 +46,26 @@ class GyroRotationFactor(Model):
     earth_rate: Array
     sigma: Array
     accel: Sequence[Array] | None = None
-    warmth: Array | None = None
+    warmth: Sequence[Array] | None = None
+    drifts: bool = False
     rows: int = 3
 
     @property
     def blocks(self) -> tuple[Block, ...]:
         """Attitudes, triad, wandered offsets and, where there are such, G with the accelerometer's triad and slope."""
         of_force = [] if self.accel is None else [9, 12]
-        return (ROT3, ROT3, 12, 3, 3, *of_force, *([] if self.warmth is None else [3]))
+        slopes = [] if self.warmth is None else [3, 3] if self.drifts else [3]
+        return (ROT3, ROT3, 12, 3, 3, *of_force, *slopes)
 
     def __call__(
         self, nRb_i: Array, nRb_j: Array, triads: Array, wandered_i: Array, wandered_j: Array, *terms: Array
     ) -> Residuals:
         """Residual Log(predicted^T nRb_j) / sigma, (n, 3)."""
-        added = 0.5 * (wandered_i + wandered_j)
-        if self.warmth is not None:
-            added = added + self.warmth[:, None] * terms[-1]
-        offsets = np.concatenate([triads[:, :9], triads[:, 9:] + added], axis=1)
-        of_force = () if self.accel is None else (*terms[:2], self.accel)
-        of_each = zip(self.stamps, self.raw, offsets, *of_force, strict=True)
+        offsets = np.concatenate([triads[:, :9], triads[:, 9:] + 0.5 * (wandered_i + wandered_j)], axis=1)
+        felt, slopes = ((), terms) if self.accel is None else (terms[:2], terms[2:])
+        raw = self._undrifted(self.raw, slopes[:1])
+        of_force = () if self.accel is None else (*felt, self._undrifted(self.accel, slopes[1:]))
+        of_each = zip(self.stamps, raw, offsets, *of_force, strict=True)
         turned = list(starmap(Turn.of, of_each))
         dR = np.array([each.rotation for each in turned])
         earth = np.array([t[-1] - t[0] for t in self.stamps])[:, None] * self.earth_rate
@@ -73,13 +76,26 @@ class GyroRotationFactor(Model):
         def jacobians() -> tuple[Array, ...]:
             left = -so3.right_jacobian_inverse(-error) * weight[:, None, None]
             right = so3.right_jacobian_inverse(error) * weight[:, None, None]
-            by = [left @ np.array(each) for each in zip(*(turn.derivatives() for turn in turned), strict=True)]
+            by = [left @ np.array(each) for each in zip(*self._derivatives(turned), strict=True)]
             by_offset = by[0][..., 9:]
-            by_slope = () if self.warmth is None else (self.warmth[:, None, None] * by_offset,)
             ends = left @ so3.matrix(so3.inverse(dR)), right
-            return *ends, by[0], 0.5 * by_offset, 0.5 * by_offset, *by[1:], *by_slope
+            return *ends, by[0], 0.5 * by_offset, 0.5 * by_offset, *by[1:]
 
         return error * weight[:, None], jacobians
+
+    def _undrifted(self, readings: Sequence[Array], slope: Sequence[Array]) -> Sequence[Array]:
+        """Readings less what they drift by a slope (n, 3) over temperature; as they are without one."""
+        if self.warmth is None or not slope:
+            return readings
+        return [each - np.outer(*by) for each, *by in zip(readings, self.warmth, slope[0], strict=True)]
+
+    def _derivatives(self, turned: Sequence[Turn]) -> list[tuple[Array, ...]]:
+        """Of each turn's rotation by what is shared, in the order of the blocks."""
+        if self.warmth is None:
+            return [turn.derivatives() for turn in turned]
+        count = 2 if self.drifts else 1
+        pairs = zip(turned, self.warmth, strict=True)
+        return [(*turn.derivatives(), *turn.by_slopes(warmth)[:count]) for turn, warmth in pairs]
 
 
 @dataclass(frozen=True)
@@ -135,10 +151,8 @@ class Turn:
 
         dw = -K (dA w + dc + dG f + G df), df = -K_a (dA_a f + dc_a).
         """
-        # The rates that the path takes as linear in between; at its last stamp that is the sample itself.
-        points = self.path.rate(self.path.t)
-        points[-1] = self.rate[-1]
-        by_offset = -_by_rate(self.path, points) @ self.K
+        points = self._points
+        by_offset = self._by_offset
         if self.force is None or self.G is None or self.accel_K is None:
             return (_by_numbers(by_offset, points),)
         forces = self.path.drivers(self.path.t)
@@ -149,6 +163,27 @@ class Turn:
             _by_numbers(by_offset, forces)[:, :9],
             _by_numbers(by_accel_offset, forces),
         )
+
+    def by_slopes(self, warmth: Array) -> tuple[Array, ...]:
+        """Likewise by the slopes over temperature of the gyro and, where there is force, of the accelerometer, (3, 3)
+        each, for a temperature (N,), K, above that at which the offsets are what they are."""
+        point_warmth = warmth - trapezoid_excess(self.path.t, warmth[:, None])[:, 0]
+        by_slope = np.einsum("kia,k->ia", self._by_offset, point_warmth)
+        if self.G is None or self.accel_K is None:
+            return (by_slope,)
+        return by_slope, -by_slope @ self.G @ self.accel_K
+
+    @cached_property
+    def _points(self) -> Array:
+        """The rates (N, 3) that the path takes as linear in between; at its last stamp that is the sample itself."""
+        points = self.path.rate(self.path.t)
+        points[-1] = self.rate[-1]
+        return points
+
+    @cached_property
+    def _by_offset(self) -> Array:
+        """Derivative (N, 3, 3) of the rotation by what is added to each reading."""
+        return np.asarray(-_by_rate(self.path, self._points) @ self.K)
 
 
 def _by_rate(path: GyroPath, points: Array) -> Array:

@@ -122,8 +122,10 @@ def _turns(rows: np.ndarray, angle: float, feels: bool = False, warm: bool = Fal
         stamps.append(t)
         raw.append(angle * np.sin(rng.uniform(0.5, 3, size=3) * t[:, None] + rng.uniform(0, 6, size=3)))
         accel.append(9.8 * np.sin(rng.uniform(0.5, 3, size=3) * t[:, None] + rng.uniform(0, 6, size=3)))
-    felt, warmth = accel if feels else None, WARMTH[rows] if warm else None
-    return GyroRotationFactor(TIMES[rows], stamps, raw, EARTH * 1e3, _sigma(rows), felt, warmth)
+    felt, warmth = accel if feels else None, [WARMTH[i] + t**2 for i, t in zip(rows, stamps, strict=True)]
+    return GyroRotationFactor(
+        TIMES[rows], stamps, raw, EARTH * 1e3, _sigma(rows), felt, warmth if warm else None, warm and feels
+    )
 
 
 @pytest.mark.parametrize(("feels", "warm"), [(False, False), (True, False), (False, True), (True, True)])
@@ -137,7 +139,7 @@ def test_turn_jacobians(angle: float, miss: float, feels: bool, warm: bool) -> N
     if feels:
         others += [1e-2 * rng.normal(size=(N, 9)), _triads(rng, 0.05)]
     if warm:
-        others.append(1e-2 * rng.normal(size=(N, 3)))
+        others += [1e-2 * rng.normal(size=(N, 3)), *([0.1 * rng.normal(size=(N, 3))] if feels else [])]
     # Attitudes at the end that miss the prediction by `miss` rad.
     error = model(start, so3.identity(N), triads, *others)[0] * _sigma(np.arange(N))[:, None]
     predicted = so3.inverse(so3.exp(error))
@@ -167,9 +169,10 @@ def test_turn_of_a_miscalibrated_gyro_on_the_turning_earth() -> None:
     feels = GyroRotationFactor(t[-1:], [t], [raw + force @ G.T], EARTH, np.ones(1), [accel])
     of_force = G.reshape(1, 9), triad(accel_K, accel_b)[None]
     np.testing.assert_allclose(feels(iRb0, nRb1, triad(K, b)[None], *wandered, *of_force)[0], 0.0, atol=1e-12)
-    slope = 1e-3 * rng.normal(size=(1, 3))
-    warm = GyroRotationFactor(t[-1:], [t], [raw + 8.0 * slope], EARTH, np.ones(1), warmth=np.array([8.0]))
-    np.testing.assert_allclose(warm(iRb0, nRb1, triad(K, b)[None], *wandered, slope)[0], 0.0, atol=1e-12)
+    slopes, warmth = 1e-3 * rng.normal(size=(2, 1, 3)), 8.0 + 3.0 * t**2
+    drifted = [raw + force @ G.T + np.outer(warmth, slopes[0])], [accel + np.outer(warmth, slopes[1])]
+    warm = GyroRotationFactor(t[-1:], [t], drifted[0], EARTH, np.ones(1), drifted[1], [warmth], drifts=True)
+    np.testing.assert_allclose(warm(iRb0, nRb1, triad(K, b)[None], *wandered, *of_force, *slopes)[0], 0.0, atol=1e-12)
 
 
 def _tags(rows: np.ndarray, blocks: list[Array] | None) -> TagAttitudeFactor:

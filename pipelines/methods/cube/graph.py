@@ -132,14 +132,16 @@ def _predict(model: Model, k: int, initial: gtsam.Values, current: gtsam.Values)
     """The attitude of pose k carried on by the gyro as calibrated so far; the rest as measured."""
     out = gtsam.Values(initial)
     samples, deviation = model.samples(k), current.atVector(deviation_key(k - 1))
-    offset = deviation
-    if "gyro" in model.parameters.slopes:
-        offset = deviation + samples.warmth * current.atVector(SLOPE_KEYS["gyro"])
-    own = current.atVector(TRIAD_KEYS["gyro"]) + np.append(np.zeros(9), offset)
+    own = current.atVector(TRIAD_KEYS["gyro"]) + np.append(np.zeros(9), deviation)
+    gyro, accel = samples.gyro, samples.accel
+    if samples.warmth is not None:
+        slopes = model.parameters.slopes
+        drifts = {name: np.outer(samples.warmth, current.atVector(SLOPE_KEYS[name])) for name in slopes}
+        gyro, accel = gyro - drifts.get("gyro", 0.0), accel - drifts.get("accel", 0.0)
     of_force = []
     if model.parameters.sensitivity is not None:
-        of_force = [current.atVector(SENSITIVITY_KEY), current.atVector(TRIAD_KEYS["accel"]), samples.accel]
-    turned = Turn.of(samples.t, samples.gyro, own, *of_force).rotation
+        of_force = [current.atVector(SENSITIVITY_KEY), current.atVector(TRIAD_KEYS["accel"]), accel]
+    turned = Turn.of(samples.t, gyro, own, *of_force).rotation
     out.update(deviation_key(k), model.deviation.correlation[k] * deviation)
     before = so3.from_gtsam([current.atRot3(pose_key(k - 1))])[0]
     earth = so3.exp(-model.earth_rate * (samples.t[-1] - samples.t[0]))

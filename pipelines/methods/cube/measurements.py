@@ -141,12 +141,15 @@ def turn_factor(model: Model, k: int) -> Factor:
     duration = float(t[-1] - t[0])
     sigma = np.sqrt([model.density[0] ** 2 * duration + (model.unknown_rate * duration) ** 2])
     accel = [samples.accel] if feels else None
-    drifts = "gyro" in model.parameters.slopes
-    warmth = np.array([samples.warmth]) if drifts else None
-    rotation = GyroRotationFactor(t[-1:], [t], [samples.gyro], model.earth_rate, sigma, accel, warmth)
+    slopes = model.parameters.slopes
+    # What an accelerometer drifts by alone is nothing beside a gyro that does not.
+    drifting = [name for name in ("gyro", *(["accel"] if feels else [])) if name in slopes and "gyro" in slopes]
+    warmth = None if samples.warmth is None or not drifting else [samples.warmth]
+    drifts = "accel" in drifting
+    rotation = GyroRotationFactor(t[-1:], [t], [samples.gyro], model.earth_rate, sigma, accel, warmth, drifts)
     of_force = [SENSITIVITY_KEY, TRIAD_KEYS["accel"]] if feels else []
     gyro = TRIAD_KEYS["gyro"]
-    slope = [SLOPE_KEYS["gyro"]] if drifts else []
+    slope = [SLOPE_KEYS[name] for name in drifting]
     ends = pose_key(k - 1), pose_key(k)
     measured = rotation.on(*ends, gyro, deviation_key(k - 1), deviation_key(k), *of_force, *slope)
     angle = float(np.sum(np.linalg.norm(samples.gyro[1:], axis=1) * np.diff(t)))

@@ -31,13 +31,13 @@ _LONGEST_GAP = 0.1
 class Turning:
     """A turn's samples: stamps (N,), s, and gyro and accelerometer (N, 3) in nominal units.
 
-    warmth, K: its mean temperature above the recording's first; 0 where nobody measures it.
+    warmth (N,), K: temperature above the recording's first; None where nobody measures it.
     """
 
     t: Array
     gyro: Array
     accel: Array
-    warmth: float
+    warmth: Array | None
 
     @property
     def whole(self) -> bool:
@@ -71,7 +71,7 @@ class Model:
         raw = self.config.section(CubeConfig).raw
         gyro, accel = nominal(self.data.gyro[rows], raw.gyro), nominal(self.data.accel[rows], raw.accel)
         t, warming = self.data.imu_t[rows], self.data.temperature
-        return Turning(t, gyro, accel, 0.0 if warming is None else float(warming.above(warming.first, t).mean()))
+        return Turning(t, gyro, accel, None if warming is None else warming.above(warming.first, t))
 
     def warmth(self, sensor: str, k: int) -> Array | None:
         """(1,) K, mean temperature in pose k above the recording's first; None where a sensor's offset ignores it."""
