@@ -17,6 +17,7 @@ from pipelines.methods.indexer.parameters import ASSUMPTIONS as INDEXER
 from pipelines.methods.los.parameters import ASSUMPTIONS as LOS
 from pipelines.methods.place import FIELD
 from pipelines.methods.tumble import turning
+from pipelines.methods.tumble.recording import SLOPES
 from pipelines.settings import Sensors
 from tests.walk import steps
 
@@ -26,7 +27,7 @@ ASSUMED: dict[str, Sequence[Assumption]] = {
     "head": HEAD,
     "indexer": INDEXER,
     "cube": (*CUBE, FIELD),
-    "tumble": (*turning.SCALE, turning.SENSITIVITY, turning.DELAY, FIELD),
+    "tumble": (*turning.SCALE, turning.SENSITIVITY, turning.DELAY, *SLOPES, FIELD),
 }
 DEFAULTS = {
     (method, f"{each.sheet}.{each.figure}"): each.sigma for method, assumed in ASSUMED.items() for each in assumed
