@@ -164,9 +164,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for size, seed in product((0.0,) if effect == NOTHING else SIZES, range(options.seeds))
     ]
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as processes:
-        found = list(processes.map(run, cases, [swept[case.effect] for case in cases]))
-    if options.out is not None:
-        options.out.write_text("".join(json.dumps(asdict(f)) + "\n" for f in found))
+        found = []
+        for each in processes.map(run, cases, [swept[case.effect] for case in cases]):
+            found.append(each)
+            if options.out is not None:
+                with options.out.open("w" if len(found) == 1 else "a") as lines:
+                    lines.write(json.dumps(asdict(each)) + "\n")
     print("\n".join(report(found)))
     return 0
 

@@ -194,7 +194,7 @@ def test_bad_options_are_refused(alidade: Command, session: Path, tmp_path: Path
         alidade("calibrate", session, "--window", "-3", "--out", tmp_path / "out"), tmp_path / "out", ("--window",)
     )
     _refused(
-        alidade("simulate", "head", "--scenario", "hed", "--out", tmp_path / "x"), tmp_path / "x", ("head_nominal",)
+        alidade("simulate", "head", "--scenario", "hed", "--out", tmp_path / "x"), tmp_path / "x", ("head_mounts",)
     )
     _refused(alidade("simulate", "hedd", "--out", tmp_path / "x"), tmp_path / "x", ("head",))
 
