@@ -148,10 +148,10 @@ def test_a_recording_that_kills_workers_is_set_aside(
     """And those that only waited on the same worker are not."""
     import dask
 
-    def deadly(file: Any, *_: object) -> Any:
-        if file.path.endswith("U03.mcap"):
+    def deadly(recording: Any, *_: object) -> Any:
+        if recording.file.path.endswith("U03.mcap"):
             os.kill(os.getpid(), signal.SIGKILL)
-        return {"sha256": file.path, "status": "calibrated", "exit_code": 0, "reason": "", "parameters": {}}
+        return {"sha256": recording.file.path, "status": "calibrated", "exit_code": 0, "reason": "", "parameters": {}}
 
     monkeypatch.setattr(fleet, "calibrate_recording", deadly)
     # One worker and no second chance make every neighbour a suspect.

@@ -222,8 +222,8 @@ def test_no_damage_of_a_file_costs_more_than_its_row(forty: Path, tmp_path: Path
         for place in rng.integers(first, len(content), 20):
             content[place] ^= int(rng.integers(1, 256))
     (tmp_path / "U.mcap").write_bytes(content)
-    (file,) = find([str(tmp_path / "U.mcap")]).values()
-    result = calibrate_recording(file, Settings(), None)
+    (recording,) = find([str(tmp_path / "U.mcap")]).values()
+    result = calibrate_recording(recording, Settings())
     assert result is not None
     assert result["exit_code"] in (0, 2, 3, 4)
     assert "\n" not in result["reason"]

@@ -8,27 +8,27 @@ Each worker reads its own recording and sends back a small mapping; nothing else
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pipelines import exit_codes, methods, progress
 from pipelines.belief import Belief
 from pipelines.config import load_config
 from pipelines.errors import InputError
+from pipelines.fleet import require_extra
 from pipelines.fleet.engine import Killed, cluster, completed, source_version
 from pipelines.fleet.histories import packed
 from pipelines.fleet.isolated import failure, quarantined, run_isolated
-from pipelines.fleet.recordings import as_date, from_metadata, from_name, local
+from pipelines.fleet.recordings import Recording, as_date, from_metadata, from_name, local
 from pipelines.fleet.store import Result, Store, settings_key
 from pipelines.reports.known import load_known
 from pipelines.sharing import walks
 
 if TYPE_CHECKING:
-    from fsspec.core import OpenFile
-
     from pipelines.graph.problem import Told
     from pipelines.reports.result import Calibration
 
@@ -46,7 +46,8 @@ class Settings:
         config: text of a YAML file that overrides the recordings' own config key by key.
         solver: batch, incremental or published.
         window: s, of the incremental solver; None keeps the whole history.
-        prior: path of the earlier calibration that each begins from, `{unit}` in place of the unit; None: of none.
+        prior: path or fsspec's address of the earlier calibration that each begins from, `{unit}` in place of the unit;
+            None: of none.
     """
 
     method: str | None = None
@@ -60,12 +61,14 @@ class Settings:
         cls, method: str | None, config: Path | None, solver: str, window: float | None, prior: str | None = None
     ) -> Settings:
         """With the text of a config file. Raises InputError when there is no such method, or a file cannot be used."""
+        require_extra()
         if method is not None:
             methods.method(method)  # there is one of that name
         if prior is not None:
-            prior = str(Path(prior).absolute())
+            prior = prior if "://" in prior else str(Path(prior).absolute())
             if _UNIT not in prior:
-                load_known(Path(prior))
+                with _earlier(prior):
+                    pass  # it can be used
         if config is None:
             return cls(method, None, solver, window, prior)
         load_config(None, config)
@@ -100,7 +103,7 @@ class Outcome:
 
 
 def calibrate_fleet(
-    recordings: Mapping[str, OpenFile],
+    recordings: Mapping[str, Recording],
     settings: Settings,
     out: Path,
     scheduler: str | None = None,
@@ -125,10 +128,26 @@ def calibrate_fleet(
         if "date" in fields:
             as_date(fields["date"])
     store = Store(out, settings_key(source_version(), asdict(settings)))
-    kept_inputs = {name: _inputs(result) for name, result in store.results.items()}
-    tasks = {name: (file, settings, told[name].get("unit"), kept_inputs.get(name)) for name, file in recordings.items()}
+    unchanged = {name for name in recordings if _unchanged(recordings[name], settings, store.results.get(name))}
+    tasks = {
+        name: (recording, settings, told[name].get("unit"), _inputs(store.results.get(name)))
+        for name, recording in recordings.items()
+        if name not in unchanged
+    }
+    fresh, again, interrupted = _calibrated_all(tasks, store, scheduler, jobs)
+    known = {**{name: store.results[name] for name in recordings if name in store.results}, **fresh}
+    results = {name: _placed(name, known[name], told[name]) for name in recordings if name in known}
+    return Outcome(results, len(recordings), len(unchanged) + again, interrupted)
+
+
+def _calibrated_all(
+    tasks: Mapping[str, tuple[Any, ...]], store: Store, scheduler: str | None, jobs: int | None
+) -> tuple[dict[str, Result], int, bool]:
+    """Results that are not to be kept; how many kept ones stand; and whether Ctrl-C came before the end."""
     fresh: dict[str, Result] = {}
-    kept, interrupted = [], False
+    again = 0
+    if not tasks:
+        return fresh, again, False
     with cluster(scheduler, jobs) as client:
         try:
             for name, result in progress.track(
@@ -137,49 +156,63 @@ def calibrate_fleet(
                 if isinstance(result, Killed):
                     fresh[name] = quarantined()
                 elif result is None:
-                    kept.append(name)
+                    again += 1
                 elif "sha256" in result:
                     store.add(name, result)
                 else:
                     fresh[name] = result
         except KeyboardInterrupt:
-            interrupted = True
-    known = {**{name: store.results[name] for name in recordings if name in store.results}, **fresh}
-    results = {name: _placed(name, known[name], told[name]) for name in recordings if name in known}
-    return Outcome(results, len(recordings), len(kept), interrupted)
+            return fresh, again, True
+    return fresh, again, False
 
 
 def calibrate_recording(
-    file: OpenFile, settings: Settings, unit: str | None = None, known: tuple[str, str | None] | None = None
+    recording: Recording, settings: Settings, unit: str | None = None, known: tuple[str, str | None] | None = None
 ) -> Result | None:
     """On the worker: the result of one recording, None when it was made of the very same.
 
     A result without `sha256` is of a file that could not be read at all; the next run tries again.
 
     Args:
-        file: the recording.
+        recording: where it is.
         settings: how.
         unit: as the file's name has it.
         known: SHA-256 of the recording and of the earlier calibration that the result known was made of.
     """
     try:
-        with local(file) as path:
+        with local(recording.file) as path:
             told = _told(path)
-            prior = None
-            if settings.prior is not None:
-                prior = Path(settings.prior.replace(_UNIT, unit or told.get("unit") or Path(file.path).stem))
-                load_known(prior)
-            result = {"sha256": _sha256(path), "prior_sha256": prior and _sha256(prior), **told}
-            if _inputs(result) == known:
-                return None
-            return {**result, **_calibrated(path, settings, prior)}
+            with _prior(settings, unit or told.get("unit") or Path(recording.file.path).stem) as prior:
+                result = {"sha256": _sha256(path), "prior_sha256": prior and _sha256(prior), **told}
+                if _inputs(result) == known:
+                    return None
+                return {**result, "tag": recording.tag, **_calibrated(path, settings, prior)}
     except (OSError, InputError) as error:
         return failure(exit_codes.BAD_INPUT, str(error))
 
 
-def _inputs(result: Result) -> tuple[str, str | None]:
+def _inputs(result: Result | None) -> tuple[str, str | None] | None:
     """What a result was made of."""
-    return result["sha256"], result["prior_sha256"]
+    return (result["sha256"], result["prior_sha256"]) if result else None
+
+
+def _unchanged(recording: Recording, settings: Settings, kept: Result | None) -> bool:
+    """Whether a kept result stands by what the listing says, so that nothing is to be fetched for it."""
+    return bool(kept and recording.tag and kept.get("tag") == recording.tag and settings.prior is None)
+
+
+def _prior(settings: Settings, unit: str) -> AbstractContextManager[Path | None]:
+    """The earlier calibration that a unit begins from, on this machine; None: of none."""
+    return nullcontext() if settings.prior is None else _earlier(settings.prior.replace(_UNIT, unit))
+
+
+@contextmanager
+def _earlier(address: str) -> Iterator[Path]:
+    import fsspec
+
+    with local(fsspec.open(address)) as path:
+        load_known(path)
+        yield path
 
 
 def _told(path: Path) -> Result:

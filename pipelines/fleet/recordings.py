@@ -10,6 +10,7 @@ import datetime
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -23,24 +24,37 @@ if TYPE_CHECKING:
 _FIELDS = {"{unit}": r"(?P<unit>.+?)", "{date}": r"(?P<date>\d{4}-?\d\d-?\d\d(?:T\d\d:?\d\d(?::?\d\d)?Z?)?)", "*": ".*"}
 
 
-def find(patterns: Sequence[str]) -> dict[str, OpenFile]:
+@dataclass(frozen=True)
+class Recording:
+    """A file of a fleet.
+
+    Attributes:
+        file: where it is.
+        tag: an object store's own mark of the content (ETag), as it lists it; None where there is none.
+    """
+
+    file: OpenFile
+    tag: str | None = None
+
+
+def find(patterns: Sequence[str]) -> dict[str, Recording]:
     """The files that match, by name, in order. Raises InputError when a pattern matches none or cannot be looked up."""
     require_extra()
-    import fsspec
+    from fsspec.core import OpenFile, url_to_fs
 
-    found: dict[str, OpenFile] = {}
+    found: dict[str, Recording] = {}
     for pattern in patterns:
-        try:
-            matches = fsspec.open_files(pattern)
-            # A name without wildcards has not been looked up; of many remote ones each would be asked for.
-            if len(matches) == 1 or all(map(_is_local, matches)):
-                matches = [file for file in matches if file.fs.isfile(file.path)]
-        except (OSError, ValueError, ImportError) as error:
-            raise InputError(f"{pattern}: cannot be looked up: {' '.join(str(error).split())}") from error
+        with _told(pattern, "looked up"):
+            fs, path = url_to_fs(pattern)
+            fs.invalidate_cache()  # what was listed before may have changed
+            listed = fs.glob(path, detail=True).values()
+            matches = [i for i in listed if i["type"] == "file" or (i.get("islink") and fs.isfile(i["name"]))]
         if not matches:
             raise InputError(f"no file matches {pattern}")
-        for file in matches:
-            found[file.path if _is_local(file) else file.full_name] = file
+        for info in matches:
+            file = OpenFile(fs, info["name"])
+            name = file.path if _is_local(file) else file.full_name
+            found[name] = Recording(file, info.get("ETag") or info.get("etag"))
     return dict(sorted(found.items()))
 
 
@@ -52,11 +66,18 @@ def local(file: OpenFile) -> Iterator[Path]:
         return
     with TemporaryDirectory(prefix="alidade.") as folder:
         path = Path(folder) / Path(file.path).name
-        try:
+        with _told(file.full_name, "read"):
             file.fs.get_file(file.path, str(path))
-        except (OSError, ValueError) as error:
-            raise InputError(f"{file.full_name}: cannot be read: {' '.join(str(error).split())}") from error
         yield path
+
+
+@contextmanager
+def _told(what: str, done: str) -> Iterator[None]:
+    """Makes one line of whatever goes wrong: file systems raise what the libraries below them raise."""
+    try:
+        yield
+    except Exception as error:
+        raise InputError(f"{what}: cannot be {done}: {' '.join(str(error).split()) or type(error).__name__}") from error
 
 
 def from_name(name: str, names: str | None) -> dict[str, str]:

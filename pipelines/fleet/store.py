@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -56,7 +57,9 @@ class Store:
 
 
 def require_writable(folder: Path) -> None:
-    """Make the folder; raises InputError when it cannot be made or written to."""
+    """Make the folder; raises InputError when it cannot be made or written to, or is an address such as s3://bucket."""
+    if re.match(r"\w+:/", str(folder)):
+        raise InputError(f"{folder}: results are kept in a folder of this machine, to be copied from there")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
