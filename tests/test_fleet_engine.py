@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import random
 import shutil
 import signal
 import subprocess
@@ -19,12 +20,14 @@ import pytest
 from pipelines.errors import InputError
 from pipelines.fleet import engine, fleet
 from pipelines.fleet.engine import cluster, completed, source_version
-from pipelines.fleet.fleet import Settings, calibrate_fleet
+from pipelines.fleet.fleet import Settings, calibrate_fleet, calibrate_recording
+from pipelines.fleet.montecarlo import simulate_and_solve
 from pipelines.fleet.recordings import find
 from pipelines.methods.head.recording import write_head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from tests.builders import IDEAL
 
+psutil = pytest.importorskip("psutil", reason="needs the extra alidade[fleet]")
 pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
 pytest.importorskip("arro3.io", reason="needs the extra alidade[fleet]")
 
@@ -120,6 +123,58 @@ def test_a_worker_killed_midway_costs_nothing(start: Start, scheduler: str, reco
     assert len(finished(out)) == COUNT
     assert first.wait() == -signal.SIGKILL
     assert second.poll() is None
+
+
+SHORT = "{duration_s: 4, gyro_rate_hz: 100, vision_rate_hz: 20, truth_rate_hz: 1, sensors: ideal}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["fleet", "montecarlo"])
+def test_workers_killed_at_random_cost_nothing(start: Start, recordings: Path, tmp_path: Path, what: str) -> None:
+    """Every result is there once, and is the one that an undisturbed process computes."""
+    out, scenario, rng = tmp_path / "out", tmp_path / "short.yaml", random.Random(7)
+    scenario.write_text(SHORT)
+    words: dict[str, tuple[object, ...]] = {
+        "fleet": (recordings / "*.mcap",),
+        "montecarlo": ("head", "--scenario", scenario, "--runs", COUNT, "--solvers", "batch"),
+    }
+    command = start("pipelines.cli", what, *words[what], "--jobs", 3, "--out", out)
+    killed = 0
+    # Killed only while some work still ends, or nothing would ever: workers take seconds to start.
+    while len(finished(out)) < COUNT - 3:
+        before = len(finished(out))
+        until(lambda before=before: len(finished(out)) >= before + 2)
+        time.sleep(rng.uniform(0.0, 0.5))
+        os.kill(rng.choice(workers_of(command.pid)), signal.SIGKILL)
+        killed += 1
+    output, error = command.communicate(timeout=100)
+    assert (command.returncode, error) == (0, "")
+    assert f"{COUNT} of {COUNT} " in output
+    assert killed >= 5
+    entries = [json.loads(line) for line in finished(out)]
+    assert len(entries) == COUNT
+    kept = {entry["name"]: untimed(entry["result"]) for entry in entries}
+    if what == "fleet":
+        found = find([f"{recordings}/*.mcap"])
+        alone = {name: untimed(calibrate_recording(each, Settings())) for name, each in found.items()}
+    else:
+        solved = {str(seed): simulate_and_solve("head", "", SHORT, seed, ["batch"], 1.0) for seed in range(COUNT)}
+        alone = {seed: untimed(result) for seed, result in solved.items()}
+    assert kept == alone
+
+
+def workers_of(command: int) -> list[int]:
+    """Process ids of the workers that a command started on this machine."""
+    children = psutil.Process(command).children(recursive=True)
+    return [child.pid for child in children if "multiprocessing.spawn" in " ".join(child.cmdline())]
+
+
+def untimed(result: Any) -> Any:
+    """A result as it is kept, without how long it took."""
+    result = json.loads(json.dumps(result))
+    for each in (result, result.get("batch", {})):
+        each.pop("seconds", None)
+    return result
 
 
 def test_ctrl_c_keeps_what_is_finished(start: Start, recordings: Path, tmp_path: Path) -> None:
