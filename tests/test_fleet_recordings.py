@@ -323,6 +323,10 @@ def with_metadata(source: Path, target: Path, name: str, content: dict[str, str]
             ["{forty}/*.mcap", "--out", "{forty}/U00_20260301.mcap/out"],
             "no folder to write results to (Not a directory)",
         ),
+        (
+            ["{forty}/*.mcap", "--out", "s3://bucket/out"],
+            "s3:/bucket/out: results are kept in a folder of this machine",
+        ),
         (["{forty}/*.mcap", "--jobs", "0"], "--jobs 0"),
         (["{forty}/*.mcap", "--jobs", "2", "--scheduler", "tcp://127.0.0.1:1"], "not together with --scheduler"),
         (
