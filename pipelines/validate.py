@@ -136,7 +136,7 @@ def _held(session: Session, known: Known) -> tuple[Holding | None, dict[str, flo
             estimate = solve_batch(problem, device=device)
     except IndeterminateError:
         return None, {}
-    own = {**problem.constants, **dict(zip(estimate.names, estimate.values.tolist(), strict=True))}
+    own = problem.numbers(estimate)
     if not estimate.converged or estimate.told is None:
         return None, {}
     inflations = dict(zip(estimate.names, estimate.inflations.tolist(), strict=True))

@@ -327,6 +327,7 @@ def test_measurements_held_out_are_predicted_as_well_as_the_noise_allows() -> No
     assert held_out(find.problem(replace(data, vision_cov=data.vision_cov / 25.0), wrong))["vision"] > 3.0
 
 
+@pytest.mark.slow
 def test_a_flipped_axis_ends_inconsistent_with_that_first(tmp_path: Path) -> None:
     """From the recording to the files: exit code 4, the cause at the head of the headline and in the report."""
     _, data, config = head_of(6.0, sensors=None)

@@ -33,7 +33,7 @@ _CLUSTER = "docs/fleet.md"
 _APART = ("docs/fleet.md", "docs/write-your-own-method.md")
 # Their commands are those of other tests, on longer recordings; `make dist` walks all tutorials.
 _TUTORIALS = ("docs/tutorials/cube.md", "docs/tutorials/indexer.md", "docs/tutorials/los.md")
-_LONG = (*_APART, *_TUTORIALS, "docs/cube.md", "docs/trust.md")
+_LONG = (*_APART, *_TUTORIALS, "docs/cube.md", "docs/over-time.md", "docs/trust.md")
 
 
 def _name(page: Path) -> str:

@@ -110,7 +110,7 @@ def follow_live(kind: str, whole: Path, config: Path, folder: Path) -> tuple[Cal
     return calibration, now - began() - upto, upto
 
 
-@pytest.mark.parametrize("kind", ["file", "standard input"])
+@pytest.mark.parametrize("kind", [pytest.param("file", marks=pytest.mark.slow), "standard input"])
 def test_five_seconds_as_they_come(kind: str, tmp_path: Path) -> None:
     """Folders and bridges are in test_follow_sources."""
     whole, config = record(tmp_path, 5.0, 8.0, 50.0)

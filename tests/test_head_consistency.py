@@ -27,6 +27,8 @@ from pipelines.solvers.incremental import solve_incremental
 
 Solve = Callable[[Problem], Estimate]
 SOLVERS = pytest.mark.parametrize("solve", [solve_batch, solve_incremental])
+# The incremental one takes long.
+BATCH_FIRST = pytest.mark.parametrize("solve", [solve_batch, pytest.param(solve_incremental, marks=pytest.mark.slow)])
 # Quick enough a platform for short runs.
 SHORT = {
     "platform": {
@@ -153,7 +155,7 @@ def test_gyro_noise_set_too_small_is_found_in_its_samples() -> None:
     assert Run(settings, 1, solve_batch, "gyro_density", known=0.0).assessment.status == "inconsistent"
 
 
-@SOLVERS
+@BATCH_FIRST
 def test_without_platform_motion_only_the_product_of_the_mounts_is_known(solve: Solve) -> None:
     """The head turned about one attitude only says how cRb and vRh act together at rest; the report names them."""
     priors = {f"camera_mount_{axis}": 0.35 for axis in "xyz"}
@@ -216,7 +218,7 @@ def test_outliers_do_not_lead_the_smoother_astray(fraction: float) -> None:
     assert np.abs((run.estimate.values - batch.values) / batch.sigmas).max() < 0.2
 
 
-@SOLVERS
+@BATCH_FIRST
 def test_back_to_normal_at_the_first_frame_after_an_outage(solve: Solve) -> None:
     gaps = [(10.0, 20.0), (28.0, 38.0)]
     run = Run(scenario(duration_s=45, vision_rate_hz=10, vision_outages_s=gaps), 1, solve)
@@ -228,7 +230,7 @@ def test_back_to_normal_at_the_first_frame_after_an_outage(solve: Solve) -> None
         assert error[np.flatnonzero(time > end)[0]] <= normal
 
 
-@SOLVERS
+@BATCH_FIRST
 @pytest.mark.parametrize("mount", [(20.0, -15.0, 17.0), pytest.param((-30.0, 0.0, 0.0), marks=pytest.mark.slow)])
 def test_mounts_thirty_degrees_off_converge(solve: Solve, mount: tuple[float, float, float]) -> None:
     run = Run(scenario(helmet_mount_deg=mount, camera_mount_deg=mount[::-1]), 1, solve)

@@ -173,6 +173,7 @@ def test_pz_and_gz_cannot_be_told_apart() -> None:
     assert "ask for delta_z = delta_pz - delta_gz instead" in assessment.directions[0].advice
 
 
+@pytest.mark.slow
 def test_without_azimuth_motion_px_is_weak_against_gx_and_gy() -> None:
     scenario = load_scenario(LosScenario, "los_no_azimuth")
     data, _ = simulate_los(scenario, 1)

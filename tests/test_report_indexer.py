@@ -18,8 +18,9 @@ from pipelines.solvers.batch import solve_batch
 def _plots(scenario: IndexerScenario) -> dict[str, Plot]:
     data, _ = simulate_indexer(scenario, 1)
     config = load_config(indexer_config(scenario).encode())
-    estimate = solve_batch(problem(data, config))
-    found = indexer_plots(data, cast(Calibration, SimpleNamespace(config=config, estimate=estimate)))
+    graph = problem(data, config)
+    estimate = solve_batch(graph)
+    found = indexer_plots(data, cast(Calibration, SimpleNamespace(config=config, problem=graph, estimate=estimate)))
     return {plot.title: plot for plot in found}
 
 

@@ -21,8 +21,9 @@ SCENARIO = LosScenario(duration_s=20.0, image_rate_hz=20.0, gyro_rate_hz=200.0, 
 def _plots(priors: str) -> list[Plot]:
     data, _ = simulate_los(SCENARIO, 1)
     config = load_config(los_config(SCENARIO).replace("priors: {}", f"priors: {priors}").encode())
-    estimate = solve_batch(problem(data, config))
-    return los_plots(data, cast(Calibration, SimpleNamespace(config=config, estimate=estimate)))
+    graph = problem(data, config)
+    estimate = solve_batch(graph)
+    return los_plots(data, cast(Calibration, SimpleNamespace(config=config, problem=graph, estimate=estimate)))
 
 
 @pytest.mark.parametrize("priors", ["{}", "{time_offset: 0.01}"])

@@ -75,7 +75,7 @@ def _worst(estimate: Estimate, truth: dict[str, float]) -> float:
 
 
 @pytest.mark.parametrize("make", [_far_los, _far_indexer, _far_cube])
-@pytest.mark.parametrize("solve", [solve_batch, solve_incremental])
+@pytest.mark.parametrize("solve", [solve_batch, pytest.param(solve_incremental, marks=pytest.mark.slow)])
 def test_mounts_30_degrees_off_are_found(make: Callable[[], Made], solve: Callable[[Problem], Estimate]) -> None:
     problem, truth = make()
     estimate = solve(problem)

@@ -39,6 +39,7 @@ def widest(estimate: Estimate) -> float:
     return float(np.sqrt(np.linalg.eigvalsh(estimate.covariance[3:6, 3:6])[-1])) / PRIOR
 
 
+@pytest.mark.slow
 def test_minutes_about_one_axis_tell_nothing_of_the_mount_about_it(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = made()
     assert widest(solve_batch(problem)) > 0.85

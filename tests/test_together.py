@@ -92,6 +92,7 @@ def _names(session: Session) -> list[str]:
     return [q.name for q in session.problem().quantities]
 
 
+@pytest.mark.slow
 def test_five_recordings_make_sigmas_smaller_by_their_root() -> None:
     """With ideal sensors and wide priors, of what is shared; what belongs to a recording stays nearly as it is."""
     opened = sessions("indexer", range(5), WIDE)

@@ -45,7 +45,7 @@ def _deviations(estimate: Estimate, truth: dict[str, float]) -> Array:
     return np.asarray((estimate.values - [truth[name] for name in estimate.names])[free] / estimate.sigmas[free])
 
 
-@pytest.mark.parametrize("solve", [solve_batch, solve_incremental])
+@pytest.mark.parametrize("solve", [solve_batch, pytest.param(solve_incremental, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("made", [_head, _los])
 def test_a_walk_faster_than_keyframes_follow_is_solved(
     made: Callable[[], Made], solve: Callable[[Problem], Estimate]

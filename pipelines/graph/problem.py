@@ -214,6 +214,10 @@ class Problem:
     noises: tuple[Level, ...] = ()
     constants: Mapping[str, float] = field(default_factory=dict)
 
+    def numbers(self, estimate: Estimate) -> dict[str, float]:
+        """What formulas need, by name: an estimate's values and the constants."""
+        return {**self.constants, **dict(zip(estimate.names, estimate.values.tolist(), strict=True))}
+
     @property
     def quantities(self) -> tuple[Quantity, ...]:
         """All reported numbers, in order."""

@@ -28,7 +28,7 @@ def cube_plots(data: CubeData, calibration: Calibration) -> list[Plot | Table]:
     """The method's own figures and tables; those that the recording has no data for are left out."""
     config = calibration.config
     estimate = calibration.estimate
-    values = {**calibration.problem.constants, **dict(zip(estimate.names, estimate.values.tolist(), strict=True))}
+    values = calibration.problem.numbers(estimate)
     poses = static_poses(data, config)
     found: list[Plot | Table | None] = [*cube_tables(calibration)]
     found += [_before_and_after(*rows) for rows in _errors(data, config, poses, calibration, values)]

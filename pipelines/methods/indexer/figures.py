@@ -28,7 +28,7 @@ def indexer_plots(data: IndexerData, calibration: Calibration) -> list[Plot]:
     """The method's own figures; those that the recording has no data for are left out."""
     config = calibration.config
     estimate = calibration.estimate
-    values = {**calibration.problem.constants, **dict(zip(estimate.names, estimate.values.tolist(), strict=True))}
+    values = calibration.problem.numbers(estimate)
     turning = [g for g in groups_of(data, config, axis_motion(data)) if g.position is not None]
     plots = [_misfit(turning, values), _contributions(turning, values)]
     half = _half_differences(data, values)

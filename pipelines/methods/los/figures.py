@@ -33,7 +33,7 @@ def los_plots(data: LosData, calibration: Calibration) -> list[Plot]:
     """LOS error measured and predicted, and their difference with and without the mounting angles."""
     config = calibration.config
     estimate = calibration.estimate
-    values = {**calibration.problem.constants, **dict(zip(estimate.names, estimate.values.tolist(), strict=True))}
+    values = calibration.problem.numbers(estimate)
     sigma = first_given(config.noise.los_error, DEFAULT_NOISE.los_error)
     margin = SMOOTHING if OFFSET in values else 0.0
     rows, starts, _ = select_pictures(data, np.full(len(data.image_t), sigma), margin)
