@@ -43,16 +43,16 @@ class Store:
         self.results[name] = result
 
     def _load(self) -> None:
-        text = self._path.read_text(encoding="utf-8")
-        for line in text.splitlines():
-            try:
-                entry = json.loads(line)
-            except json.JSONDecodeError:
-                continue  # cut off when the machine went down; that one is done again
-            if entry["settings"] == self._settings:
-                self.results[entry["name"]] = entry["result"]
-        if text and not text.endswith("\n"):
-            with self._path.open("a", encoding="utf-8") as stream:
+        line = "\n"
+        with self._path.open("r+", encoding="utf-8") as stream:
+            for line in stream:
+                try:
+                    entry = json.loads(line)
+                except json.JSONDecodeError:
+                    continue  # cut off when the machine went down; that one is done again
+                if entry["settings"] == self._settings:
+                    self.results[entry["name"]] = entry["result"]
+            if not line.endswith("\n"):
                 stream.write("\n")
 
 
