@@ -131,9 +131,10 @@ def axis_angles(axes: Sequence[str], once_per_turn: Sequence[str], delay: str, k
             (sine, cosine), read = numbers_of(v, names), np.asarray(getattr(v, axis))
             return np.asarray(read - sine * np.sin(read) - cosine * np.cos(read))
 
-        sine, cosine = (name if name in known else "0" for name in names)
-        expression = f"{axis} - {sine} * sin({axis}) - {cosine} * cos({axis})"
-        return Formula(f"angle of the {axis} axis, rad{late}", f"{axis}_angle", expression, (axis,), compute)
+        waves = [
+            f" - {name} * {wave}({axis})" for name, wave in zip(names, ("sin", "cos"), strict=True) if name in known
+        ]
+        return Formula(f"angle of the {axis} axis, rad{late}", f"{axis}_angle", axis + "".join(waves), (axis,), compute)
 
     return [angle(axis, once_per_turn[2 * i : 2 * i + 2]) for i, axis in enumerate(axes)]
 
