@@ -37,6 +37,11 @@ class GyroPair(Method):
     section = GyroPairConfig
     rotations: ClassVar[Mapping[str, str]] = {"rotation": "aRb"}
     of_recording = ("bias_difference_*",)
+    meanings: ClassVar[Mapping[str, str]] = {
+        r"rotation_([xyz])": "How gyro b is mounted against gyro a, part {0} of the rotation vector.",
+        r"bias_difference_([xyz])": "What gyro b reads about {0} at rest less what gyro a reads there, in b.",
+        r"time_offset": "How much later than gyro b's stamps its readings are, on gyro a's clock.",
+    }
     scenarios = Path(__file__).parent / "scenarios"
 
     @property
