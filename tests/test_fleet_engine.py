@@ -201,6 +201,7 @@ def test_ctrl_c_keeps_what_is_finished(start: Start, recordings: Path, tmp_path:
     assert len(rows_of(out)) == 10
 
 
+@pytest.mark.slow
 def test_a_recording_that_kills_workers_is_set_aside(
     recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
