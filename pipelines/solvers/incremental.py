@@ -13,7 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 
 import gtsam
 import numpy as np
@@ -78,6 +78,11 @@ def solve_incremental(problem: Problem, window: Window = DEFAULT_WINDOW) -> Esti
     return run.finish(time.perf_counter() - start)
 
 
+def _no_course() -> Course | None:
+    """Of a run that was never solved in batch, or has a way of its own."""
+    return None
+
+
 @dataclass(frozen=True)
 class _Solved:
     """A batch solution of a young run.
@@ -138,7 +143,7 @@ class Run:
         # Of a young run: information that is its states' noise, and covariance that linear systems do not know of.
         self._noise: Array | None = None
         self._bent: Array | None = None
-        self._course: Callable[[], Course | None] = cache(lambda: None)  # of the last batch solution while young
+        self._course: Callable[[], Course | None] = _no_course  # of the last batch solution while young
 
     @classmethod
     def resumed(cls, problem: Problem, window: Keyframes | float, base: State, scales: Mapping[str, float]) -> Run:
@@ -362,18 +367,22 @@ class Run:
         self._noise = self._bent = None
         system, current = solution.system, self.current_keys
         if self._young:
+            covariance = self.covariance()
             self._noise = information_of_noise(
-                self.problem, system.linearize, system.ordering, values, self.covariance(), current
+                self.problem, system.linearize, system.ordering, values, covariance, current
             )
-            self._bent = second_order(self.problem, system, values, self.covariance(), current)
+            if self._noise is not None:
+                covariance = self.covariance()
+            self._bent = second_order(self.problem, system, values, covariance, current)
         if from_start:
             self.moments += 1
-            linear = partial(system.linearize, values)
             self._course = cache(
-                lambda: sequential_history(self.problem, linear(), system.ordering, values, whole.boundaries)
+                lambda: sequential_history(
+                    self.problem, system.linearize(values), system.ordering, values, whole.boundaries
+                )
             )
             if not self._young:
-                self.way, self._course = Way.of(self._course()), cache(lambda: None)
+                self.way, self._course = Way.of(self._course()), _no_course
             self.attitudes.clear()
         self._record(whole.keyframes if from_start else last, values)
         self._solved = _Solved(since, len(self.past), self.values(), np.sqrt(np.diag(self.covariance())))
