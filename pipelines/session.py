@@ -443,12 +443,16 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
 
 
 def _check_sheets(method: Method, config: Config) -> None:
-    """Raise InputError when a data sheet is stated that the method has no use for: it would be ignored in silence."""
-    for name in config.sensors.model_fields_set - set(method.sheets):
-        sheet = getattr(config.sensors, name)
-        if any(getattr(sheet, figure) != 0.0 for figure in sheet.model_fields_set):
-            used = ", ".join(f"sensors.{each}" for each in method.sheets) or "no data sheet"
-            raise InputError(f"sensors.{name}: method {method.name} has no use for it; it uses {used}")
+    """Raise InputError when a figure is stated that the method has no use for: it would be ignored in silence."""
+    for name in sorted(config.sensors.model_fields_set):
+        sheet, figures = getattr(config.sensors, name), method.sheets.get(name, ())
+        useless = [each for each in sorted(sheet.model_fields_set - {*figures}) if getattr(sheet, each) != 0.0]
+        if not useless:
+            continue
+        where = f"sensors.{name}.{useless[0]}" if figures else f"sensors.{name}"
+        used = [f"sensors.{name}.{each}" for each in figures] or [f"sensors.{each}" for each in method.sheets]
+        useful = ", ".join(used) or "no data sheet"
+        raise InputError(f"{where}: method {method.name} has no use for it; it uses {useful}")
 
 
 def _first(tried: Sequence[Cause], assumed: Sequence[Cause]) -> list[Cause]:

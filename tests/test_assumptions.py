@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import alidade
+from pipelines import methods
 from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.graph.assumptions import Assumption, pull, quantities
@@ -22,6 +23,7 @@ from pipelines.methods.head.graph import problem
 from pipelines.methods.head.recording import HeadData, read_head, write_head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from pipelines.recording.reading import open_recording
+from pipelines.session import Session
 from pipelines.simulation.scenario import load_scenario
 from pipelines.solvers.batch import solve_batch
 from tests.command import Command
@@ -176,3 +178,18 @@ def test_a_data_sheet_that_a_method_has_no_use_for_is_refused() -> None:
         alidade.open(simulated, config=stated).problem()
     for nothing in ("ideal", {"clock": {"skew": 0.0}}):
         alidade.open(simulated, config=alidade.Config.model_validate({"sensors": nothing})).problem()
+    stated = alidade.Config.model_validate({"sensors": {"camera": {"focal": 1e-3, "scale": 1e-3}}})
+    with pytest.raises(alidade.InputError, match=r"sensors\.camera\.scale: .* uses sensors\.camera\.focal, "):
+        alidade.open(simulated, config=stated).problem()
+
+
+@pytest.mark.parametrize("name", ["los", "indexer", "head", "cube", "tumble"])
+def test_a_method_says_which_figures_it_uses(name: str) -> None:
+    method = methods.method(name)
+    taken = {f"{sensor}.{figure}" for sensor, figures in method.sheets.items() for figure in figures}
+    for scenario in (None, f"{name}_warming", *(("tumble_phone",) if name == "tumble" else ())):
+        settings = method.settings(scenario)
+        problem = Session.of(method, method.simulate(settings, 0)).problem()
+        used = {q.sheet for q in problem.quantities if q.group == "assumption" and q.sheet}
+        assert used
+        assert used <= taken

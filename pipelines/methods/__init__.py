@@ -52,7 +52,7 @@ class Method(ABC):
         topics: what it reads, the optional ones included.
         needs: what it cannot do without.
         section: the model of its own section of the config, if it has one.
-        sheets: the data sheets it uses, as under `sensors` in the config.
+        sheets: the data sheets it uses, as under `sensors` in the config -> their figures.
         of_recording: patterns of the parameters that belong to a recording; the others are the device's.
         rotations: parameters that are rotation vectors, without their _x, _y, _z -> the rotation each is.
         meanings: pattern of parameters' names -> what they are, a sentence with {0}, {1} for the pattern's groups; what
@@ -71,7 +71,7 @@ class Method(ABC):
     topics: ClassVar[tuple[Topic, ...]]
     needs: ClassVar[tuple[Need, ...]]
     section: ClassVar[type[MethodSection] | None] = None
-    sheets: ClassVar[tuple[str, ...]] = ()
+    sheets: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     of_recording: ClassVar[tuple[str, ...]] = ()
     rotations: ClassVar[Mapping[str, str]] = {}
     meanings: ClassVar[Mapping[str, str]] = {}

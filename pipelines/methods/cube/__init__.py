@@ -32,7 +32,13 @@ class Cube(Method):
     topics = TOPICS
     needs = NEEDS
     section = CubeConfig
-    sheets = ("gyro", "accel", "reference", "field", "camera")
+    sheets: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "gyro": ("g_sensitivity", "temperature"),
+        "accel": ("square", "cube", "temperature"),
+        "reference": ("tilt",),
+        "field": ("model_error",),
+        "camera": ("focal", "centre"),
+    }
     drawn = True
     of_recording = ("gyro_b?", "accel_b?", "field_?", "reference_*")
     sketch = Path(__file__).with_name("frames.svg")

@@ -31,7 +31,12 @@ class Head(Method):
     topics = TOPICS
     needs = NEEDS
     section = HeadConfig
-    sheets = ("gyro", "platform_gyro", "camera", "clock")
+    sheets: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "gyro": ("scale", "skew", "g_sensitivity", "temperature"),
+        "platform_gyro": ("bias", "scale", "skew"),
+        "camera": ("scale",),
+        "clock": ("skew",),
+    }
     of_recording = ("gyro_bias_*", "time_offset", "clock_skew", "platform_bias_*")
     sketch = Path(__file__).with_name("frames.svg")
     meanings: ClassVar[Mapping[str, str]] = {

@@ -31,7 +31,10 @@ class Indexer(Method):
     topics = TOPICS
     needs = NEEDS
     section = IndexerConfig
-    sheets = ("gyro", "encoder")
+    sheets: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "gyro": ("scale", "skew", "temperature"),
+        "encoder": ("once_per_turn", "delay"),
+    }
     of_recording = ("gyro_bias_*",)
     sketch = Path(__file__).with_name("frames.svg")
     meanings: ClassVar[Mapping[str, str]] = {

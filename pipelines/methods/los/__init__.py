@@ -30,7 +30,14 @@ class Los(Method):
     title = "Line of sight"
     topics = TOPICS
     needs = NEEDS
-    sheets = ("gyro", "camera", "encoder", "clock", "gimbal", "target")
+    sheets: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "gyro": ("scale", "skew", "g_sensitivity", "temperature"),
+        "camera": ("scale", "roll"),
+        "encoder": ("once_per_turn", "delay"),
+        "clock": ("offset", "skew"),
+        "gimbal": ("collimation", "nonperpendicularity"),
+        "target": ("rate",),
+    }
     of_recording = ("gyro_bias_*", "time_offset", "clock_skew", "target_rate_*")
     sketch = Path(__file__).with_name("frames.svg")
     meanings: ClassVar[Mapping[str, str]] = {

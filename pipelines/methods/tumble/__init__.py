@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from pipelines.methods import Method, Scenario
 from pipelines.methods.tumble.topics import NEEDS, TOPICS
@@ -31,7 +31,12 @@ class Tumble(Method):
     title = "Tumbled magnetometer and accelerometer"
     topics = TOPICS
     needs = NEEDS
-    sheets = ("gyro", "accel", "mag", "field")
+    sheets: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "gyro": ("scale", "skew", "g_sensitivity", "temperature"),
+        "accel": ("temperature",),
+        "mag": ("delay",),
+        "field": ("model_error",),
+    }
     of_recording = ("accel_b?", "gyro_bias_*", "gravity", "field_*")
     sketch = Path(__file__).with_name("frames.svg")
     drawn = True
