@@ -457,6 +457,11 @@ def test_px4_logs(tmp_path: Path) -> None:
                 "timestamp": us + np.uint64(300),
                 "timestamp_sample": us,
                 **{axis: f4["mag"][:, i] for i, axis in enumerate("xyz")},
+                "temperature": np.full(n, np.nan, np.float32),
+            },
+            "vehicle_imu_status": {
+                "timestamp": us[::25],
+                "temperature_gyro": np.array([np.nan, 30.5, 31.0, 31.5], np.float32),
             },
             "vehicle_attitude": {"timestamp": us, "q": q},
             "vehicle_imu": {
@@ -495,6 +500,10 @@ def test_px4_logs(tmp_path: Path) -> None:
     magnetic = recording.magnetic("/sensor_mag")
     np.testing.assert_array_equal(magnetic.t_ns, t_ns)
     np.testing.assert_array_equal(magnetic.field, 1e-4 * f4["mag"].astype(float))
+    warm = recording.temperature("/vehicle_imu_status/temperature_gyro")
+    np.testing.assert_array_equal(warm.t_ns, t_ns[25::25])
+    np.testing.assert_array_equal(warm.celsius, [30.5, 31.0, 31.5])
+    assert {topic for topic in recording.topics if "temperature" in topic} == {"/vehicle_imu_status/temperature_gyro"}
     means = recording.imu("/vehicle_imu")
     np.testing.assert_array_equal(means.t_ns, t_ns - 2_000_000)
     np.testing.assert_allclose(means.gyro, f4["gyro"].astype(float) / 0.004, rtol=1e-12)

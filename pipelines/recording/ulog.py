@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,8 +32,9 @@ _ENU_FROM_NED = np.array([0.0, np.sqrt(0.5), np.sqrt(0.5), 0.0])
 def read_ulog(path: Path, strict: bool, data: Path) -> ArrayContainer:
     """The sensors, attitudes and fixes in a log, each under the name of its topic there, `/sensor_combined`.
 
-    Further instances of a sensor are `/sensor_gyro/1` and so on. Raises InputError when pyulog is not installed or the
-    file is damaged beyond reading; with `strict` when it is damaged at all.
+    Further instances of a sensor are `/sensor_gyro/1` and so on, a sensor's temperature `/sensor_gyro/temperature`.
+    Raises InputError when pyulog is not installed or the file is damaged beyond reading; with `strict` when it is damaged
+    at all.
     """
     try:
         from pyulog import ULog
@@ -41,9 +42,9 @@ def read_ulog(path: Path, strict: bool, data: Path) -> ArrayContainer:
         raise InputError(f"{path}: a PX4 log; to read it: pip install 'alidade[px4]'") from error
     try:
         with contextlib.redirect_stdout(io.StringIO()):
-            log = ULog(str(data), [*_READERS, *_CLOCKS])
+            log = ULog(str(data), [*_READERS, *_CLOCKS, _STATUS])
         offset = _unix_offset(log.data_list)
-        topics = {_name(found): _READERS[found.name](found.data, offset) for found in log.data_list if _is_used(found)}
+        topics = {name: read for found in log.data_list for name, read in _topics(found, offset)}
     except Exception as error:  # a parser on bytes that may be anything
         raise InputError(f"{path}: a PX4 log that cannot be read ({' '.join(str(error).split())[:200]})") from error
     remarks = []
@@ -61,12 +62,18 @@ def read_ulog(path: Path, strict: bool, data: Path) -> ArrayContainer:
     return container
 
 
-def _is_used(found: Any) -> bool:
-    return found.name in _READERS and len(found.data["timestamp"]) > 0
-
-
-def _name(found: Any) -> str:
-    return f"/{found.name}" + (f"/{found.multi_id}" if found.multi_id else "")
+def _topics(found: Any, offset: int) -> Iterator[tuple[str, series.Topic]]:
+    """What a topic of the log has, and under it the temperatures of the sensor, where it says them."""
+    if len(found.data["timestamp"]) == 0:
+        return
+    name = f"/{found.name}" + (f"/{found.multi_id}" if found.multi_id else "")
+    if found.name in _READERS:
+        yield name, _READERS[found.name](found.data, offset)
+    for column in _TEMPERATURES & found.data.keys():
+        celsius = found.data[column].astype(float)
+        told = np.isfinite(celsius)
+        if told.any():
+            yield f"{name}/{column}", series.TemperatureSeries(_stamps(found.data, offset)[told], celsius[told])
 
 
 def _unix_offset(topics: list[Any]) -> int:
@@ -165,5 +172,8 @@ _READERS: dict[str, Callable[[Columns, int], series.Topic]] = {
     "vehicle_gps_position": _fix,
     "sensor_gps": _fix,
 }
+# What drivers say of sensors once a second, their temperatures among it, and how columns with temperatures are called.
+_STATUS = "vehicle_imu_status"
+_TEMPERATURES = {"temperature", "temperature_gyro", "temperature_accel"}
 # Topics that know what time it is.
 _CLOCKS = ("vehicle_gps_position", "sensor_gps")
