@@ -33,8 +33,8 @@ def read_ulog(path: Path, strict: bool, data: Path) -> ArrayContainer:
     """The sensors, attitudes and fixes in a log, each under the name of its topic there, `/sensor_combined`.
 
     Further instances of a sensor are `/sensor_gyro/1` and so on, a sensor's temperature `/sensor_gyro/temperature`.
-    Raises InputError when pyulog is not installed or the file is damaged beyond reading; with `strict` when it is damaged
-    at all.
+    Raises InputError when pyulog is not installed or the file is damaged beyond reading; with `strict` when it is
+    damaged at all.
     """
     try:
         from pyulog import ULog
