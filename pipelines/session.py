@@ -10,7 +10,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -123,12 +123,9 @@ class Arrays:
         return int(self.data.epoch_ns)
 
     def sha256(self) -> str:
-        """Of the arrays' bytes, field by field."""
+        """Of all arrays and numbers, field by field."""
         digest = hashlib.sha256()
-        for field in fields(self.data):
-            value = getattr(self.data, field.name)
-            digest.update(field.name.encode())
-            digest.update(np.ascontiguousarray(value).tobytes() if isinstance(value, np.ndarray) else b"")
+        _feed(digest, self.data)
         return digest.hexdigest()
 
     def facts(self, _: Config) -> SessionFacts:
@@ -199,6 +196,10 @@ class Session:
 
     def problem(self) -> Problem:
         """The graph. Raises InputError when the data are too few, or the config says what the method has no use for."""
+        return self._problem
+
+    @cached_property
+    def _problem(self) -> Problem:
         _check_sheets(self.method, self.config)
         return self.method.graph(self.data, self.config)
 
@@ -207,16 +208,20 @@ class Session:
         """What went in."""
         return self.origin.facts(self.config)
 
-    def calibrate(self, solver: str = "batch", window: float | None = 1.0, check: bool = False) -> Calibration:
+    def calibrate(
+        self, solver: str = "batch", window: float | None = 1.0, check: bool = False, report: bool = True
+    ) -> Calibration:
         """The calibration by one of SOLVERS; `window` in s is the incremental one's, None keeps the whole history.
 
-        With `check` the incremental one is held against batch.
+        With `check` the incremental one is held against batch. Without `report` there are values, sigmas and verdicts,
+        the same to the last digit, and nothing of what else a report explains: where the variances come from, which
+        measurements move a number most, what inputs taken for exact would do to it, the method's own findings.
 
         Raises:
             InputError: no such solver, or the data cannot be used.
             IndeterminateError: states other than the parameters are not determined.
         """
-        (calibration,) = self.calibrations([solver], window, check=check)
+        (calibration,) = self.calibrations([solver], window, check=check, report=report)
         return calibration
 
     def calibrations(
@@ -225,14 +230,16 @@ class Session:
         window: float | None = 1.0,
         seconds: Mapping[str, float] | None = None,
         check: bool = False,
+        report: bool = True,
     ) -> list[Calibration]:
-        """One calibration a solver; `seconds` is what came before (phase -> s). Raises as `calibrate` does."""
+        """One calibration a solver; `seconds` is what came before (phase -> s). For the rest see `calibrate`."""
         if isinstance(solvers, str):
             raise InputError(f"solvers: a list of names is needed, not the text {solvers!r}")
         for solver in solvers:
             if solver not in SOLVERS:
                 raise InputError(f"no solver {solver!r}; there are {', '.join(SOLVERS)}")
-        return self.judged((self._solve(solver, window) for solver in solvers), seconds or {}, check)
+        solved = (self._solve(solver, window, report=report) for solver in solvers)
+        return self.judged(solved, seconds or {}, check, report)
 
     def calibrated_beside(self, others: Callable[[Told], Mapping[str, float]]) -> Calibration:
         """The calibration by batch, what it says of its numbers linear where others have them. Raises as `calibrate`.
@@ -244,7 +251,11 @@ class Session:
         return calibration
 
     def judged(
-        self, solved: Iterable[tuple[Estimate, Problem]], seconds: Mapping[str, float], check: bool = False
+        self,
+        solved: Iterable[tuple[Estimate, Problem]],
+        seconds: Mapping[str, float],
+        check: bool = False,
+        report: bool = True,
     ) -> list[Calibration]:
         """Estimates, each with the problem it solves, ready to be reported.
 
@@ -252,6 +263,7 @@ class Session:
             solved: as above.
             seconds: what reading took.
             check: hold incremental estimates against batch.
+            report: with the method's findings.
         """
         sha256, truth = self.origin.sha256(), self.origin.truth()
         found = []
@@ -312,7 +324,7 @@ class Session:
                     beside=cache(self._published) if estimate.solver == "incremental" else None,
                     stability=change,
                     self_check=checked,
-                    findings=self.method.findings(self.data, self.config, estimate),
+                    findings=self.method.findings(self.data, self.config, estimate) if report else {},
                 )
             )
         return found
@@ -325,7 +337,11 @@ class Session:
             return Moved(split_at(self.method, self.data, self.config, change.time_s))
 
     def _solve(
-        self, solver: str, window: float | None, others: Callable[[Told], Mapping[str, float]] | None = None
+        self,
+        solver: str,
+        window: float | None,
+        others: Callable[[Told], Mapping[str, float]] | None = None,
+        report: bool = True,
     ) -> tuple[Estimate, Problem]:
         problem = self.problem()
         if solver == "published":
@@ -339,7 +355,8 @@ class Session:
 
         device = walks(self.method, self.config, [q.name for q in problem.quantities])
         with progress.doing("solving"):
-            return solve_batch(problem, budget=True, changed=self._changed(), device=device, elsewhere=others), problem
+            changed = self._changed() if report else ()
+            return solve_batch(problem, budget=report, changed=changed, device=device, elsewhere=others), problem
 
     def _changed(self) -> Iterator[tuple[str, Problem]]:
         """Each input that the graph takes for exact, and the graph with that input off by its step."""
@@ -378,6 +395,7 @@ def calibrate(
     auto_topics: bool = False,
     check: bool = False,
     prior: Path | None = None,
+    report: bool = True,
 ) -> list[Calibration]:
     """One calibration a solver, from one reading of the recording.
 
@@ -391,6 +409,7 @@ def calibrate(
         auto_topics: take the topics that `alidade info` suggests where those of the method are not there.
         check: hold an incremental calibration against batch.
         prior: an earlier calibration of the device to begin from, result.json or calibration.yaml.
+        report: with what only a report tells, see `Session.calibrate`.
 
     Raises:
         InputError: recording or config cannot be used, or there is no such solver.
@@ -399,7 +418,7 @@ def calibrate(
     start = time.perf_counter()
     with progress.doing("reading"):
         session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics, prior)
-    return session.calibrations(solvers, window, {"read": time.perf_counter() - start}, check)
+    return session.calibrations(solvers, window, {"read": time.perf_counter() - start}, check, report)
 
 
 def self_agreement(
@@ -440,6 +459,19 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
         f"({ENCODING}): `alidade info` tells which for each method, `topics:` in the config can rename"
         + (f"; nearest is {nearest}" if nearest else "")
     )
+
+
+def _feed(digest: hashlib._Hash, data: Any) -> None:
+    """The arrays and numbers of a dataclass, and of those inside it, with their names into a hash."""
+    for field in fields(data):
+        value = getattr(data, field.name)
+        digest.update(field.name.encode())
+        if is_dataclass(value):
+            _feed(digest, value)
+        elif isinstance(value, np.ndarray):
+            digest.update(np.ascontiguousarray(value).tobytes())
+        elif isinstance(value, int | float | str):
+            digest.update(repr(value).encode())
 
 
 def _check_sheets(method: Method, config: Config) -> None:

@@ -226,7 +226,16 @@ def _calibrated(path: Path, settings: Settings, prior: Path | None) -> Result:
         if settings.config is not None:
             config = Path(folder) / "config.yaml"
             config.write_text(settings.config, encoding="utf-8")
-        return run_isolated(_summary, path, settings.solver, settings.method, config, settings.window, prior)
+        return run_isolated(_summary, lambda: _calibration(path, settings, config, prior))
+
+
+def _calibration(path: Path, settings: Settings, config: Path | None, prior: Path | None) -> Calibration:
+    from pipelines.session import calibrate
+
+    (calibration,) = calibrate(
+        path, [settings.solver], settings.method, config, settings.window, prior=prior, report=False
+    )
+    return calibration
 
 
 def _summary(calibration: Calibration) -> Result:

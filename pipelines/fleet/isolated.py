@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipelines import exit_codes
@@ -14,24 +13,12 @@ if TYPE_CHECKING:
     from pipelines.reports.result import Calibration
 
 
-def run_isolated(
-    summarise: Callable[[Calibration], Result],
-    path: Path,
-    solver: str,
-    method: str | None,
-    config: Path | None,
-    window: float | None,
-    prior: Path | None = None,
-) -> Result:
-    """Status, exit code, reason, seconds of wall time, and what `summarise` takes from the calibration.
-
-    The other arguments are those of `pipelines.session.calibrate`. Never raises.
-    """
-    from pipelines.session import calibrate
+def run_isolated(summarise: Callable[[Calibration], Result], calibrate: Callable[[], Calibration]) -> Result:
+    """Status, exit code, reason, seconds of wall time, and what `summarise` takes from the calibration. Never raises."""
     from pipelines.solvers.marginals import IndeterminateError
 
     try:
-        (calibration,) = calibrate(path, [solver], method, config, window, prior=prior)
+        calibration = calibrate()
         assessment = calibration.assessment
         return {
             "status": assessment.status,

@@ -4,16 +4,16 @@
     study.nees("batch").consistent
 
 Every seed is simulated and solved by one task on one core, so that the numbers do not depend on how many workers there
-are. A worker writes the recording to a folder of its own and sends back numbers only.
+are. The simulated arrays are solved as they are: written to a file and read again they are the same, but for the last
+digits of noise densities, which messages carry as variances. A worker sends back numbers only.
 """
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +27,9 @@ from pipelines.fleet.store import Result, Store, settings_key
 from pipelines.fleet.tables import Cell, Row
 
 if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    from pipelines.methods import Method
     from pipelines.reports.result import Calibration
 
 SOLVERS = ("published", "batch", "incremental")
@@ -142,16 +145,12 @@ def run_study(
         raise InputError(f"no solver {', '.join(unknown)!r}; the solvers are {', '.join(SOLVERS)}, or all")
     if not seeds:
         raise InputError("--runs: at least one run is needed")
-    scenario = scenario or methods.method(method).nominal()
-    file = Path(scenario)
-    text = file.read_text(encoding="utf-8") if file.is_file() else None
-    # The first recording tells this scenario and simulator from others; and a bad scenario is refused here.
-    fingerprint = _fingerprint(method, scenario, seeds[0])
-    store = Store(out, settings_key(source_version(), fingerprint, method, list(solvers), window))
+    chosen = methods.method(method)
+    settings = chosen.settings(scenario)
+    # The first recording tells this scenario and simulator from others; and one that cannot be drawn is refused here.
+    store = Store(out, settings_key(source_version(), *_first(chosen, settings, seeds[0]), list(solvers), window))
     tasks = {
-        str(seed): (method, scenario, text, seed, tuple(solvers), window)
-        for seed in seeds
-        if str(seed) not in store.results
+        str(seed): (method, settings, seed, tuple(solvers), window) for seed in seeds if str(seed) not in store.results
     }
     kept, interrupted = len(seeds) - len(tasks), False
     killed: dict[str, Result] = {}
@@ -169,21 +168,21 @@ def run_study(
                 interrupted = True
     known = {**store.results, **killed}
     results = {seed: known[str(seed)] for seed in seeds if str(seed) in known}
-    name = file.stem if text is not None else scenario
+    name = Path(scenario or chosen.nominal()).stem
     return Study(method, name, tuple(solvers), results, len(seeds), kept, interrupted)
 
 
 def simulate_and_solve(
-    method: str, scenario: str, text: str | None, seed: int, solvers: Sequence[str], window: float | None
+    method: str, scenario: BaseModel, seed: int, solvers: Sequence[str], window: float | None
 ) -> dict[str, Result]:
-    """On the worker: solver -> numbers of one seed. `text` is the scenario file's, which the worker may not see."""
-    with TemporaryDirectory(prefix="alidade.") as folder:
-        if text is not None:
-            scenario = str(Path(folder) / "scenario.yaml")
-            Path(scenario).write_text(text, encoding="utf-8")
-        session = Path(folder) / "session.mcap"
-        methods.simulate(method, scenario, seed, session)
-        return {solver: run_isolated(_numbers, session, solver, method, None, window) for solver in solvers}
+    """On the worker: solver -> numbers of one seed of a scenario."""
+    from pipelines.session import Session
+
+    chosen = methods.method(method)
+    session = Session.of(chosen, chosen.simulate(scenario, seed))
+    return {
+        solver: run_isolated(_numbers, partial(session.calibrate, solver, window, report=False)) for solver in solvers
+    }
 
 
 def run_table(study: Study) -> list[Row]:
@@ -229,12 +228,12 @@ def _coverage_cells(shares: tuple[float, float, float]) -> dict[str, Cell]:
     return {f"within_{k}_sigma": share for k, share in enumerate(shares, start=1)}
 
 
-def _fingerprint(method: str, scenario: str, seed: int) -> str:
-    with TemporaryDirectory(prefix="alidade.") as folder:
-        session = Path(folder) / "session.mcap"
-        methods.simulate(method, scenario, seed, session)
-        with session.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
+def _first(method: Method, scenario: BaseModel, seed: int) -> tuple[str, str, str, dict[str, float]]:
+    """What tells a study's recordings from others: method, data of one, their config and truth."""
+    from pipelines.session import Arrays
+
+    simulated = method.simulate(scenario, seed)
+    return method.name, Arrays(method, simulated.data).sha256(), simulated.config, dict(simulated.truth)
 
 
 def _numbers(calibration: Calibration) -> Result:
