@@ -24,6 +24,7 @@ from pipelines.fleet.engine import cluster, completed, source_version
 from pipelines.fleet.fleet import Settings, calibrate_fleet, calibrate_recording
 from pipelines.fleet.montecarlo import simulate_and_solve
 from pipelines.fleet.recordings import find
+from pipelines.methods import method
 from pipelines.methods.head.recording import write_head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from tests.builders import IDEAL
@@ -158,7 +159,8 @@ def test_workers_killed_at_random_cost_nothing(start: Start, recordings: Path, t
         found = find([f"{recordings}/*.mcap"])
         alone = {name: untimed(calibrate_recording(each, Settings())) for name, each in found.items()}
     else:
-        solved = {str(seed): simulate_and_solve("head", "", SHORT, seed, ["batch"], 1.0) for seed in range(COUNT)}
+        settings = method("head").settings(str(scenario))
+        solved = {str(seed): simulate_and_solve("head", settings, seed, ["batch"], 1.0) for seed in range(COUNT)}
         alone = {seed: untimed(result) for seed, result in solved.items()}
     assert kept == alone
 

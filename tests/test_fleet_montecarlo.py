@@ -6,13 +6,16 @@ import csv
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from pipelines.fleet import consistency
-from pipelines.fleet.montecarlo import SOLVERS, run_study, simulate_and_solve
-from pipelines.methods import names
+from pipelines.fleet.montecarlo import SOLVERS, _first, run_study, simulate_and_solve
+from pipelines.methods import method, names
+from pipelines.reports.result import truth_errors
+from pipelines.session import Session, calibrate
 from tests.browser import fits
 from tests.fleet_command import alidade
 
@@ -55,13 +58,63 @@ def test_same_seeds_same_numbers_whatever_the_workers(
     assert [(row["seed"], row["solver"]) for row in rows] == [(str(s), k) for s in range(3, 7) for k in SOLVERS]
 
 
-def test_numbers_are_those_of_a_run_by_hand() -> None:
-    result = simulate_and_solve("head", "", SHORT, 3, ["batch"], 1.0)["batch"]
+def test_numbers_are_those_of_a_run_by_hand(scenario: Path) -> None:
+    result = simulate_and_solve("head", method("head").settings(str(scenario)), 3, ["batch"], 1.0)["batch"]
     assert list(result["parameters"]) == ["gyro_bias_x", "gyro_bias_y", "gyro_bias_z"]
     normalised = np.array([p["error"] / p["sigma"] for p in result["parameters"].values()])
     assert result["dof"] == 3
     # Biases of the three axes are nearly uncorrelated.
     assert result["nees"] == pytest.approx(float(normalised @ normalised), rel=0.1)
+
+
+# The same simulator with less of everything.
+BRIEFEST: dict[str, dict[str, Any]] = {
+    "los": {"duration_s": 4.0, "gyro_rate_hz": 100.0, "image_rate_hz": 20.0},
+    "indexer": {"gyro_rate_hz": 40.0, "encoder_rate_hz": 20.0, "rate_deg_s": 40.0, "dwell_s": 2.0},
+    "head": {"duration_s": 4.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 20.0},
+    "cube": {"poses": 8},
+    "tumble": {"attitudes": 12},
+}
+
+
+@pytest.mark.parametrize("name", names())
+def test_arrays_give_what_the_same_recording_gives_from_a_file(name: str, tmp_path: Path) -> None:
+    """All but noise densities are the same to the last bit; those go through a file as variances."""
+    found = method(name)
+    settings = found.scenario.model_validate(BRIEFEST[name])
+    path = tmp_path / "session.mcap"
+    found.write(path, found.simulate(settings, 5))
+    (written,) = calibrate(path, ["batch"])
+    result = simulate_and_solve(name, settings, 5, ["batch"], 1.0)["batch"]
+    assert result["status"] == written.status
+    errors = truth_errors(written)
+    assert list(result["parameters"]) == [p.name for p in written.parameters.values() if p.name in errors and p.sigma]
+    for parameter, said in result["parameters"].items():
+        sigma = written.parameters[parameter].sigma
+        assert said["sigma"] == pytest.approx(sigma, rel=1e-8)
+        assert said["error"] == pytest.approx(errors[parameter].error, abs=1e-7 * sigma)
+    assert result["chi_square"] == pytest.approx(written.estimate.chi_square.value, rel=1e-8)  # type: ignore[union-attr]
+
+
+def test_numbers_do_not_depend_on_what_a_report_tells() -> None:
+    found = method("los")
+    session = Session.of(found, found.simulate(found.scenario.model_validate(BRIEFEST["los"]), 5))
+    whole, bare = session.calibrate(), session.calibrate(report=False)
+    np.testing.assert_array_equal(bare.estimate.values, whole.estimate.values)
+    np.testing.assert_array_equal(bare.assessment.covariance, whole.assessment.covariance)
+    assert bare.assessment.headline == whole.assessment.headline
+    assert whole.budget is not None
+    assert bare.budget is None
+
+
+def test_another_scenario_is_another_study() -> None:
+    """Even where only what the camera saw differs."""
+    cube = method("cube")
+    first, second = (
+        _first(cube, cube.scenario.model_validate(BRIEFEST["cube"] | {"noise": {"corner_px": px}}), 0)
+        for px in (0.2, 0.4)
+    )
+    assert first[1] != second[1]
 
 
 def test_study_goes_on_and_sums_up(

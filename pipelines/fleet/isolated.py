@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def run_isolated(summarise: Callable[[Calibration], Result], calibrate: Callable[[], Calibration]) -> Result:
-    """Status, exit code, reason, seconds of wall time, and what `summarise` takes from the calibration. Never raises."""
+    """Status, exit code, reason, seconds of wall time, and what `summarise` takes of the calibration. Never raises."""
     from pipelines.solvers.marginals import IndeterminateError
 
     try:

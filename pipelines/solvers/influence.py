@@ -22,6 +22,7 @@ import gtsam
 import numpy as np
 
 from pipelines.graph.problem import Array, Factor, Problem, Pull
+from pipelines.solvers.marginals import places_of, solved
 
 # Family of the priors, which are told one by one.
 _PRIOR = "prior"
@@ -91,25 +92,20 @@ def influence(
         values: the estimate.
         current_keys: parameter key -> variable that holds its value, for parameters that move along.
     """
-    zero = gtsam.VectorValues.Zero(bayes_net.optimize())
-    keys = sorted(linear.keyVector())
-    ends = np.cumsum([len(zero.at(key)) for key in keys]).tolist()
+    places = places_of(linear)
     names: list[str] = []
-    solved: list[Array] = []
     gradients: list[tuple[int, Array]] = []
     for p in problem.parameters:
         key = current_keys.get(p.key, p.key)
         for quantity, gradient in zip(p.quantities, p.coordinates(values, key)[1], strict=True):
-            if quantity.prior_sigma == 0.0:
-                continue
-            right, own = gtsam.VectorValues(zero), gtsam.VectorValues()
-            own.insert(key, gradient)
-            right.update(own)
-            solved.append(bayes_net.backSubstitute(bayes_net.backSubstituteTranspose(right)).vector(keys))
-            names.append(quantity.name)
-            gradients.append((key, gradient))
-    whole = np.array(solved).reshape(len(names), -1).T
-    solutions = {key: whole[start:stop] for key, start, stop in zip(keys, [0, *ends[:-1]], ends, strict=True)}
+            if quantity.prior_sigma != 0.0:
+                names.append(quantity.name)
+                gradients.append((key, gradient))
+    right = np.zeros((max(place.stop for place in places.values()), len(names)))
+    for j, (key, gradient) in enumerate(gradients):
+        right[places[key], j] = gradient
+    whole = solved(bayes_net, places, right)
+    solutions = {key: whole[place] for key, place in places.items()}
     covariance = np.array([gradient @ solutions[key] for key, gradient in gradients]).reshape(len(names), -1)
     return Influence(tuple(names), factors, linear, solutions, 0.5 * (covariance + covariance.T))
 

@@ -8,6 +8,8 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.sparse import csr_array
 
 from pipelines.graph.problem import Array, ChiSquare, Factor, History, Parameter, Problem
 
@@ -178,14 +180,61 @@ def coordinate_inverse(parameters: Sequence[Parameter], values: gtsam.Values, ke
 
 
 def eliminated(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.GaussianBayesNet:
-    """The triangular factor of a linear system. Raises IndeterminateError, naming a variable that is not determined."""
-    try:
+    """The triangular factor of a linear system, cliques of variables together in the order of their elimination.
+
+    One variable at a time would take a factor on many of them apart as many times.
+
+    Raises:
+        IndeterminateError: names a variable that is not determined.
+    """
+    bayes_net = gtsam.GaussianBayesNet()
+
+    # gtsam's tree does not hand out its cliques, but asks for each to be eliminated, children before parents.
+    def kept(
+        graph: gtsam.GaussianFactorGraph, keys: gtsam.Ordering
+    ) -> tuple[gtsam.GaussianConditional, gtsam.GaussianFactor]:
         # By QR: tight processes beside loose priors cost Cholesky its digits, and with them the whole system.
-        bayes_net = linear.eliminateSequential(ordering, gtsam.EliminateQR)
+        conditional, rest = gtsam.EliminateQR(graph, keys)
+        bayes_net.push_back(conditional)
+        return conditional, rest
+
+    try:
+        linear.eliminateMultifrontal(ordering, kept)
         bayes_net.optimize()
         return bayes_net
     except RuntimeError as error:
         raise IndeterminateError(explain(str(error))) from None
+
+
+def solved(bayes_net: gtsam.GaussianBayesNet, places: Mapping[int, slice], right: Array) -> Array:
+    """N^-1 times right sides (d, k), N the information of a whole system.
+
+    Args:
+        bayes_net: the system's triangular factor.
+        places: variable -> its rows among the d.
+        right: by columns.
+    """
+    x = right.copy()
+    cliques = []
+    for i in range(bayes_net.size()):
+        conditional = bayes_net.at(i)
+        rows = np.concatenate([np.arange(places[key].start, places[key].stop) for key in conditional.keys()])
+        R, S = conditional.R(), conditional.S()
+        cliques.append((R, S, rows[: len(R)], rows[len(R) :]))
+    for R, S, own, parents in cliques:
+        x[own] = solve_triangular(R, x[own], trans="T", check_finite=False)
+        x[parents] -= S.T @ x[own]
+    for R, S, own, parents in reversed(cliques):
+        x[own] = solve_triangular(R, x[own] - S @ x[parents], check_finite=False)
+    return x
+
+
+def places_of(linear: gtsam.GaussianFactorGraph) -> dict[int, slice]:
+    """Variable -> its rows in vectors over all variables of a linear system, which stand there by their keys."""
+    gradient = linear.gradientAtZero()
+    keys = sorted(linear.keyVector())
+    ends = np.cumsum([len(gradient.at(key)) for key in keys]).tolist()
+    return {key: slice(start, stop) for key, start, stop in zip(keys, [0, *ends[:-1]], ends, strict=True)}
 
 
 def drawn(
@@ -282,12 +331,11 @@ def expected_squares(
         bayes_net: the system's triangular factor.
         values: the estimate.
     """
-    origin = bayes_net.optimize()
-    keys = sorted(linear.keyVector())
-    ends = np.cumsum([len(origin.at(key)) for key in keys]).tolist()
+    places = places_of(linear)
+    width = max(place.stop for place in places.values())
     # Nonzero elements of the system: rows in the order of the factors, columns in that of the keys, then those of b.
     elements = linear.sparseJacobian_()
-    elements = elements[:, elements[1] <= ends[-1]]
+    elements = elements[:, elements[1] <= width]
     row, column, element = elements[0].astype(int) - 1, elements[1].astype(int) - 1, elements[2]
     sizes = [len(linear.at(i).jacobian()[1]) for i in range(linear.size())]
     labels: dict[tuple[str, int], int] = {}
@@ -302,15 +350,11 @@ def expected_squares(
     square: Array = np.bincount(first, np.where(measured, stands - held, 0.0), len(labels)).astype(float)
     generator = np.random.default_rng(0)
     samples = int(np.clip(_SAMPLED_ROWS // len(group), _SAMPLES, _MOST_SAMPLES))
-    for _ in range(samples):
-        noise = np.where(counted, generator.choice([-1.0, 1.0], len(group)), 0.0)
-        pulls = np.bincount(column, element * noise[row], ends[-1])
-        projection = gtsam.VectorValues()
-        for key, start, stop in zip(keys, [0, *ends[:-1]], ends, strict=True):
-            projection.insert(key, pulls[start:stop])
-        x = bayes_net.backSubstitute(bayes_net.backSubstituteTranspose(projection)).vector(keys)
-        left = np.bincount(row, element * x[column], len(group)) - noise
-        square = square + np.bincount(group, left**2, len(labels)) / samples
+    signs = np.array([generator.choice([-1.0, 1.0], len(group)) for _ in range(samples)]).T
+    noise = np.where(counted[:, None], signs, 0.0)
+    A = csr_array((element, (row, column)), shape=(len(group), width))
+    left = A @ solved(bayes_net, places, A.T @ noise) - noise
+    square = square + np.bincount(group, (left**2).sum(axis=1) / samples, len(labels))
     return dict(zip(labels, square.tolist(), strict=True))
 
 
