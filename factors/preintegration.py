@@ -226,12 +226,16 @@ def _rate(w0: Array, a: Array, s: Array, arc: Array) -> Array:
 
 
 def _running_product(q: Array) -> Array:
-    """q0, q0 q1, q0 q1 q2, ...: in blocks, vectorised over the blocks, so that the loop is as long as one block."""
+    """q0, q0 q1, q0 q1 q2, ...: in blocks, vectorised over the blocks, so that the loop is as long as one block.
+
+    Few are multiplied over twice the distance each time, which are far fewer calls.
+    """
     n = len(q)
-    if n <= 64:
-        out = q.copy()
-        for i in range(1, n):
-            out[i] = so3.multiply(out[i - 1], q[i])
+    if n <= 500:
+        out, distance = q, 1
+        while distance < n:
+            out = np.concatenate([out[:distance], so3.multiply(out[:-distance], out[distance:])])
+            distance *= 2
         return so3.normalize(out)
     length = int(np.sqrt(n))
     blocks = -(-n // length)

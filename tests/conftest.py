@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 # As the command has it, and before anything imports numpy.
@@ -34,6 +35,14 @@ def example_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     example = Path(__file__).parents[1] / "docs" / "examples" / "gyro_pair"
     subprocess.run([sys.executable, "-m", "pip", "install", *options, "--target", site, example], check=True)
     return site
+
+
+@pytest.fixture(scope="session")
+def local_cluster() -> Iterator[str]:
+    """Address of a cluster with two workers."""
+    distributed = pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
+    with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster:
+        yield cluster.scheduler_address
 
 
 @pytest.fixture

@@ -18,19 +18,21 @@ from pipelines.recording import writing
 from pipelines.reports.result import truth_errors
 from pipelines.session import calibrate
 from pipelines.simulation.motion import EulerMotion, Swing
+from tests.builders import IDEAL
 from tests.command import Command
 from tests.damage import boundaries, cuts, flips, rewrite, spoilt
 
 LOS = LosScenario(
-    duration_s=20.0,
+    duration_s=12.0,
     carrier=EulerMotion(
         yaw=[Swing(amplitude_deg=20, frequency_hz=0.15)],
         pitch=[Swing(amplitude_deg=8, frequency_hz=0.31)],
         roll=[Swing(amplitude_deg=12, frequency_hz=0.21)],
     ),
-    image_rate_hz=20.0,
-    gyro_rate_hz=200.0,
+    image_rate_hz=10.0,
+    gyro_rate_hz=100.0,
     gimbal_rate_hz=100.0,
+    sensors=IDEAL,
 )
 
 
@@ -40,7 +42,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     path = tmp_path_factory.mktemp("los") / "s.mcap"
     data, truth = simulate_los(LOS, 3)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(writing, "_CHUNK", 120_000)
+        patch.setattr(writing, "_CHUNK", 70_000)
         write_los(path, data, truth, los_config(LOS))
     return path.read_bytes()
 
@@ -119,7 +121,7 @@ def test_what_is_lost_is_in_the_result_the_report_and_the_terminal(
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert any(told in note for note in result["notes"])
     lost = result["session"]["dropped"]["/imu: lost with damaged bytes of the file"]
-    assert lost + result["session"]["counts"]["/imu"] == 20 * 200
+    assert lost + result["session"]["counts"]["/imu"] == 12 * 100
     assert (tmp_path / "out" / "report.html").read_text().count("is damaged: 1 chunk") == 2
     for command in (
         ["info", path],
@@ -164,7 +166,7 @@ def test_pages_show_the_strings_of_a_recording_and_obey_none(alidade: Command, s
     (tmp_path / "s.mcap").write_bytes(session)
     imu, error = f"/imu{EVIL}", f"/los/error'{EVIL}<!--"
     path = tmp_path / "x<b onclick=alert(3)>&'.mcap"
-    rewrite(tmp_path / "s.mcap", path, {"/imu": imu, "/los/error": error})
+    rewrite(tmp_path / "s.mcap", path, {"/imu": imu, "/los/error": error}, chunk_size=70_000)
     (tmp_path / "c.yaml").write_text(json.dumps({"topics": {"imu": imu, "los_error": error}}))
     # Damaged, so that the names are in the notes too.
     data = path.read_bytes()

@@ -28,6 +28,7 @@ from pipelines.methods import method
 from pipelines.methods.head.recording import write_head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from tests.builders import IDEAL
+from tests.fleet_command import alidade
 
 psutil = pytest.importorskip("psutil", reason="needs the extra alidade[fleet]")
 pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
@@ -183,10 +184,17 @@ def untimed(result: Any) -> Any:
     return result
 
 
-def test_ctrl_c_keeps_what_is_finished(start: Start, recordings: Path, tmp_path: Path) -> None:
+def test_ctrl_c_keeps_what_is_finished(
+    start: Start,
+    local_cluster: str,
+    recordings: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     out = tmp_path / "out"
-    words = ("pipelines.cli", "fleet", recordings / "U0*.mcap", "--jobs", 2, "--out", out)
-    command = start(*words)
+    words = ("fleet", recordings / "U0*.mcap", "--out", out)
+    command = start("pipelines.cli", *words, "--jobs", 1)
     until(lambda: len(finished(out)) >= 2)
     # As a terminal does: to every process of the group.
     os.killpg(command.pid, signal.SIGINT)
@@ -196,10 +204,8 @@ def test_ctrl_c_keeps_what_is_finished(start: Start, recordings: Path, tmp_path:
     kept = len(finished(out))
     assert 2 <= kept < 10
     assert len(rows_of(out)) == kept
-    again = start(*words)
-    output, error = again.communicate(timeout=60)
-    assert f"10 of 10 recordings, {kept} from an earlier run" in output
-    assert (again.returncode, error) == (0, "")
+    assert alidade(monkeypatch, *words, "--scheduler", local_cluster) == 0
+    assert f"10 of 10 recordings, {kept} from an earlier run" in capsys.readouterr().out
     assert len(rows_of(out)) == 10
 
 
@@ -253,7 +259,7 @@ def test_a_scheduler_without_workers_is_told(scheduler: str, monkeypatch: pytest
         cluster(scheduler, None).__enter__()
 
 
-def test_overhead_order_and_faults() -> None:
+def test_overhead_order_and_faults(local_cluster: str) -> None:
     """Nothing to do, many times over: what a task costs besides its work, far below 5 % of 2 s on two workers."""
 
     def nothing(number: int) -> dict[str, float]:
@@ -262,7 +268,7 @@ def test_overhead_order_and_faults() -> None:
         return {f"parameter {i}": float(number) for i in range(50)}
 
     count = 200
-    with cluster(None, 2) as client:
+    with cluster(local_cluster, None) as client:
         list(completed(client, nothing, {str(i): (i,) for i in range(10)}))
         begin = time.perf_counter()
         results = dict(completed(client, nothing, {str(i): (i,) for i in range(count)}))

@@ -6,7 +6,6 @@ import csv
 import json
 import re
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from pipelines.methods.head.simulation import HeadScenario, head_config, simulat
 from tests.browser import fits
 from tests.fleet_command import alidade
 
-distributed = pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
+pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
 pytest.importorskip("arro3.io", reason="needs the extra alidade[fleet]")
 
 DATES = ("20260301", "20260401")
@@ -91,29 +90,22 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 
 @pytest.fixture(scope="module")
-def scheduler() -> Iterator[str]:
-    """Address of a cluster with two workers."""
-    with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster:
-        yield cluster.scheduler_address
-
-
-@pytest.fixture(scope="module")
-def calibrated(forty: Path, scheduler: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def calibrated(forty: Path, local_cluster: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The results of the command on the forty."""
     out = tmp_path_factory.mktemp("fleet")
     with pytest.MonkeyPatch.context() as monkeypatch:
-        assert alidade(monkeypatch, "fleet", forty / "*.mcap", *NAMES, "--scheduler", scheduler, "--out", out) == 0
+        assert alidade(monkeypatch, "fleet", forty / "*.mcap", *NAMES, "--scheduler", local_cluster, "--out", out) == 0
     return out
 
 
 def test_the_table_as_json(
     calibrated: Path,
     forty: Path,
-    scheduler: str,
+    local_cluster: str,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    common = ("fleet", forty / "*.mcap", *NAMES, "--scheduler", scheduler, "--out", calibrated)
+    common = ("fleet", forty / "*.mcap", *NAMES, "--scheduler", local_cluster, "--out", calibrated)
     assert alidade(monkeypatch, *common, "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["schema"], told["wanted"], told["interrupted"]) == ("alidade.fleet/1", 40, False)
@@ -151,11 +143,15 @@ def test_planted_faults_are_told_apart(calibrated: Path, tmp_path: Path) -> None
 
 
 def test_turn_on_biases_are_no_change(
-    calibrated: Path, forty: Path, scheduler: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    calibrated: Path,
+    forty: Path,
+    local_cluster: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """They differ by many sigmas from recording to recording in every unit, and have a repeatability for it."""
     assert not [row for row in rows_of(calibrated / "changes.csv") if row["parameter"].startswith("gyro_bias")]
-    common = ("fleet", forty / "*.mcap", *NAMES, "--scheduler", scheduler, "--out", calibrated)
+    common = ("fleet", forty / "*.mcap", *NAMES, "--scheduler", local_cluster, "--out", calibrated)
     assert alidade(monkeypatch, *common, "--json") == 0
     parameters = {p["name"]: p for p in json.loads(capsys.readouterr().out)["parameters"]}
     bias, mount = parameters["gyro_bias_x"], parameters["helmet_mount_x"]
@@ -180,7 +176,7 @@ def test_parquet_and_csv_say_the_same(calibrated: Path) -> None:
 
 def test_nothing_is_done_twice(
     forty: Path,
-    scheduler: str,
+    local_cluster: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -188,7 +184,7 @@ def test_nothing_is_done_twice(
     """Of files, config and version that are the same."""
 
     def run(pattern: str, *options: object) -> str:
-        common = (*NAMES, "--scheduler", scheduler, "--out", tmp_path / "out")
+        common = (*NAMES, "--scheduler", local_cluster, "--out", tmp_path / "out")
         assert alidade(monkeypatch, "fleet", tmp_path / pattern, *common, *options) == 0
         return capsys.readouterr().out
 
@@ -230,20 +226,20 @@ def test_no_damage_of_a_file_costs_more_than_its_row(forty: Path, tmp_path: Path
 
 
 def test_recordings_come_from_other_file_systems(
-    forty: Path, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    forty: Path, local_cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An archive stands for S3: no path on this machine."""
     with zipfile.ZipFile(tmp_path / "campaign.zip", "w") as archive:
         for path in sorted(forty.glob("U0[01]*.mcap")):
             archive.write(path, path.name)
     where = f"zip://*.mcap::{tmp_path}/campaign.zip"
-    assert alidade(monkeypatch, "fleet", where, *NAMES, "--scheduler", scheduler, "--out", tmp_path / "out") == 0
+    assert alidade(monkeypatch, "fleet", where, *NAMES, "--scheduler", local_cluster, "--out", tmp_path / "out") == 0
     rows = rows_of(tmp_path / "out" / "fleet.csv")
     assert [(row["unit"], row["status"]) for row in rows] == [("U00", "calibrated"), ("U01", "calibrated")]
 
 
 def test_unit_and_date_come_from_metadata(
-    forty: Path, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    forty: Path, local_cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of any record, or of rosbag2's custom data; else the file's name and the start of the recording stand in."""
     source = next(iter(sorted(forty.glob("U00*.mcap"))))
@@ -251,7 +247,9 @@ def test_unit_and_date_come_from_metadata(
     with_metadata(source, tmp_path / "a.mcap", "campaign", {"unit": "U99", "date": "2026-02-01T10:00"})
     with_metadata(source, tmp_path / "b.mcap", "rosbag2", {"serialized_metadata": yaml})
     (tmp_path / "c.mcap").write_bytes(source.read_bytes())
-    assert alidade(monkeypatch, "fleet", tmp_path / "*.mcap", "--scheduler", scheduler, "--out", tmp_path / "out") == 0
+    assert (
+        alidade(monkeypatch, "fleet", tmp_path / "*.mcap", "--scheduler", local_cluster, "--out", tmp_path / "out") == 0
+    )
     rows = rows_of(tmp_path / "out" / "fleet.csv")
     assert [(row["unit"], row["date"]) for row in rows] == [
         ("U99", "2026-02-01T10:00:00Z"),
@@ -261,7 +259,7 @@ def test_unit_and_date_come_from_metadata(
 
 
 def test_each_unit_begins_from_its_own_calibration(
-    forty: Path, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    forty: Path, local_cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A recording is done again when that has changed; one whose unit has none is told."""
     for path in sorted(forty.glob("U3[012]_20260401*.mcap")):
@@ -271,7 +269,7 @@ def test_each_unit_begins_from_its_own_calibration(
         assert alidade(monkeypatch, "calibrate", before, "--quiet", "--out", tmp_path / "last" / unit) == 0
 
     def run() -> dict[str, dict[str, str]]:
-        command = ("fleet", tmp_path / "*.mcap", *NAMES, "--scheduler", scheduler, "--out", tmp_path / "out")
+        command = ("fleet", tmp_path / "*.mcap", *NAMES, "--scheduler", local_cluster, "--out", tmp_path / "out")
         assert alidade(monkeypatch, *command, "--prior", tmp_path / "last" / "{unit}" / "result.json") == 0
         return {row["unit"]: row for row in rows_of(tmp_path / "out" / "fleet.csv")}
 

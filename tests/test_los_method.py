@@ -34,7 +34,7 @@ BRISK = EulerMotion(
     yaw=[Swing(amplitude_deg=6, frequency_hz=0.23)],
 )
 SHORT = LosScenario(
-    duration_s=15.0, carrier=BRISK, image_rate_hz=25.0, gyro_rate_hz=200.0, gimbal_rate_hz=100.0, sensors=IDEAL
+    duration_s=15.0, carrier=BRISK, image_rate_hz=10.0, gyro_rate_hz=100.0, gimbal_rate_hz=100.0, sensors=IDEAL
 )
 # The same with errors of the sensors, drawn as their data sheets have them.
 REAL = SHORT.model_copy(update={"sensors": Sensors()})
@@ -85,7 +85,7 @@ def _mean_nees(scenario: LosScenario, solve: Solve, runs: int) -> tuple[float, i
 
 @pytest.mark.parametrize(
     ("scenario", "solve", "runs"),
-    [(REAL, solve_batch, 4), (SHORT, solve_batch, 6), (REAL, solve_incremental, 1)],
+    [(REAL, solve_batch, 3), (SHORT, solve_batch, 5), (REAL, solve_incremental, 1)],
     ids=["real", "ideal", "real, incremental"],
 )
 def test_errors_fit_their_covariance_in_a_few_short_runs(scenario: LosScenario, solve: Solve, runs: int) -> None:
@@ -187,8 +187,8 @@ def test_without_azimuth_motion_px_is_weak_against_gx_and_gy() -> None:
 
 def test_gaps_of_gyro_and_gimbal_are_stepped_over() -> None:
     data, truth = simulate_los(SHORT, 9)
-    gyro = (data.gyro_t < 4.0) | (data.gyro_t > 4.3)
-    gimbal = (data.gimbal_t < 9.0) | (data.gimbal_t > 9.2)
+    gyro = (data.gyro_t < 4.0) | (data.gyro_t > 4.6)
+    gimbal = (data.gimbal_t < 9.0) | (data.gimbal_t > 9.6)
     broken = replace(
         data,
         gyro_t=data.gyro_t[gyro],
@@ -226,7 +226,7 @@ def test_config_that_cannot_be_served(config: Config, said: str) -> None:
 
 def test_too_few_pictures_is_one_clear_line() -> None:
     data, _ = simulate_los(SHORT, 1)
-    with pytest.raises(InputError, match="only 0 of 375 LOS errors can be used"):
+    with pytest.raises(InputError, match="only 0 of 150 LOS errors can be used"):
         problem(replace(data, gyro_t=data.gyro_t + 100.0, gimbal_t=data.gimbal_t + 100.0), Config())
 
 

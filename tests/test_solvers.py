@@ -37,14 +37,17 @@ def test_batch_is_the_closed_form(seed: int) -> None:
     assert estimate.chi_square.value == pytest.approx(square, rel=1e-9)
 
 
+@pytest.mark.parametrize("runs", [50, pytest.param(200, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("h_of", [lambda rng: rng.standard_normal((30, 2)), lambda rng: 0.02 * rng.random((30, 2))])
-def test_degrees_of_freedom_are_the_expected_sum_of_squares(h_of: Callable[[np.random.Generator], Array]) -> None:
+def test_degrees_of_freedom_are_the_expected_sum_of_squares(
+    h_of: Callable[[np.random.Generator], Array], runs: int
+) -> None:
     """Also where priors decide as much as the data do (the second, weak one)."""
     h = h_of(np.random.default_rng(9))
-    found = [solve_batch(Walk.random(seed, h)[0].problem()).chi_square for seed in range(200)]
+    found = [solve_batch(Walk.random(seed, h)[0].problem()).chi_square for seed in range(runs)]
     value, dof = (np.array([getattr(c, what) for c in found]) for what in ("value", "dof"))
     assert np.ptp(dof) < 1e-6
-    # Standard deviation of the mean of 200: sqrt(2 dof / 200).
+    # Standard deviation of the mean: sqrt(2 dof / runs).
     assert abs(value.mean() - dof[0]) < 3.5 * np.sqrt(2.0 * dof[0] / len(dof))
     for family in ("seen", "walk"):
         squares, expected = (np.array([c.families[family][i] for c in found if c]) for i in (0, 1))
@@ -141,10 +144,11 @@ def test_history_is_what_batch_finds_on_the_data_so_far(window: float | None) ->
         np.testing.assert_allclose(sigma, np.sqrt(np.diag(covariance)), rtol=1e-5)
 
 
-def test_innovations_are_white() -> None:
+@pytest.mark.parametrize("runs", [5, pytest.param(20, marks=pytest.mark.slow)])
+def test_innovations_are_white(runs: int) -> None:
     """Their squares have the mean of their dimension."""
     squares = []
-    for seed in range(20):
+    for seed in range(runs):
         residuals = solve_incremental(Walk.random(seed)[0].problem(), None).residuals["seen"]
         late = residuals.time > 2.05  # innovations proper; what came before was solved in batch
         squares.append(residuals.whitened[late] ** 2)

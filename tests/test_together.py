@@ -34,6 +34,8 @@ from tests.broad_trials import TRIALS, converted
 from tests.one_graph import one_graph, solved
 
 EXACT = "noise_known: 0\nsensors: ideal\n"
+# An indexer's samples at the usual rates take four times as long.
+COARSE = {"gyro_rate_hz": 50.0, "encoder_rate_hz": 50.0}
 
 
 def sessions(name: str, seeds: Sequence[int], config: str, scenario: object = None) -> list[Session]:
@@ -45,16 +47,26 @@ def jointly(opened: Sequence[Session]) -> Calibration:
     return calibrate_together([partial(lambda session: session, each) for each in opened])
 
 
+TURNING = {
+    "helmet_mount_deg": [3.0, -4.0, 2.0],
+    "camera_mount_deg": [-1.0, 2.0, 1.5],
+    "priors": {},
+    "platform": {
+        "yaw": [{"amplitude_deg": 20, "frequency_hz": 0.25}],
+        "pitch": [{"amplitude_deg": 8, "frequency_hz": 0.31}],
+        "roll": [{"amplitude_deg": 12, "frequency_hz": 0.17}],
+    },
+}
 # Wide enough that the recordings alone decide.
 WIDE = EXACT + "priors: {theta_x: 10.0, theta_y: 10.0, theta_z: 10.0}\n"
 CASES = {
-    "indexer, ideal": ("indexer", EXACT, None),
+    "indexer, ideal": ("indexer", EXACT, COARSE),
     "indexer": ("indexer", "noise_known: 0", None),
-    "head with mounts, ideal": ("head", EXACT, "head_mounts"),
+    "head with mounts, ideal": ("head", EXACT, {"duration_s": 12.0, **TURNING}),
     "head, its clock the device's": (
         "head",
         "noise_known: 0\nshare: {time_offset: device, clock_skew: device, 'platform_bias_*': device}",
-        None,
+        {"duration_s": 20.0, "vision_rate_hz": 15.0, **TURNING},
     ),
 }
 
@@ -132,18 +144,6 @@ def test_errors_are_as_large_as_their_covariance_says() -> None:
         freedoms.append(float(len(kept)))
     nees = mean_nees(np.array(squares), np.array(freedoms))
     assert nees.consistent, nees
-
-
-TURNING = {
-    "helmet_mount_deg": [3.0, -4.0, 2.0],
-    "camera_mount_deg": [-1.0, 2.0, 1.5],
-    "priors": {},
-    "platform": {
-        "yaw": [{"amplitude_deg": 20, "frequency_hz": 0.25}],
-        "pitch": [{"amplitude_deg": 8, "frequency_hz": 0.31}],
-        "roll": [{"amplitude_deg": 12, "frequency_hz": 0.17}],
-    },
-}
 
 
 def linear(rng: np.random.Generator, names: tuple[str, ...], truth: Array, device: int) -> Told:
@@ -236,8 +236,8 @@ print(again.call_count, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 102
 
 
 def test_recordings_that_are_of_another_device_are_told() -> None:
-    opened = sessions("indexer", [1, 2], EXACT)
-    moved = alidade.simulate("indexer", {"mounting_deg": [0.5, -0.3 - 1.02 / 3600.0, 0.4]}, seed=3)
+    opened = sessions("indexer", [1, 2], EXACT, COARSE)
+    moved = alidade.simulate("indexer", {**COARSE, "mounting_deg": [0.5, -0.3 - 1.02 / 3600.0, 0.4]}, seed=3)
     opened.append(alidade.open(moved, config=load_config(EXACT.encode())))
     found = jointly(opened)
     assert found.status == "inconsistent"
@@ -245,7 +245,7 @@ def test_recordings_that_are_of_another_device_are_told() -> None:
 
 
 def test_a_list_of_sources_is_calibrated_together() -> None:
-    simulated = [alidade.simulate("indexer", None, seed=seed) for seed in (1, 2)]
+    simulated = [alidade.simulate("indexer", COARSE, seed=seed) for seed in (1, 2)]
     found = alidade.calibrate(simulated, config=load_config(EXACT.encode()))
     assert len(found.recordings) == 2
     assert found.status == "calibrated"
@@ -258,7 +258,9 @@ def test_what_walks_has_a_number_for_each_recording() -> None:
     walking = EXACT + "share: {'theta_*': 1.0e-6}\n"
     opened = []
     for month, arcsec in enumerate((0.0, 0.5, 0.5)):
-        simulated = alidade.simulate("indexer", {"mounting_deg": [0.5, -0.3 - arcsec / 3600.0, 0.4]}, seed=month)
+        simulated = alidade.simulate(
+            "indexer", {**COARSE, "mounting_deg": [0.5, -0.3 - arcsec / 3600.0, 0.4]}, seed=month
+        )
         later = replace(simulated.data, epoch_ns=simulated.data.epoch_ns + month * 30 * 86_400 * 10**9)
         opened.append(alidade.open(later, method="indexer", config=load_config(walking.encode())))
     found = jointly(opened)
@@ -277,7 +279,7 @@ def test_how_far_it_walks_is_told_by_the_recordings() -> None:
     rng, mounting, opened = np.random.default_rng(8), np.array([0.5, -0.3, 0.4]), []
     rate = np.deg2rad(2.0 / 3600.0) / 30.0**0.5
     for seed in range(8):
-        simulated = alidade.simulate("indexer", {"mounting_deg": mounting.tolist()}, seed=seed)
+        simulated = alidade.simulate("indexer", {**COARSE, "mounting_deg": mounting.tolist()}, seed=seed)
         config = load_config(simulated.config.encode(), load_config(b"sensors: ideal\nshare: {theta_*: walks}"))
         later = replace(simulated.data, epoch_ns=simulated.data.epoch_ns + seed * 30 * 86_400 * 10**9)
         opened.append(alidade.open(later, method="indexer", config=config))
