@@ -23,8 +23,6 @@ from tests.command import Command
 
 fsspec = pytest.importorskip("fsspec", reason="needs the extra alidade[fleet]")
 pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
-pytest.importorskip("s3fs", reason="needs the extra alidade[s3]")
-moto = pytest.importorskip("moto.server", reason="needs the tests' tools, alidade[dev]")
 
 UNITS = 4
 
@@ -49,6 +47,9 @@ class Bucket:
 
 @pytest.fixture
 def bucket(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bucket]:
+    # Imported here: it takes a second, also where these tests are left out.
+    pytest.importorskip("s3fs", reason="needs the extra alidade[s3]")
+    moto = pytest.importorskip("moto.server", reason="needs the tests' tools, alidade[dev]")
     server = moto.ThreadedMotoServer(ip_address="127.0.0.1", port=0)
     server.start()
     host, port = server.get_host_and_port()

@@ -29,6 +29,7 @@ from pipelines.reports.result import Calibration
 from pipelines.session import calibrate
 from pipelines.simulation.motion import EulerMotion, Swing
 from tests.builders import IDEAL
+from tests.command import Command
 
 ROOT = Path(__file__).resolve().parents[1]
 BRISK = EulerMotion(
@@ -216,10 +217,9 @@ def test_what_is_missing_is_said_until_the_accuracy_is_reached(whole: Path, tmp_
     assert {c.what for c in last.checklist} >= {"target", "sway about x", "sway about y", "sway about z"}
 
 
-def test_json_is_all_that_is_printed(whole: Path, tmp_path: Path) -> None:
-    command = _alidade("follow", str(whole), "--json", "--no-check", "--out", str(tmp_path / "out"))
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert json.loads(done.stdout) == json.loads((tmp_path / "out" / "result.json").read_text())
+def test_json_is_all_that_is_printed(whole: Path, tmp_path: Path, alidade: Command) -> None:
+    done = alidade("follow", whole, "--json", "--no-check", "--out", tmp_path / "out")
+    assert json.loads(done.out) == json.loads((tmp_path / "out" / "result.json").read_text())
 
 
 def test_no_file(tmp_path: Path) -> None:

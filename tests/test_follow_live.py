@@ -22,7 +22,9 @@ from pipelines.methods.los.simulation import LosScenario, los_config, simulate_l
 from pipelines.recording.growing import Growing
 from pipelines.reports.result import Calibration
 from pipelines.session import calibrate
+from pipelines.settings import Sensors
 from pipelines.simulation.motion import EulerMotion, Swing
+from tests.builders import IDEAL
 from tests.live import Bridge, Message, messages, paced, write
 
 BRISK = EulerMotion(
@@ -32,10 +34,15 @@ BRISK = EulerMotion(
 )
 
 
-def record(path: Path, seconds: float, images_hz: float, rate_hz: float) -> tuple[Path, Path]:
+def record(path: Path, seconds: float, images_hz: float, rate_hz: float, sensors: Sensors = IDEAL) -> tuple[Path, Path]:
     """A recording, and its config, which streams do not carry."""
     scenario = LosScenario(
-        duration_s=seconds, carrier=BRISK, image_rate_hz=images_hz, gyro_rate_hz=rate_hz, gimbal_rate_hz=rate_hz
+        duration_s=seconds,
+        carrier=BRISK,
+        image_rate_hz=images_hz,
+        gyro_rate_hz=rate_hz,
+        gimbal_rate_hz=rate_hz,
+        sensors=sensors,
     )
     write_los(path / "whole.mcap", *simulate_los(scenario, 2), los_config(scenario))
     (path / "c.yaml").write_text(los_config(scenario))
@@ -124,7 +131,7 @@ def test_five_seconds_as_they_come(kind: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["file", "folder", "bridge", "standard input"])
 def test_ninety_seconds_as_they_come(kind: str, tmp_path: Path) -> None:
     """In the end what the finished file says; how long a message takes to be in the estimate is printed."""
-    whole, config = record(tmp_path, 90.0, 10.0, 100.0)
+    whole, config = record(tmp_path, 90.0, 10.0, 100.0, Sensors())
     calibration, late, upto = follow_live(kind, whole, config, tmp_path)
     print(f"{kind}: median delay {np.median(late):.3f} s, 95 % below {np.percentile(late, 95):.3f} s")
     assert upto[-1] > 89.0

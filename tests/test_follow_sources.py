@@ -30,6 +30,7 @@ from pipelines.reports.result import Calibration
 from pipelines.session import calibrate
 from pipelines.simulation.motion import EulerMotion, Swing
 from tests import forms
+from tests.builders import IDEAL
 from tests.live import Bridge, messages, write
 
 connect = websockets().sync.client.connect
@@ -43,6 +44,7 @@ SCENARIO = LosScenario(
     image_rate_hz=6.0,
     gyro_rate_hz=50.0,
     gimbal_rate_hz=50.0,
+    sensors=IDEAL,
 )
 
 
@@ -80,7 +82,7 @@ def agree(calibration: Calibration, batch: Calibration, sigmas: float = 0.05) ->
     assert (difference <= sigmas * batch.estimate.sigmas).all(), difference / batch.estimate.sigmas
 
 
-def test_a_folder_in_which_splits_appear(whole: Path, batch: Calibration, tmp_path: Path) -> None:
+def test_a_folder_in_which_splits_appear(whole: Path, config: Path, batch: Calibration, tmp_path: Path) -> None:
     folder, sent = tmp_path / "bag", messages(whole)
     source = Source(folder)
     assert source.size == 0
@@ -103,7 +105,7 @@ def test_a_folder_in_which_splits_appear(whole: Path, batch: Calibration, tmp_pa
         views.append(view)
         next(parts, None)
 
-    settings = Settings(method="los", patience=30.0)
+    settings = Settings(config=config, patience=30.0)
     calibration = Follower(source, settings, show, lambda _: None, lambda: False).follow()
     assert next(parts, None) is None
     agree(calibration, batch)

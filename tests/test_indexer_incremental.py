@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,15 @@ def _problem(scenario: IndexerScenario, seed: int) -> tuple[Problem, dict[str, f
     return problem(data, config), truth
 
 
+@cache
+def _in_batch(name: str) -> tuple[Problem, dict[str, float], Estimate]:
+    """Of ideal sensors, and no more samples than it takes."""
+    coarse = {"gyro_rate_hz": 100.0, "encoder_rate_hz": 100.0}
+    scenario = load_scenario(IndexerScenario, f"indexer_{name}").model_copy(update={"sensors": IDEAL, **coarse})
+    graph, truth = _problem(scenario, 1)
+    return graph, truth, solve_batch(graph)
+
+
 def _assert_same(estimate: Estimate, batch: Estimate) -> None:
     """Values and the angles' sigmas as in batch.
 
@@ -43,9 +53,8 @@ def _assert_same(estimate: Estimate, batch: Estimate) -> None:
 @pytest.mark.parametrize("window", [1.0, None], ids=["window", "all"])
 @pytest.mark.parametrize("name", ["ideal", "rough", "large_angles", "two_positions"])
 def test_ends_where_batch_does(name: str, window: float | None) -> None:
-    ideal = load_scenario(IndexerScenario, f"indexer_{name}").model_copy(update={"sensors": IDEAL})
-    graph, truth = _problem(ideal, 1)
-    batch, incremental = solve_batch(graph), solve_incremental(graph, window)
+    graph, truth, batch = _in_batch(name)
+    incremental = solve_incremental(graph, window)
     _assert_same(incremental, batch)
     error = incremental.values - np.array([truth[n] for n in incremental.names])
     assert np.abs(error / incremental.sigmas).max() < 3.0
