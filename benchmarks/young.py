@@ -1,0 +1,297 @@
+"""The incremental solver while little is known: python -m benchmarks.young METHOD [--only CASE ...] [--seeds N] ...
+
+Recordings that begin badly, with everything to be found and every error of the sensors drawn from its prior: at rest,
+about one axis, slowly, with mounts that nobody knows, without pictures, among outliers. At ten moments of each the
+joint error is taken in units of the joint covariance (NEES); its mean over the seeds is to be the number of parameters.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import chi2
+
+from pipelines import methods
+from pipelines.graph.problem import Array, Problem, rotation_vector_coordinates
+from pipelines.methods.cube.scenario import CubeScenario, Errors
+from pipelines.methods.head.simulation import HeadScenario
+from pipelines.methods.indexer.simulation import IndexerScenario, Position
+from pipelines.methods.los.simulation import LosAngles, LosScenario
+from pipelines.methods.tumble.scenario import TumbleScenario
+from pipelines.session import Session
+from pipelines.settings import Sensors
+from pipelines.simulation.motion import EulerMotion, Swing
+from pipelines.solvers.incremental import DEFAULT_WINDOW, Run
+
+HEAD = HeadScenario(
+    duration_s=30.0, vision_rate_hz=10.0, gyro_rate_hz=100.0, latitude_deg=None, sensors=Sensors()
+)  # to be changed by the cases, as those below
+LOS = LosScenario(duration_s=30.0, image_rate_hz=10.0, gyro_rate_hz=100.0, gimbal_rate_hz=50.0, sensors=Sensors())
+INDEXER = IndexerScenario(
+    positions=[Position(axis=axis, other_deg=other, turns=1.0) for axis in ("outer", "inner") for other in (0.0, 180.0)],
+    rate_deg_s=30.0,
+    sensors=Sensors(),
+)
+CUBE = CubeScenario(
+    poses=16, errors=Errors(gain=0.2, accel_bias=2.0, gyro_bias=0.2, mag_bias=1e-4), sensors=Sensors()
+)
+TUMBLE = TumbleScenario()
+# s at rest before anything moves, and deg that a mount may be off by where nobody knows it; by seed, in turn.
+RESTS, MOUNTS = (10.0, 20.0, 30.0, 60.0), (90.0, 120.0, 180.0)
+_AXES = ("yaw", "pitch", "roll")
+# Shares of a recording's motion, or of the rest before it, at which errors are looked at.
+_LATER = np.array([0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.55, 0.75, 0.97])
+_BEFORE, _AFTER = np.array([0.15, 0.5, 0.95]), np.array([0.07, 0.1, 0.15, 0.25, 0.4, 0.6, 0.97])
+LEVEL = 0.99
+
+Case = Callable[[int], tuple[object, Array]]
+
+
+@dataclass(frozen=True)
+class Found:
+    """What came out of one recording.
+
+    Attributes:
+        method, case, seed: of which.
+        moments: s, at which the errors were looked at.
+        nees: joint errors there, in sigmas squared.
+        numbers: of free parameters.
+        worst: the largest error there of a parameter alone, in its sigmas.
+        message: of a run that did not converge; empty: it did.
+        seconds: of the processor.
+    """
+
+    method: str
+    case: str
+    seed: int
+    moments: list[float]
+    nees: list[float]
+    numbers: int
+    worst: float
+    message: str
+    seconds: float
+
+
+def beginning(motion: EulerMotion, since: Mapping[str, float], slowly: float = 0.0) -> EulerMotion:
+    """A motion, each of the axes named from some second on, the others never; for `slowly` s at a twentieth."""
+    axes: dict[str, list[Swing]] = {}
+    for axis, start in since.items():
+        whole = [swing.model_copy(update={"start_s": start + slowly}) for swing in getattr(motion, axis)]
+        slight = [
+            swing.model_copy(update={"start_s": start, "amplitude_deg": 0.05 * swing.amplitude_deg})
+            for swing in getattr(motion, axis)
+        ]
+        axes[axis] = whole + (slight if slowly else [])
+    return EulerMotion(**axes)
+
+
+def drawn_head(seed: int, **changes: object) -> HeadScenario:
+    """A head whose mount and time offset are drawn from their priors."""
+    rng = np.random.default_rng([seed, 3])
+    mount = tuple(np.rad2deg(0.35 * rng.standard_normal(3)).tolist())
+    drawn = {"helmet_mount_deg": mount, "time_offset_s": 0.05 * float(rng.standard_normal())}
+    return HEAD.model_copy(update={**drawn, **changes})
+
+
+def drawn_los(seed: int, **changes: object) -> LosScenario:
+    """A gimbal whose mounting angles are drawn from their priors."""
+    rng = np.random.default_rng([seed, 3])
+    angles = {f"delta_{name}": float(np.rad2deg(rng.normal(0.0, 0.1))) for name in ("px", "gx", "gy", "gz")}
+    return LOS.model_copy(update={"angles_deg": LosAngles(delta_pz=0.0, **angles), **changes})
+
+
+def _mount(seed: int) -> tuple[float, float, float]:
+    """Rotation vector, deg, about any axis."""
+    axis = np.random.default_rng([seed, 4]).standard_normal(3)
+    x, y, z = (MOUNTS[seed % len(MOUNTS)] * axis / np.linalg.norm(axis)).tolist()
+    return x, y, z
+
+
+def _resting(drawn: Callable[..., HeadScenario | LosScenario], motion: EulerMotion, seed: int) -> tuple[object, Array]:
+    rest = RESTS[seed % len(RESTS)]
+    since = beginning(motion, dict.fromkeys(_AXES, rest))
+    moving = {"head" if drawn is drawn_head else "carrier": since, "duration_s": rest + 20.0}
+    return drawn(seed, **moving), np.concatenate([rest * _BEFORE, rest + 20.0 * _AFTER])
+
+
+def _indexer(seed: int, **changes: object) -> tuple[object, Array]:
+    mount = np.rad2deg(0.1 * np.random.default_rng([seed, 3]).standard_normal(3))
+    return INDEXER.model_copy(update={"mounting_deg": tuple(mount.tolist()), **changes}), _LATER
+
+
+def _free(names: Sequence[str]) -> dict[str, None]:
+    return dict.fromkeys(names)
+
+
+HELMET = [f"helmet_mount_{axis}" for axis in "xyz"]
+THETA = [f"theta_{axis}" for axis in "xyz"]
+ONE, ALL = {"yaw": 0.0}, dict.fromkeys(_AXES, 0.0)
+# Method -> case -> a seed's scenario and the moments, s or, where the duration comes out of the motion, its shares.
+CASES: dict[str, dict[str, Case]] = {
+    "head": {
+        "rest": lambda seed: _resting(drawn_head, HEAD.head, seed),
+        "one axis": lambda seed: (drawn_head(seed, head=beginning(HEAD.head, ONE)), 30.0 * _LATER),
+        "slow": lambda seed: (drawn_head(seed, head=beginning(HEAD.head, ALL, 15.0)), 30.0 * _LATER),
+        "mount": lambda seed: (
+            drawn_head(seed, helmet_mount_deg=_mount(seed), priors=_free(HELMET)),
+            30.0 * _LATER,
+        ),
+        "dropouts": lambda seed: (
+            drawn_head(seed, vision_outages_s=[(0.0, 0.8), (1.3, 3.0), (3.5, 6.0)]),
+            30.0 * _LATER,
+        ),
+        "outliers": lambda seed: (drawn_head(seed, outlier_fraction=0.2), 30.0 * _LATER),
+    },
+    "los": {
+        "rest": lambda seed: _resting(drawn_los, LOS.carrier, seed),
+        "one axis": lambda seed: (drawn_los(seed, carrier=beginning(LOS.carrier, ONE)), 30.0 * _LATER),
+        "slow": lambda seed: (drawn_los(seed, carrier=beginning(LOS.carrier, ALL, 15.0)), 30.0 * _LATER),
+        "dropouts": lambda seed: (
+            drawn_los(seed, dropouts_s=[(0.0, 0.8), (1.3, 3.0), (3.5, 6.0)]),
+            30.0 * _LATER,
+        ),
+        "outliers": lambda seed: (drawn_los(seed, outlier_share=0.2), 30.0 * _LATER),
+    },
+    "indexer": {
+        "rest": lambda seed: _indexer(seed, dwell_s=RESTS[seed % len(RESTS)]),
+        "one axis": lambda seed: _indexer(seed, positions=INDEXER.positions[:2]),
+        "slow": lambda seed: _indexer(seed, acceleration_deg_s2=2.0),
+        "mount": lambda seed: _indexer(seed, mounting_deg=_mount(seed), priors=_free(THETA)),
+    },
+    "cube": {
+        "rest": lambda seed: (CUBE.model_copy(update={"static_s": 12.0}), _LATER),
+        "one axis": lambda seed: (CUBE.model_copy(update={"turn_axes": [(0.0, 0.0, 1.0)]}), _LATER),
+        "slow": lambda seed: (CUBE.model_copy(update={"turn_rad_s": 0.3}), _LATER),
+    },
+    "tumble": {
+        "rest": lambda seed: (TUMBLE.model_copy(update={"rest_s": 3.0}), _LATER),
+        "one axis": lambda seed: (TUMBLE.model_copy(update={"tilt_deg": 10.0}), _LATER),
+        "slow": lambda seed: (TUMBLE.model_copy(update={"turn_rad_s": 0.4}), _LATER),
+    },
+}
+
+
+def made(method: str, settings: object, seed: int) -> tuple[Problem, Array]:
+    """The graph of a simulated recording and the true values (n,) of its parameters.
+
+    What is added to sigmas for what the simulation does not have is left out.
+    """
+    chosen = methods.method(method)
+    simulated = chosen.simulate(settings, seed)
+    problem = Session.of(chosen, simulated).problem()
+    parameters = tuple(
+        replace(p, quantities=tuple(replace(q, extra_sigma=0.0) for q in p.quantities)) for p in problem.parameters
+    )
+    return replace(problem, parameters=parameters), np.array([simulated.truth[q.name] for q in problem.quantities])
+
+
+def nees(values: Array, covariance: Array, truth: Array) -> tuple[float, int]:
+    """Joint error in sigmas squared, and of how many numbers."""
+    free = np.diag(covariance) > 0.0
+    sigma = np.sqrt(np.diag(covariance)[free])
+    error = (values - truth)[free] / sigma
+    return float(error @ np.linalg.solve(covariance[np.ix_(free, free)] / np.outer(sigma, sigma), error)), len(error)
+
+
+def followed(problem: Problem, truth: Array, moments: Array) -> tuple[list[float], list[float], int, float, str]:
+    """Times looked at, joint errors there, numbers, the worst error alone, what did not converge."""
+    run = Run(problem, DEFAULT_WINDOW)
+    times: list[float] = []
+    found: list[float] = []
+    numbers, worst, messages = 0, 0.0, []
+    for step in problem.steps(1):
+        run.add_step(step)
+        if len(found) < len(moments) and step.time >= moments[len(found)]:
+            values, covariance = run.values(), run.covariance()
+            true = _nearest(problem, truth, values)
+            size, numbers = nees(values, covariance, true)
+            times.append(step.time)
+            found.append(size)
+            sigma = np.sqrt(np.diag(covariance))
+            worst = max(worst, float(np.max(np.abs(values - true)[sigma > 0.0] / sigma[sigma > 0.0])))
+            estimate = run.estimate()
+            messages += [] if estimate.converged else [estimate.message]
+    final = run.finish(0.0)
+    return times, found, numbers, worst, "; ".join([*messages, *([] if final.converged else [final.message])])
+
+
+def _nearest(problem: Problem, truth: Array, values: Array) -> Array:
+    """The true values with rotation vectors, of which one turn more is the same, as near to the estimates as can be."""
+    found, start = truth.copy(), 0
+    for p in problem.parameters:
+        of, start = slice(start, start + len(p.quantities)), start + len(p.quantities)
+        if p.coordinates is rotation_vector_coordinates and (angle := np.linalg.norm(found[of])) > 0.0:
+            other = found[of] * (1.0 - 2.0 * np.pi / angle)
+            if np.linalg.norm(other - values[of]) < np.linalg.norm(found[of] - values[of]):
+                found[of] = other
+    return found
+
+
+def run(method: str, case: str, seed: int) -> Found:
+    """Simulate and follow one recording."""
+    # No two cases of a method draw the same.
+    number = 1000 * list(CASES[method]).index(case) + seed
+    settings, moments = CASES[method][case](number)
+    problem, truth = made(method, settings, number)
+    if moments[-1] <= 1.0:
+        moments = moments * [step.time for step in problem.steps(1)][-1]
+    begun = time.process_time()
+    times, found, numbers, worst, message = followed(problem, truth, moments)
+    return Found(method, case, seed, times, found, numbers, worst, message, time.process_time() - begun)
+
+
+def report(found: Sequence[Found]) -> Iterator[str]:
+    """A table with the mean NEES at each moment, per case, and how it stands to its interval."""
+    yield "| case | recordings | numbers | mean joint NEES at the ten moments | 99 % interval | outside | worst alone, sigmas | not converged |"
+    yield "| --- | --- | --- | --- | --- | --- | --- | --- |"
+    for case in dict.fromkeys(f.case for f in found):
+        of = [f for f in found if f.case == case]
+        few = min(len(f.nees) for f in of)
+        mean = np.mean([f.nees[:few] for f in of], axis=0)
+        low, high = interval(of[0].numbers, len(of))
+        outside = int(((mean < low) | (mean > high)).sum())
+        yield (
+            f"| {case} | {len(of)} | {of[0].numbers} | {', '.join(f'{x:.1f}' for x in mean)} | {low:.1f} to {high:.1f} | "
+            f"{outside} | {max(f.worst for f in of):.1f} | {sum(bool(f.message) for f in of)} |"
+        )
+
+
+def interval(numbers: int, recordings: int) -> tuple[float, float]:
+    """Of the mean NEES of so many recordings, if the covariances are true."""
+    low, high = chi2.ppf([0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL], numbers * recordings) / recordings
+    return float(low), float(high)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the study of one method; what FILE already has is not run again."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.young", description=__doc__.split("\n\n")[1])
+    parser.add_argument("method", choices=CASES)
+    parser.add_argument("--only", nargs="+", metavar="CASE", help="default: all")
+    parser.add_argument("--seeds", type=int, default=50)
+    parser.add_argument("--out", type=Path, metavar="FILE", help="where to write what came out, a line each (JSON)")
+    options = parser.parse_args(arguments)
+    found: list[Found] = []
+    if options.out is not None and options.out.exists():
+        found = [Found(**json.loads(line)) for line in options.out.read_text().splitlines()]
+    done = {(f.method, f.case, f.seed) for f in found}
+    for seed in range(options.seeds):
+        for case in options.only or CASES[options.method]:
+            if (options.method, case, seed) in done:
+                continue
+            found.append(run(options.method, case, seed))
+            if options.out is not None:
+                with options.out.open("a") as lines:
+                    lines.write(json.dumps(asdict(found[-1])) + "\n")
+    print("\n".join(report([f for f in found if f.method == options.method])))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
