@@ -2,57 +2,32 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from pipelines.config import load_config
+from benchmarks.young import CASES, beginning, followed, made, nees, report, run
 from pipelines.graph.problem import Array, Estimate, Problem
-from pipelines.methods.head import graph as head
-from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from pipelines.methods.head.simulation import HeadScenario
 from pipelines.settings import Sensors
 from pipelines.simulation.motion import EulerMotion
 from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.incremental import Run, solve_incremental
+from pipelines.solvers.incremental import solve_incremental
 
 MOUNT = slice(3, 6)
 PRIOR = 0.35
 SCENARIO = HeadScenario(vision_rate_hz=10.0, gyro_rate_hz=100.0, sensors=Sensors(), helmet_mount_deg=(12.0, -8.0, 10.0))
 
 
-def _motion(since: dict[str, float]) -> EulerMotion:
-    """The nominal head motion, each axis from some second on."""
-    axes = {
-        axis: [swing.model_copy(update={"start_s": since[axis]}) for swing in getattr(SCENARIO.head, axis)]
-        for axis in since
-    }
-    return EulerMotion(**axes)
+def _made(seed: int, **changes: object) -> tuple[Problem, Array]:
+    """The problem and the true values of its parameters."""
+    return made("head", SCENARIO.model_copy(update=changes), seed)
 
 
 def _rest_first(rest_s: float) -> EulerMotion:
-    return _motion(dict.fromkeys(("yaw", "pitch", "roll"), rest_s))
-
-
-def _made(seed: int, **changes: object) -> tuple[Problem, Array]:
-    """The problem and the true values of its parameters."""
-    scenario = SCENARIO.model_copy(update=changes)
-    data, truth = simulate_head(scenario, seed)
-    problem = head.problem(data, load_config(head_config(scenario).encode()))
-    return problem, np.array([truth[q.name] for q in problem.quantities])
-
-
-def _nees(problem: Problem, truth: Array, moments: Array) -> list[float]:
-    """Joint errors, in sigmas squared, at some times."""
-    run = Run(problem, 1.0)
-    found: list[float] = []
-    for step in problem.steps(1):
-        run.add_step(step)
-        if len(found) < len(moments) and step.time >= moments[len(found)]:
-            error, covariance = run.values() - truth, run.covariance()
-            free = np.diag(covariance) > 0.0
-            found.append(float(error[free] @ np.linalg.solve(covariance[np.ix_(free, free)], error[free])))
-    assert run.finish(0.0).converged
-    return found
+    return beginning(SCENARIO.head, dict.fromkeys(("yaw", "pitch", "roll"), rest_s))
 
 
 def _apart(one: Estimate, other: Estimate) -> float:
@@ -73,7 +48,7 @@ def test_nothing_is_made_up_at_rest() -> None:
 
 
 def test_a_mount_about_the_only_axis_of_motion_keeps_its_prior() -> None:
-    problem, _ = _made(2, duration_s=8.0, head=_motion({"yaw": 0.0}))
+    problem, _ = _made(2, duration_s=8.0, head=beginning(SCENARIO.head, {"yaw": 0.0}))
     batch, incremental = solve_batch(problem), solve_incremental(problem)
     for estimate in (batch, incremental):
         widest = np.linalg.eigvalsh(estimate.covariance[MOUNT, MOUNT])[-1]
@@ -92,15 +67,38 @@ def test_outliers_from_the_first_picture_on_are_judged_again_when_more_is_known(
 @pytest.mark.slow
 def test_errors_fit_their_covariance_at_all_times() -> None:
     moments = np.array([2.0, 5.0, 8.0, 12.0, 16.0, 19.0])
-    nees = np.mean([_nees(*_made(seed, duration_s=20.0, head=_rest_first(10.0)), moments) for seed in range(3)], axis=0)
-    dof = 3 * 24
-    assert (nees * 3 < chi2.ppf(0.9995, dof)).all(), nees
+    found = [followed(*_made(seed, duration_s=20.0, head=_rest_first(10.0)), moments) for seed in range(3)]
+    assert not any(each.message for each in found)
+    nees = np.sum([each.nees for each in found], axis=0)
+    assert (nees < chi2.ppf(0.9995, 3 * found[0].numbers)).all(), nees
 
 
 @pytest.mark.slow
 def test_a_second_axis_after_the_run_was_folded() -> None:
     since = {"yaw": 0.0, "pitch": 45.0, "roll": 45.0}
-    problem, truth = _made(4, duration_s=60.0, head=_motion(since))
+    problem, truth = _made(4, duration_s=60.0, head=beginning(SCENARIO.head, since))
     batch, incremental = solve_batch(problem), solve_incremental(problem)
     assert _apart(incremental, batch) < 0.3
     assert np.abs((incremental.values - truth) / np.maximum(incremental.sigmas, 1e-12))[MOUNT].max() < 4.0
+
+
+@pytest.mark.parametrize(("seed", "until_s"), [(4001, 3.4), (4002, 1.35)])
+def test_outliers_among_few_pictures_lead_to_no_far_minimum(seed: int, until_s: float) -> None:
+    """Plain least squares ends where assumptions are tens of their priors' sigmas off."""
+    settings, _ = CASES["los"]["outliers"](seed)
+    problem, truth = made("los", settings.model_copy(update={"duration_s": 5.0}), seed)
+    first = [step for step in problem.steps(1) if step.time <= until_s]
+    estimate = solve_batch(replace(problem, steps=lambda _: iter(first)))
+    size, numbers = nees(estimate.values, estimate.covariance, truth)
+    assert estimate.converged
+    assert size < chi2.ppf(0.999, numbers)
+    assert 0 < estimate.rejected["los"] < 0.4 * len(first)
+
+
+def test_the_study_follows_a_recording_to_its_end() -> None:
+    found = run("indexer", "one axis", 0)
+    assert len(found.moments) == len(found.nees) == 10
+    assert not found.message
+    assert found.numbers == 17
+    assert found.worst < 4.0
+    assert len(list(report([found]))) == 3

@@ -363,20 +363,56 @@ def optimize(
     start = values
     plain = _minimize(unweighed, start, _ROUGH_TOLERANCE * measurements, min(most, _MOST_PLAIN) if held else most)
     values, iterations = plain.values, plain.iterations
-    norms = np.concatenate([np.linalg.norm(r.whitened, axis=1) for r in unweighed.residuals(values).values()])
-    outlying = norms[norms > loss.gate]
-    if outlying.sum() > _MILD_PULL * len(norms):
+    norms = _norms(unweighed, values)
+    outlying = norms[norms > loss.gate].sum() > _MILD_PULL * len(norms)
+    if outlying:
         if held:
             tied = System.of([*factors, *(_tie(key, start.atVector(key)) for key in held)], shared, None)
             plain_but_held = _minimize(tied, start, _ROUGH_TOLERANCE * measurements, most)
             values, iterations = plain_but_held.values, iterations + plain_but_held.iterations
-        mu = loss.gate**2 / (2.0 * float(outlying.max()) ** 2 - loss.gate**2)
-        while mu < 1e3:
-            relaxed = _minimize(unweighed.under(replace(loss, mu=mu)), values, most=2)
-            values, iterations = relaxed.values, iterations + relaxed.iterations
-            mu *= 4.0
-    final = _truncated(unweighed, loss, values, plain.values, most)
-    return replace(final, iterations=iterations + final.iterations)
+        values, more = _relaxed(unweighed, loss, values, float(norms.max()))
+        iterations += more
+    final, sound = _truncated(unweighed, loss, values, plain.values, most)
+    iterations += final.iterations
+    if outlying and not (sound and final.converged):
+        # Among few measurements outliers lead plain least squares far beyond what the priors allow, and what is found
+        # from there is none of the likely minima. With noise as large as they are the priors keep their say.
+        soft = _minimize(System.of(_softened(factors, float(norms.max()) / loss.gate), shared, None), start, most=most)
+        values, more = _relaxed(unweighed, loss, soft.values, float(_norms(unweighed, soft.values).max()))
+        again, _ = _truncated(unweighed, loss, values, soft.values, most)
+        iterations += soft.iterations + more + again.iterations
+        truncated = unweighed.under(loss)
+        if truncated.error(again.values) < truncated.error(final.values):
+            final = again
+    return replace(final, iterations=iterations)
+
+
+def _norms(system: System, values: gtsam.Values) -> Array:
+    """Whitened norms of all measurements."""
+    return np.concatenate([np.linalg.norm(r.whitened, axis=1) for r in system.residuals(values).values()])
+
+
+def _softened(factors: Sequence[Factor], by: float) -> list[Factor]:
+    """The factors with the noise of all measurements so many times as large."""
+    return [
+        f
+        if (m := f.measurement) is None
+        else Factor.of(f.family, m.weighed((np.ones(1) if m.weights is None else m.weights) / by), f.beside)
+        for f in factors
+    ]
+
+
+def _relaxed(unweighed: System, loss: TruncatedLoss, values: gtsam.Values, largest: float) -> tuple[gtsam.Values, int]:
+    """Values to which one surrogate of the loss after the other leads, and the iterations that takes.
+
+    `largest` is the largest whitened norm of a measurement, for which the first surrogate is convex.
+    """
+    iterations, mu = 0, loss.gate**2 / max(2.0 * largest**2 - loss.gate**2, 1e-300)
+    while mu < 1e3:
+        relaxed = _minimize(unweighed.under(replace(loss, mu=mu)), values, most=2)
+        values, iterations = relaxed.values, iterations + relaxed.iterations
+        mu *= 4.0
+    return values, iterations
 
 
 def with_levels(
@@ -420,17 +456,22 @@ def _again(problem: Problem, system: System, values: gtsam.Values, far: bool, mo
         return _minimize(system, values, most=most)
     if far:
         return optimize(system.factors, values, system.shared, problem.loss, most, held=problem.assumed)
-    return _truncated(system, problem.loss, values, values, most)
+    return _truncated(system, problem.loss, values, values, most)[0]
 
 
 def _truncated(
     unweighed: System, loss: TruncatedLoss, values: gtsam.Values, plain: gtsam.Values, most: int
-) -> Solution:
-    """Least squares on what lies inside the gate, from some values; on all, from plain ones, where few do."""
+) -> tuple[Solution, bool]:
+    """Least squares on what lies inside the gate, from some values, and whether most do.
+
+    Where few do it is least squares on all, from plain values.
+    """
     truncated = unweighed.under(loss)
     final = _minimize(truncated, values, most=most)
     used = np.concatenate([r.used for r in truncated.residuals(final.values).values()])
-    return _minimize(unweighed, plain, most=most) if used.mean() < _FEWEST_USED else final
+    if used.mean() < _FEWEST_USED:
+        return _minimize(unweighed, plain, most=most), False
+    return final, True
 
 
 def _tie(key: int, at: Array) -> Factor:
