@@ -30,7 +30,7 @@ from pipelines.solvers.linearity import is_linear
 from pipelines.solvers.marginals import IndeterminateError, reported, reported_covariance
 from pipelines.solvers.noise_levels import weigh
 from pipelines.solvers.rows import Rows
-from pipelines.solvers.smoother import Smoother, linearized, unweighed, used_part
+from pipelines.solvers.smoother import FixedLag, Smoother, Unlimited, linearized, unweighed, used_part
 from pipelines.solvers.spurious import information_of_noise
 from pipelines.solvers.state import State, explained, require_known, require_sound
 from pipelines.solvers.window import Keyframes, Window
@@ -312,10 +312,8 @@ class Run:
                 used = self.innovations.accept(f, prediction, gated=self.problem.loss is not None)
                 if used is not None:
                     measurements.append(unweighed(used))
-        if self._fixed or (self.window is not None and self.innovations.rejected_in_a_row == 0):
-            measurements = [linearized(f, point) for f in measurements]
-            processes = [f if f.vectorized is None else linearized(f, point) for f in processes]
-        return processes + measurements
+        found = processes + measurements
+        return found if self.window is None else [linearized(f, point) for f in found]
 
     def _aged(self, timestamps: Mapping[int, float]) -> dict[int, float]:
         """Times of last use, s, in the window's unit: the number of the step, one a keyframe, or as they are."""
@@ -443,7 +441,7 @@ class Run:
         self._start([state.factor], state.estimate, state.stamps)
 
     def _start(self, factors: Sequence[Factor], values: gtsam.Values, stamps: Mapping[int, float]) -> None:
-        self._smoother = Smoother(self.window, self._fixed)
+        self._smoother = Unlimited() if self.window is None else FixedLag(self.window)
         self._stamps = dict(stamps)
         try:
             self._smoother.update(factors, values, stamps)

@@ -15,7 +15,7 @@ from pipelines.graph.problem import Array, ChiSquare, Factor, Residuals
 from pipelines.solvers.batch import graph_of, residuals_of
 from pipelines.solvers.marginals import ordering_of
 from pipelines.solvers.rows import Rows
-from pipelines.solvers.smoother import Smoother
+from pipelines.solvers.smoother import Smoother, slices
 
 # After so many rejections in a row it is the prediction that is wrong: take the measurement.
 _MOST_REJECTED = 10
@@ -44,11 +44,11 @@ class Prediction:
         involved = set(self._process.keyVector())
         held = [k for k in dict.fromkeys([*keys, *involved]) if k not in fresh]
         P = self.smoother.covariance(held)
-        where = _slices(held + fresh, dims)
+        where = slices(held + fresh, dims)
         if fresh:
             order = [k for k in held if k in involved] + fresh
             A = self._process.jacobian(ordering_of(order))[0]
-            columns = _slices(order, dims)
+            columns = slices(order, dims)
             inverse = np.linalg.pinv(A[:, columns[fresh[0]].start :])
             carry = np.zeros((inverse.shape[0], P.shape[0]))
             for key in order[: -len(fresh)]:
@@ -158,9 +158,3 @@ class Innovations:
             family: int((rows.array[:, 1] == 0.0).sum()) + self.unusable.get(family, 0)
             for family, rows in self.families.items()
         }
-
-
-def _slices(keys: Sequence[int], dims: Mapping[int, int]) -> dict[int, slice]:
-    """Where each variable stands when they are stacked in this order."""
-    ends = np.cumsum([dims[key] for key in keys])
-    return {key: slice(int(end) - dims[key], int(end)) for key, end in zip(keys, ends, strict=True)}

@@ -1,32 +1,50 @@
-"""iSAM2, in a fixed-lag window or over everything."""
+"""What takes a recording step by step: iSAM2 over everything, or a fixed-lag smoother in square-root form."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from collections.abc import Collection, Mapping, Sequence
+from typing import Protocol
 
 import gtsam
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from factors.loss import TruncatedLoss
 from pipelines.graph.problem import Array, Factor
 from pipelines.solvers.batch import graph_of
+from pipelines.solvers.marginals import ordering_of
 
 # Move of a variable, in its own units (rad, rad/s, s), that makes iSAM2 linearise its factors anew.
 _RELINEARIZE = 1e-2
 
 
-class Smoother:
-    """iSAM2 with a window (s) or without (None), behind one face.
+class Smoother(Protocol):
+    """What a run asks of either."""
 
-    Args:
-        window: s.
-        fixed: each variable stays linearised where it began.
-    """
+    def update(self, factors: Sequence[Factor], values: gtsam.Values, stamps: Mapping[int, float]) -> None:
+        """Add factors and new variables; `stamps` are times of last use, of those that age.
 
-    def __init__(self, window: float | None, fixed: bool = False) -> None:
+        Raises RuntimeError, which spoils the smoother, if the system is singular.
+        """
+
+    def point(self) -> gtsam.Values:
+        """The values about which the variables are linearised; the caller may add to them."""
+
+    def estimate(self) -> gtsam.Values:
+        """Current values of all variables held; the caller may add to them."""
+
+    def linearized(self) -> tuple[gtsam.GaussianFactorGraph, gtsam.Values]:
+        """All that is known of the variables held, and about which values it is linear."""
+
+    def covariance(self, keys: Sequence[int]) -> Array:
+        """Joint marginal covariance of the variables, in their order."""
+
+
+class Unlimited:
+    """iSAM2, which forgets nothing: what has moved is linearised anew."""
+
+    def __init__(self) -> None:
         params = gtsam.ISAM2Params()
-        params.enableRelinearization = not fixed
         params.setRelinearizeThreshold(_RELINEARIZE)
         params.relinearizeSkip = 1
         params.findUnusedFactorSlots = True
@@ -34,56 +52,129 @@ class Smoother:
         params.setFactorization("QR")
         # Back-substitution goes on however small a change is: 0.001, gtsam's limit, is much for a bias in rad/s.
         params.setOptimizationParams(gtsam.ISAM2GaussNewtonParams(0.0))
-        self._lagged = None if window is None else gtsam.IncrementalFixedLagSmoother(window, params)
-        self._plain = gtsam.ISAM2(params)
-        self._kept: set[int] = set()  # variables that stay for good
+        self._isam = gtsam.ISAM2(params)
         self._estimate = gtsam.Values()
 
-    def update(self, factors: Sequence[Factor], values: gtsam.Values, stamps: Mapping[int, float]) -> None:
-        """Add factors and new variables. Raises RuntimeError, which spoils the smoother, if the system is singular."""
-        if self._lagged is None:
-            self._plain.update(graph_of(factors), values)
-            self._estimate = self._plain.calculateEstimate()
-            return
-        self._kept = (self._kept | set(values.keys())) - stamps.keys()
-        if stamps:
-            # Without a time of their own gtsam would order them among the variables about to be forgotten, and now and
-            # then before one of these, which then cannot be taken out of the Bayes tree.
-            stamps = {**stamps, **dict.fromkeys(self._kept, max(stamps.values()))}
-        self._lagged.update(graph_of(factors), values, cast(Any, stamps))
-        self._estimate = self._lagged.calculateEstimate()
+    def update(self, factors: Sequence[Factor], values: gtsam.Values, _stamps: Mapping[int, float]) -> None:
+        """As Smoother has it."""
+        self._isam.update(graph_of(factors), values)
+        self._estimate = self._isam.calculateEstimate()
 
     def point(self) -> gtsam.Values:
-        """The values about which the variables are linearised; the caller may add to them."""
-        isam = self._plain if self._lagged is None else self._lagged.getISAM2()
-        return gtsam.Values(isam.getLinearizationPoint())
+        """As Smoother has it."""
+        return gtsam.Values(self._isam.getLinearizationPoint())
 
     def estimate(self) -> gtsam.Values:
-        """Current values of all variables held; the caller may add to them."""
+        """As Smoother has it."""
         return gtsam.Values(self._estimate)
 
     def linearized(self) -> tuple[gtsam.GaussianFactorGraph, gtsam.Values]:
-        """All factors held, and about which values they are linear.
-
-        Those that stand for forgotten variables know no others: iSAM2 never moves the variables in them.
-        """
-        isam = self._plain if self._lagged is None else self._lagged.getISAM2()
-        point = isam.getLinearizationPoint()
-        return isam.getFactorsUnsafe().linearize(point), point
+        """As Smoother has it."""
+        point = self._isam.getLinearizationPoint()
+        return self._isam.getFactorsUnsafe().linearize(point), point
 
     def covariance(self, keys: Sequence[int]) -> Array:
-        """Joint marginal covariance of the variables, in their order."""
-        isam = self._plain if self._lagged is None else self._lagged.getISAM2()
-        joint = isam.jointMarginalCovariance(list(keys))
+        """As Smoother has it."""
+        joint = self._isam.jointMarginalCovariance(list(keys))
         return np.block([[joint.at(i, j) for j in keys] for i in keys])
+
+
+class FixedLag:
+    """A Gaussian in square-root form: the variables in use, and those of the window before, given these.
+
+    In use are the variables of the last moment and those that never age: a few dozen numbers that every measurement
+    joins, so that they are one dense block. The others were eliminated from it in time order and hang on it until their
+    time leaves the window; a factor on one of them takes it back, with what is younger. Each variable stays linearised
+    where it began, for good.
+
+    Args:
+        window: how long variables are held after their last use, s or whatever the stamps count.
+    """
+
+    def __init__(self, window: float) -> None:
+        self._window = window
+        self._stamps: dict[int, float] = {}
+        self._past: list[tuple[int, gtsam.GaussianConditional]] = []  # a variable, given younger ones; oldest first
+        self._present: gtsam.GaussianConditional | None = None  # of the variables in use
+        self._point = gtsam.Values()
+        self._estimate = gtsam.Values()
+
+    def update(self, factors: Sequence[Factor], values: gtsam.Values, stamps: Mapping[int, float]) -> None:
+        """As Smoother has it; a factor that is not linear yet (`linearized`) is linearised about `point`."""
+        self._point.insert(values)
+        self._stamps.update(stamps)
+        graph = graph_of(factors).linearize(self._point)
+        first = self._oldest({key for f in factors for key in f.factor.keys()}.union(stamps))
+        graph.push_back(self._known(first))
+        del self._past[first:]
+        latest = max(self._stamps.values(), default=0.0)
+        keys = graph.keyVector()
+        for key in sorted((k for k in keys if self._stamps.get(k, latest) < latest), key=self._stamps.__getitem__):
+            conditional, rest = gtsam.EliminateQR(graph, ordering_of([key]))
+            self._past.append((key, conditional))
+            graph = gtsam.GaussianFactorGraph()
+            graph.add(rest)
+        in_use = [key for key in keys if self._stamps.get(key, latest) >= latest]
+        self._present, _ = gtsam.EliminateQR(graph, ordering_of(in_use))
+        while self._past and self._stamps[self._past[0][0]] < latest - self._window:
+            key, _ = self._past.pop(0)
+            self._point.erase(key)
+            del self._stamps[key]
+        bayes_net = gtsam.GaussianBayesNet()
+        for conditional in (*(conditional for _, conditional in self._past), self._present):
+            bayes_net.push_back(conditional)
+        self._estimate = self._point.retract(bayes_net.optimize())
+
+    def point(self) -> gtsam.Values:
+        """As Smoother has it."""
+        return gtsam.Values(self._point)
+
+    def estimate(self) -> gtsam.Values:
+        """As Smoother has it."""
+        return gtsam.Values(self._estimate)
+
+    def linearized(self) -> tuple[gtsam.GaussianFactorGraph, gtsam.Values]:
+        """As Smoother has it."""
+        return self._known(0), self._point
+
+    def covariance(self, keys: Sequence[int]) -> Array:
+        """As Smoother has it."""
+        assert self._present is not None
+        first = self._oldest(keys)
+        order = [*(key for key, _ in self._past[first:]), *self._present.keys()]
+        R, _ = self._known(first).jacobian(ordering_of(order))
+        where = slices(order, self._point.dims())
+        inverse = solve_triangular(R, np.eye(len(R)), check_finite=False)
+        rows = np.concatenate([inverse[where[key]] for key in keys])
+        return np.asarray(rows @ rows.T)
+
+    def _oldest(self, keys: Collection[int]) -> int:
+        """Where in the past the oldest of the variables is; its end if none is in it."""
+        return next((i for i, (key, _) in enumerate(self._past) if key in keys), len(self._past))
+
+    def _known(self, first: int) -> gtsam.GaussianFactorGraph:
+        """What is known of the variables in use and of those of the past from one on."""
+        graph = gtsam.GaussianFactorGraph()
+        for _, conditional in self._past[first:]:
+            graph.push_back(conditional)
+        if self._present is not None:
+            graph.push_back(self._present)
+        return graph
+
+
+def slices(keys: Sequence[int], dims: Mapping[int, int]) -> dict[int, slice]:
+    """Where each variable stands when they are stacked in this order."""
+    found, start = {}, 0
+    for key in keys:
+        found[key] = slice(start, start + dims[key])
+        start += dims[key]
+    return found
 
 
 def linearized(factor: Factor, values: gtsam.Values) -> Factor:
     """The factor as it is about the values, for good.
 
-    iSAM2 would not move the point either unless a variable moved by _RELINEARIZE, but ask a Python factor for the same
-    numbers again at every update. What moves farther in the first moments is made good by the next re-initialisation,
-    which solves the steps' own factors.
+    What moves far in the first moments is made good by the next re-initialisation, which solves the steps' own factors.
     """
     return Factor(factor.family, gtsam.LinearContainerFactor(factor.factor.linearize(values), values))
 
