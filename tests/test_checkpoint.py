@@ -23,7 +23,7 @@ from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
 from pipelines.solvers.incremental import Run, solve_incremental
-from pipelines.solvers.smoother import Smoother
+from pipelines.solvers.smoother import FixedLag
 from tests.builders import IDEAL
 
 BRISK = EulerMotion(
@@ -158,7 +158,7 @@ def test_a_checkpoint_takes_the_place_of_the_old_one_whole_or_not_at_all(
 
 
 def test_a_smoother_that_throws_is_built_anew_from_what_is_known(saved: Saved, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = Smoother.update
+    whole = FixedLag.update
     calls = 0
 
     def update(*arguments: object) -> None:
@@ -168,7 +168,7 @@ def test_a_smoother_that_throws_is_built_anew_from_what_is_known(saved: Saved, m
             raise RuntimeError("indeterminate")
         whole(*arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(Smoother, "update", update)
+    monkeypatch.setattr(FixedLag, "update", update)
     end = solve_incremental(replace(saved.made))
     assert calls > 450
     assert np.abs((end.values - saved.end.values) / saved.end.sigmas).max() < 0.05
@@ -177,7 +177,7 @@ def test_a_smoother_that_throws_is_built_anew_from_what_is_known(saved: Saved, m
 
 def test_a_smoother_that_throws_late_loses_no_attitudes(saved: Saved, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those from before the past was marginalised out were recorded then, and only then."""
-    whole, calls = Smoother.update, 0
+    whole, calls = FixedLag.update, 0
 
     def update(*arguments: object) -> None:
         nonlocal calls
@@ -189,7 +189,7 @@ def test_a_smoother_that_throws_late_loses_no_attitudes(saved: Saved, monkeypatc
     def attitudes(keyframes: Sequence[int], _: object) -> Attitudes:
         return Attitudes(np.array(keyframes, dtype=float), np.tile([1.0, 0.0, 0.0, 0.0], (len(keyframes), 1)))
 
-    monkeypatch.setattr(Smoother, "update", update)
+    monkeypatch.setattr(FixedLag, "update", update)
     end = solve_incremental(replace(saved.made, attitudes=attitudes))
     assert calls > 450
     assert end.attitudes is not None

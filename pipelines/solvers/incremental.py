@@ -197,10 +197,9 @@ class Run:
         if self._young:
             if self._due(since):
                 self._reinitialize()
-        elif since >= MARGINALIZE_EVERY and self._smoother is not None:
-            alive = self._alive(self._smoother.estimate(), self._stamps)
-            if alive is not None:
-                self._continue_from(State.of(step.time, *self._smoother.linearized(), alive, self._stamps))
+        elif since >= MARGINALIZE_EVERY and isinstance(self._smoother, FixedLag):
+            known, about = self._smoother.linearized()
+            self._continue_from(State.of(step.time, known, about, _in_use(about, self._stamps), self._stamps))
 
     def values(self) -> Array:
         """The parameters now, as reported."""
@@ -277,18 +276,13 @@ class Run:
     def _advance(self, smoother: Smoother, step: Step) -> None:
         """Predict the new states, then take the measurements that agree with the prediction."""
         try:
-            values = smoother.estimate()
-            new = step.initial if step.predict is None else step.predict(values)
-            values.insert(new)
-            point, begins = values, new
-            if self._fixed:
-                # Linearised all about one value of each parameter: else what they cannot be told apart by would seem to
-                # be known (first-estimates Jacobians, Huang, Mourikis and Roumeliotis 2010).
-                point = smoother.point()
-                begins = step.initial if step.predict is None else step.predict(point)
-                point.insert(begins)
+            about = smoother.point()
+            # Linearised all about one value of each parameter: else what they cannot be told apart by would seem to be
+            # known (first-estimates Jacobians, Huang, Mourikis and Roumeliotis 2010).
+            new = step.initial if step.predict is None else step.predict(about if self._young else smoother.estimate())
+            about.insert(new)
             stamps = self._aged(step.timestamps)
-            smoother.update(self._accepted(smoother, step, values, new, point), begins, stamps)
+            smoother.update(self._accepted(smoother, step, about, new), new, stamps)
         except (RuntimeError, np.linalg.LinAlgError):
             # Singular, if only by rounding. The smoother is spoilt, but all it knew is in the base and the steps since.
             self._reinitialize()
@@ -297,23 +291,24 @@ class Run:
         self._stamps = {k: t for k, t in {**self._stamps, **stamps}.items() if values.exists(k)}
         self._record(step.keyframes, values)
 
-    def _accepted(
-        self, smoother: Smoother, step: Step, values: gtsam.Values, new: gtsam.Values, point: gtsam.Values
-    ) -> list[Factor]:
-        """The step's processes and those of its measurements that are to be used, linear about a point."""
+    def _accepted(self, smoother: Smoother, step: Step, about: gtsam.Values, new: gtsam.Values) -> list[Factor]:
+        """The processes of a step and the measurements to be used, in a window linear about the values."""
         factors = weigh(step.factors, self.levels)
+        require_known(factors, about, step.time)
         processes = [f for f in factors if f.measurement is None]
-        require_sound(processes, values, step.time)
-        prediction = Prediction(smoother, processes, values, new)
+        if self.window is not None:
+            processes = [linearized(f, about) for f in processes]
+        require_sound(processes, about, step.time)
+        prediction = Prediction(smoother, processes, about, new)
         measurements = []
         for f in factors:
             if f.measurement is not None:
-                require_known([f], values, step.time)
                 used = self.innovations.accept(f, prediction, gated=self.problem.loss is not None)
                 if used is not None:
                     measurements.append(unweighed(used))
-        found = processes + measurements
-        return found if self.window is None else [linearized(f, point) for f in found]
+        if self.window is not None:
+            measurements = [linearized(f, about) for f in measurements]
+        return processes + measurements
 
     def _aged(self, timestamps: Mapping[int, float]) -> dict[int, float]:
         """Times of last use, s, in the window's unit: the number of the step, one a keyframe, or as they are."""
@@ -405,11 +400,6 @@ class Run:
         """(n,) of the priors; of assumptions, which are small whatever they are, none."""
         return np.array([np.inf if q.group == "assumption" else q.scale for q in self.problem.quantities])
 
-    @property
-    def _fixed(self) -> bool:
-        """Whether the smoother leaves everything linearised where the last batch solution has it."""
-        return self._young and self.window is not None
-
     def _since_base(self) -> Iterator[Step]:
         """The steps since the base; those since the start with many measurements in each, which solve faster."""
         now = -np.inf
@@ -423,13 +413,12 @@ class Run:
     def _restart(self, solution: Solution, stamps: Mapping[int, float]) -> None:
         """Start the smoother from a solution: from what it says of the variables it goes on with, or from all of it."""
         values, loss = solution.values, solution.system.loss
-        alive = self._alive(values, stamps)
-        if alive is None:
+        if self.window is None:
             past = (f for step in self.past for f in weigh(step.factors, self.levels))
             factors = [used_part(f, values, loss) for f in past]
             self._start([unweighed(f) for f in factors if f is not None], values, stamps)
             return
-        state = State.of(self.time, solution.system.linearize(values), values, alive, stamps)
+        state = State.of(self.time, solution.system.linearize(values), values, _in_use(values, stamps), stamps)
         if self._young:
             self._start([state.factor], state.values, state.stamps)
         else:
@@ -441,19 +430,15 @@ class Run:
         self._start([state.factor], state.estimate, state.stamps)
 
     def _start(self, factors: Sequence[Factor], values: gtsam.Values, stamps: Mapping[int, float]) -> None:
-        self._smoother = Unlimited() if self.window is None else FixedLag(self.window)
+        self._smoother = Unlimited() if self.window is None else FixedLag(self.window, self._young)
         self._stamps = dict(stamps)
         try:
             self._smoother.update(factors, values, stamps)
         except RuntimeError as error:
             raise IndeterminateError(explained(error)) from None
 
-    def _alive(self, values: gtsam.Values, stamps: Mapping[int, float]) -> list[int] | None:
-        """The variables that later steps may refer to, None where everything is kept.
 
-        Those are the ones used in the last moment and those that never age.
-        """
-        if self.window is None:
-            return None
-        latest = max(stamps.values(), default=-np.inf)
-        return [key for key in values.keys() if stamps.get(key, np.inf) >= latest]
+def _in_use(values: gtsam.Values, stamps: Mapping[int, float]) -> list[int]:
+    """The variables that later steps may refer to: those used in the last moment and those that never age."""
+    latest = max(stamps.values(), default=-np.inf)
+    return [key for key in values.keys() if stamps.get(key, np.inf) >= latest]

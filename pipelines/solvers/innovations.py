@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -28,26 +28,26 @@ class Prediction:
     Attributes:
         smoother: what is known of the old ones.
         processes: factors that are no measurements.
-        values: of all variables.
+        about: values of all variables, about which the prediction is linear.
         new: those of the new ones.
     """
 
     smoother: Smoother
     processes: Sequence[Factor]
-    values: gtsam.Values
+    about: gtsam.Values
     new: gtsam.Values
 
-    def covariance(self, keys: Sequence[int]) -> Array:
-        """Joint covariance of variables, old and new."""
-        dims = self.values.dims()
+    def of(self, keys: Sequence[int]) -> tuple[Array, Array]:
+        """Where variables, old and new, are from `about` (d,), and their joint covariance (d, d)."""
+        dims = self.about.dims()
         fresh = list(self.new.keys())
         involved = set(self._process.keyVector())
         held = [k for k in dict.fromkeys([*keys, *involved]) if k not in fresh]
-        P = self.smoother.covariance(held)
+        P, moves = self.smoother.covariance(held), self.smoother.moves(held)
         where = slices(held + fresh, dims)
         if fresh:
             order = [k for k in held if k in involved] + fresh
-            A = self._process.jacobian(ordering_of(order))[0]
+            A, b = self._process.jacobian(ordering_of(order))
             columns = slices(order, dims)
             inverse = np.linalg.pinv(A[:, columns[fresh[0]].start :])
             carry = np.zeros((inverse.shape[0], P.shape[0]))
@@ -55,12 +55,13 @@ class Prediction:
                 carry[:, where[key]] = -inverse @ A[:, columns[key]]
             across = carry @ P
             P = np.block([[P, across.T], [across, across @ carry.T + inverse @ inverse.T]])
+            moves = np.append(moves, carry @ moves + inverse @ b)
         pick = np.concatenate([np.arange(P.shape[0])[where[key]] for key in keys])
-        return P[np.ix_(pick, pick)]
+        return moves[pick], P[np.ix_(pick, pick)]
 
     @cached_property
     def _process(self) -> gtsam.GaussianFactorGraph:
-        return graph_of(self.processes).linearize(self.values)
+        return graph_of(self.processes).linearize(self.about)
 
 
 @dataclass
@@ -94,12 +95,13 @@ class Innovations:
         """What of a factor is to be used, the measurements whose innovation lies within the gate; notes all of them."""
         measurement = factor.measurement
         assert measurement is not None
-        error, A = measurement.rows(prediction.values)
+        error, A = measurement.rows(prediction.about)
         n = len(measurement.model.time)
         if not (np.isfinite(error).all() and np.isfinite(A).all()):
             self.unusable[factor.family] = self.unusable.get(factor.family, 0) + n
             return None
-        S = A @ prediction.covariance(measurement.keys) @ A.T + np.eye(len(error))
+        moves, P = prediction.of(measurement.keys)
+        error, S = error + A @ moves, A @ P @ A.T + np.eye(len(error))
         parts = n if measurement.divisible else 1
         size = len(error) // parts
         spans = [slice(i, i + size) for i in range(0, len(error), size)]

@@ -28,13 +28,13 @@ class Smoother(Protocol):
         """
 
     def point(self) -> gtsam.Values:
-        """The values about which the variables are linearised; the caller may add to them."""
+        """The values about which new factors are to be linear; the caller may add to them."""
 
     def estimate(self) -> gtsam.Values:
         """Current values of all variables held; the caller may add to them."""
 
-    def linearized(self) -> tuple[gtsam.GaussianFactorGraph, gtsam.Values]:
-        """All that is known of the variables held, and about which values it is linear."""
+    def moves(self, keys: Sequence[int]) -> Array:
+        """From the point to the estimate (d,), of variables in their order."""
 
     def covariance(self, keys: Sequence[int]) -> Array:
         """Joint marginal covariance of the variables, in their order."""
@@ -62,16 +62,16 @@ class Unlimited:
 
     def point(self) -> gtsam.Values:
         """As Smoother has it."""
-        return gtsam.Values(self._isam.getLinearizationPoint())
+        return self.estimate()
 
     def estimate(self) -> gtsam.Values:
         """As Smoother has it."""
         return gtsam.Values(self._estimate)
 
-    def linearized(self) -> tuple[gtsam.GaussianFactorGraph, gtsam.Values]:
+    def moves(self, keys: Sequence[int]) -> Array:
         """As Smoother has it."""
-        point = self._isam.getLinearizationPoint()
-        return self._isam.getFactorsUnsafe().linearize(point), point
+        dims = self._estimate.dims()
+        return np.zeros(sum(dims[key] for key in keys))
 
     def covariance(self, keys: Sequence[int]) -> Array:
         """As Smoother has it."""
@@ -84,26 +84,29 @@ class FixedLag:
 
     In use are the variables of the last moment and those that never age: a few dozen numbers that every measurement
     joins, so that they are one dense block. The others were eliminated from it in time order and hang on it until their
-    time leaves the window; a factor on one of them takes it back, with what is younger. Each variable stays linearised
-    where it began, for good.
+    time leaves the window; a factor on one of them takes it back, with what is younger. What is in it stays linear
+    about the values with which each variable began.
 
     Args:
         window: how long variables are held after their last use, s or whatever the stamps count.
+        fixed: new factors are to be linear about these values, too; else about the estimate of what is a vector.
     """
 
-    def __init__(self, window: float) -> None:
-        self._window = window
+    def __init__(self, window: float, fixed: bool) -> None:
+        self._window, self._fixed = window, fixed
         self._stamps: dict[int, float] = {}
         self._past: list[tuple[int, gtsam.GaussianConditional]] = []  # a variable, given younger ones; oldest first
         self._present: gtsam.GaussianConditional | None = None  # of the variables in use
-        self._point = gtsam.Values()
-        self._estimate = gtsam.Values()
+        self._begun = gtsam.Values()  # each variable with the value about which it is linear
+        self._vectors: set[int] = set()  # those with the same tangent space everywhere
+        self._moves = gtsam.VectorValues()  # from there to the estimate
 
     def update(self, factors: Sequence[Factor], values: gtsam.Values, stamps: Mapping[int, float]) -> None:
-        """As Smoother has it; a factor that is not linear yet (`linearized`) is linearised about `point`."""
-        self._point.insert(values)
+        """As Smoother has it."""
+        self._begun.insert(values)
+        self._vectors.update(key for key in values.keys() if _is_vector(values, key))
         self._stamps.update(stamps)
-        graph = graph_of(factors).linearize(self._point)
+        graph = graph_of(factors).linearize(self._begun)
         first = self._oldest({key for f in factors for key in f.factor.keys()}.union(stamps))
         graph.push_back(self._known(first))
         del self._past[first:]
@@ -118,24 +121,33 @@ class FixedLag:
         self._present, _ = gtsam.EliminateQR(graph, ordering_of(in_use))
         while self._past and self._stamps[self._past[0][0]] < latest - self._window:
             key, _ = self._past.pop(0)
-            self._point.erase(key)
+            self._begun.erase(key)
             del self._stamps[key]
+            self._vectors.discard(key)
         bayes_net = gtsam.GaussianBayesNet()
         for conditional in (*(conditional for _, conditional in self._past), self._present):
             bayes_net.push_back(conditional)
-        self._estimate = self._point.retract(bayes_net.optimize())
+        self._moves = bayes_net.optimize()
 
     def point(self) -> gtsam.Values:
         """As Smoother has it."""
-        return gtsam.Values(self._point)
+        point = gtsam.Values(self._begun)
+        for key in self._moved():
+            point.update(key, point.atVector(key) + self._moves.at(key))
+        return point
 
     def estimate(self) -> gtsam.Values:
         """As Smoother has it."""
-        return gtsam.Values(self._estimate)
+        return self._begun.retract(self._moves)
+
+    def moves(self, keys: Sequence[int]) -> Array:
+        """As Smoother has it."""
+        moved = self._moved()
+        return np.concatenate([(0.0 if key in moved else 1.0) * self._moves.at(key) for key in keys])
 
     def linearized(self) -> tuple[gtsam.GaussianFactorGraph, gtsam.Values]:
-        """As Smoother has it."""
-        return self._known(0), self._point
+        """All that is known of the variables held, and about which values it is linear."""
+        return self._known(0), self._begun
 
     def covariance(self, keys: Sequence[int]) -> Array:
         """As Smoother has it."""
@@ -143,10 +155,14 @@ class FixedLag:
         first = self._oldest(keys)
         order = [*(key for key, _ in self._past[first:]), *self._present.keys()]
         R, _ = self._known(first).jacobian(ordering_of(order))
-        where = slices(order, self._point.dims())
+        where = slices(order, self._begun.dims())
         inverse = solve_triangular(R, np.eye(len(R)), check_finite=False)
         rows = np.concatenate([inverse[where[key]] for key in keys])
         return np.asarray(rows @ rows.T)
+
+    def _moved(self) -> set[int]:
+        """Variables about whose estimate new factors are linear."""
+        return set() if self._fixed or self._present is None else self._vectors.intersection(self._present.keys())
 
     def _oldest(self, keys: Collection[int]) -> int:
         """Where in the past the oldest of the variables is; its end if none is in it."""
@@ -162,6 +178,14 @@ class FixedLag:
         return graph
 
 
+def _is_vector(values: gtsam.Values, key: int) -> bool:
+    try:
+        values.atVector(key)
+    except RuntimeError:
+        return False
+    return True
+
+
 def slices(keys: Sequence[int], dims: Mapping[int, int]) -> dict[int, slice]:
     """Where each variable stands when they are stacked in this order."""
     found, start = {}, 0
@@ -172,10 +196,7 @@ def slices(keys: Sequence[int], dims: Mapping[int, int]) -> dict[int, slice]:
 
 
 def linearized(factor: Factor, values: gtsam.Values) -> Factor:
-    """The factor as it is about the values, for good.
-
-    What moves far in the first moments is made good by the next re-initialisation, which solves the steps' own factors.
-    """
+    """The factor as it is about the values, for good."""
     return Factor(factor.family, gtsam.LinearContainerFactor(factor.factor.linearize(values), values))
 
 
