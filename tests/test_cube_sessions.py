@@ -107,6 +107,13 @@ def test_a_steady_turn_is_no_rest() -> None:
     assert not ((middle > 1.0) & (middle < 3.5)).any()
 
 
+def test_a_gyro_that_gravity_shifts_is_at_rest_in_all_poses(session: CubeData) -> None:
+    """By ten times what usual gyros have, 0.02 rad/s and more from face to face."""
+    sensitivity = 2e-3 * np.random.default_rng(3).choice([-1.0, 1.0], (3, 3))
+    shifted = replace(session, gyro=session.gyro + session.accel @ sensitivity.T)
+    np.testing.assert_array_equal(static_intervals(shifted, _config()), static_intervals(session, _config()))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

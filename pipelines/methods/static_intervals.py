@@ -22,8 +22,10 @@ _QUIET, _STILL = 3.0, 6.0
 _MARGIN = 0.25
 # The noise is what the quietest twentieth of the recording shows, between these multiples of the stated one.
 _FLOOR_SHARE, _FLOOR_LIMITS = 0.05, (0.2, 10.0)
-# A steady turn is as quiet; its mean rate departs from that of the static intervals by more than this, rad/s.
-_STEADY = 0.01
+# A steady turn is as quiet; its mean rate departs from that of the static intervals by more than this, rad/s, and by more
+# than gravity can shift it: the sigma of a number of the gyro's g-sensitivity, rad/s per m/s^2, of one out of order.
+_STEADY, _SHIFT = 0.01, 2e-3
+_REWEIGHTINGS = 20
 # A pause between samples is a gap when longer than this many intervals.
 _GAP_SAMPLES = 5.0
 
@@ -44,8 +46,10 @@ def find_static_intervals(t: Array, gyro: Array, accel: Array, gyro_sigma: float
         InputError: there is none.
     """
     runs, scatter, floor = _quiet_runs(t, [(gyro, gyro_sigma), (accel, accel_sigma)])
-    means = np.array([gyro[a : b + 1].mean(axis=0) for a, b in runs]).reshape(-1, 3)
-    still = _turns_not(means, runs[:, 1] - runs[:, 0] + 1, floor[0])
+    means, forces = (
+        np.array([values[a : b + 1].mean(axis=0) for a, b in runs]).reshape(-1, 3) for values in (gyro, accel)
+    )
+    still = _turns_not(means, forces, runs[:, 1] - runs[:, 0] + 1, floor[0])
     if len(runs) and not still.any():
         raise InputError(
             f"no static pose: the device is quiet in {len(runs)} stretches, but the gyro's mean rates in them lie up "
@@ -108,10 +112,21 @@ def _scatter(values: Array, half: int) -> Array:
     return out
 
 
-def _turns_not(means: Array, lengths: NDArray[np.intp], sigma: float) -> NDArray[np.bool_]:
-    """Which runs, of so many samples, have the mean rate (n, 3) that most of the quiet time has."""
+def _turns_not(means: Array, forces: Array, lengths: NDArray[np.intp], sigma: float) -> NDArray[np.bool_]:
+    """Which runs, of so many samples, have the mean rate (n, 3) that gyro bias and g-sensitivity give in most of them.
+
+    Bias b and g-sensitivity G of means = b + G forces by least squares with Cauchy's weights, from the median on; what a
+    turn adds is far from all that gravity does.
+    """
     if not len(means):
         return np.zeros(0, dtype=bool)
     middle = np.quantile(means, 0.5, axis=0, weights=lengths, method="inverted_cdf")
     allowed = _STEADY + 5.0 * sigma / np.sqrt(lengths)
-    return np.asarray(np.abs(means - middle).max(axis=1) < allowed)
+    design = np.column_stack([np.ones(len(means)), forces])
+    prior = np.diag([0.0, *3 * [(_STEADY / _SHIFT) ** 2]])
+    off = means - middle
+    for _ in range(_REWEIGHTINGS):
+        weights = lengths / lengths.max() / (1.0 + (off**2).sum(axis=1) / _STEADY**2)
+        normal = design.T @ (weights[:, None] * design) + prior
+        off = means - design @ np.linalg.solve(normal, design.T @ (weights[:, None] * means))
+    return np.asarray(np.abs(off).max(axis=1) < allowed)
