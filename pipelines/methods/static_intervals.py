@@ -22,9 +22,11 @@ _QUIET, _STILL = 3.0, 6.0
 _MARGIN = 0.25
 # The noise is what the quietest twentieth of the recording shows, between these multiples of the stated one.
 _FLOOR_SHARE, _FLOOR_LIMITS = 0.05, (0.2, 10.0)
-# A steady turn is as quiet; its mean rate departs from that of the static intervals by more than this, rad/s, and by more
-# than gravity can shift it: the sigma of a number of the gyro's g-sensitivity, rad/s per m/s^2, of one out of order.
+# A steady turn is as quiet; its mean rate departs from that of the static intervals by more than this, rad/s, when what
+# gravity does to the gyro is taken off, whose g-sensitivity, if it is out of order, has this sigma, rad/s per m/s^2.
 _STEADY, _SHIFT = 0.01, 2e-3
+# How well rates at rest repeat, rad/s.
+_REPEATED = 3e-3
 _REWEIGHTINGS = 20
 # A pause between samples is a gap when longer than this many intervals.
 _GAP_SAMPLES = 5.0
@@ -115,18 +117,18 @@ def _scatter(values: Array, half: int) -> Array:
 def _turns_not(means: Array, forces: Array, lengths: NDArray[np.intp], sigma: float) -> NDArray[np.bool_]:
     """Which runs, of so many samples, have the mean rate (n, 3) that gyro bias and g-sensitivity give in most of them.
 
-    Bias b and g-sensitivity G of means = b + G forces by least squares with Cauchy's weights, from the median on; what a
-    turn adds is far from all that gravity does.
+    Bias b and g-sensitivity G of means = b + G forces by least squares with Cauchy's weights, from the median on: a
+    turn adds far more than gravity does.
     """
     if not len(means):
         return np.zeros(0, dtype=bool)
     middle = np.quantile(means, 0.5, axis=0, weights=lengths, method="inverted_cdf")
     allowed = _STEADY + 5.0 * sigma / np.sqrt(lengths)
     design = np.column_stack([np.ones(len(means)), forces])
-    prior = np.diag([0.0, *3 * [(_STEADY / _SHIFT) ** 2]])
+    prior = np.diag([0.0, *3 * [(_REPEATED / _SHIFT) ** 2]])
     off = means - middle
     for _ in range(_REWEIGHTINGS):
-        weights = lengths / lengths.max() / (1.0 + (off**2).sum(axis=1) / _STEADY**2)
+        weights = lengths / lengths.max() / (1.0 + (off**2).sum(axis=1) / _REPEATED**2)
         normal = design.T @ (weights[:, None] * design) + prior
         off = means - design @ np.linalg.solve(normal, design.T @ (weights[:, None] * means))
     return np.asarray(np.abs(off).max(axis=1) < allowed)
