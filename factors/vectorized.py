@@ -6,7 +6,7 @@ gtsam wants them. One Python call for 20 measurements costs little more than for
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass, field, fields, replace
@@ -277,7 +277,9 @@ class Ensemble:
         groups: dict[Hashable, list[VectorizedFactor]] = {}
         for factor in factors:
             groups.setdefault(_kind(factor), []).append(factor)
-        self._groups = [_Group(group) for group in groups.values()]
+        # Variables of one kind and where each is in the array of all their values: read once, whoever takes them.
+        self._places: dict[Block, dict[int, int]] = {}
+        self._groups = [_Group(group, self._places) for group in groups.values()]
         self._values: gtsam.Values | None = None
 
     @contextmanager
@@ -289,8 +291,9 @@ class Ensemble:
             loss: within the block it stands in place of the factors' own, where they have one; None weighs all in full.
         """
         if values is not self._values:
+            read = {block: _array(_read(values, list(keys), block), block) for block, keys in self._places.items()}
             for group in self._groups:
-                group.evaluate(values)
+                group.evaluate(read)
             self._values = values
         try:
             for group in self._groups:
@@ -304,32 +307,32 @@ class Ensemble:
 class _Group:
     """Factors whose models are evaluated as one."""
 
-    def __init__(self, factors: Sequence[VectorizedFactor]) -> None:
+    def __init__(self, factors: Sequence[VectorizedFactor], places: dict[Block, dict[int, int]]) -> None:
         self._factors = factors
         self._model = _stack([f.model for f in factors])
         ends = np.cumsum([len(f.model.time) for f in factors]).tolist()
         self._spans = list(zip([0, *ends[:-1]], ends, strict=True))
-        self._columns = [self._column(i) for i in range(len(factors[0].columns))]
+        self._columns = [self._column(i, places.setdefault(block, {})) for i, block in enumerate(factors[0].blocks)]
         self._parts: list[_Evaluation] = []
 
-    def _column(self, i: int) -> tuple[list[int], NDArray[np.intp] | None]:
-        """The variables of a column and which of them each measurement takes; None: there is only one."""
-        keys: dict[int, int] = {}
+    def _column(self, i: int, places: dict[int, int]) -> NDArray[np.intp]:
+        """The place of the variable that each measurement takes in a column; only one if they share it."""
         rows: list[Any] = []
         for factor in self._factors:
             column = factor.columns[i]
             if isinstance(column, int):
-                rows.append(np.broadcast_to(keys.setdefault(column, len(keys)), len(factor.model.time)))
+                rows.append(np.broadcast_to(places.setdefault(column, len(places)), len(factor.model.time)))
             else:
-                rows.append([keys.setdefault(key, len(keys)) for key in column])
-        return list(keys), np.concatenate(rows) if len(keys) > 1 else None
+                rows.append([places.setdefault(key, len(places)) for key in column])
+        whole = np.concatenate(rows)
+        return whole[:1] if (whole == whole[:1]).all() else whole
 
-    def evaluate(self, values: gtsam.Values) -> None:
+    def evaluate(self, read: Mapping[Block, Array]) -> None:
         n = self._spans[-1][1]
         blocks = []
-        for (keys, rows), block in zip(self._columns, self._factors[0].blocks, strict=True):
-            array = _array(_read(values, keys, block), block)
-            blocks.append(np.broadcast_to(array, (n, array.shape[1])) if rows is None else array[rows])
+        for rows, block in zip(self._columns, self._factors[0].blocks, strict=True):
+            array = read[block][rows]
+            blocks.append(np.broadcast_to(array, (n, array.shape[1])))
         whole = _Evaluation(*self._model(*blocks))
         self._parts = [whole.part(start, stop) for start, stop in self._spans]
 
