@@ -66,6 +66,10 @@ class Prediction:
         return {q.name: sigmas[q.name] / q.require for q in estimated if sigmas[q.name] > q.require}
 
 
+# Scenario, as text, and seed -> what is predicted of that draw.
+Made = dict[tuple[str, int], Prediction]
+
+
 @dataclass(frozen=True)
 class Step:
     """A change of the motion.
@@ -123,18 +127,19 @@ def make_plan(
     wanted = dict(require or {})
     method = methods.method(method_name)
     settings = method.settings(scenario).model_dump()
+    made: Made = {}
     with progress.doing("predicting"):
-        now = predict(method_name, settings, config_file, wanted)
+        now = predict(method_name, settings, config_file, wanted, made=made)
     steps: list[Step] = []
     best = now
     while best.missing and len(steps) < most_steps:
-        found = list(progress.track(_candidates(method, best, config_file, wanted), "trying other motions"))
+        found = list(progress.track(_candidates(method, best, config_file, wanted, made), "trying other motions"))
         if not found:
             break
         step = max(found, key=lambda each: each.gain)
         if step.gain < _LEAST_GAIN:
             break
-        best = predict(method_name, step.prediction.scenario, config_file, wanted)
+        best = predict(method_name, step.prediction.scenario, config_file, wanted, made=made)
         steps.append(replace(step, prediction=best))
     return Plan(method_name, now, tuple(steps))
 
@@ -145,6 +150,7 @@ def predict(
     config_file: Path | None,
     require: Mapping[str, float],
     seeds: Sequence[int] | None = None,
+    made: Made | None = None,
 ) -> Prediction:
     """The sigmas that a recording of this motion would end with, the largest of some draws of what is drawn in it.
 
@@ -152,12 +158,17 @@ def predict(
         method_name, config_file, require: as in `make_plan`.
         scenario: the motion.
         seeds: of the draws; None: as many as the method's scenarios need.
+        made: predictions of draws, which are not made again; new ones are added. All else has to be the same.
 
     Raises:
         InputError: the recording would be unusable.
     """
+    made = {} if made is None else made
     drawn = range(_DRAWS if methods.method(method_name).drawn else 1) if seeds is None else seeds
-    each = [_predicted(method_name, scenario, config_file, require, seed) for seed in drawn]
+    for seed in drawn:
+        if (repr(scenario), seed) not in made:
+            made[repr(scenario), seed] = _predicted(method_name, scenario, config_file, require, seed)
+    each = [made[repr(scenario), seed] for seed in drawn]
     worst = max(each, key=lambda prediction: max(prediction.missing.values(), default=0.0))
     largest = np.max([prediction.assessment.sigmas for prediction in each], axis=0)
     own = worst.assessment.sigmas
@@ -226,14 +237,14 @@ def scenario_yaml(scenario: Scenario) -> str:
 
 
 def _candidates(
-    method: Method, before: Prediction, config_file: Path | None, require: Mapping[str, float]
+    method: Method, before: Prediction, config_file: Path | None, require: Mapping[str, float], made: Made
 ) -> Iterator[Step]:
     """Each possible change with what it would bring to the worst draw; those that cannot be recorded are left out."""
     seeds = (before.worst,)
-    now = predict(method.name, before.scenario, config_file, require, seeds)
+    now = predict(method.name, before.scenario, config_file, require, seeds, made)
     for change, scenario in method.candidates(before.scenario):
         try:
-            after = predict(method.name, scenario, config_file, require, seeds)
+            after = predict(method.name, scenario, config_file, require, seeds, made)
         except InputError:
             continue
         yield Step(change, _gain(now, after), after)
