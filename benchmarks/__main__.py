@@ -14,7 +14,20 @@ from pathlib import Path
 from benchmarks.measure import Ratio, run, worse
 
 BASELINE = Path(__file__).with_name("baseline.json")
-SUITE = ("reading", "gyro", "batch", "peers", "static", "incremental", "following", "detection", "command", "pages")
+SUITE = (
+    "reading",
+    "gyro",
+    "batch",
+    "peers",
+    "static",
+    "incremental",
+    "following",
+    "detection",
+    "command",
+    "montecarlo",
+    "pages",
+    "demo",
+)
 # One thread each, or the ratio tells how many cores there are.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 

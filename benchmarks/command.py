@@ -45,7 +45,5 @@ def run() -> Iterator[Ratio]:
     problem = los.problem(data, load_config(los_config(MINUTES).encode()))
     graph = native(problem)
     (b,) = costs([lambda: solve(problem, graph)])
-    compared = (
-        "alidade calibrate, 10 min of los at 1 kHz, all outputs (12 s wanted), over solving its native-only graph"
-    )
-    yield Ratio("command.calibrate", compared, a.seconds / b.seconds, ours=a, theirs=b)
+    compared = "alidade calibrate, 10 min of los at 1 kHz, all outputs, over solving its native-only graph"
+    yield Ratio("command.calibrate", compared, a.seconds / b.seconds, wanted=3.0, ours=a, theirs=b)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.measure import Cost, Ratio
+from benchmarks.measure import Cost, Ratio, costs
 from pipelines.methods import simulate
 from pipelines.reports.html import report_html
 from pipelines.session import calibrate
@@ -18,6 +18,8 @@ from tests.browser import CHROMIUM
 _METHODS = ("los", "indexer", "head", "cube")
 # A page may have so many bytes, and be shown after so many seconds.
 _BYTES, _SECONDS = 1e6, 1.5
+# ... and take so long, s, to be made.
+_WRITTEN = 0.3
 
 
 def run() -> Iterator[Ratio]:
@@ -28,7 +30,9 @@ def run() -> Iterator[Ratio]:
             simulate(method, None, 1, folder / "session.mcap")
             (calibration,) = calibrate(folder / "session.mcap", ["batch"])
             page = folder / f"{method}.html"
-            page.write_text(report_html(calibration), encoding="utf-8")
+            (written,) = costs([lambda c=calibration, p=page: p.write_text(report_html(c), encoding="utf-8")])
+            compared = f"making the report of {method} over {_WRITTEN:g} s"
+            yield Ratio(f"pages.written_{method}", compared, written.seconds / _WRITTEN, wanted=1.0, ours=written)
             size = page.stat().st_size
             yield Ratio(
                 f"pages.size_{method}", f"report of {method}, {size / 1e3:.0f} kB, over 1 MB", size / _BYTES, wanted=1.0

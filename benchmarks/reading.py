@@ -85,7 +85,7 @@ def run() -> Iterator[Ratio]:
             f"decompression's time over ours, {HOUR:,} Imu",
             b.seconds / a.seconds,
             "higher",
-            wanted=0.25,
+            wanted=0.6,
             ours=a,
             theirs=b,
         )
