@@ -28,6 +28,7 @@ from pipelines.judgement.causes import find_causes
 from pipelines.judgement.halves import Halves, held_out, span, split_at, split_halves
 from pipelines.judgement.observability import Cause, assess
 from pipelines.judgement.rejection import rejection_sentence, too_many_rejected
+from pipelines.judgement.second import other_solution
 from pipelines.judgement.self_check import SelfCheck
 from pipelines.judgement.stability import Moved, Stability, stability
 from pipelines.methods import Method
@@ -307,6 +308,7 @@ class Session:
                 checked = SelfCheck.of(estimate, self._batch_beside())
                 assessment = assessment.remarked(checked.sentence if checked else "")
             if ours:
+                assessment = assessment.remarked(other_solution(estimate, quantities))
                 assessment = assessment.remarked(*noise_levels.remarks(estimate.levels), *problem.premises)
             found.append(
                 Calibration(

@@ -197,6 +197,8 @@ class Problem:
         unsettled: see `onward`, s.
         noises: that are in force, with what sensors' own samples say of them.
         constants: numbers of the recording that formulas need beside the parameters, by name.
+        elsewhere: of a solution, values that explain the measurements as well in another way, near which there may be
+            other minima. None: the method has no such.
     """
 
     method: str
@@ -213,6 +215,7 @@ class Problem:
     unsettled: float = 1.0
     noises: tuple[Level, ...] = ()
     constants: Mapping[str, float] = field(default_factory=dict)
+    elsewhere: Callable[[gtsam.Values], Iterator[gtsam.Values]] | None = None
 
     def numbers(self, estimate: Estimate) -> dict[str, float]:
         """What formulas need, by name: an estimate's values and the constants."""
@@ -336,6 +339,14 @@ class Told:
 
 
 @dataclass(frozen=True)
+class Minimum:
+    """Another solution: reported values (n,), and by how much its chi-square, priors included, is larger."""
+
+    values: Array
+    chi_square: float
+
+
+@dataclass(frozen=True)
 class Estimate:
     """A calibration by one solver; `names`, `values` (n,) and `covariance` (n, n) belong together.
 
@@ -361,6 +372,7 @@ class Estimate:
         colours: family -> how many of its measurements in a row count as one, of those whose residuals are correlated.
         inflation: (n,) by what the sigmas are larger because residuals are correlated in time; None: by nothing.
         told: what the graph says without the device's priors; None: not asked for.
+        second: the second best solution of several, if it is nearly as likely; None: there is none, or not looked for.
         seconds: phase -> wall time.
     """
 
@@ -384,6 +396,7 @@ class Estimate:
     colours: Mapping[str, float] = field(default_factory=dict)
     inflation: Array | None = None
     told: Told | None = None
+    second: Minimum | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
 
     @property

@@ -513,6 +513,13 @@ class SelfCheckResult(_Record):
     sigma_ratio: float  # the smallest of incremental over batch
 
 
+class SecondResult(_Record):
+    """Another solution that is nearly as likely; SI."""
+
+    chi_square: float  # by how much it is higher, priors included
+    parameters: dict[str, float]
+
+
 class PartParameter(_Record):
     """A number of one recording; SI."""
 
@@ -593,6 +600,7 @@ class Result(_Record):
     sensitivity: dict[str, SensitivityResult] | None  # input taken for exact: what it does
     measurements: list[MeasurementResult] | None  # the twenty that matter most
     findings: dict[str, list[dict[str, object]]]  # the method's own tables
+    second_best: SecondResult | None = None  # where there is another solution that is nearly as likely
     constants: dict[str, float] | None = None  # that formulas need beside the parameters
     recordings: list[PartResult] | None = None  # of a joint calibration
     changes: ChangesResult | None = None  # of a joint calibration
@@ -629,6 +637,7 @@ def result(calibration: Calibration) -> Result:
         sensitivity=c.sensitivity,
         measurements=c.measurements,
         findings={name: [dict(row) for row in rows] for name, rows in c.findings.items()},
+        second_best=_second(c.estimate),
         constants=dict(c.problem.constants) or None,
         recordings=list(c.recordings) or None,
         changes=_changes(c),
@@ -636,10 +645,18 @@ def result(calibration: Calibration) -> Result:
     )
 
 
+def _second(estimate: Estimate) -> SecondResult | None:
+    if estimate.second is None:
+        return None
+    values = dict(zip(estimate.names, estimate.second.values.tolist(), strict=True))
+    return SecondResult(chi_square=estimate.second.chi_square, parameters=values)
+
+
 def result_json(calibration: Calibration) -> str:
     """The text of result.json; keys that only some calibrations have are left out of the others."""
     model = result(calibration)
-    left_out = {name for name in ("truth", "constants", "recordings", "changes") if getattr(model, name) is None}
+    seldom = ("truth", "second_best", "constants", "recordings", "changes")
+    left_out = {name for name in seldom if getattr(model, name) is None}
     return model.model_dump_json(by_alias=True, indent=1, exclude=left_out) + "\n"
 
 

@@ -33,6 +33,7 @@ from pipelines.solvers.marginals import (
     reported,
     smoothed,
 )
+from pipelines.solvers.minima import likeliest
 from pipelines.solvers.noise_levels import far, refined, weigh
 from pipelines.solvers.spurious import information_of_noise
 from pipelines.solvers.told import told
@@ -203,6 +204,9 @@ def solve_batch(
     weighed = weigh(whole.factors, problem.noises)
     solution = optimize(weighed, whole.initial, shared, problem.loss, most, held=problem.assumed)
     solution, levels, about = with_levels(problem, whole.factors, solution, problem.noises, most)
+    best, second = likeliest(problem, solution, _minimize, whole.current_keys)
+    if best is not solution:
+        solution, about = best, Linearized.of(best)
     solved = time.perf_counter()
     values, system, ordering = solution.values, solution.system, solution.system.ordering
     linear, factors = about.graph, system.factors
@@ -260,6 +264,7 @@ def solve_batch(
         rejected={family: int((~r.used).sum()) for family, r in residuals.items()},
         levels=levels,
         told=_told(problem, solution, linear, whole.current_keys, device, elsewhere) if device else None,
+        second=second,
         seconds={"build": built - start, "solve": solved - built, "marginals": done - solved},
     )
 

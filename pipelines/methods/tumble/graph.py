@@ -11,12 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 
+import gtsam
 import numpy as np
 
 from factors.chi_square import gate
-from factors.ellipsoid import DipFactor, StrengthFactor
+from factors.ellipsoid import DipFactor, StrengthFactor, entries
 from factors.loss import TruncatedLoss
 from pipelines.graph.noise import Level
 from pipelines.graph.problem import Array, Factor, Problem, Step
@@ -53,6 +54,7 @@ def problem(data: TumbleData, config: Config) -> Problem:
         dropped=model.dropped,
         premises=model.premises,
         noises=tuple(noises),
+        elsewhere=partial(_mirrored, model),
         constants=temperature.constants(temperature.reference(data.temperature)),
     )
 
@@ -78,6 +80,29 @@ def _steps(model: Model, found: tuple[Variable, ...], chunk: int) -> Iterator[St
         if first or step.factors:
             yield step
         first = False
+
+
+def _mirrored(model: Model, values: gtsam.Values) -> Iterator[gtsam.Values]:
+    """The same lengths and dips, of a body seen in mirrors across the axes of the K that is symmetric, or is to be.
+
+    Lengths and angles stay under any rotation or mirror Q of all nominal vectors, and Q K is symmetric for these alone.
+    """
+    numbers = {s.name: entries(s.symmetric) @ values.atVector(TRIAD_KEYS[s.name]) for s in model.sensors}
+    own = next(s.name for s in model.sensors if s.symmetric)
+    axes = np.linalg.eigh(numbers[own][:9].reshape(3, 3))[1]
+    for signs in product((1.0, -1.0), repeat=3):
+        if min(signs) > 0.0:
+            continue
+        Q = (axes * signs) @ axes.T
+        other = gtsam.Values(values)
+        for sensor in model.sensors:
+            rows = np.vstack([numbers[sensor.name][:9].reshape(3, 3).T, numbers[sensor.name][9:]])
+            K, b = (rows @ Q.T)[:3].T, (rows @ Q.T)[3]
+            of = entries(sensor.symmetric)
+            other.update(TRIAD_KEYS[sensor.name], of.T @ np.append(K, b) / of.sum(axis=0))
+            if sensor.warmth is not None:
+                other.update(SLOPE_KEY, Q @ values.atVector(SLOPE_KEY))
+        yield other
 
 
 def _rows(time: Array, low: float, high: float) -> slice:
