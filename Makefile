@@ -14,7 +14,7 @@ test: $(VENV)/dev
 	$(BIN)/python -m pytest -q -n auto --dist worksteal
 
 slow: $(VENV)/dev
-	$(BIN)/python -m pytest -q -n auto -m slow
+	$(BIN)/python -m pytest -q -n auto --dist worksteal -m slow --durations 25
 
 lint: $(VENV)/dev
 	$(BIN)/ruff check .

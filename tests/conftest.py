@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 # As the command has it, and before anything imports numpy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -17,6 +19,18 @@ from pipelines import cli
 from tests.command import Command, Run
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    """After `make slow`: how long the tests of each file took, as the table in CONTRIBUTING.md has it."""
+    if config.option.markexpr != "slow":
+        return
+    seconds: defaultdict[str, list[float]] = defaultdict(list)
+    for report in (*terminalreporter.stats.get("passed", ()), *terminalreporter.stats.get("failed", ())):
+        seconds[report.nodeid.partition("::")[0]].append(report.duration)
+    terminalreporter.write_line("| file | tests | s | longest, s |\n| --- | --- | --- | --- |")
+    for file, each in sorted(seconds.items(), key=lambda item: -sum(item[1])):
+        terminalreporter.write_line(f"| `{file}` | {len(each)} | {sum(each):.0f} | {max(each):.0f} |")
 
 
 @pytest.fixture(scope="session")

@@ -7,10 +7,12 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+
+from tests.command import Run
 
 ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "docs" / "examples" / "gyro_pair"
@@ -19,23 +21,47 @@ duration_s: 16
 gyro_a: {rate_hz: 100}
 gyro_b: {rate_hz: 120, density: 2.0e-4}
 """
-Run = subprocess.CompletedProcess[str]
+# One process runs all commands, since each of its own would import everything anew.
+COMMANDS = """
+import json, os, sys
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
+from pipelines import cli
+
+for line in sys.stdin:
+    folder, words = json.loads(line)
+    os.chdir(folder)
+    sys.argv = ["alidade", *words]
+    code, out, err = 0, StringIO(), StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        try:
+            cli.main()
+        except SystemExit as stop:
+            code = stop.code or 0
+    print(json.dumps([code, out.getvalue(), err.getvalue()]), flush=True)
+"""
 Command = Callable[..., Run]
 
 
 @pytest.fixture(scope="module")
-def command(example_site: Path) -> Command:
+def command(example_site: Path) -> Iterator[Command]:
     """Runs alidade with the example installed."""
     env = {"PYTHONPATH": os.pathsep.join([str(ROOT), str(example_site)]), "PATH": "/usr/bin:/bin"}
+    with subprocess.Popen(
+        [sys.executable, "-c", COMMANDS], env=env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        to_it, from_it = process.stdin, process.stdout
 
-    def run(folder: Path, *words: str, code: int = 0) -> Run:
-        done = subprocess.run(
-            [sys.executable, "-m", "pipelines.cli", *words], cwd=folder, env=env, capture_output=True, text=True
-        )
-        assert done.returncode == code, f"{words}\n{done.stdout}{done.stderr}"
-        return done
+        def run(folder: Path, *words: str, code: int = 0) -> Run:
+            print(json.dumps([str(folder), words]), file=to_it, flush=True)
+            done = Run(*json.loads(from_it.readline()))
+            assert done.code == code, f"{words}\n{done.out}{done.err}"
+            return done
 
-    return run
+        yield run
+        to_it.close()
 
 
 @pytest.fixture(scope="module")
@@ -66,17 +92,17 @@ def test_validate(command: Command, folder: Path, tmp_path: Path) -> None:
     command(folder, "calibrate", "s.mcap", "--out", str(tmp_path), "--quiet")
     calibration = str(tmp_path / "calibration.yaml")
     done = command(folder, "validate", "s.mcap", "--calibration", calibration, "--out", str(tmp_path), "--quiet")
-    assert "rate of gyro b against gyro a's" in done.stdout
+    assert "rate of gyro b against gyro a's" in done.out
     assert (tmp_path / "validation.html").exists()
 
 
 def test_info_knows_it(command: Command, folder: Path) -> None:
-    assert "gyro_pair: yes" in command(folder, "info", "s.mcap", "--quiet").stdout.splitlines()
+    assert "gyro_pair: yes" in command(folder, "info", "s.mcap", "--quiet").out.splitlines()
 
 
 def test_compare_with_halves(command: Command, folder: Path, tmp_path: Path) -> None:
     done = command(folder, "compare", "s.mcap", "--out", str(tmp_path), "--quiet")
-    assert all(solver in done.stdout for solver in ("published", "batch", "incremental"))
+    assert all(solver in done.out for solver in ("published", "batch", "incremental"))
     assert "time_offset" in (tmp_path / "compare.html").read_text()
 
 
@@ -84,13 +110,13 @@ def test_plan_finds_the_second_axis(command: Command, folder: Path, tmp_path: Pa
     """The scenario is one that the distribution brings, by its name."""
     better = tmp_path / "better.yaml"
     done = command(folder, "plan", "gyro_pair", "--scenario", "gyro_pair_one_axis", "--out", str(better), code=3)
-    assert "the body: sway by 20 deg" in done.stdout
+    assert "the body: sway by 20 deg" in done.out
     command(folder, "plan", "gyro_pair", "--scenario", str(better), "--quiet")
 
 
 def test_follow(command: Command, folder: Path, tmp_path: Path) -> None:
     done = command(folder, "follow", "s.mcap", "--out", str(tmp_path))
-    assert "the accuracy wanted is reached" in done.stdout + done.stderr
+    assert "the accuracy wanted is reached" in done.out + done.err
     assert result(tmp_path)["status"] == "calibrated"
 
 
@@ -98,7 +124,7 @@ def test_montecarlo_of_the_nominal_scenario(command: Command, folder: Path, tmp_
     pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
     words = ("--runs", "2", "--jobs", "1", "--solvers", "published,batch", "--out", str(tmp_path), "--quiet")
     done = command(folder, "montecarlo", "gyro_pair", *words)
-    assert "batch: mean NEES" in done.stdout
+    assert "batch: mean NEES" in done.out
     with (tmp_path / "runs.csv").open(newline="") as stream:
         rows = list(csv.DictReader(stream))
     assert [row["status"] for row in rows] == ["calibrated"] * 4
@@ -107,12 +133,10 @@ def test_montecarlo_of_the_nominal_scenario(command: Command, folder: Path, tmp_
 
 def test_what_it_cannot_do_is_one_line(command: Command, folder: Path) -> None:
     done = command(folder, "simulate", "gyro_pair", "--images", "--out", "x.mcap", "--quiet", code=2)
-    assert done.stderr == "alidade: gyro_pair has no camera: leave out --images\n"
+    assert done.err == "alidade: gyro_pair has no camera: leave out --images\n"
     assert (
         "gyro_pair_one_axis"
-        in command(
-            folder, "simulate", "gyro_pair", "--scenario", "one_axis", "--out", "x.mcap", "--quiet", code=2
-        ).stderr
+        in command(folder, "simulate", "gyro_pair", "--scenario", "one_axis", "--out", "x.mcap", "--quiet", code=2).err
     )
 
 

@@ -168,11 +168,12 @@ def test_numbers_that_differ_in_every_unit_differ_by_nature() -> None:
     assert a.repeatability.value == pytest.approx(0.05, abs=3.0 * a.repeatability.sigma)
 
 
-def test_variance_components_are_told_with_their_sigmas() -> None:
+@pytest.mark.parametrize("fleets", [80, pytest.param(200, marks=pytest.mark.slow)])
+def test_variance_components_are_told_with_their_sigmas(fleets: int) -> None:
     """Both standard deviations lie within one of their sigmas in two of three fleets, and of none there is a bound."""
     rng = np.random.default_rng(11)
     pulls, bounded, seen_in_nothing = [], [], []
-    for _ in range(200):
+    for _ in range(fleets):
         units = np.repeat(np.arange(20), 3)
         sigmas = rng.uniform(0.5, 1.5, 60)
         noise = sigmas * rng.standard_normal(60)
