@@ -174,7 +174,7 @@ def _show_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:
 def show_plan(plan: Plan) -> None:
     """Predicted sigmas of a motion and of the better one, what falls short, and what to change."""
     from pipelines.reports.budget import limits
-    from pipelines.reports.units import human_unit
+    from pipelines.reports.units import human_unit, rounded
 
     limited = {limit.name: limit for limit in limits(plan.best.budget, plan.best.quantities)}
     table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
@@ -187,7 +187,7 @@ def show_plan(plan: Plan) -> None:
     now, best = plan.now.sigmas, plan.best.sigmas
     for q in filter(lambda q: q.judged, plan.now.quantities):
         unit, factor = human_unit(q)
-        cells = [f"{factor * sigma:.2g}" for sigma in (q.require, now[q.name], best[q.name])]
+        cells = [rounded(factor * sigma) for sigma in (q.require, now[q.name], best[q.name])]
         verdict = plan.now.assessment.verdicts[q.name]
         most = limited[q.name].parts[0] if q.name in limited else ("", 0.0)
         limit = f"{most[0]}, {100.0 * most[1]:.0f} %" if most[0] else ""
@@ -232,14 +232,14 @@ def show_noise(study: NoiseStudy) -> None:
 
 
 def _cell(parameter: ParameterResult, factor: float, error_sigmas: float | None, alone: bool) -> str:
-    from pipelines.reports.units import to_digits_of
+    from pipelines.reports.units import rounded, signed, to_digits_of
 
     value = to_digits_of(parameter.value * factor, parameter.sigma * factor)
     if parameter.sigma == 0.0:
         return f"{value} fixed"
     # Several solvers fit a terminal's 80 columns only with the error below the value.
-    error = "" if error_sigmas is None else f"{' ' if alone else chr(10)}({error_sigmas:+.1f})"
-    return f"{value} ±{parameter.sigma * factor:.2g}{error}"
+    error = "" if error_sigmas is None else f"{' ' if alone else chr(10)}({signed(error_sigmas)})"
+    return f"{value} ±{rounded(parameter.sigma * factor)}{error}"
 
 
 def _verdict(calibration: Calibration, name: bool) -> None:

@@ -147,7 +147,7 @@ def _stepped(step: Change, held: Holding) -> str:
     """A parameter that changed, in the unit people read."""
     unit, factor = human_unit(held.quantities[step.name])
     size, sigma = (to_digits_of(factor * x, factor * step.sigma) for x in (step.size, step.sigma))
-    return f"{step.name} changed by {size} ± {sigma} {unit.removeprefix('1')}".strip()
+    return f"{step.name} changed by {size} ± {sigma} {unit}".strip()
 
 
 def parameter_rows(validated: Validated) -> list[tuple[str, str, str, str, str]]:

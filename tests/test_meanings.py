@@ -29,7 +29,7 @@ def test_every_parameter_has_a_meaning(case: str) -> None:
 
 def test_the_words_are_of_the_parameter() -> None:
     assert meaning(method("head"), "gyro_bias_y") == "What the gyro reads about its y axis when it does not turn."
-    assert meaning(method("cube"), "mag_k12") == "Part of y of the magnetometer's reading that is x of the body."
+    assert meaning(method("cube"), "mag_k12") == "Share of the magnetometer's y that is added to x."
     assert meaning(method("head"), "unheard_of") == ""
 
 

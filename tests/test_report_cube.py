@@ -140,7 +140,8 @@ def test_without_camera_and_magnetometer_there_is_less_to_show() -> None:
     plots = _plots((data, config, estimate, findings(data, config, estimate), truth))
     assert "Sphere of the accelerometer" in plots
     assert not [title for title in plots if "agnetometer" in title]
-    assert plots["Static poses"].rows[0][-1] == "accelerometer, gyro at rest"
+    assert plots["Static poses"].rows[0][-1] == ""
+    assert "Used of each: accelerometer, gyro at rest, but" in plots["Static poses"].caption
 
 
 @pytest.mark.parametrize(

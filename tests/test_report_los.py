@@ -36,4 +36,4 @@ def test_the_prediction_follows_the_measured_error(priors: str) -> None:
         np.testing.assert_allclose(predicted[axis], measured[axis], atol=0.5)
     spread = {mark.name: np.std(mark.y) for mark in left.figure.marks}
     assert spread["phx, mounting angles found"] < 150.0 < 500.0 < spread["phx, mounting angles zero"]
-    assert "urad" in left.caption
+    assert "µrad" in left.caption

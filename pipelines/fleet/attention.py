@@ -87,7 +87,7 @@ def _changed(history: History, fleet: Mapping[tuple[str, str], Population]) -> l
     def told(step: Change) -> str:
         unit, factor = readable(fleet[history.method, step.name])
         size, sigma = (to_digits_of(factor * x, factor * step.sigma) for x in (step.size, step.sigma))
-        return f"{what(step)} by {size} ± {sigma} {unit.removeprefix('1')} ".rstrip() + f" {between(step.after)}"
+        return f"{what(step)} by {size} ± {sigma} {unit} ".rstrip() + f" {between(step.after)}"
 
     jointly = [
         Finding("changed", f"all parameters together {between(after)}, none by more than chance for itself")
@@ -109,7 +109,7 @@ def _outlying(p: Population, i: int) -> Finding:
     assert p.spread is not None  # without one nothing is outlying
     unit, factor = readable(p)
     off, scale = factor * (p.values[i] - p.spread.centre), factor * float(np.hypot(p.spread.tau, p.sigmas[i]))
-    text = f"{p.name} is {to_digits_of(off, scale)} {unit.removeprefix('1')} ".rstrip()
+    text = f"{p.name} is {to_digits_of(off, scale)} {unit} ".rstrip()
     return Finding("outlying", f"{text} off the fleet's centre ({_day(p.dates[i])})", float(p.z[i]))
 
 

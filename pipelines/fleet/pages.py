@@ -16,6 +16,8 @@ from pipelines.fleet.attention import Unit, readable, sentence, units_of_interes
 from pipelines.fleet.histories import History
 from pipelines.fleet.statistics import Component
 from pipelines.graph.problem import Array, Quantity
+from pipelines.methods import method
+from pipelines.methods.meanings import meaning
 from pipelines.reports.answer import Answer
 from pipelines.reports.figure import COLORS, REJECTED, Figure, Shape, milliseconds, thin
 from pipelines.reports.result import Plot
@@ -53,6 +55,7 @@ def fleet_html(outcome: Outcome, fleet: Sequence[Population], found: Sequence[Hi
         attention=attention[:_MOST_LISTED],
         hidden=max(len(attention) - _MOST_LISTED, 0),
         parameters=[_parameter_row(p) for p in fleet],
+        methods=len({p.method for p in fleet}),
     )
 
 
@@ -62,7 +65,8 @@ def _attention(found: Sequence[Unit], units: int, parameters: bool) -> Answer:
     if not found:
         word = "none" if parameters else "cannot say"
         said = f"None of {units} units stands out." if parameters else "No recording gave a calibration to compare."
-        return Answer(question, word, "good" if parameters else "fixed", said)
+        step = "Run the same command when there are new recordings; those finished are kept."
+        return Answer(question, word, "good" if parameters else "fixed", said, (), (step,))
     steps = (
         "Start with the first in the table: units that changed, then those unlike the others.",
         "Record a unit again before it is sent back: what stands out twice is the unit, not the recording.",
@@ -78,11 +82,12 @@ def study_html(study: Study) -> str:
         "montecarlo.html",
         [plot for solver in solvers for plot in (_nees_plot(study, solver), _errors_plot(study, solver))],
         study=study,
+        title=method(study.method).title,
         answer=_truth(study, solvers),
         finished=len(study.results),
         rows=[_consistency_row(study, solver) for solver in solvers],
         failures={solver: study.failures(solver) for solver in study.solvers},
-        accuracies=[_accuracy_row(solver, *row) for solver in solvers for row in study.accuracies(solver).items()],
+        accuracies=[_accuracy_row(study, solver, *row) for solver in solvers for row in study.accuracies(solver).items()],
     )
 
 
@@ -93,7 +98,7 @@ def _parameter_row(p: Population) -> dict[str, Any]:
     """The cells of a parameter, in the unit people read."""
     unit, factor = readable(p)
     sigma = factor * float(np.median(p.sigmas))
-    row: dict[str, Any] = {"name": p.name, "method": p.method, "unit": unit.removeprefix("1"), "count": len(p.values)}
+    row: dict[str, Any] = {"name": p.name, "meaning": meaning(method(p.method), p.name), "method": p.method, "unit": unit, "count": len(p.values)}
     row |= {"sigma": rounded(sigma)}
     row |= {"centre": "", "low": "", "high": "", "beyond": "", "drift": "", "drifts": p.drifts}
     row |= {"outlying": int(p.outlying.sum()), "changed": len({p.units[i] for i in np.flatnonzero(p.changed)})}
@@ -135,7 +140,7 @@ def _population_plot(p: Population) -> Plot:
     if p.spread and p.control:
         out.levels(factor * p.spread.centre, dash="solid")
         out.levels(factor * np.array(p.control), dash="dashed")
-    caption = f"{len(p.values)} recordings of {len(set(p.units))} units, {unit}, with one sigma each"
+    caption = f"{len(p.values)} recordings of {len(set(p.units))} units, with one sigma each"
     limits = "; dashed are the control limits, three standard deviations about the centre" if p.spread else ""
     return Plot(f"{p.name} ({p.method})", f"{caption}{limits}.", out, (counts,))
 
@@ -167,15 +172,16 @@ def _truth(study: Study, solvers: Sequence[str]) -> Answer:
         solver: study.nees(solver) for solver in solvers
     }
     if not judged:
-        return Answer(question, "cannot say", "fixed", "No run gave an estimate.")
+        return Answer(question, "cannot say", "fixed", "No run gave an estimate.", (), ("See below why the runs failed.",))
     said = ", ".join(
-        f"{solver} has a mean NEES of {nees.mean:.3g} where {nees.dof:g} is right and chance makes {nees.low:.3g} to "
-        f"{nees.high:.3g}"
+        f"{solver} has a mean NEES of {rounded(nees.mean, 3)} where {nees.dof:g} is right and chance allows "
+        f"{rounded(nees.low, 3)} to {rounded(nees.high, 3)}"
         for solver, nees in judged.items()
     )
     wrong = [solver for solver, nees in judged.items() if not nees.consistent]
     if not wrong:
-        return Answer(question, "yes", "good", f"Errors are as large as the sigmas say: {said}.")
+        steps = ("Rely on the sigmas of recordings like this one; another motion or sensor is another study.",)
+        return Answer(question, "yes", "good", f"Errors are as large as the sigmas say: {said}.", (), steps)
     steps = ("See below which parameters' ratio of error to sigma is far from 1, and which are biased.",)
     return Answer(question, "no", "bad", f"Not those of {', '.join(wrong)}: {said}.", (), steps)
 
@@ -191,12 +197,13 @@ def _consistency_row(study: Study, solver: str) -> dict[str, Any]:
     }
 
 
-def _accuracy_row(solver: str, name: str, row: tuple[statistics.Accuracy, Result]) -> dict[str, Any]:
+def _accuracy_row(study: Study, solver: str, name: str, row: tuple[statistics.Accuracy, Result]) -> dict[str, Any]:
     a, parameter = row
     unit, factor = human_unit(Quantity(name, parameter["unit"], None, 1.0, parameter["require"] or math.inf))
     return {
         "solver": solver,
         "name": name,
+        "meaning": meaning(method(study.method), name),
         "unit": unit,
         "bias": f"{to_digits_of(factor * a.bias, factor * a.bias_sigma)} ± {rounded(factor * a.bias_sigma)}",
         "biased": abs(a.bias) > 3.0 * a.bias_sigma,
@@ -218,7 +225,7 @@ def _nees_plot(study: Study, solver: str) -> Plot:
     return Plot(
         f"{solver}: NEES",
         f"Normalised estimation error squared of {len(values)} runs; the line is what true covariances give. "
-        f"{int((values > top).sum())} runs beyond {top:.3g} stand in the last bar.",
+        f"Those beyond {rounded(top, 3)}, {int((values > top).sum())}, stand in the last bar.",
         out,
     )
 

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from pipelines.follow.guidance import View
 from pipelines.follow.qr import qr
-from pipelines.reports.units import human_unit, to_digits_of
+from pipelines.reports.units import human_unit, rounded, to_digits_of
 from pipelines.terminal import COLOURS
 
 # A line at most this often where there is no terminal, s.
@@ -79,13 +79,13 @@ def _parameters(view: View) -> Table:
     for i in view.shown:
         q = view.quantities[i]
         unit, factor = human_unit(q)
-        required = f"{factor * q.require:.2g}"
+        required = rounded(factor * q.require)
         if view.values is None or view.assessment is None or view.sigmas is None:
             table.add_row(q.name, unit, "", "", required, "")
             continue
         sigma, verdict = float(view.sigmas[i]), view.assessment.verdicts[q.name]
         value = to_digits_of(factor * float(view.values[i]), factor * sigma)
-        table.add_row(q.name, unit, value, f"{factor * sigma:.2g}", required, f"[{COLOURS[verdict]}]{verdict}[/]")
+        table.add_row(q.name, unit, value, rounded(factor * sigma), required, f"[{COLOURS[verdict]}]{verdict}[/]")
     if len(view.shown) < len(view.estimated):
         table.caption = f"the least accurate of {len(view.estimated)} parameters"
     return table

@@ -20,7 +20,7 @@ class Validation:
         before: (n, m) errors, one column an axis, with nothing compensated.
         after: (n, m) the same with the calibration applied.
         note: what a reader has to know beside it, a sentence without its full stop; may be empty.
-        micro: angles are read in urad, as in the trade of pointing, not in degrees.
+        micro: angles are read in µrad, as in the trade of pointing, not in degrees.
     """
 
     name: str

@@ -35,13 +35,34 @@ COMMON: Mapping[str, str] = {
     r"clock_skew": "Part of the time by which the pictures' clock runs faster than the gyro's.",
     r"encoder_([a-z_]+)_(sin|cos)": "Error of the {0} axis' encoder that comes once a turn with the {1} of its angle.",
     r"encoder_delay": "How much later than its stamp an encoder's reading is true.",
-    r"(accel|gyro|mag)_k([123])\2": "Multiplies {1} of the {0}'s reading.",
-    r"(accel|gyro|mag)_k([123])([123])": "Part of {2} of the {0}'s reading that is {1} of the body.",
-    r"(accel|gyro|mag)_b([123])": "Added to {1} of the {0} after that.",
+    r"(accel|gyro|mag)_k([123])\2": "Factor of the {0}'s {1}.",
+    r"(accel|gyro|mag)_k([123])([123])": "Share of the {0}'s {2} that is added to {1}.",
+    r"(accel|gyro|mag)_b([123])": "Offset added to the {0}'s {1} after that.",
     r"field_([enu])": "Magnetic field where it was recorded, its part towards {0}.",
     r"field_strength": "Strength of the magnetic field, to which the magnetometer is scaled.",
     r"field_dip": "Angle by which the magnetic field points below the horizon.",
     r"gravity": "Strength of gravity, to which the accelerometer is scaled.",
+}
+
+# Noises by their names in the config.
+NOISES: Mapping[str, str] = {
+    "gyro_density": "White noise of the gyro.",
+    "gyro_bias_walk": "Random walk of the gyro's bias.",
+    "gyro_repeatability": "Gyro, from rest to rest, beyond white noise.",
+    "turn_repeatability": "Gyro, share of the angle turned, beyond white noise.",
+    "platform_gyro_density": "White noise of the platform's gyro.",
+    "accel_density": "White noise of the accelerometer.",
+    "accel_repeatability": "Accelerometer, from rest to rest, beyond white noise.",
+    "mag_density": "White noise of the magnetometer.",
+    "mag_repeatability": "Magnetometer, from rest to rest, beyond white noise.",
+    "los_error": "Line-of-sight error, of one measurement and axis.",
+    "los_roll": "Rotation of the picture about the line of sight, of one measurement.",
+    "encoder": "Encoder, of one sample.",
+    "vision_attitude": "Attitude by vision, of one frame and axis.",
+    "corner_px": "Corner of a tag in a picture, of one axis.",
+    "turn_rate": "Mean rate over a turn.",
+    "move_rate": "Mean rate over a move between positions.",
+    "dwell_rate": "Mean rate over a dwell in a position.",
 }
 
 

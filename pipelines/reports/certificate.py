@@ -11,6 +11,7 @@ import json
 import logging
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import NormalDist
@@ -21,6 +22,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from factors.chi_square import student
 from pipelines.errors import InputError, nearest
 from pipelines.graph.problem import Quantity
+from pipelines.methods import method
+from pipelines.methods.meanings import meaning
 from pipelines.reports.answer import Answer, Tone
 from pipelines.reports.known import load_known
 from pipelines.reports.templating import environment
@@ -286,6 +289,7 @@ def _html(result: _Result, stated: Fields, rows: Sequence[Row], before: Path | N
             f=said,
             result=result,
             rows=[_readable(row, quantities[row.name], stated) for row in rows],
+            meanings=_meanings(result.method, [row.name for row in rows]),
             budgets=[(row.name, [(s, 100.0 * x) for s, x in row.budget.items() if x >= 5e-4]) for row in rows],
             probability=f"{100.0 * stated.coverage_probability:.4g}",
             before=None if before is None else before.name,
@@ -295,13 +299,21 @@ def _html(result: _Result, stated: Fields, rows: Sequence[Row], before: Path | N
     )
 
 
+def _meanings(name: str, parameters: Sequence[str]) -> dict[str, str]:
+    """What the parameters are; of a method that is not installed here, nothing."""
+    with suppress(InputError):
+        made_by = method(name)
+        return {parameter: meaning(made_by, parameter) for parameter in parameters}
+    return {}
+
+
 def _answer(result: _Result, rows: Sequence[Row], missing: Sequence[str]) -> Answer:
     """Whether the item is within its limits, or, where it has none, what the calibration is worth."""
-    steps = (f"State in the file of `--fields`: {', '.join(missing)}.",) if missing else ()
+    steps = (f"Still to be stated, in the file given with `--fields`: {', '.join(missing)}.",) if missing else ()
     held = [row.conformity for row in rows if row.conformity]
     tone: Tone = "good" if result.status == "calibrated" else "warn"
     if not held:
-        said = f"The status of the calibration is {result.status}; there are no limits to hold the item against."
+        said = f"The status of the calibration is {result.status}; no limits are stated to compare the item with."
         return Answer("Is the item calibrated?", result.status, tone, said, (), steps)
     within = held.count("conforms")
     word = "yes" if within == len(held) else "no" if "does not conform" in held else "no statement"
@@ -333,7 +345,7 @@ def _readable(row: Row, quantity: Quantity, stated: Fields) -> dict[str, str]:
     limits = stated.limits.get(row.name)
     return {
         "name": row.name,
-        "unit": unit.removeprefix("1"),
+        "unit": unit,
         "value": shown(row.value),
         "expanded": shown(row.expanded),
         "coverage": f"{row.coverage:.2f}",

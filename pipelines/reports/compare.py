@@ -10,6 +10,7 @@ import numpy as np
 
 from pipelines.graph.problem import Quantity
 from pipelines.judgement.halves import Halves
+from pipelines.methods.meanings import meaning
 from pipelines.reports.answer import Answer
 from pipelines.reports.figure import COLORS, Dash, Figure
 from pipelines.reports.result import Calibration, Plot, truth_errors
@@ -47,7 +48,8 @@ def compare_html(
         plots,
         calibrations=calibrations,
         recording=calibrations[0].recording,
-        method=calibrations[0].problem.method,
+        method=calibrations[0].method.title,
+        meanings={q.name: meaning(calibrations[0].method, q.name) for q in quantities},
         answer=_answer(halves, predicted),
         truth_known=known,
         several=len(calibrations) > 1 and _batch(calibrations) is not None,
@@ -55,7 +57,7 @@ def compare_html(
         rows=[
             [
                 q.name,
-                human_unit(q)[0].removeprefix("1"),
+                human_unit(q)[0],
                 *(cell for c in calibrations for cell in _cells(c, calibrations, q, known)),
             ]
             for q in quantities
@@ -96,8 +98,8 @@ def _from_batch(calibration: Calibration, calibrations: Sequence[Calibration], n
 def _heads(calibration: Calibration, calibrations: Sequence[Calibration], known: bool) -> list[str]:
     """Of a solver's columns."""
     solver, batch = calibration.estimate.solver, _batch(calibrations)
-    apart = [f"{solver} from batch, sigmas"] if batch is not None and batch is not calibration else []
-    return [solver, *apart, *([f"error of {solver}, sigmas"] if known else [])]
+    apart = [f"{solver} from batch, σ"] if batch is not None and batch is not calibration else []
+    return [solver, *apart, *([f"error of {solver}, σ"] if known else [])]
 
 
 def _cells(calibration: Calibration, calibrations: Sequence[Calibration], quantity: Quantity, known: bool) -> list[str]:
@@ -149,7 +151,7 @@ def _half(quantity: Quantity, halves: Halves) -> tuple[str, str, str, str, str]:
     unit, factor = human_unit(quantity)
     first = _with_sigma(factor * halves.first, factor * halves.first_sigma)
     second = _with_sigma(factor * halves.second, factor * halves.second_sigma)
-    return quantity.name, unit.removeprefix("1"), first, second, signed(halves.difference_sigmas)
+    return quantity.name, unit, first, second, signed(halves.difference_sigmas)
 
 
 def _differences(calibrations: Sequence[Calibration], quantities: Sequence[Quantity]) -> list[Plot]:
@@ -206,5 +208,6 @@ def _convergence(calibrations: Sequence[Calibration], quantities: Sequence[Quant
         if reach and out.marks:
             edge = 0.05 * (max(reach) - min(reach))
             out.y_range = (min(reach) - edge, max(reach) + edge)
-            plots.append(Plot(f"{q.name} over time", f"{unit}; the band is one sigma of incremental.", out))
+            caption = meaning(calibrations[0].method, q.name)
+            plots.append(Plot(f"{q.name} over time", f"{caption} The band is one sigma of incremental.".strip(), out))
     return plots

@@ -12,21 +12,21 @@ from dataclasses import dataclass
 
 from pipelines.graph.problem import Quantity
 from pipelines.judgement.observability import by_advice
-from pipelines.methods.meanings import meaning
+from pipelines.methods.meanings import NOISES, meaning
 from pipelines.reports.answer import Answer, Tone
 from pipelines.reports.budget import Limit, limits
 from pipelines.reports.calibration import SavedCalibration, saved
 from pipelines.reports.plots import common_plots
-from pipelines.reports.result import Calibration, Plot, Table, quantities_of, truth_errors
+from pipelines.reports.result import Calibration, NoiseResult, Plot, Table, quantities_of, truth_errors
 from pipelines.reports.ros import ros_parameters
 from pipelines.reports.sketch import enlarged, sketch_with, told
 from pipelines.reports.snippets import c_code, python_code
 from pipelines.reports.templating import environment, page
-from pipelines.reports.units import human_unit, rounded, signed, to_digits_of
+from pipelines.reports.units import human_unit, noise_unit, rounded, signed, to_digits_of
 
 # Beyond so many sigmas of its prior a number says nothing.
 _MEANINGLESS = 10.0
-# What an input moves by less than this, in sigmas, is not worth a word.
+# What an input moves by less than this, in sigmas, is not named.
 _LEAST_MOVE = 0.1
 # So many parameters are named of those that it moves.
 _MOST_MOVED = 6
@@ -47,6 +47,22 @@ class _Row:
     assumed: bool
     pull: str
     error: str
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """A noise as people read it, and what is used in SI, as the config has it."""
+
+    name: str
+    meaning: str
+    unit: str
+    source: str
+    stated: str
+    estimated: str
+    sigma: str
+    used: str
+    used_si: str
+    inflation: str
 
 
 @dataclass(frozen=True)
@@ -78,7 +94,7 @@ def report_html(calibration: Calibration) -> str:
         start=datetime.datetime.fromtimestamp(facts.epoch_ns // 1_000_000_000, datetime.UTC),
         rows=[row for row in rows if not row.assumed],
         assumptions=[row for row in rows if row.assumed],
-        noises=calibration.noises,
+        noises=[_noise(each) for each in calibration.noises],
         limits=found,
         advised=_short_of(calibration, found),
         exact=_exact(calibration),
@@ -167,6 +183,22 @@ def _short_of(calibration: Calibration, found: list[Limit]) -> list[str]:
     return [limit.sentence for limit in told]
 
 
+def _noise(found: NoiseResult) -> _Noise:
+    unit, factor = noise_unit(found.name, found.unit)
+    return _Noise(
+        name=found.name,
+        meaning=NOISES.get(found.name, ""),
+        unit=unit,
+        source=found.source,
+        stated=rounded(factor * found.stated, 3),
+        estimated="" if found.estimated is None else rounded(factor * found.estimated, 3),
+        sigma="" if found.sigma is None else rounded(factor * found.sigma, 1),
+        used=rounded(factor * found.used, 3),
+        used_si="" if factor == 1.0 else f"{found.used:.3g} {found.unit}",
+        inflation=f"{found.inflation:.2f}" if found.inflation > 1.0 else "",
+    )
+
+
 def _exact(calibration: Calibration) -> list[_Exact]:
     """The inputs that are taken for exact, each with the parameters that it moves by more than a trifle."""
     quantities = {q.name: q for q in calibration.problem.quantities if not q.assumed}
@@ -180,13 +212,13 @@ def _exact(calibration: Calibration) -> list[_Exact]:
         told = [_moved(quantities[p], moves[p], sigmas[p]) for p in worth[:_MOST_MOVED]]
         rest = [f"{len(worth) - len(told)} more by less"] if len(worth) > len(told) else []
         off_by = f"{100.0 * step:g} %" if unit == "1" else f"{step:g} {unit}"
-        found.append(_Exact(name, off_by, ", ".join([*told, *rest]) or "nothing worth a word"))
+        found.append(_Exact(name, off_by, ", ".join([*told, *rest]) or "nothing noticeably"))
     return found
 
 
 def _moved(quantity: Quantity, move: float, sigma: float) -> str:
     unit, factor = human_unit(quantity)
-    size = f"{to_digits_of(factor * move, factor * sigma)} {unit.removeprefix('1')}".strip()
+    size = f"{to_digits_of(factor * move, factor * sigma)} {unit}".strip()
     return f"{quantity.name} {signed(move / sigma)} σ ({size})"
 
 
@@ -211,7 +243,7 @@ def _rows(calibration: Calibration) -> list[_Row]:
                 meaning=meaning(calibration.method, p.name),
                 value=to_digits_of(factor * p.value, factor * p.sigma) if known else "unknown",
                 sigma=to_digits_of(factor * p.sigma, factor * p.sigma) if known else "unknown",
-                unit=unit.removeprefix("1"),
+                unit=unit,
                 prior="free" if p.prior_sigma is None else rounded(factor * p.prior_sigma, 3),
                 require="" if p.require is None else rounded(factor * p.require, 3),
                 verdict=p.observability or "",

@@ -14,7 +14,7 @@ from pipelines.graph.problem import Quantity
 from pipelines.judgement.changes import Change, Changes
 from pipelines.reports.figure import COLORS, Figure, milliseconds
 from pipelines.reports.result import Calibration, PartResult, Plot, Table
-from pipelines.reports.units import human_unit, to_digits_of
+from pipelines.reports.units import human_unit, rounded, to_digits_of
 
 # Beyond so many days a forecast says nothing.
 _FAR_DAYS = 36_525.0
@@ -55,8 +55,8 @@ def forecasts(calibration: Calibration) -> list[tuple[str, str]]:
         if rate is None or found is None or not q.judged:
             continue
         unit, factor = human_unit(q)
-        per_day = f"{factor * rate.rate:.2g} {unit.removeprefix('1')}".strip()
-        at_most = f"{factor * rate.upper:.2g}" if math.isfinite(rate.upper) else "unknown"
+        per_day = f"{rounded(factor * rate.rate)} {unit}".strip()
+        at_most = rounded(factor * rate.upper) if math.isfinite(rate.upper) else "unknown"
         likely, soonest = (_days(q.require, found.sigma, each) for each in (rate.rate, rate.upper))
         told.append((q.name, f"walks {per_day} in the root of a day (at most {at_most}); {_when(likely, soonest)}"))
     return told
@@ -113,7 +113,7 @@ def _figures(calibration: Calibration) -> list[Plot]:
     for which in dict.fromkeys(map(kind, known)):
         own = [q for name, q in known.items() if kind(name) == which]
         unit, factor = human_unit(own[0])
-        out = Figure(f"{which}, {unit.removeprefix('1')}", "date of the recording", x_scale="datetime")
+        out = Figure(f"{which}, {unit}".removesuffix(", "), "date of the recording", x_scale="datetime")
         for q, color in zip(own, cycle(COLORS), strict=False):
             _add(out, calibration, q, factor, color)
         caption = (
@@ -176,4 +176,4 @@ def _between(after: int, parts: Sequence[PartResult]) -> str:
 def _shown(value: float, sigma: float, quantity: Quantity) -> str:
     unit, factor = human_unit(quantity)
     number, spread = (to_digits_of(factor * x, factor * sigma) for x in (value, sigma))
-    return f"{number} ± {spread} {unit.removeprefix('1')}".strip()
+    return f"{number} ± {spread} {unit}".strip()

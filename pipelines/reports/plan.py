@@ -25,7 +25,7 @@ def plan_html(plan: Plan) -> str:
         source, share = limited[q.name].parts[0] if q.name in limited else ("", 0.0)
         limit = f"{source}, {100.0 * share:.0f} %" if source else ""
         verdict = plan.now.assessment.verdicts[q.name]
-        rows.append((q.name, meaning(method, q.name), unit.removeprefix("1"), *sigmas, verdict, limit))
+        rows.append((q.name, meaning(method, q.name), unit, *sigmas, verdict, limit))
     return page(
         "pipelines.reports",
         "plan.html",

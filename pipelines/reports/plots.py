@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from itertools import cycle
 
@@ -13,6 +14,10 @@ from pipelines.reports.figure import COLORS, PALE, REJECTED, Figure
 from pipelines.reports.result import Calibration, Plot, quantities_of
 from pipelines.reports.units import human_unit
 
+# What tells the numbers of one variable apart: an axis, an element, a harmonic.
+_AXIS = re.compile(r"_([xyzenu]{1,2}|sin|cos)$|_?\d+$")
+# So many variables are named in a title.
+_MOST_NAMED = 3
 # Numbers are written into the correlation map up to this many parameters.
 _MOST_LABELLED = 12
 # Ellipses are drawn of so many pairs that are correlated at least so much.
@@ -87,7 +92,7 @@ def _squares(family: str, residuals: Residuals) -> Plot:
     out.levels(rows.shape[1])
     return Plot(
         f"Innovations squared of {family}",
-        f"The mean should stay at {rows.shape[1]} (dotted): above it noise is larger than reckoned with or the model "
+        f"The mean should stay at {rows.shape[1]} (dotted): above it noise is larger than assumed or the model "
         "lacks something at that time, below it noise is smaller.",
         out,
     )
@@ -123,7 +128,7 @@ def _histories(calibration: Calibration, history: History) -> list[Plot]:
         plots.append(
             Plot(
                 f"{title} over time",
-                f"Estimate at each moment from what was recorded until then, {unit}; the band is one sigma"
+                "Estimate at each moment from what was recorded until then; the band is one sigma"
                 + "".join(f", {line}" for line in _OTHERS if line in shown)
                 + ".",
                 out,
@@ -171,22 +176,19 @@ def _learning(calibration: Calibration, history: History) -> Plot:
         out.line(history.time, history.sigmas[:, column[name]] / require[name], name, color)
     out.levels(1.0)
     return Plot(
-        "What was known when",
-        "Sigma of each parameter over the one required, as the recording went on; below the dotted line it is as "
-        "accurate as required. Where a line falls steeply the motion said much."
-        + (f" The {len(slowest)} of {len(last)} that are known least." if len(last) > len(slowest) else ""),
+        "Sigmas over time",
+        "Sigma of each parameter over the one required; below the dotted line it is as accurate as required. Where a "
+        "line falls steeply the motion was informative."
+        + (f" The {len(slowest)} of {len(last)} with the largest ratio." if len(last) > len(slowest) else ""),
         out,
     )
 
 
 def _common_name(names: Sequence[str]) -> str:
     """What the names of one variable have in common, for a title."""
-    if len(names) == 1:
-        return names[0]
-    common = names[0]
-    while common and not all(name.startswith(common) for name in names):
-        common = common[:-1]
-    return common.rstrip("_") or ", ".join(names)
+    stems = list(dict.fromkeys(_AXIS.sub("", name) for name in names)) if len(names) > 1 else list(names)
+    more = len(stems) - _MOST_NAMED
+    return ", ".join(stems[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _correlation(calibration: Calibration) -> Plot | None:
@@ -205,7 +207,7 @@ def _correlation(calibration: Calibration) -> Plot | None:
     out.heat(correlation, numbers=len(names) <= _MOST_LABELLED)
     return Plot(
         "Correlation of the parameters",
-        "Red +1, blue -1. Near either two parameters trade against each other: their errors are not independent.",
+        "Red +1, blue -1. Near either, two parameters trade against each other: their errors are not independent.",
         out,
     )
 

@@ -12,6 +12,7 @@ import platform
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import metadata
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -275,8 +276,16 @@ class Calibration:
 
     @property
     def config_text(self) -> str:
-        """The config in force, YAML."""
-        return self.config.model_dump_json(indent=1, exclude_defaults=True)
+        """The config in force, YAML; what is as by default is left out."""
+        from ruamel.yaml import YAML
+
+        yaml = YAML(typ="safe", pure=True)
+        yaml.default_flow_style = None
+        yaml.sort_base_mapping_type_on_output = False
+        yaml.width = 80
+        text = StringIO()
+        yaml.dump(self.config.model_dump(mode="json", exclude_defaults=True), text)
+        return text.getvalue()
 
     @property
     def formulas(self) -> Sequence[Formula]:

@@ -6,12 +6,14 @@ import math
 
 from pipelines.graph.problem import Quantity
 
+_G = 9.80665  # standard gravity, m/s^2
+
 # What is wanted to better than this, rad or rad/s, is read in arc seconds or degrees per hour.
 _FINE = 2e-4
 
 
 def human_unit(quantity: Quantity) -> tuple[str, float]:
-    """The unit to show a quantity in, and what to multiply its SI number by."""
+    """The unit to show a quantity in, empty for a plain number, and what to multiply its SI number by."""
     fine = quantity.require < _FINE
     match quantity.unit:
         case "rad":
@@ -27,9 +29,48 @@ def human_unit(quantity: Quantity) -> tuple[str, float]:
         case "rad/s/K":
             return "deg/s/K", math.degrees(1.0)
         case "rad/s/(m/s^2)":
-            return "deg/s/g", math.degrees(9.80665)
+            return "deg/s/g", math.degrees(_G)
+        case "m/s^2":
+            return "m/s²", 1.0
+        case "m/s^2/K":
+            return "m/s²/K", 1.0
+        case "T/K":
+            return "nT/K", 1e9
+        case "s^2/m":
+            return "µg/g²", 1e6 * _G
+        case "s^4/m^2":
+            return "µg/g³", 1e6 * _G**2
+        case "1":
+            return "", 1.0
         case other:
             return other, 1.0
+
+
+_ARW = ("deg/√h", math.degrees(60.0))
+_RRW = ("deg/h/√h", math.degrees(60.0) * 3600.0)
+# Noises by their names in the config -> unit people use, and what to multiply SI by.
+_NOISE: dict[str, tuple[str, float]] = {
+    "gyro_density": _ARW,
+    "platform_gyro_density": _ARW,
+    "gyro_bias_walk": _RRW,
+    "gyro_repeatability": ("deg/h", math.degrees(3600.0)),
+    "accel_density": ("µg/√Hz", 1e6 / _G),
+    "accel_repeatability": ("µg", 1e6 / _G),
+    "mag_density": ("nT/√Hz", 1e9),
+    "mag_repeatability": ("nT", 1e9),
+    "los_error": ("µrad", 1e6),
+    "los_roll": ("µrad", 1e6),
+    "encoder": ("arcsec", math.degrees(3600.0)),
+    "vision_attitude": ("deg", math.degrees(1.0)),
+    "turn_rate": ("deg/h", math.degrees(3600.0)),
+    "move_rate": ("deg/h", math.degrees(3600.0)),
+    "dwell_rate": ("deg/h", math.degrees(3600.0)),
+}
+
+
+def noise_unit(name: str, si: str) -> tuple[str, float]:
+    """The unit to show a noise of the config in, and what to multiply its SI number by."""
+    return _NOISE.get(name, (si, 1.0))
 
 
 def signed(value: float, decimals: int = 1) -> str:

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipelines.judgement.validation import Validation, peak, rms
+from pipelines.methods import method
+from pipelines.methods.meanings import meaning
 from pipelines.reports.answer import Answer, Tone
 from pipelines.reports.calibration import SavedCalibration
 from pipelines.reports.figure import BEFORE, COLORS, Figure
@@ -63,11 +65,14 @@ def validation_html(
         sentence: that in words.
         parameters: name, change, sigma, from what on it would be noticed, unit.
     """
+    made_by = method(calibration.method)
     return page(
         "pipelines.reports",
         "validation.html",
         [_plot(v) for v in validations],
         c=calibration,
+        method=made_by.title,
+        meanings={row[0]: meaning(made_by, row[0]) for row in parameters},
         recording=recording,
         answer=_answer(verdict, sentence),
         parameters=parameters,
@@ -76,12 +81,12 @@ def validation_html(
 
 
 _WORDS: dict[str, tuple[str, Tone, tuple[str, ...]]] = {
-    "holds": ("yes", "good", ("Go on using it.",)),
+    "holds": ("yes", "good", ("Continue to use it.",)),
     "changed": (
         "no",
         "bad",
         (
-            "Do not go on with it: `alidade calibrate` this recording, and apply that.",
+            "Do not use it any longer: run `alidade calibrate` on this recording, and apply the result.",
             "If the change is larger than wear explains, look at mounts and screws first.",
         ),
     ),
@@ -113,6 +118,6 @@ def _readable(validation: Validation) -> tuple[str, float]:
     if validation.unit != "rad":
         return validation.unit, 1.0
     if validation.micro:
-        return "urad", 1e6
+        return "µrad", 1e6
     fine = rms(validation.after) < _FINE
     return ("arcsec", math.degrees(3600.0)) if fine else ("deg", math.degrees(1.0))

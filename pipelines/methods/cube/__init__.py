@@ -43,10 +43,10 @@ class Cube(Method):
     of_recording = ("gyro_b?", "accel_b?", "field_?", "reference_*")
     sketch = Path(__file__).with_name("frames.svg")
     meanings: ClassVar[Mapping[str, str]] = {
-        r"camera_mount_([xyz])": "Camera turned about its {0} from where the config has it.",
+        r"camera_mount_([xyz])": "Camera rotated about its {0}, relative to the config.",
         r"reference_heading": "Heading that the reference's attitude is off, about up.",
         r"reference_tilt_([en])": "Tilt that the reference's attitude is off, about {0}.",
-        r"tag_(\d+)_([xyz])": "Tag {0} turned about its {1} from where the config has it.",
+        r"tag_(\d+)_([xyz])": "Tag {0} rotated about its {1}, relative to the config.",
         r"accel_square_([123])": "How the accelerometer's reading of {0} bends: per m/s^2, squared.",
         r"accel_cube_([123])": "How the accelerometer's reading of {0} bends: per m/s^2, cubed.",
         r"camera_focal": "Part by which the camera's focal length is larger than stated.",

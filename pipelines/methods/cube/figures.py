@@ -18,6 +18,7 @@ from pipelines.methods.cube.tables import NAMES, cube_tables
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.reports.figure import BEFORE, COLORS, FAINT, Figure, thin
 from pipelines.reports.result import Calibration, Plot, Table
+from pipelines.reports.units import rounded
 from pipelines.settings import Config
 
 # Unit that people read an error in, and what to multiply its SI number by.
@@ -101,7 +102,7 @@ def _before_and_after(name: str, time: Array, before: Array, after: Array) -> Pl
     against = "" if name == "gyro" else " against what it should say at the attitude found"
     return Plot(
         f"{NAMES[name].capitalize()} before and after",
-        f"{what}{against}: {rms[0]:.3g} {unit} RMS as recorded, {rms[1]:.3g} {unit} calibrated.",
+        f"{what}{against}: {rounded(rms[0], 3)} {unit} RMS as recorded, {rounded(rms[1], 3)} {unit} calibrated.",
         out,
     )
 
@@ -146,7 +147,7 @@ def _sphere(
     return Plot(
         f"Sphere of the {NAMES[name]}",
         f"Means of the static poses over the strength they should have, seen along z and along y, and below how far "
-        f"their lengths are off: {rms[0]:.2g} % RMS as recorded, {rms[1]:.2g} % calibrated.",
+        f"their lengths are off: {rounded(rms[0])} % RMS as recorded, {rounded(rms[1])} % calibrated.",
         views[0],
         (views[1], lengths),
     )

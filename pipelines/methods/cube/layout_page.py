@@ -130,10 +130,10 @@ def layout_html(layout: Layout, recordings: Sequence[str]) -> str:
 
 def _answer(layout: Layout) -> Answer:
     steps = tuple(f"{step[:1].upper()}{step[1:]}." for step in advice(layout))
-    word = "in part" if layout.unplaced else "here they are"
+    word = "in part" if layout.unplaced else "yes"
     apply = "Use the section `cube: tags` that was written, in the config of recordings of this cube."
     tone: Tone = "warn" if steps else "good"
-    return Answer("Where are the tags?", word, tone, headline(layout) + ".", (), (*steps, apply))
+    return Answer("Are all tags located?", word, tone, headline(layout) + ".", (), (*steps, apply))
 
 
 _CAPTION = (

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipelines.reports.result import Calibration, Table
 from pipelines.reports.sphere_map import described
-from pipelines.reports.units import to_digits_of
+from pipelines.reports.units import rounded, to_digits_of
 
 NAMES = {"accel": "accelerometer", "gyro": "gyro", "mag": "magnetometer"}
 _NOISE = {"accel": ("µg/√Hz", 1e6 / 9.80665), "gyro": ("deg/√h", np.rad2deg(60.0)), "mag": ("nT/√Hz", 1e9)}
@@ -56,7 +56,7 @@ def _number(part: str, value: float, sigma: float, unit: str) -> str:
     shown, spread = factor * (value - (part == "scale")), factor * sigma
     if not spread < _UNKNOWN:
         return "unknown"
-    return f"{to_digits_of(shown, spread)} ± {spread:.2g}" if spread > 0.0 else f"{to_digits_of(shown, 0.0)} fixed"
+    return f"{to_digits_of(shown, spread)} ± {rounded(spread)}" if spread > 0.0 else f"{to_digits_of(shown, 0.0)} fixed"
 
 
 def _noise(calibration: Calibration) -> Table:
@@ -88,13 +88,22 @@ def _disturbed(calibration: Calibration) -> Table:
 
 
 def _static_poses(calibration: Calibration) -> Table:
+    found = rows_of(calibration, "static_poses")
+    whole = list(dict.fromkeys(family for row in found for family in row["used"]))
     rows = [
-        (str(k + 1), f"{row['start_s']:.2f}", f"{row['end_s']:.2f}", described(row["up"]), ", ".join(row["used"]))
-        for k, row in enumerate(rows_of(calibration, "static_poses"))
+        (
+            str(k + 1),
+            f"{row['start_s']:.2f}",
+            f"{row['end_s']:.2f}",
+            described(row["up"]),
+            ", ".join(family for family in whole if family not in row["used"]),
+        )
+        for k, row in enumerate(found)
     ]
     return Table(
         "Static poses",
-        "When gyro and accelerometer were quiet, which side was up, and what was used of it.",
-        ("pose", "from, s", "to, s", "up", "used"),
+        f"When gyro and accelerometer were quiet, and which side was up. Used of each: {', '.join(whole)}, but for what is "
+        "named as not used.",
+        ("pose", "from, s", "to, s", "up", "not used"),
         tuple(rows),
     )

@@ -20,6 +20,7 @@ from pipelines.methods.los.pictures import select_pictures
 from pipelines.methods.los.recording import LosData
 from pipelines.reports.figure import COLORS, Figure
 from pipelines.reports.result import Calibration, Plot
+from pipelines.reports.units import rounded
 from pipelines.settings import DEFAULT_NOISE, first_given
 
 _AXES = ("phx", "phz")
@@ -78,7 +79,7 @@ def _measured_and_predicted(time: Array, measured: Array, predicted: Array) -> P
 
 
 def _left(time: Array, without: Array, compensated: Array) -> Plot:
-    out = Figure("measured less predicted, urad")
+    out = Figure("measured less predicted, µrad")
     for i, axis in enumerate(_AXES):
         out.points(time, _URAD * without[:, i], f"{axis}, mounting angles zero", COLORS[4 + 2 * i], 3)
     for i, axis in enumerate(_AXES):
@@ -88,7 +89,7 @@ def _left(time: Array, without: Array, compensated: Array) -> Plot:
     out.y_range = (-reach, reach)
     return Plot(
         "What gyro, gimbal and calibration leave of the LOS error",
-        f"Per axis {spread[0]:.3g} urad with the mounting angles zero, {spread[1]:.3g} urad with those found (standard "
+        f"Per axis {rounded(spread[0], 3)} µrad with the mounting angles zero, {rounded(spread[1], 3)} µrad with those found (standard "
         "deviations, from the median). The gyro's noise adds up from a target's first picture on, so what is left may "
         "wander; it should not follow the sway.",
         out,

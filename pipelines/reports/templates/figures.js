@@ -78,7 +78,8 @@
         return mark.texts.length ? [tiles, figure.text({ ...at, ...words, text_font_size: "11px" })] : [tiles];
       }
       case "patches": {
-        const palette = blend(mix(color("paper"), ink, 0.12), ink, 50);
+        // No darker than what is written on it can be read on.
+        const palette = blend(mix(color("paper"), ink, 0.12), mix(color("paper"), ink, 0.45), 50);
         return [figure.patches({ xs: field("x"), ys: field("y"), source, line_color: color("soft"), fill_color: mapped(palette, 0, Math.max(...data.value)) })];
       }
     }
@@ -89,7 +90,7 @@
     points: [["x", "y"]], line: [["x", "y"]], boxes: [[null, "high"]], heat: [[null, "value"]], patches: [[null, "value"]],
   };
 
-  function build(spec, before) {
+  function build(spec, before, wrapped, narrow) {
     const dates = spec.x_scale == "datetime";
     const range = limits => limits ? new Bokeh.Range1d({ start: limits[0], end: limits[1] }) : new Bokeh.DataRange1d();
     const zoom = new Bokeh.BoxZoomTool();
@@ -109,6 +110,7 @@
       axis.axis_label_text_font_size = axis.major_label_text_font_size = "12px";
       axis.axis_line_color = axis.major_tick_line_color = color("faint");
       axis.minor_tick_line_color = null;
+      if (narrow) axis.ticker.desired_num_ticks = 4;
       axis.visible = !spec.bare;
     }
     for (const grid of figure.grids) { grid.grid_line_color = color("faint"); grid.grid_line_alpha = 0.6; grid.visible = !spec.bare; }
@@ -125,7 +127,7 @@
       const follow = () => figure.y_range.setv({ start: before.y_range.start, end: before.y_range.end });
       for (const end of ["start", "end"]) before.y_range.properties[end].change.connect(follow);
       follow();
-      figure.yaxes[0].visible = false;
+      figure.yaxes[0].visible = wrapped;
     }
     const renderers = spec.marks.map(mark => {
       const made = add(figure, mark, spec);
@@ -148,9 +150,9 @@
       await load();
       const made = [];
       for (const [i, spec] of figures[place.dataset.figures].entries()) {
-        const built = build(spec, made.at(-1)?.figure);
+        const panel = place.querySelectorAll(".panel")[i], previous = panel.previousElementSibling;
+        const built = build(spec, made.at(-1)?.figure, previous && panel.offsetTop > previous.offsetTop, panel.clientWidth < 400);
         made.push(built);
-        const panel = place.querySelectorAll(".panel")[i];
         panel.replaceChildren();
         await Bokeh.Plotting.show(built.figure, panel);
       }
