@@ -35,21 +35,21 @@ _UG = 1e6 / 9.80665
 # Kind and coefficient -> SI unit, the unit people use, and what to multiply SI by.
 _UNITS: dict[str, dict[str, tuple[str, str, float]]] = {
     "gyro": {
-        "N": ("rad/s/sqrt(Hz)", "deg/sqrt(h)", math.degrees(60.0)),
+        "N": ("rad/s/sqrt(Hz)", "deg/√h", math.degrees(60.0)),
         "B": ("rad/s", "deg/h", _DEG_H),
-        "K": ("rad/s/sqrt(s)", "deg/h/sqrt(h)", 60.0 * _DEG_H),
+        "K": ("rad/s/sqrt(s)", "deg/h/√h", 60.0 * _DEG_H),
         "Q": ("rad", "arcsec", _DEG_H),
     },
     "accel": {
-        "N": ("m/s^2/sqrt(Hz)", "ug/sqrt(Hz)", _UG),
-        "B": ("m/s^2", "ug", _UG),
-        "K": ("m/s^2/sqrt(s)", "ug/sqrt(h)", 60.0 * _UG),
+        "N": ("m/s^2/sqrt(Hz)", "µg/√Hz", _UG),
+        "B": ("m/s^2", "µg", _UG),
+        "K": ("m/s^2/sqrt(s)", "µg/√h", 60.0 * _UG),
         "Q": ("m/s", "mm/s", 1e3),
     },
     "mag": {
-        "N": ("T/sqrt(Hz)", "nT/sqrt(Hz)", 1e9),
+        "N": ("T/sqrt(Hz)", "nT/√Hz", 1e9),
         "B": ("T", "nT", 1e9),
-        "K": ("T/sqrt(s)", "nT/sqrt(h)", 60e9),
+        "K": ("T/sqrt(s)", "nT/√h", 60e9),
         "Q": ("T s", "nT s", 1e9),
     },
 }
@@ -180,11 +180,11 @@ def _answer(study: NoiseStudy) -> Answer:
     question, notes = "What is the noise of the sensors?", tuple(note.removesuffix(".") for note in study.notes)
     steps = ("Paste the section below into the config of your recordings.",)
     if not silent:
-        sentence = "White noise, bias instability and random walk are told of every axis."
+        sentence = "White noise, bias instability and random walk of every axis are determined."
         return Answer(question, "known", "good", sentence, notes, steps)
     sentence = (
         f"{asked - silent} of {asked} coefficients (white noise, bias instability and random walk of each axis) are "
-        "told; of the others there are bounds."
+        "determined; for the others there are upper bounds."
     )
     longer = "Leave the sensors at rest for longer where the remarks ask for it, if you need the others."
     return Answer(question, "known in part", "warn", sentence, notes, (*steps, longer))
@@ -303,14 +303,15 @@ def _sensor_json(sensor: SensorNoise) -> dict[str, Any]:
 
 def _plot(sensor: SensorNoise) -> Plot:
     """Allan deviation of each axis with its interval, and the model that was fitted, dotted."""
-    out = Figure(f"Allan deviation, {sensor.unit}", "averaging time, s", 420, x_scale="log", y_scale="log")
+    _, unit, factor = _UNITS[sensor.kind]["B"]
+    out = Figure(f"Allan deviation, {unit}", "averaging time, s", 420, x_scale="log", y_scale="log")
     for (axis, noise), color in zip(sensor.axes.items(), cycle(COLORS)):
         tau = noise.curve.tau
         # On a logarithmic axis a bound at infinity has no place.
         high = np.where(np.isfinite(noise.high), noise.high, 10.0 * noise.curve.deviation)
-        out.band(tau, noise.low, high, color, axis)
-        out.line(tau, noise.curve.deviation, axis, color)
-        out.points(tau, noise.curve.deviation, axis, color)
-        out.line(tau, np.sqrt(allan_variance(tau, noise.fit.squares)), axis, color, "dotted", shown=False)
-    caption = "Overlapping Allan deviation with its 95 % interval; dotted what the coefficients give."
+        out.band(tau, factor * noise.low, factor * high, color, axis)
+        out.line(tau, factor * noise.curve.deviation, axis, color)
+        out.points(tau, factor * noise.curve.deviation, axis, color)
+        out.line(tau, factor * np.sqrt(allan_variance(tau, noise.fit.squares)), axis, color, "dotted", shown=False)
+    caption = "Overlapping Allan deviation with its 95 % interval; dotted: as the coefficients have it."
     return Plot(title(sensor), caption, out)
