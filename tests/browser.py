@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import re
 import shutil
 import tempfile
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ DESKTOP, PHONE = 1280, 390
 PAPER = 725
 _PATIENCE_S = 60.0
 
-# Elements that stand out of the page to the right, or of a box that would have to be scrolled; on a phone the sketch is.
+# Elements that stand out of the page to the right, and boxes that have to be scrolled; on a phone the sketch has to be.
 _OVERFLOWING = """(() => {
   const width = document.documentElement.clientWidth, found = [];
   for (const element of document.querySelectorAll("body *")) {
@@ -79,6 +80,16 @@ def on_paper(tab: Tab) -> Look:
     tab.print()
     tab.size(PAPER)
     return _seen(tab)
+
+
+def sheets(text: str, folder: Path) -> int:
+    """Number of pages of paper that a page takes when it is printed."""
+    (folder / "page.html").write_text(text, encoding="utf-8")
+    tab = running()
+    look(tab, folder / "page.html", DESKTOP)
+    tab.print()
+    tab.pdf(folder / "page.pdf")
+    return len(re.findall(rb"/Type\s*/Page\b", (folder / "page.pdf").read_bytes()))
 
 
 @cache

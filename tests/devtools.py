@@ -118,7 +118,7 @@ class Tab:
             message["sessionId"] = self._session
         self._socket.send(json.dumps(message))
         while True:
-            told = json.loads(self._socket.recv(timeout=30.0))
+            told = json.loads(self._socket.recv(timeout=60.0))
             if told.get("id") == self._count:
                 assert "error" not in told, told
                 return dict(told["result"])

@@ -9,7 +9,7 @@ import pytest
 from pipelines.methods import simulate
 from pipelines.reports.html import report_html
 from pipelines.session import calibrate
-from tests.browser import drawn, needs_browser
+from tests.browser import drawn, needs_browser, sheets
 
 SCENARIOS = {
     "los": "{duration_s: 15, gyro_rate_hz: 200, image_rate_hz: 20}",
@@ -29,6 +29,18 @@ def test_a_browser_draws_the_report_at_the_width_of_a_desktop_and_of_a_phone(nam
     (calibration,) = calibrate(tmp_path / "s.mcap", [solver])
     text = report_html(calibration)
     assert drawn(text, tmp_path) == text.count('class="plot"') > 4
+
+
+# Sheets of paper that the nominal recording's report may take, default sensors.
+SHEETS = {"los": 5, "indexer": 5, "head": 5, "cube": 8, "tumble": 4}
+
+
+@needs_browser
+@pytest.mark.parametrize("name", [pytest.param(n, marks=[pytest.mark.slow] * (n != "tumble")) for n in SHEETS])
+def test_a_printed_report_is_short(name: str, tmp_path: Path) -> None:
+    simulate(name, None, 1, tmp_path / "s.mcap")
+    (calibration,) = calibrate(tmp_path / "s.mcap", ["batch"])
+    assert 1 < sheets(report_html(calibration), tmp_path) <= SHEETS[name]
 
 
 @needs_browser

@@ -38,7 +38,7 @@ def test_differences_are_in_sigmas_of_batch() -> None:
 def test_truth_halves_and_held_out_measurements_are_told() -> None:
     halves = {"time_offset": Halves(0.010, 0.003, 0.020, 0.004)}
     page = Page(compare_html(solvers({"time_offset": 0.0125}), halves, {"vision": 1.06}))
-    assert "error of batch, sigmas" in page.text
+    assert "error of batch, σ" in page.text
     assert "Does the recording agree with itself? yes Its two halves" in page.text
     assert "10.0 ± 3.0 20.0 ± 4.0 +2.0" in page.text
     assert "1.06 sigmas (vision)" in page.text

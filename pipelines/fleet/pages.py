@@ -87,7 +87,9 @@ def study_html(study: Study) -> str:
         finished=len(study.results),
         rows=[_consistency_row(study, solver) for solver in solvers],
         failures={solver: study.failures(solver) for solver in study.solvers},
-        accuracies=[_accuracy_row(study, solver, *row) for solver in solvers for row in study.accuracies(solver).items()],
+        accuracies=[
+            _accuracy_row(study, solver, *row) for solver in solvers for row in study.accuracies(solver).items()
+        ],
     )
 
 
@@ -98,7 +100,13 @@ def _parameter_row(p: Population) -> dict[str, Any]:
     """The cells of a parameter, in the unit people read."""
     unit, factor = readable(p)
     sigma = factor * float(np.median(p.sigmas))
-    row: dict[str, Any] = {"name": p.name, "meaning": meaning(method(p.method), p.name), "method": p.method, "unit": unit, "count": len(p.values)}
+    row: dict[str, Any] = {
+        "name": p.name,
+        "meaning": meaning(method(p.method), p.name),
+        "method": p.method,
+        "unit": unit,
+        "count": len(p.values),
+    }
     row |= {"sigma": rounded(sigma)}
     row |= {"centre": "", "low": "", "high": "", "beyond": "", "drift": "", "drifts": p.drifts}
     row |= {"outlying": int(p.outlying.sum()), "changed": len({p.units[i] for i in np.flatnonzero(p.changed)})}
@@ -172,7 +180,9 @@ def _truth(study: Study, solvers: Sequence[str]) -> Answer:
         solver: study.nees(solver) for solver in solvers
     }
     if not judged:
-        return Answer(question, "cannot say", "fixed", "No run gave an estimate.", (), ("See below why the runs failed.",))
+        return Answer(
+            question, "cannot say", "fixed", "No run gave an estimate.", (), ("See below why the runs failed.",)
+        )
     said = ", ".join(
         f"{solver} has a mean NEES of {rounded(nees.mean, 3)} where {nees.dof:g} is right and chance allows "
         f"{rounded(nees.low, 3)} to {rounded(nees.high, 3)}"

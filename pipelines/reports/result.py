@@ -279,7 +279,7 @@ class Calibration:
         """The config in force, YAML; what is as by default is left out."""
         from ruamel.yaml import YAML
 
-        yaml = YAML(typ="safe", pure=True)
+        yaml: Any = YAML(typ="safe", pure=True)
         yaml.default_flow_style = None
         yaml.sort_base_mapping_type_on_output = False
         yaml.width = 80

@@ -102,8 +102,8 @@ def _static_poses(calibration: Calibration) -> Table:
     ]
     return Table(
         "Static poses",
-        f"When gyro and accelerometer were quiet, and which side was up. Used of each: {', '.join(whole)}, but for what is "
-        "named as not used.",
+        f"When gyro and accelerometer were quiet, and which side was up. Used of each: {', '.join(whole)}, but for "
+        "what is named as not used.",
         ("pose", "from, s", "to, s", "up", "not used"),
         tuple(rows),
     )

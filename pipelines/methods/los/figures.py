@@ -89,8 +89,9 @@ def _left(time: Array, without: Array, compensated: Array) -> Plot:
     out.y_range = (-reach, reach)
     return Plot(
         "What gyro, gimbal and calibration leave of the LOS error",
-        f"Per axis {rounded(spread[0], 3)} µrad with the mounting angles zero, {rounded(spread[1], 3)} µrad with those found (standard "
-        "deviations, from the median). The gyro's noise adds up from a target's first picture on, so what is left may "
-        "wander; it should not follow the sway.",
+        f"phx is the angle to the target below, phz to the right. Per axis {rounded(spread[0], 3)} µrad with the "
+        f"mounting angles zero, {rounded(spread[1], 3)} µrad with those found (standard deviations, from the median). "
+        "The gyro's noise adds up from a target's first picture on, so what is left may wander; it should not follow "
+        "the sway.",
         out,
     )
