@@ -43,6 +43,7 @@ def sequential_history(
     last = {key: i for i, own in enumerate(keys) for key in own}
     carried, begin = gtsam.GaussianFactorGraph(), 0
     rows: list[tuple[float, Array, Array]] = []
+    blocks: dict[int, Array] = {}
     held_at_first: list[int] | None = None
     steady = np.ones(len(problem.quantities), dtype=bool)
     moments = _moments(boundaries)
@@ -61,7 +62,7 @@ def sequential_history(
             now = _without(carried, sorted(set(_keys(carried)) - set(held), key=place.__getitem__))
         except RuntimeError:
             return None
-        numbers, covariance = _solved(problem, now, values, boundary.current_keys, held)
+        numbers, covariance = _solved(problem, now, values, boundary.current_keys, held, blocks)
         rows.append((boundary.time, numbers, covariance))
     time, numbers, covariances = (np.array(column) for column in zip(*rows, strict=True))
     return Course(time, numbers, covariances, steady)
@@ -90,11 +91,12 @@ def _solved(
     values: gtsam.Values,
     current_keys: Mapping[int, int],
     held: Sequence[int],
+    blocks: dict[int, Array],
 ) -> tuple[Array, Array]:
-    """Reported numbers and their covariance from a graph of nothing but the parameters."""
+    """Reported numbers and their covariance from a graph of nothing but the parameters; for `blocks` see marginals."""
     information, slope = graph.hessian(ordering_of(held))
-    covariance = reported_covariance(problem.parameters, information, values, held)
-    inverse = coordinate_inverse(problem.parameters, values, held)
+    covariance = reported_covariance(problem.parameters, information, values, held, blocks=blocks)
+    inverse = coordinate_inverse(problem.parameters, values, held, blocks)
     extra = np.array([0.0 if q.prior_sigma == 0.0 else q.extra_sigma**2 for q in problem.quantities])
     move = (covariance - np.diag(extra)) @ inverse.T @ slope
     return reported(problem, values, current_keys) + move, covariance

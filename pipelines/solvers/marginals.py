@@ -135,13 +135,14 @@ def reported_covariance(
     values: gtsam.Values,
     keys: Sequence[int],
     noise: Array | None = None,
+    blocks: dict[int, Array] | None = None,
 ) -> Array:
     """Covariance of the reported numbers from the information matrix of the variables' tangents, in this order.
 
-    `noise` is as joint_covariance has it.
+    `noise` is as joint_covariance has it, `blocks` as coordinate_inverse.
     """
     quantities = [q for p in parameters for q in p.quantities]
-    free, scale, unit = prior_units(parameters, values, keys)
+    free, scale, unit = prior_units(parameters, values, keys, blocks)
     extra = np.array([quantities[i].extra_sigma for i in free])
     own = unit.T @ information @ unit
     eigenvalues, vectors = np.linalg.eigh(own if noise is None else own - noise)
@@ -152,28 +153,41 @@ def reported_covariance(
 
 
 def prior_units(
-    parameters: Sequence[Parameter], values: gtsam.Values, keys: Sequence[int]
+    parameters: Sequence[Parameter],
+    values: gtsam.Values,
+    keys: Sequence[int],
+    blocks: dict[int, Array] | None = None,
 ) -> tuple[NDArray[np.intp], Array, Array]:
     """Which reported numbers are free, their prior scales, and by columns what one of these is of the tangents.
 
     In these units one threshold serves angles, rates and seconds. Fixed numbers are left out: their huge information
-    would cost the others their digits.
+    would cost the others their digits. `blocks` are as coordinate_inverse has them.
     """
     quantities = [q for p in parameters for q in p.quantities]
     free = np.flatnonzero([q.prior_sigma != 0.0 for q in quantities])
     scale = np.array([quantities[i].prior_scale for i in free])
-    return free, scale, coordinate_inverse(parameters, values, keys)[:, free] * scale
+    return free, scale, coordinate_inverse(parameters, values, keys, blocks)[:, free] * scale
 
 
-def coordinate_inverse(parameters: Sequence[Parameter], values: gtsam.Values, keys: Sequence[int]) -> Array:
+def coordinate_inverse(
+    parameters: Sequence[Parameter],
+    values: gtsam.Values,
+    keys: Sequence[int],
+    blocks: dict[int, Array] | None = None,
+) -> Array:
     """Pseudo-inverse of the Jacobian of the reported numbers by the variables' tangents, stacked in this order.
 
-    Each number follows from one variable, so that the inverse has the same blocks.
+    Each number follows from one variable, so that the inverse has the same blocks. Those of variables looked at again
+    and again at the same values are kept in `blocks`, by key.
     """
-    blocks = [np.linalg.pinv(p.coordinates(values, key)[1]) for p, key in zip(parameters, keys, strict=True)]
-    inverse = np.zeros((sum(b.shape[0] for b in blocks), sum(b.shape[1] for b in blocks)))
+    known = {} if blocks is None else blocks
+    for p, key in zip(parameters, keys, strict=True):
+        if key not in known:
+            known[key] = np.asarray(np.linalg.pinv(p.coordinates(values, key)[1]), dtype=float)
+    own = [known[key] for key in keys]
+    inverse = np.zeros((sum(b.shape[0] for b in own), sum(b.shape[1] for b in own)))
     row = column = 0
-    for block in blocks:
+    for block in own:
         inverse[row : row + block.shape[0], column : column + block.shape[1]] = block
         row, column = row + block.shape[0], column + block.shape[1]
     return inverse
