@@ -18,7 +18,7 @@ from pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 if TYPE_CHECKING:
     from pipelines.vision.camera import Camera
-    from pipelines.vision.layout import Layout
+    from pipelines.vision.layout import Layout, Shots
     from pipelines.vision.tags import Detections
 
 
@@ -39,18 +39,27 @@ def cube_layout(recordings: Sequence[tuple[Recording, Config]], refine_camera: b
 
     Raises InputError when there are no pictures or detections, or none that ties the tags together.
     """
-    from pipelines.vision.layout import Shots, estimate_layout
+    from pipelines.vision.layout import estimate_layout
     from pipelines.vision.pose import TagBody
 
-    shots = [Shots(read_camera(recording, config), _tags(recording, config)) for recording, config in recordings]
+    shots = [_shots(recording, config) for recording, config in recordings]
     if not any(len(found) for each in shots for found in each.pictures):
         pictures = sum(len(each.pictures) for each in shots)
         raise InputError(f"no tag in any of {pictures} pictures; are they blurred, or the tags of another family?")
     return estimate_layout(shots, TagBody.from_board(recordings[0][1].section(CubeConfig)), refine_camera)
 
 
-def _tags(recording: Recording, config: Config) -> list[Detections]:
-    """The tags in each picture, in time order."""
+def _shots(recording: Recording, config: Config) -> Shots:
+    """The camera, and the tags in each picture."""
+    from pipelines.vision.layout import Shots
+
+    found = _tags(recording, config)
+    time = [(t_ns - found[0][0]) / 1e9 for t_ns, _ in found]
+    return Shots(read_camera(recording, config), [tags for _, tags in found], time)
+
+
+def _tags(recording: Recording, config: Config) -> list[tuple[int, Detections]]:
+    """Stamp, ns, of each picture and the tags in it, in time order."""
     topic = config.topic(IMAGE)
     if topic not in recording.topics:
         return _detections(recording, config)
@@ -58,7 +67,7 @@ def _tags(recording: Recording, config: Config) -> list[Detections]:
 
     pictures = islice(recording.images(topic), None, None, _every(recording.topics[topic].count))
     seen = detections(pictures, config.section(CubeConfig).tag_family, read_camera(recording, config))
-    return [tags for _, tags in seen if tags is not None]
+    return [(t_ns, tags) for t_ns, tags in seen if tags is not None]
 
 
 def _every(pictures: int) -> int:
@@ -66,7 +75,7 @@ def _every(pictures: int) -> int:
     return -(-pictures // _MOST_PICTURES)
 
 
-def _detections(recording: Recording, config: Config) -> list[Detections]:
+def _detections(recording: Recording, config: Config) -> list[tuple[int, Detections]]:
     from pipelines.vision.tags import Detections
 
     seen = recording.detections(config.topic(TAG_DETECTIONS))
@@ -75,7 +84,8 @@ def _detections(recording: Recording, config: Config) -> list[Detections]:
     for frame in range(0, len(seen), _every(len(seen))):
         rows = np.flatnonzero(seen.frame == frame)
         covariance = np.tile(sigma**2 * np.eye(2), (len(rows), 4, 1, 1))
-        found.append(Detections(seen.tag_id[rows], seen.corners[rows], covariance))
+        tags = Detections(seen.tag_id[rows], seen.corners[rows], covariance)
+        found.append((int(seen.t_ns[frame]), tags))
     return found
 
 
@@ -97,7 +107,10 @@ def layout_yaml(layout: Layout) -> str:
     yaml.width = _WIDE
     yaml.dump({"cube": cube}, text)
     sigmas = np.sqrt(np.diag(layout.covariance)).reshape(-1, 6)
-    lines = [f"# From {layout.frames} pictures; corners good to {layout.rms_px:.3f} px RMS. Sigmas:"]
+    lines = [
+        f"# From {layout.frames} pictures; corners good to {layout.rms_px:.3f} px RMS, tags flat and square to "
+        f"{layout.bend:.2%} of their size. Sigmas:"
+    ]
     lines.append(f"# tag {body.ids[0]}: defines the body frame")
     lines += [
         f"# tag {i}: {np.rad2deg(s[:3].max()):.3f} deg, {1e3 * s[3:].max():.3f} mm"

@@ -25,6 +25,8 @@ COLUMNS = ("tag", "pictures", "px", "sigma, deg", "sigma, mm", "false", "correla
 _SELDOM = 0.25
 # A tag that misses by this many times the others' median is no flat square of its size.
 _MISFIT = 2.5
+# A sigma below this share of its prior's is told by the pictures.
+_TOLD = 0.5
 
 
 def headline(layout: Layout) -> str:
@@ -93,20 +95,26 @@ def layout_json(layout: Layout) -> str:
                 for i, (tag, seen) in enumerate(layout.seen.items())
             ],
             "unplaced": {str(tag): why for tag, why in layout.unplaced.items()},
+            "bend": layout.bend,
+            "line_time": layout.line_time.tolist(),
+            "line_time_sigma": layout.line_time_sigma.tolist(),
             "advice": advice(layout),
         },
     )
 
 
 def camera_rows(layout: Layout) -> list[tuple[str, ...]]:
-    """Camera, name, value given, value found and sigma of each number that was adjusted."""
-    if layout.camera_sigma is None:
-        return []
+    """Camera, name, value given, value found and sigma of each number that was adjusted and that pictures tell."""
+    from pipelines.vision.layout import LINE_TIME
+
     out: list[tuple[str, ...]] = []
     for k, (found, given) in enumerate(zip(layout.cameras, layout.given_cameras, strict=True)):
         count = len(given.intrinsics) - 4
         names = ["fx, px", "fy, px", "cx, px", "cy, px", *(f"distortion {i + 1}" for i in range(count))]
-        numbers = zip(names, given.intrinsics, found.intrinsics, layout.camera_sigma[k], strict=False)
+        sigmas = np.zeros(len(names)) if layout.camera_sigma is None else layout.camera_sigma[k]
+        numbers = list(zip(names, given.intrinsics, found.intrinsics, sigmas, strict=False))
+        if layout.line_time_sigma[k] < _TOLD * LINE_TIME:
+            numbers.append(("line time, us", 0.0, 1e6 * layout.line_time[k], 1e6 * layout.line_time_sigma[k]))
         out += [
             (str(k + 1), name, to_digits_of(a, s), to_digits_of(b, s), f"{s:.2g}") for name, a, b, s in numbers if s
         ]
@@ -125,6 +133,7 @@ def layout_html(layout: Layout, recordings: Sequence[str]) -> str:
         columns=COLUMNS,
         rows=rows(layout),
         cameras=camera_rows(layout),
+        bend=f"{layout.bend:.2%}",
     )
 
 

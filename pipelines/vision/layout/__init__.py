@@ -1,8 +1,8 @@
 """Where the tags sit on a body, from pictures of it: bundle adjustment of their corners, with covariance.
 
 The tag with the lowest id stays where it is given and so defines the body's frame; the sizes given define its scale.
-Tags are placed by a vote of all pictures (`placing`), then poses of tags and pictures, each tag the rigid square it is,
-are adjusted together (`bundle`, `robust`), with the cameras if asked for.
+Tags are placed by a vote of all pictures (`placing`), then poses of tags and pictures are adjusted together (`bundle`,
+`robust`), with the time that shutters take to roll and, if asked for, the cameras (`additional`).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from pipelines import progress
 from pipelines.errors import InputError
 from pipelines.vision.camera import Camera
+from pipelines.vision.layout.additional import LINE_TIME, shutters, with_intrinsics
 from pipelines.vision.layout.bundle import moved, refined_pictures
-from pipelines.vision.layout.cameras import free_cameras
 from pipelines.vision.layout.covariance import Covariance, covariance
 from pipelines.vision.layout.pictures import Gathered, Shots, gathered
 from pipelines.vision.layout.placing import joint
@@ -26,7 +26,7 @@ from pipelines.vision.layout.sights import Array, Sights, linearized
 from pipelines.vision.layout.whole import adjusted_whole, flip_told
 from pipelines.vision.pose import TagBody, part
 
-__all__ = ["Layout", "Shots", "TagSeen", "estimate_layout"]
+__all__ = ["LINE_TIME", "Layout", "Shots", "TagSeen", "estimate_layout"]
 
 # More sights of a tag than this share left out as false: it is not one rigid tag.
 _MOSTLY_FALSE = 0.5
@@ -60,6 +60,9 @@ class Layout:
         unplaced: id -> why it could not be placed, and what to do.
         cameras, given_cameras: as used in the end, and as given.
         camera_sigma: (c, n) of their intrinsics, None if not adjusted.
+        line_time, line_time_sigma: (c,) s, from one row of a picture to the next, where it moves and pictures are close
+            enough in time to tell; about 0 with a sigma of 30 us.
+        bend: sigma of a tag's corners against a flat square, each way, as a share of its size.
         with_camera: (6 (n - 1) + 3, the same) covariance of the tags, of the focal length, as a share, and of the
             centre, px, where the one camera that there is was adjusted; else None.
     """
@@ -75,6 +78,9 @@ class Layout:
     given_cameras: tuple[Camera, ...]
     camera_sigma: Array | None
     with_camera: Array | None
+    line_time: Array
+    line_time_sigma: Array
+    bend: float
 
 
 def estimate_layout(shots: Sequence[Shots], given: TagBody, refine_camera: bool = False) -> Layout:
@@ -103,9 +109,9 @@ def estimate_layout(shots: Sequence[Shots], given: TagBody, refine_camera: bool 
         if int(given.ids[0]) in wrong:
             raise InputError(f"tag {given.ids[0]}, which defines the body's frame: {wrong[int(given.ids[0])]}")
         unplaced, body = unplaced | wrong, fit.bundle.body
-    if refine_camera:
-        refined = fitted(fit.bundle, views.sights[fit.whole], 0, free_cameras(fit.bundle.cameras))
-        fit = replace(refined, whole=fit.whole)
+    bundle, whole = fit.bundle, fit.whole
+    additional = with_intrinsics(bundle) if refine_camera else shutters(bundle)
+    fit = replace(fitted(bundle, views.sights[whole], 0, additional), whole=whole)
     return _layout(views, fit, unplaced)
 
 
@@ -166,7 +172,7 @@ def _layout(views: Gathered, fit: Fit, unplaced: Mapping[int, str]) -> Layout:
     known = covariance(fit, 0, views.view)
     if known.correction is not None:
         stay = np.zeros((len(fit.bundle.cRb), 6))
-        there = moved(fit.bundle, known.correction, stay, fit.cameras)
+        there = moved(fit.bundle, known.correction, stay, fit.additional)
         bundle, *_ = refined_pictures(there, fit.sights)
         fit = replace(fit, bundle=bundle, rows=linearized(bundle, fit.sights))
     body = fit.bundle.body
@@ -185,14 +191,18 @@ def _layout(views: Gathered, fit: Fit, unplaced: Mapping[int, str]) -> Layout:
         unplaced=dict(sorted(unplaced.items())),
         cameras=fit.bundle.cameras,
         given_cameras=views.start.cameras,
-        camera_sigma=known.cameras,
-        with_camera=_with_camera(known, fit.bundle.cameras),
+        camera_sigma=fit.additional.parts(known.sigma)[0] if fit.additional.intrinsics.any() else None,
+        with_camera=_with_camera(known, fit),
+        line_time=fit.bundle.line_time,
+        line_time_sigma=fit.additional.parts(known.sigma)[1],
+        bend=known.bend,
     )
 
 
-def _with_camera(known: Covariance, cameras: tuple[Camera, ...]) -> Array | None:
+def _with_camera(known: Covariance, fit: Fit) -> Array | None:
     """As a layout has it; the share is the mean of those of the two focal lengths."""
-    if known.cameras is None or len(cameras) > 1:
+    cameras = fit.bundle.cameras
+    if not fit.additional.intrinsics.any() or len(cameras) > 1:
         return None
     tags = len(known.tags)
     pick = np.zeros((tags + 3, len(known.whole)))

@@ -1,4 +1,4 @@
-"""Bundle adjustment of rigid tags: poses of pictures, poses of tags on the body and, if asked for, the cameras."""
+"""Bundle adjustment of tags: poses of pictures, poses of tags on the body, and what is adjusted beside these."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from factors import so3
-from pipelines.vision.layout.cameras import Cameras
+from pipelines.vision.layout.additional import Additional
 from pipelines.vision.layout.normal import normal_equations
 from pipelines.vision.layout.sights import Array, Bundle, Rows, Sights, linearized
 
@@ -17,8 +17,8 @@ _DIAGONAL = np.arange(6)
 _SETTLED = 1e-10
 
 
-def moved(bundle: Bundle, shared: Array, pictures: Array, cameras: Cameras) -> Bundle:
-    """The bundle a step on: `shared` (p,) of tags and cameras, `pictures` (f, 6)."""
+def moved(bundle: Bundle, shared: Array, pictures: Array, additional: Additional) -> Bundle:
+    """The bundle a step on: `shared` (p,) of tags and, if any, additional parameters, `pictures` (f, 6)."""
     tags = len(bundle.body.ids)
     step = shared[: 6 * tags].reshape(tags, 6)
     body = replace(
@@ -26,17 +26,17 @@ def moved(bundle: Bundle, shared: Array, pictures: Array, cameras: Cameras) -> B
         bRt=so3.multiply(bundle.body.bRt, so3.exp(step[:, :3])),
         position=bundle.body.position + step[:, 3:],
     )
-    return Bundle(
-        cameras.moved(bundle.cameras, shared[6 * tags :]) if len(shared) > 6 * tags else bundle.cameras,
-        bundle.camera,
-        body,
-        so3.multiply(bundle.cRb, so3.exp(pictures[:, :3])),
-        bundle.position + pictures[:, 3:],
+    there = replace(
+        bundle,
+        body=body,
+        cRb=so3.multiply(bundle.cRb, so3.exp(pictures[:, :3])),
+        position=bundle.position + pictures[:, 3:],
     )
+    return additional.moved(there, shared[6 * tags :]) if len(shared) > 6 * tags else there
 
 
 def adjusted(
-    bundle: Bundle, sights: Sights, fixed: int, cameras: Cameras, far: float = np.inf, steps: int = _STEPS
+    bundle: Bundle, sights: Sights, fixed: int, additional: Additional, far: float = np.inf, steps: int = _STEPS
 ) -> tuple[Bundle, Rows]:
     """The bundle of least squares, by Levenberg's and Marquardt's method.
 
@@ -44,17 +44,17 @@ def adjusted(
         bundle: where to start.
         sights: what is seen.
         fixed: index of the tag that stays.
-        cameras: what of the cameras is adjusted.
+        additional: what is adjusted beside poses.
         far: sum of squares of a tag in a picture beyond which it counts less and less (Geman, McClure).
         steps: at most.
     """
     rows, damping = linearized(bundle, sights), 1e-4
-    cost = _cost(rows, bundle, cameras, far)
+    cost = _cost(rows, bundle, additional, far)
     for _ in range(steps):
-        normal = normal_equations(bundle, sights, rows, weights(rows, far), fixed, cameras, damping)
-        after = moved(bundle, *normal.step(), cameras)
+        normal = normal_equations(bundle, sights, rows, weights(rows, far), fixed, additional, damping)
+        after = moved(bundle, *normal.step(), additional)
         there = linearized(after, sights)
-        now = _cost(there, after, cameras, far)
+        now = _cost(there, after, additional, far)
         if not now < cost:
             if damping > 1e6 or cost - now >= -_SETTLED * cost:
                 break
@@ -77,9 +77,9 @@ def loss(squares: Array, far: float) -> Array:
     return squares if np.isinf(far) else np.asarray(squares * (far / (far + squares)))
 
 
-def _cost(rows: Rows, bundle: Bundle, cameras: Cameras, far: float) -> float:
-    free = cameras.free
-    priors = (cameras.off(bundle.cameras)[free] / cameras.sigma.ravel()[free]) ** 2
+def _cost(rows: Rows, bundle: Bundle, additional: Additional, far: float) -> float:
+    free = additional.free
+    priors = (additional.off(bundle)[free] / additional.sigma[free]) ** 2
     return float(loss(rows.squares, far).sum() + priors.sum())
 
 
@@ -113,11 +113,10 @@ def refined_pictures(
             position=np.where(better[:, None], after.position, bundle.position),
         )
         mine = better[sights.picture][:, None]
-        rows = Rows(
-            np.where(mine, there.miss, rows.miss),
-            np.where(mine[..., None], there.by_picture, rows.by_picture),
-            rows.by_tag,
-            rows.points,
+        rows = replace(
+            rows,
+            miss=np.where(mine, there.miss, rows.miss),
+            by_picture=np.where(mine[..., None], there.by_picture, rows.by_picture),
         )
         cost = np.minimum(now, cost)
         if done:

@@ -4,12 +4,13 @@ A tag's corners err by what its print, its blur and the camera's model have wron
 and the more so in one in which nothing has moved. The layout errs by L r, L the influence of the whitened errors r, so
 with autocovariance g of r its covariance is the sum over tags, views and lags of L' g(lag) L, as for noise coloured in
 time (pipelines.solvers.coloured). g is that of the errors left, all tags together, up to the lag where it has died out;
-tags that fit worse than the others have a variance of their own.
+tags that fit worse than the others have a variance of their own. What stays the same in all pictures of a tag is in
+`bending`.
 
-Priors of cameras are weighed against such errors, not against independent ones: with the information A of independent
-errors, of which the gradient has covariance S, and that of the priors P, the best linear estimate has the information
-A S^-1 A + P. The adjustment, whose information is A + P, takes pictures for better than they are; `correction` is the
-step from there.
+Priors of additional parameters are weighed against such errors, not against independent ones: with the information A
+of independent errors, of which the gradient has covariance S, and that of the priors P, the best linear estimate has
+the information A S^-1 A + P. The adjustment, whose information is A + P, takes pictures for better than they are;
+`correction` is the step from there.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipelines.vision.layout.bending import BENDS, bend_rows, bending
 from pipelines.vision.layout.normal import normal_equations, shared_rows
 from pipelines.vision.layout.robust import Fit
 from pipelines.vision.layout.sights import Array, Index
@@ -42,16 +44,18 @@ class Covariance:
 
     Attributes:
         tags: (6 (n - 1), 6 (n - 1)), of all tags but the fixed one, rad and m.
-        whole: (q, q) of these tags and of all that is adjusted of the cameras.
-        cameras: (c, k) sigmas of the cameras' intrinsics; None where they are as given.
+        whole: (q, q) of these tags and of all additional parameters that are adjusted.
+        sigma: (k,) of the additional parameters, 0 of those that stay as they are.
         inflation: (n,) by what each tag's sigmas exceed those of independent corners.
-        correction: (6 n + c k,) what priors of cameras move yet, tags first; None where there are none.
+        bend: sigma of a tag's corners against a flat square, as a share of its size.
+        correction: (6 n + k,) what priors of these move yet, tags first; None where there are none.
     """
 
     tags: Array
     whole: Array
-    cameras: Array | None
+    sigma: Array
     inflation: Array
+    bend: float
     correction: Array | None
 
 
@@ -65,37 +69,38 @@ def covariance(fit: Fit, fixed: int, view: Index) -> Covariance:
     """
     bundle, sights, rows = fit.bundle, fit.sights, fit.rows
     curved = fit.curvature[sights.picture]
-    information = normal_equations(bundle, sights, rows, curved, fixed, fit.cameras).information
+    information = normal_equations(bundle, sights, rows, curved, fixed, fit.additional).information
     white: Array = np.asarray(np.linalg.inv(information), dtype=float)
-    found = _sandwich(fit, fixed, view, white)
+    own, by_bends = _eliminated(fit, fixed)
+    bent = bending(rows.miss, by_bends, own, white)
+    found = _sandwich(fit, own, view, white) + bent.spread
     correction = None
-    if fit.cameras.free.any():
-        found, free = _with_priors(fit, information, found)
-        correction = np.zeros(6 * len(bundle.body.ids) + fit.cameras.sigma.size)
+    free = fit.additional.free
+    if free.any():
+        found, step = _with_priors(fit, information, found)
+        correction = np.zeros(6 * len(bundle.body.ids) + len(free))
         of_tags = np.repeat(np.arange(len(bundle.body.ids)) != fixed, 6)
-        correction[np.concatenate([of_tags, fit.cameras.free])] = free
+        correction[np.concatenate([of_tags, free])] = step
     n, tags = len(bundle.body.ids), 6 * (len(bundle.body.ids) - 1)
     inflation = np.ones(n)
     for k, tag in enumerate(np.flatnonzero(np.arange(n) != fixed)):
         at = slice(6 * k, 6 * k + 6)
         inflation[tag] = np.sqrt(np.trace(np.linalg.solve(white[at, at], found[at, at])) / 6.0)
-    cameras: Array | None = None
-    if fit.cameras.free.any():
-        cameras = np.zeros(fit.cameras.sigma.shape)
-        cameras[fit.cameras.sigma > 0.0] = np.sqrt(np.diag(found)[tags:])
-    return Covariance(found[:tags, :tags], found, cameras, inflation, correction)
+    sigma = np.zeros(len(free))
+    sigma[free] = np.sqrt(np.diag(found)[tags:])
+    return Covariance(found[:tags, :tags], found, sigma, inflation, bent.level, correction)
 
 
 def _with_priors(fit: Fit, information: Array, found: Array) -> tuple[Array, Array]:
-    """Covariance (q, q) and step (q,) of the best estimate with the cameras' priors.
+    """Covariance (q, q) and step (q,) of the best estimate with the priors of additional parameters.
 
     Args:
         fit: adjusted with independent errors.
         information: (q, q) of that, A + P.
         found: (q, q) covariance of its errors but for what the priors bring, (A + P)^-1 S (A + P)^-1.
     """
-    cameras = fit.cameras
-    q, free = len(information), cameras.sigma.ravel()[cameras.free]
+    additional = fit.additional
+    q, free = len(information), additional.sigma[additional.free]
     prior = np.zeros(q)
     prior[q - len(free) :] = free**-2.0
     # In units of A + P, which is positive definite even where pictures alone tell nothing.
@@ -106,21 +111,34 @@ def _with_priors(fit: Fit, information: Array, found: Array) -> tuple[Array, Arr
     weighed = A @ np.linalg.inv(S)
     covariance = np.linalg.inv(weighed @ A + P)
     pull = np.zeros(q)
-    pull[q - len(free) :] = prior[q - len(free) :] * cameras.off(fit.bundle.cameras)[cameras.free]
+    pull[q - len(free) :] = prior[q - len(free) :] * additional.off(fit.bundle)[additional.free]
     step = -covariance @ ((np.eye(q) - weighed) @ (back @ pull))
     return np.asarray(back.T @ covariance @ back), np.asarray(back.T @ step)
 
 
-def _sandwich(fit: Fit, fixed: int, view: Index, white: Array) -> Array:
-    """(q, q) covariance of all that pictures share, from the influence of every error."""
+def _eliminated(fit: Fit, fixed: int) -> tuple[Array, Array]:
+    """Errors by all that is adjusted and pictures share, (m, 8, q), and by tags' bends, without pictures' poses."""
     bundle, sights, rows = fit.bundle, fit.sights, fit.rows
-    normal = normal_equations(bundle, sights, rows, np.ones(len(sights)), fixed, fit.cameras)
-    by_pose = (normal.inverse @ normal.across)[sights.picture]
-    shared = shared_rows(bundle, sights, rows, fit.cameras)[..., normal.free]
-    own = shared - rows.by_picture @ by_pose
+    normal = normal_equations(bundle, sights, rows, np.ones(len(sights)), fixed, fit.additional)
+    shared = shared_rows(bundle, sights, rows, fit.additional)[..., normal.free]
+    m, tags = len(sights), len(bundle.body.ids)
+    of_tags = np.zeros((m, 8, tags, len(BENDS)))
+    of_tags[np.arange(m), :, sights.tag] = bend_rows(bundle, sights, rows)
+    bends = of_tags.reshape(m, 8, -1)
+    across = np.zeros((len(bundle.cRb), 6, bends.shape[2]))
+    np.add.at(across, sights.picture, np.swapaxes(rows.by_picture, 1, 2) @ bends)
+    return (
+        shared - rows.by_picture @ (normal.inverse @ normal.across)[sights.picture],
+        bends - rows.by_picture @ (normal.inverse @ across)[sights.picture],
+    )
+
+
+def _sandwich(fit: Fit, own: Array, view: Index, white: Array) -> Array:
+    """(q, q) covariance of all that pictures share, from the influence of every error."""
+    bundle, sights = fit.bundle, fit.sights
     of, views = view[sights.picture], int(view.max()) + 1
     power, common = _spectrum(_correlations(fit, of, views), views), _common(fit, of)
-    free = fit.cameras.sigma.ravel()[fit.cameras.free]
+    free = fit.additional.sigma[fit.additional.free]
     of_priors = white[:, len(white) - len(free) :]
     parts, taken = [], []
     for tag in range(len(bundle.body.ids)):

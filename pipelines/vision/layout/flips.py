@@ -60,7 +60,7 @@ def lone_scale(bundle: Bundle, sights: Sights, found: Flips) -> float:
     alone = Sights(np.arange(m), sights.tag, sights.corners, sights.sigma)
     costs = []
     for k in range(2):
-        start = Bundle(bundle.cameras, bundle.camera[sights.picture], body, found.cRt[:, k], found.place[:, k])
+        start = Bundle.of(bundle.cameras, bundle.camera[sights.picture], body, found.cRt[:, k], found.place[:, k])
         costs.append(refined_pictures(start, alone)[1])
     # The median of a chi-square of two degrees of freedom is 2 ln 2.
     return float(np.sqrt(np.median(np.minimum(*costs)) / (2.0 * np.log(2.0))))
@@ -110,7 +110,7 @@ def _start_costs(bundle: Bundle, sights: Sights, cRb: Array, position: Array, fa
     a, b = pairs(sights.picture)
     costs = []
     for k in range(2):
-        start = Bundle(bundle.cameras, bundle.camera[sights.picture], bundle.body, cRb[:, k], position[:, k])
+        start = Bundle.of(bundle.cameras, bundle.camera[sights.picture], bundle.body, cRb[:, k], position[:, k])
         # Each start is a picture of its own, which sees what the picture sees.
         seen = Sights(a, sights.tag[b], sights.corners[b], sights.sigma[b])
         costs.append(np.bincount(a, loss(linearized(start, seen).squares, 100.0 * far), len(sights)))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.vision.layout.cameras import Cameras
+from pipelines.vision.layout.additional import Additional
 from pipelines.vision.layout.sights import Array, Bundle, Rows, Sights
 
 _DIAGONAL = np.arange(6)
@@ -18,7 +18,7 @@ class Normal:
     """Normal equations with the pictures eliminated.
 
     Attributes:
-        free: (p,) which of the numbers shared by pictures are adjusted: six a tag, then the cameras'.
+        free: (p,) which of the numbers shared by pictures are adjusted: six a tag, then the additional ones.
         information: (q, q) of those that are free.
         projection: (q,) their gradient.
         across: (f, 6, q) picture's poses against them.
@@ -42,28 +42,17 @@ class Normal:
         return shared, pictures
 
 
-def camera_rows(bundle: Bundle, sights: Sights, rows: Rows, cameras: Cameras) -> Array:
-    """Jacobian (m, 8, c * n) of the errors by the cameras' intrinsics."""
-    m, (count, n) = len(sights), cameras.sigma.shape
-    out = np.zeros((m, 4, 2, count, n))
-    for k, camera in enumerate(bundle.cameras):
-        mine = bundle.camera[sights.picture] == k
-        by = camera.by_intrinsics(rows.points[mine])
-        out[mine, :, :, k, : by.shape[-1]] = np.nan_to_num(by) / sights.sigma[mine, None, None, None]
-    return out.reshape(m, 8, count * n)
-
-
-def shared_rows(bundle: Bundle, sights: Sights, rows: Rows, cameras: Cameras) -> Array:
-    """Jacobian (m, 8, p) of the errors by all that pictures share: the tags' poses, then the cameras."""
+def shared_rows(bundle: Bundle, sights: Sights, rows: Rows, additional: Additional) -> Array:
+    """Jacobian (m, 8, p) of the errors by all that pictures share: the tags' poses, then additional parameters."""
     m, tags = len(sights), len(bundle.body.ids)
     out = np.zeros((m, 8, 6 * tags))
     columns = 6 * sights.tag[:, None] + np.arange(6)
     np.put_along_axis(out, np.broadcast_to(columns[:, None], (m, 8, 6)), rows.by_tag, axis=2)
-    return np.concatenate([out, camera_rows(bundle, sights, rows, cameras)], axis=2) if cameras.free.any() else out
+    return np.concatenate([out, additional.rows(bundle, sights, rows)], axis=2) if additional.free.any() else out
 
 
 def normal_equations(
-    bundle: Bundle, sights: Sights, rows: Rows, weights: Array, fixed: int, cameras: Cameras, damping: float = 0.0
+    bundle: Bundle, sights: Sights, rows: Rows, weights: Array, fixed: int, additional: Additional, damping: float = 0.0
 ) -> Normal:
     """Normal equations of weighted errors; tag number `fixed` stays, Levenberg's damping is relative."""
     f = len(bundle.cRb)
@@ -73,11 +62,11 @@ def normal_equations(
     np.add.at(gradient, sights.picture, (At @ rows.miss[..., None])[..., 0])
     information, vector, across = _of_tags(bundle, sights, rows, weights, At)
     free = np.repeat(np.arange(len(bundle.body.ids)) != fixed, 6)
-    if cameras.free.any():
-        information, vector, across = _with_cameras(
-            bundle, sights, rows, weights, cameras, (information, vector, across)
+    if additional.free.any():
+        information, vector, across = _with_additional(
+            bundle, sights, rows, weights, additional, (information, vector, across)
         )
-        free = np.concatenate([free, cameras.free])
+        free = np.concatenate([free, additional.free])
     information, vector, across = information[np.ix_(free, free)], vector[free], across[..., free]
     own[:, _DIAGONAL, _DIAGONAL] *= 1.0 + damping
     diagonal = np.diag_indices_from(information)
@@ -106,26 +95,28 @@ def _of_tags(bundle: Bundle, sights: Sights, rows: Rows, weights: Array, At: Arr
     return information.reshape(n, n), gradient.ravel(), across.transpose(0, 2, 1, 3).reshape(f, 6, n)
 
 
-def _with_cameras(
+def _with_additional(
     bundle: Bundle,
     sights: Sights,
     rows: Rows,
     weights: Array,
-    cameras: Cameras,
+    additional: Additional,
     tags: tuple[Array, Array, Array],
 ) -> tuple[Array, Array, Array]:
-    """What `_of_tags` gives, with the cameras' numbers and their priors after the tags'."""
+    """What `_of_tags` gives, with the additional parameters and their priors after the tags'."""
     information, gradient, across = tags
-    C = camera_rows(bundle, sights, rows, cameras)
-    Ct = np.swapaxes(C, 1, 2) * weights[:, None, None]
+    C = additional.rows(bundle, sights, rows)
     f, n = len(bundle.cRb), C.shape[2]
+    weighted = C * weights[:, None, None]
+    Ct = np.swapaxes(weighted, 1, 2)
     with_pictures, with_tags = np.zeros((f, n, 6)), np.zeros((len(bundle.body.ids), n, 6))
     np.add.at(with_pictures, sights.picture, Ct @ rows.by_picture)
     np.add.at(with_tags, sights.tag, Ct @ rows.by_tag)
     mixed = with_tags.transpose(1, 0, 2).reshape(n, -1)
-    precision = np.where(cameras.free, cameras.sigma.ravel(), 1.0) ** -2.0
-    own = (Ct @ C).sum(axis=0) + np.diag(precision)
-    pull = (Ct @ rows.miss[..., None])[..., 0].sum(axis=0) + precision * cameras.off(bundle.cameras)
+    precision = np.where(additional.free, additional.sigma, 1.0) ** -2.0
+    flat = weighted.reshape(-1, n).T
+    own = flat @ C.reshape(-1, n) + np.diag(precision)
+    pull = flat @ rows.miss.ravel() + precision * additional.off(bundle)
     return (
         np.block([[information, mixed.T], [mixed, own]]),
         np.concatenate([gradient, pull]),

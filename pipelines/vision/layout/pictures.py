@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,10 +23,11 @@ _FORWARD = 0.05
 
 @dataclass(frozen=True, eq=False)
 class Shots:
-    """A camera and the tags found in each of its pictures, in time order."""
+    """A camera and the tags found in each of its pictures, in time order; at what time, s, if that is known."""
 
     camera: Camera
     pictures: Sequence[Detections]
+    time: Sequence[float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,19 +54,21 @@ def gathered(shots: Sequence[Shots], given: TagBody) -> Gathered:
     pictures: list[_Seen] = []
     camera: list[int] = []
     view: list[int] = []
+    time: list[float] = []
     for each in shots:
         known = [k for k, other in enumerate(cameras) if _same(other, each.camera)]
         if not known:
             cameras.append(each.camera)
         number = known[0] if known else len(cameras) - 1
         first: _Seen | None = None
-        for found in each.pictures:
+        for k, found in enumerate(each.pictures):
             if not (seen := _usable(each.camera, given, found)):
                 continue
             moved = first is None or not _still(first, seen)
             first = seen if moved or first is None else {**seen, **first}
             view.append((view[-1] if view else -1) + moved)
             camera.append(number)
+            time.append(np.nan if each.time is None else each.time[k])
             pictures.append(seen)
     rows = [(f, tag, *one) for f, seen in enumerate(pictures) for tag, one in sorted(seen.items())]
     sights = Sights(
@@ -75,8 +78,8 @@ def gathered(shots: Sequence[Shots], given: TagBody) -> Gathered:
         np.array([row[3] for row in rows], dtype=float),
     )
     f = len(pictures)
-    start = Bundle(tuple(cameras), np.array(camera, dtype=np.intp), given, so3.identity(f), np.zeros((f, 3)))
-    return Gathered(start, sights, np.array(view, dtype=np.intp))
+    start = Bundle.of(tuple(cameras), np.array(camera, dtype=np.intp), given, so3.identity(f), np.zeros((f, 3)))
+    return Gathered(replace(start, time=np.array(time)), sights, np.array(view, dtype=np.intp))
 
 
 def _same(a: Camera, b: Camera) -> bool:

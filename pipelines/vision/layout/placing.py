@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import so3
+from pipelines.vision.layout.additional import nothing
 from pipelines.vision.layout.bundle import adjusted, loss
-from pipelines.vision.layout.cameras import fixed_cameras
 from pipelines.vision.layout.flips import Flips, Sides, pairs, sides
 from pipelines.vision.layout.sights import Array, Bundle, Index, Sights, linearized
 from pipelines.vision.pose import TagBody, part
@@ -97,8 +97,8 @@ def _settled(bundle: Bundle, sights: Sights, told: Sides, placed: NDArray[np.boo
     seen = seen[together(seen)]
     number = np.cumsum(placed) - 1
     start = with_pictures(replace(bundle, body=part(bundle.body, placed)), told)
-    cameras = fixed_cameras(bundle.cameras)
-    after, _ = adjusted(start, replace(seen, tag=number[seen.tag]), int(number[seed]), cameras, FAR, _ON_THE_WAY)
+    seen = replace(seen, tag=number[seen.tag])
+    after, _ = adjusted(start, seen, int(number[seed]), nothing(start), FAR, _ON_THE_WAY)
     bRt, position = bundle.body.bRt.copy(), bundle.body.position.copy()
     bRt[placed], position[placed] = after.body.bRt, after.body.position
     return replace(bundle, body=replace(bundle.body, bRt=bRt, position=position))
@@ -173,7 +173,7 @@ def _against(
     body = TagBody(np.arange(h), np.full(h, bundle.body.size[sights.tag[0]]), bRt, place, bundle.body.family)
     camera = bundle.camera[sights.picture][sight]
     seen = Sights(np.arange(len(sight)), proposal, sights.corners[sight], sights.sigma[sight])
-    rows = linearized(Bundle(bundle.cameras, camera, body, cRb[sight, side], position[sight, side]), seen)
+    rows = linearized(Bundle.of(bundle.cameras, camera, body, cRb[sight, side], position[sight, side]), seen)
     A, B = rows.by_picture, rows.by_tag
     weight = np.linalg.inv(np.eye(8) + A @ spread[sight, side] @ np.swapaxes(A, 1, 2))
     Bw = np.swapaxes(B, 1, 2) @ weight

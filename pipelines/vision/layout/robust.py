@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.vision.layout.additional import Additional
 from pipelines.vision.layout.bundle import adjusted
-from pipelines.vision.layout.cameras import Cameras
+from pipelines.vision.layout.motion import with_motion
 from pipelines.vision.layout.sights import Array, Bundle, Index, Rows, Sights, linearized
 
 # Degrees of freedom of the t distribution.
@@ -36,7 +37,7 @@ class Fit:
         sigma: of a corner in a common picture, in the sigmas given.
         sigma_px: of a corner in a common picture, per axis.
         whole: indices of the sights that were looked at, used or not, in a table of the caller's.
-        cameras: what was adjusted of the cameras.
+        additional: what was adjusted beside poses.
     """
 
     bundle: Bundle
@@ -46,7 +47,7 @@ class Fit:
     sigma: float
     sigma_px: float
     whole: Index
-    cameras: Cameras
+    additional: Additional
 
     @property
     def freedom(self) -> Array:
@@ -71,14 +72,14 @@ class Fit:
         return float(np.sqrt((weight * (self.errors_px**2).mean(axis=(1, 2))[keep]).sum() / weight.sum()))
 
 
-def fitted(bundle: Bundle, sights: Sights, fixed: int, cameras: Cameras) -> Fit:
+def fitted(bundle: Bundle, sights: Sights, fixed: int, additional: Additional) -> Fit:
     """The most likely bundle; false detections are left out.
 
     Args:
         bundle: a start.
         sights: with sigmas that are right among each other.
         fixed: index of the tag that stays.
-        cameras: what of the cameras is adjusted.
+        additional: what is adjusted beside poses.
     """
     used = np.ones(len(sights), dtype=bool)
     # Where the start is it is not yet drawn to what is false.
@@ -89,7 +90,7 @@ def fitted(bundle: Bundle, sights: Sights, fixed: int, cameras: Cameras) -> Fit:
             break
         used[np.flatnonzero(used)[false]] = False
         used[np.flatnonzero(used)[~_with_others(sights[used])]] = False
-        fit = _reweighted(bundle, sights[used], fixed, cameras)
+        fit = _reweighted(bundle, sights[used], fixed, additional)
         bundle, sigma = fit.bundle, fit.sigma
         squares = fit.rows.squares * (sigma**2 / fit.weight[fit.sights.picture])
     return replace(fit, whole=np.arange(len(sights)))
@@ -111,24 +112,29 @@ def _with_others(sights: Sights) -> NDArray[np.bool_]:
     return np.asarray(np.bincount(sights.picture)[sights.picture] > 1)
 
 
-def _reweighted(bundle: Bundle, sights: Sights, fixed: int, cameras: Cameras) -> Fit:
+def _reweighted(bundle: Bundle, sights: Sights, fixed: int, additional: Additional) -> Fit:
     f, tags = len(bundle.cRb), len(bundle.body.ids)
     free = freedom(sights, f)
-    shared = 6.0 * (tags - 1) + cameras.free.sum()
+    shared = 6.0 * (tags - 1) + additional.free.sum()
     # The share of the tags in what a picture determines is theirs, not the noise's.
     free *= 1.0 - shared / max(free.sum(), shared + 1.0)
     sigma, weight = 1.0, np.ones(f)
     for _ in range(_ROUNDS):
         scaled = replace(sights, sigma=sights.sigma * sigma / np.sqrt(weight[sights.picture]))
-        bundle, rows = adjusted(bundle, scaled, fixed, cameras)
+        bundle, rows = adjusted(_moving(bundle, sights, additional), scaled, fixed, additional)
         squares = np.bincount(sights.picture, rows.squares, f) * sigma**2 / weight
         before, (sigma, weight) = sigma, _scale(squares, free)
         if abs(sigma / before - 1.0) < _SETTLED:
             break
     scaled = replace(sights, sigma=sights.sigma * sigma / np.sqrt(weight[sights.picture]))
-    bundle, rows = adjusted(bundle, scaled, fixed, cameras)
+    bundle, rows = adjusted(bundle, scaled, fixed, additional)
     sigma_px = sigma * float(np.median(sights.sigma))
-    return Fit(bundle, scaled, rows, weight, sigma, sigma_px, np.arange(len(sights)), cameras)
+    return Fit(bundle, scaled, rows, weight, sigma, sigma_px, np.arange(len(sights)), additional)
+
+
+def _moving(bundle: Bundle, sights: Sights, additional: Additional) -> Bundle:
+    """The bundle with the motion that its pictures show, if a shutter may roll."""
+    return with_motion(bundle, np.unique(sights.picture)) if additional.line_time.any() else bundle
 
 
 def freedom(sights: Sights, pictures: int) -> Array:

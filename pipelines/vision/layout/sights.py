@@ -1,7 +1,7 @@
 """What is seen of tags on a body, where they would be seen, and how that follows all poses.
 
 A corner at q in a tag's frame is at P = cRb (position of the tag + bRt q) + position of the picture in the camera's
-frame.
+frame. A shutter that rolls sees it when its row is exposed, at an attitude cRb Exp(w t) and a position v t farther.
 """
 
 from __future__ import annotations
@@ -54,6 +54,10 @@ class Bundle:
         camera: (f,) index of the camera of each picture.
         body: the tags.
         cRb, position: (f, 4), (f, 3) m, where the body stands in the camera's frame in each picture.
+        time: (f,) s, NaN where it is not known.
+        motion: (f, 6) per s, of the body in each picture, as far as it is known: turn w, rad in b, and velocity v, m in
+            the camera's frame.
+        line_time: (c,) s, from one row of a picture to the next; a picture's pose is that at its middle row.
     """
 
     cameras: tuple[Camera, ...]
@@ -61,6 +65,20 @@ class Bundle:
     body: TagBody
     cRb: Array
     position: Array
+    time: Array
+    motion: Array
+    line_time: Array
+
+    @classmethod
+    def of(cls, cameras: tuple[Camera, ...], camera: Index, body: TagBody, cRb: Array, position: Array) -> Bundle:
+        """As if nothing moved while a picture is taken."""
+        f = len(cRb)
+        return cls(cameras, camera, body, cRb, position, np.full(f, np.nan), np.zeros((f, 6)), np.zeros(len(cameras)))
+
+    def lines(self, sights: Sights) -> Array:
+        """(m, 4) by how many rows corners are below the middle of their picture."""
+        middle = np.array([0.5 * (camera.height - 1) for camera in self.cameras])
+        return np.asarray(sights.corners[..., 1] - middle[self.camera[sights.picture], None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,13 +86,16 @@ class Rows:
     """Reprojection errors (m, 8) in sigmas and their Jacobians.
 
     By [delta, epsilon]: cRb Exp(delta), position + epsilon of pictures, `by_picture` (m, 8, 6), and bRt Exp(delta),
-    position + epsilon of tags, `by_tag` (m, 8, 6). `points` (m, 4, 3) are the corners in the camera's frame, m.
+    position + epsilon of tags, `by_tag` (m, 8, 6). `points` and `velocity` (m, 4, 3) are the corners in the camera's
+    frame when they were seen, m and m/s, and `by_point` (m, 4, 2, 3) is how errors follow them.
     """
 
     miss: Array
     by_picture: Array
     by_tag: Array
     points: Array
+    velocity: Array
+    by_point: Array
 
     @cached_property
     def squares(self) -> Array:
@@ -85,10 +106,13 @@ class Rows:
 def linearized(bundle: Bundle, sights: Sights) -> Rows:
     """Errors (predicted - seen) of all sights and how they follow the poses."""
     m, body = len(sights), bundle.body
-    cRb, bRt = bundle.cRb[sights.picture], body.bRt[sights.tag]
+    at_middle, bRt = bundle.cRb[sights.picture][:, None], body.bRt[sights.tag]
+    w, v = np.split(bundle.motion[sights.picture][:, None], 2, axis=-1)
+    t = (bundle.line_time[bundle.camera[sights.picture], None] * bundle.lines(sights))[..., None]
     local = SQUARE * body.size[sights.tag][:, None, None]
     in_body = body.position[sights.tag][:, None] + so3.rotate(bRt[:, None], local)
-    points = so3.rotate(cRb[:, None], in_body) + bundle.position[sights.picture][:, None]
+    turned = so3.rotate(so3.exp(w * t), in_body) if t.any() else in_body
+    points = so3.rotate(at_middle, turned) + bundle.position[sights.picture][:, None] + v * t
     seen, by_point = np.empty((m, 4, 2)), np.empty((m, 4, 2, 3))
     for k, camera in enumerate(bundle.cameras):
         mine = bundle.camera[sights.picture] == k
@@ -97,7 +121,9 @@ def linearized(bundle: Bundle, sights: Sights) -> Rows:
     weight = 1.0 / sights.sigma[:, None, None]
     miss = np.where(good[..., None], weight * (seen - sights.corners), _BEHIND)
     by_point = np.where(good[..., None, None], weight[..., None] * by_point, 0.0)
-    in_b = by_point @ so3.matrix(cRb)[:, None]
-    by_picture = np.concatenate([-in_b @ so3.hat(in_body), by_point], axis=-1)
+    by_turned = by_point @ so3.matrix(at_middle)
+    in_b = by_turned @ so3.matrix(so3.exp(w * t)) if t.any() else by_turned
+    by_picture = np.concatenate([-by_turned @ so3.hat(turned), by_point], axis=-1)
     by_tag = np.concatenate([-in_b @ so3.matrix(bRt)[:, None] @ so3.hat(local), in_b], axis=-1)
-    return Rows(miss.reshape(m, 8), by_picture.reshape(m, 8, 6), by_tag.reshape(m, 8, 6), points)
+    velocity = so3.rotate(at_middle, so3.cross(w, turned)) + v
+    return Rows(miss.reshape(m, 8), by_picture.reshape(m, 8, 6), by_tag.reshape(m, 8, 6), points, velocity, by_point)

@@ -8,8 +8,8 @@ import numpy as np
 
 from factors import so3
 from pipelines.errors import InputError
+from pipelines.vision.layout.additional import nothing
 from pipelines.vision.layout.bundle import adjusted, loss
-from pipelines.vision.layout.cameras import fixed_cameras
 from pipelines.vision.layout.flips import Flips, flips, lone_scale, pairs, sides
 from pipelines.vision.layout.pictures import Gathered
 from pipelines.vision.layout.placing import FAR, grown, joint, mirrored, together, vote, with_pictures
@@ -49,7 +49,7 @@ def adjusted_whole(views: Gathered, body: TagBody | None) -> Fit:
             "no picture tells the poses of the tags in it from their planar flips; take pictures from nearer, or that "
             "show more tags on different faces"
         )
-    return replace(fitted(with_pictures(start, told), sights[whole], 0, fixed_cameras(start.cameras)), whole=whole)
+    return replace(fitted(with_pictures(start, told), sights[whole], 0, nothing(start)), whole=whole)
 
 
 def _telling(sights: Sights, view: Index) -> Index:
@@ -83,7 +83,7 @@ def _right_side_out(start: Bundle, sights: Sights, found: Flips) -> TagBody:
     for body in (start.body, mirrored(start.body, 0)):
         there = replace(start, body=body)
         there = with_pictures(there, sides(there, sights, found, FAR))
-        after, rows = adjusted(there, seen, 0, fixed_cameras(start.cameras), FAR)
+        after, rows = adjusted(there, seen, 0, nothing(start), FAR)
         bodies.append(after.body)
         costs.append(float(loss(rows.squares, FAR).sum()))
     best = int(np.argmin(costs))
