@@ -27,6 +27,8 @@ from tests.one_graph import one_graph
 from tests.short_problems import head_problem
 
 KNOWN = "noise_known: 0\n"
+# An indexer's samples at the usual rate take twice as long.
+COARSE = {"gyro_rate_hz": 100.0}
 # Sigma by hand, and of what the recording says: about equal, so that both count.
 MOUNT, SIGMA = np.array([0.06, -0.08, 0.03]), 1e-3
 
@@ -128,13 +130,18 @@ def earlier(tmp_path_factory: pytest.TempPathFactory) -> tuple[Calibration, Path
     return found, folder
 
 
+@pytest.fixture(scope="module")
+def today(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    recording = tmp_path_factory.mktemp("today") / "today.mcap"
+    CliRunner().invoke(app, ["simulate", "indexer", "--seed", "2", "--out", str(recording)])
+    return recording
+
+
 @pytest.mark.parametrize("file", ["result.json", "calibration.yaml"])
 def test_the_command_begins_from_an_earlier_calibration(
-    earlier: tuple[Calibration, Path], file: str, tmp_path: Path
+    earlier: tuple[Calibration, Path], today: Path, file: str, tmp_path: Path
 ) -> None:
-    recording = tmp_path / "today.mcap"
-    CliRunner().invoke(app, ["simulate", "indexer", "--seed", "2", "--out", str(recording)])
-    arguments = ["calibrate", str(recording), "--prior", str(earlier[1] / file), "--json", "--out", str(tmp_path / "o")]
+    arguments = ["calibrate", str(today), "--prior", str(earlier[1] / file), "--json", "--out", str(tmp_path / "o")]
     ended = CliRunner().invoke(app, arguments)
     assert ended.exit_code == 0, ended.output
     result = json.loads(ended.stdout)
@@ -148,7 +155,7 @@ def test_the_command_begins_from_an_earlier_calibration(
 
 
 def test_what_walks_is_known_less_well_after_a_while(earlier: tuple[Calibration, Path]) -> None:
-    simulated = alidade.simulate("indexer", None, seed=2)
+    simulated = alidade.simulate("indexer", COARSE, seed=2)
     rate = 1e-5
     config = load_config(simulated.config.encode(), load_config(f"share: {{theta_*: {rate}}}".encode()))
     session = alidade.open(simulated, config=config)
