@@ -1,7 +1,7 @@
-"""Incremental: the same steps, fed one by one to iSAM2.
+"""Incremental: the same steps, fed one by one to a smoother.
 
 By default in a fixed-lag window, where old states are marginalised out and an update costs the same in hour ten as in
-minute one; the calibration variables stay. With window None it is plain iSAM2 over the whole history.
+minute one; the calibration variables stay. With window None it is iSAM2 over the whole history.
 
 Now and then everything but the variables in use is marginalised out of the smoother: what it knows of them becomes one
 Gaussian, and a new smoother goes on from that alone. A run can be saved there and taken up again in another process,
@@ -198,8 +198,8 @@ class Run:
             if self._due(since):
                 self._reinitialize()
         elif since >= MARGINALIZE_EVERY and isinstance(self._smoother, FixedLag):
-            known, about = self._smoother.linearized()
-            self._continue_from(State.of(step.time, known, about, _in_use(about, self._stamps), self._stamps))
+            known, about = self._smoother.in_use()
+            self._continue_from(State.of(step.time, known, about, list(known.keyVector()), self._stamps))
 
     def values(self) -> Array:
         """The parameters now, as reported."""

@@ -145,9 +145,9 @@ class FixedLag:
         moved = self._moved()
         return np.concatenate([(0.0 if key in moved else 1.0) * self._moves.at(key) for key in keys])
 
-    def linearized(self) -> tuple[gtsam.GaussianFactorGraph, gtsam.Values]:
-        """All that is known of the variables held, and about which values it is linear."""
-        return self._known(0), self._begun
+    def in_use(self) -> tuple[gtsam.GaussianFactorGraph, gtsam.Values]:
+        """What is known of the variables in use, all others marginalised out, and values about which it is linear."""
+        return self._known(len(self._past)), self._begun
 
     def covariance(self, keys: Sequence[int]) -> Array:
         """As Smoother has it."""

@@ -44,7 +44,7 @@ class State:
             IndeterminateError: a variable that is marginalised out is not determined.
         """
         kept = set(keys)
-        rest = [key for key in values.keys() if key not in kept]
+        rest = [key for key in linear.keyVector() if key not in kept]
         try:
             # By QR: tight processes beside loose priors cost Cholesky its digits.
             remaining = linear.eliminatePartialMultifrontal(rest, gtsam.EliminateQR)[1] if rest else linear
