@@ -304,6 +304,32 @@ class Ensemble:
                 group.take()
 
 
+@contextmanager
+def residuals_at(
+    parts: Sequence[Sequence[VectorizedFactor]], values: gtsam.Values, loss: TruncatedLoss | None
+) -> Iterator[None]:
+    """As `Ensemble.at` for many factors, part by part: within the block they answer with residuals alone.
+
+    The models' Jacobians, and what these are made of, are let go after each part.
+    """
+    try:
+        for factors in parts:
+            with Ensemble(factors).at(values, loss):
+                given = [factor._given for factor in factors]
+            for factor, each in zip(factors, given, strict=True):
+                assert each is not None
+                factor._given = _Evaluation(each[0].residuals, _no_jacobians), each[1]
+        yield
+    finally:
+        for factors in parts:
+            for factor in factors:
+                factor._given = None
+
+
+def _no_jacobians() -> tuple[Array, ...]:
+    raise RuntimeError("evaluated for residuals alone")
+
+
 class _Group:
     """Factors whose models are evaluated as one."""
 

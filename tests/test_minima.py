@@ -14,8 +14,9 @@ from pipelines.graph.problem import Problem, Step
 from pipelines.methods.tumble.scenario import TumbledAccelerometer, TumbledMagnetometer, TumbleScenario
 from pipelines.session import Session
 from pipelines.solvers.assembly import Assembly
-from pipelines.solvers.batch import CHUNK, System, solve_batch
+from pipelines.solvers.batch import CHUNK, solve_batch
 from pipelines.solvers.minima import CLOSE
+from pipelines.solvers.system import System
 
 # Iron by which one axis of the magnetometer says little.
 STRONG = TumbleScenario(magnetometer=TumbledMagnetometer(soft_iron=0.2))

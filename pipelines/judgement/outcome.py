@@ -95,7 +95,8 @@ def quick_score(method: Method, data: Any, config: Config) -> float:
 
 def _score(problem: Problem) -> float:
     from pipelines.solvers.assembly import Assembly
-    from pipelines.solvers.batch import CHUNK, optimize, residuals_of
+    from pipelines.solvers.batch import CHUNK, optimize
+    from pipelines.solvers.system import residuals_of
 
     whole = Assembly.of(problem.steps(CHUNK))
     factors = whole.factors

@@ -9,33 +9,32 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
 from factors.loss import TruncatedLoss
-from factors.vectorized import Ensemble
 from pipelines.graph.noise import Level
-from pipelines.graph.problem import Array, Estimate, Factor, Problem, Residuals, Told
-from pipelines.solvers.assembly import Assembly
+from pipelines.graph.problem import Array, Estimate, Factor, Problem, Told
+from pipelines.solvers.assembly import Assembly, StepBoundary
 from pipelines.solvers.coloured import added_variance, coloured, inflations
 from pipelines.solvers.curvature import second_order
 from pipelines.solvers.history import sequential_history
 from pipelines.solvers.influence import Influence, influence, strongest, uncertainty_budget
 from pipelines.solvers.marginals import (
+    IndeterminateError,
     chi_square,
-    eliminated,
-    expected_squares,
     joint_covariance,
-    ordering_of,
     reported,
+    rows_used,
     smoothed,
 )
 from pipelines.solvers.minima import likeliest
 from pipelines.solvers.noise_levels import far, refined, weigh
+from pipelines.solvers.redundancy import expected_squares
 from pipelines.solvers.spurious import information_of_noise
+from pipelines.solvers.system import Linear, System, without_rejected
 from pipelines.solvers.told import told
 
 # Frames in one vectorised factor: past this the Jacobians' zeros cost more than the Python calls they save.
@@ -51,8 +50,6 @@ _ERROR_TOLERANCE = 1e-5
 _LITTLE = 0.15
 # Parts of a step along it that are tried, and how many steps the states have to return to the floor.
 _SHARES, _MOST_RETURNS = (1.0, 0.3, 0.1, 0.03), 2
-# Shared variables are held by so many times their information.
-HELD = 1e6
 # So much a measurement is near enough to tell which ones lie outside the gate: on average they move by 0.05 sigma yet.
 _ROUGH_TOLERANCE = 1e-3
 # Below this mean pull of outliers on plain least squares, in sigmas a measurement, good measurements stay inside the
@@ -71,73 +68,6 @@ _STRONGEST = 20
 
 
 @dataclass(frozen=True)
-class System:
-    """A graph, the order in which its variables are eliminated, and its vectorised factors evaluated all at once.
-
-    Attributes:
-        factors: of the graph.
-        graph: the same for gtsam.
-        ordering: of the elimination.
-        shared: the variables that all measurements share.
-        ensemble: the vectorised ones among the factors.
-        loss: how those that may be outliers are weighed; None counts all in full.
-    """
-
-    factors: Sequence[Factor]
-    graph: gtsam.NonlinearFactorGraph
-    ordering: gtsam.Ordering
-    shared: Sequence[int]
-    ensemble: Ensemble
-    loss: TruncatedLoss | None
-
-    @classmethod
-    def of(cls, factors: Sequence[Factor], shared: Sequence[int], loss: TruncatedLoss | None) -> System:
-        """The system of some factors; the shared variables are eliminated last."""
-        graph = graph_of(factors)
-        return cls(factors, graph, elimination_ordering(graph, shared), shared, _ensemble(factors), loss)
-
-    def made_of(self, factors: Sequence[Factor]) -> System:
-        """The same system with other noise: of factors on the same variables, one for one."""
-        return replace(self, factors=factors, graph=graph_of(factors), ensemble=_ensemble(factors))
-
-    def under(self, loss: TruncatedLoss | None) -> System:
-        """The same system with another loss."""
-        return replace(self, loss=loss)
-
-    def at(self, values: gtsam.Values) -> AbstractContextManager[None]:
-        """Within the block the factors answer for these values, under the system's loss."""
-        return self.ensemble.at(values, self.loss)
-
-    def error(self, values: gtsam.Values) -> float:
-        """Half the sum of squares."""
-        with self.at(values):
-            return float(self.graph.error(values))
-
-    def linearize(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
-        """The linear system about the values."""
-        with self.at(values):
-            return self.graph.linearize(values)
-
-    def holding_shared(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
-        """The linear system about the values in which the shared variables stay where they are."""
-        return held(self.linearize(values), HELD, {key: np.zeros(values.dims()[key]) for key in self.shared})
-
-    def without_rejected(self, values: gtsam.Values) -> System:
-        """The same system with the measurements alone that count at the values, wherever it is asked from then on."""
-        with self.at(values):
-            return self.made_of([_without_rejected(f, f, values) for f in self.factors]).under(None)
-
-    def residuals(self, values: gtsam.Values) -> dict[str, Residuals]:
-        """Residuals of all measurements, by family."""
-        with self.at(values):
-            return residuals_of(self.factors, values)
-
-
-def _ensemble(factors: Sequence[Factor]) -> Ensemble:
-    return Ensemble([v for f in factors if (v := f.vectorized) is not None])
-
-
-@dataclass(frozen=True)
 class Solution:
     """Values at a minimum of a system, and how it was reached."""
 
@@ -146,30 +76,6 @@ class Solution:
     converged: bool
     message: str
     iterations: int
-
-
-@dataclass(frozen=True)
-class Linearized:
-    """A system about a solution.
-
-    Attributes:
-        graph: linearised.
-        bayes_net: its triangular factor.
-        expected: squares of the residuals, see marginals.expected_squares.
-    """
-
-    graph: gtsam.GaussianFactorGraph
-    bayes_net: gtsam.GaussianBayesNet
-    expected: dict[tuple[str, int], float]
-
-    @classmethod
-    def of(cls, solution: Solution) -> Linearized:
-        """Raises IndeterminateError, naming a variable that is not determined."""
-        system, values = solution.system, solution.values
-        graph = system.linearize(values)
-        bayes_net = eliminated(graph, system.ordering)
-        with system.at(values):
-            return cls(graph, bayes_net, expected_squares(system.factors, graph, bayes_net, values))
 
 
 def solve_batch(
@@ -202,21 +108,23 @@ def solve_batch(
     built = time.perf_counter()
     shared = whole.shared(problem)
     weighed = weigh(whole.factors, problem.noises)
-    solution = optimize(weighed, whole.initial, shared, problem.loss, most, held=problem.assumed)
-    solution, levels, about = with_levels(problem, whole.factors, solution, problem.noises, most)
+    solution = optimize(
+        weighed, whole.initial, shared, problem.loss, most, held=problem.assumed, boundaries=whole.boundaries
+    )
+    solution, levels, about, expected = with_levels(problem, whole.factors, solution, problem.noises, most)
     best, second = likeliest(problem, solution, _minimize, whole.current_keys)
     if best is not solution:
-        solution, about = best, Linearized.of(best)
+        solution, (about, expected) = best, _expected(best)
     solved = time.perf_counter()
     values, system, ordering = solution.values, solution.system, solution.system.ordering
     linear, factors = about.graph, system.factors
-    course = sequential_history(problem, linear, ordering, values, whole.boundaries)
+    course = sequential_history(problem, linear, ordering, values, about.boundaries)
     marginal = (
         joint_covariance(problem, linear, ordering, values, whole.current_keys)
         if course is None
         else course.covariance[-1]
     )
-    noise = information_of_noise(problem, system.linearize, ordering, values, marginal, whole.current_keys)
+    noise = information_of_noise(problem, system, values, marginal, whole.current_keys)
     if noise is not None:
         marginal = joint_covariance(problem, linear, ordering, values, whole.current_keys, noise)
     bent = second_order(problem, system, values, marginal, whole.current_keys)
@@ -224,11 +132,11 @@ def solve_batch(
         marginal = marginal + bent
     residuals = system.residuals(values)
     with system.at(values):
-        summary = chi_square(problem, factors, values, marginal, about.expected)
+        summary = chi_square(problem, factors, values, marginal, expected)
         colours = coloured(factors, values) if levels else {}
     sources, moved, pulls, inflation = None, None, None, np.ones(len(marginal))
     if budget or colours:
-        found = influence(problem, factors, linear, about.bayes_net, values, whole.current_keys)
+        found = influence(problem, about, whole.current_keys)
         added = added_variance(found, colours)
         inflation = inflations(problem, marginal, found.names, added)
         if budget:
@@ -263,7 +171,7 @@ def solve_batch(
         strongest=pulls,
         rejected={family: int((~r.used).sum()) for family, r in residuals.items()},
         levels=levels,
-        told=_told(problem, solution, linear, whole.current_keys, device, elsewhere) if device else None,
+        told=_told(problem, about, whole.current_keys, device, elsewhere) if device else None,
         second=second,
         seconds={"build": built - start, "solve": solved - built, "marginals": done - solved},
     )
@@ -271,15 +179,14 @@ def solve_batch(
 
 def _told(
     problem: Problem,
-    solution: Solution,
-    linear: gtsam.GaussianFactorGraph,
+    about: Linear,
     current_keys: Mapping[int, int],
     device: Collection[str],
     elsewhere: Callable[[Told], Mapping[str, float]] | None,
 ) -> Told:
     """What a graph says, linear about its solution or where the reported numbers are to be."""
-    system, values = solution.system, solution.values
-    own = told(problem, system.factors, linear, values, current_keys, device)
+    values = about.values
+    own = told(problem, about, current_keys, device)
     wanted = {} if elsewhere is None else elsewhere(own)
     if not wanted:
         return own
@@ -289,8 +196,8 @@ def _told(
         numbers, J = p.coordinates(values, key)
         to = [wanted.get(q.name, number) for q, number in zip(p.quantities, numbers, strict=True)]
         moves[key] = np.linalg.pinv(J) @ (np.array(to) - numbers)
-    there = values.retract(eliminated(held(linear, HELD, moves), system.ordering).optimize())
-    return told(problem, system.factors, system.linearize(there), there, current_keys, device)
+    there = values.retract(about.holding(moves).solution())
+    return told(problem, about.system.linearized(there), current_keys, device)
 
 
 def _moves(changed: Problem, solution: Solution, levels: tuple[Level, ...], found: Influence) -> dict[str, float]:
@@ -303,8 +210,8 @@ def _moves(changed: Problem, solution: Solution, levels: tuple[Level, ...], foun
     if [_shape(f) for f in factors] != [_shape(f) for f in system.factors]:
         return {}
     with system.at(values):
-        kept = [_without_rejected(f, own, values) for f, own in zip(factors, system.factors, strict=True)]
-    moves = found.moves(system.made_of(kept).under(None).linearize(values))
+        kept = [without_rejected(f, own, values) for f, own in zip(factors, system.factors, strict=True)]
+    moves = found.moves(system.made_of(kept).under(None).linearized(values))
     return dict(zip(found.names, moves.tolist(), strict=True))
 
 
@@ -312,39 +219,6 @@ def _shape(factor: Factor) -> tuple[str, list[int], int]:
     """What the factors of two graphs of one recording have in common: family, variables, how many measurements."""
     vectorized = factor.vectorized
     return factor.family, factor.factor.keys(), 0 if vectorized is None else len(vectorized.model.time)
-
-
-def _without_rejected(factor: Factor, like: Factor, values: gtsam.Values) -> Factor:
-    """A factor with no weight on the measurements that another one, of the same, rejects at the values."""
-    if factor.measurement is None or like.measurement is None or (used := like.measurement.used(values)).all():
-        return factor
-    weights = np.ones(1) if factor.measurement.weights is None else factor.measurement.weights
-    return Factor.of(factor.family, factor.measurement.weighed(weights * used[:, None]))
-
-
-def graph_of(factors: Sequence[Factor]) -> gtsam.NonlinearFactorGraph:
-    """The gtsam graph of the factors, in their order."""
-    graph = gtsam.NonlinearFactorGraph()
-    for f in factors:
-        graph.add(f.factor)
-    return graph
-
-
-def elimination_ordering(graph: gtsam.NonlinearFactorGraph, shared: Sequence[int]) -> gtsam.Ordering:
-    """Nested dissection of the chain with the shared variables last, which suits chains with a few common variables."""
-    # METIS wants variables that share a factor with another, or it brings the process down.
-    joined = gtsam.NonlinearFactorGraph()
-    alone = dict.fromkeys(shared)
-    for i in range(graph.size()):
-        keys = graph.at(i).keys()
-        if len(keys) > 1:
-            joined.push_back(graph.at(i))
-        else:
-            alone.update(dict.fromkeys(keys))
-    last = set(shared)
-    metis = gtsam.Ordering.MetisNonlinearFactorGraph(joined) if joined.size() else gtsam.Ordering()
-    chain = [metis.at(i) for i in range(metis.size()) if metis.at(i) not in last]
-    return ordering_of([*(alone.keys() - last - set(chain)), *chain, *shared])
 
 
 def optimize(
@@ -355,13 +229,14 @@ def optimize(
     most: int = _MOST_ITERATIONS,
     most_damping: float = _MOST_DAMPING,
     held: Sequence[int] = (),
+    boundaries: Sequence[StepBoundary] = (),
 ) -> Solution:
     """Minimise; with a loss: plain least squares first, and the graduated relaxation only if it leaves outliers.
 
     The relaxation begins where plain least squares leads when the vectors `held` stay as they are: outliers taken for
     measurements would drive small effects, which priors hold by no more than measurements count, out of all bounds.
     """
-    unweighed = System.of(factors, shared, None)
+    unweighed = System.of(factors, shared, None, boundaries)
     if loss is None:
         return _minimize(unweighed, values, most=most, most_damping=most_damping)
     measurements = sum(len(f.measurement.model.time) for f in factors if f.measurement is not None)
@@ -372,7 +247,7 @@ def optimize(
     outlying = norms[norms > loss.gate].sum() > _MILD_PULL * len(norms)
     if outlying:
         if held:
-            tied = System.of([*factors, *(_tie(key, start.atVector(key)) for key in held)], shared, None)
+            tied = System.of([*factors, *(_tie(key, start.atVector(key)) for key in held)], shared, None, boundaries)
             plain_but_held = _minimize(tied, start, _ROUGH_TOLERANCE * measurements, most)
             values, iterations = plain_but_held.values, iterations + plain_but_held.iterations
         values, more = _relaxed(unweighed, loss, values, float(norms.max()))
@@ -382,7 +257,8 @@ def optimize(
     if outlying and not (sound and final.converged):
         # Among few measurements outliers lead plain least squares far beyond what the priors allow, and what is found
         # from there is none of the likely minima. With noise as large as they are the priors keep their say.
-        soft = _minimize(System.of(_softened(factors, float(norms.max()) / loss.gate), shared, None), start, most=most)
+        softened = unweighed.made_of(_softened(factors, float(norms.max()) / loss.gate))
+        soft = _minimize(softened, start, most=most)
         values, more = _relaxed(unweighed, loss, soft.values, float(_norms(unweighed, soft.values).max()))
         again, _ = _truncated(unweighed, loss, values, soft.values, most)
         iterations += soft.iterations + more + again.iterations
@@ -426,8 +302,8 @@ def with_levels(
     solution: Solution,
     levels: tuple[Level, ...],
     most: int = _MOST_ITERATIONS,
-) -> tuple[Solution, tuple[Level, ...], Linearized]:
-    """The solution with the noise levels that the recording tells, these, and the system about it.
+) -> tuple[Solution, tuple[Level, ...], Linear, dict[tuple[str, int], float]]:
+    """The solution with the noise levels that the recording tells, and these; it linearised, and its expected squares.
 
     Args:
         problem: the graph's.
@@ -439,20 +315,29 @@ def with_levels(
     Raises:
         IndeterminateError: a variable is not determined.
     """
-    first, linear = levels, Linearized.of(solution)
+    first, (linear, expected) = levels, _expected(solution)
     for _ in range(_MOST_LEVELS if any(level.noise.estimated for level in levels) else 0):
         if not solution.converged:
             break
         system, values, before = solution.system, solution.values, levels
         with system.at(values):
-            levels, steady = refined(levels, system.factors, values, linear.expected, levels is first)
+            levels, steady = refined(levels, system.factors, values, expected, levels is first)
         if steady:
             break
         weighed = system.made_of(weigh(factors, levels)).under(None)
         again = _again(problem, weighed, values, far(levels, before), most)
         solution = replace(again, iterations=solution.iterations + again.iterations)
-        linear = Linearized.of(solution)
-    return solution, levels, linear
+        linear, expected = _expected(solution)
+    return solution, levels, linear, expected
+
+
+def _expected(solution: Solution) -> tuple[Linear, dict[tuple[str, int], float]]:
+    """A solution linearised, and the expected squares of its residuals."""
+    system, values = solution.system, solution.values
+    with system.at(values):
+        stands = [np.array(rows_used(stretch.factors, values), dtype=float) for stretch in system.stretches]
+    linear = system.linearized(values)
+    return linear, expected_squares(linear, stands)
 
 
 def _again(problem: Problem, system: System, values: gtsam.Values, far: bool, most: int) -> Solution:
@@ -460,7 +345,15 @@ def _again(problem: Problem, system: System, values: gtsam.Values, far: bool, mo
     if problem.loss is None:
         return _minimize(system, values, most=most)
     if far:
-        return optimize(system.factors, values, system.shared, problem.loss, most, held=problem.assumed)
+        return optimize(
+            system.factors,
+            values,
+            system.shared,
+            problem.loss,
+            most,
+            held=problem.assumed,
+            boundaries=system.boundaries,
+        )
     return _truncated(system, problem.loss, values, values, most)[0]
 
 
@@ -502,9 +395,9 @@ def _minimize(
         return Solution(system, values, False, "the residuals at the start are not finite", 0)
     damping = 0.0
     for iteration in range(1, most + 1):
-        linear = system.linearize(values)
+        linear = _linearized(system, values)
         while True:
-            delta, foreseen = _step(linear, system.ordering, damping)
+            delta, foreseen = _step(system, values, linear, damping)
             candidate = values if delta is None else values.retract(delta)
             new_error = np.inf if delta is None else system.error(candidate)
             if delta is not None and damping == 0.0 and error < new_error:
@@ -536,7 +429,8 @@ def _along_valley(
     for share in _SHARES:
         candidate = values.retract(delta.scale(share))
         for _ in range(_MOST_RETURNS):
-            back, _ = _step(system.holding_shared(candidate), system.ordering, 0.0)
+            about = _linearized(system, candidate)
+            back, _ = _step(system, candidate, about and about.holding_shared(), 0.0)
             if back is None:
                 break
             candidate = candidate.retract(back)
@@ -546,54 +440,21 @@ def _along_valley(
     return values, np.inf
 
 
+def _linearized(system: System, values: gtsam.Values) -> Linear | None:
+    """A system about some values; None: a stretch does not determine what it alone holds."""
+    try:
+        return system.linearized(values)
+    except IndeterminateError:
+        return None
+
+
 def _step(
-    linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, damping: float
+    system: System, values: gtsam.Values, linear: Linear | None, damping: float
 ) -> tuple[gtsam.VectorValues | None, float]:
     """One (damped) step, None if the system is singular, and by how much it should lower the error."""
     try:
         if damping > 0.0:
-            linear = held(linear, damping)
-        delta = linear.optimize(ordering, gtsam.EliminateQR)
-        return delta, -0.5 * linear.gradientAtZero().dot(delta)
-    except RuntimeError:
+            linear = system.linearized(values, damping) if linear is None else linear.damped(damping)
+        return (None, 0.0) if linear is None else linear.step()
+    except (RuntimeError, IndeterminateError):
         return None, 0.0
-
-
-def held(
-    linear: gtsam.GaussianFactorGraph, weight: float, at: Mapping[int, Array] | None = None
-) -> gtsam.GaussianFactorGraph:
-    """The system with each unknown held where it is by `weight` times its own information, or some at moves (d,)."""
-    gradient = linear.gradientAtZero()
-    diagonal = {key: np.zeros(len(gradient.at(key))) for key in linear.keyVector()}
-    for i in range(linear.size()):
-        factor = linear.at(i)
-        squares = (factor.jacobian()[0] ** 2).sum(axis=0)
-        for key in factor.keys():
-            size = len(diagonal[key])
-            diagonal[key] += squares[:size]
-            squares = squares[size:]
-    out = linear.clone()
-    for key in diagonal if at is None else at:
-        scale = np.sqrt(weight * np.maximum(diagonal[key], 1e-6))
-        noise = gtsam.noiseModel.Unit.Create(len(scale))
-        aim = np.zeros(len(scale)) if at is None else scale * at[key]
-        out.add(gtsam.JacobianFactor(key, np.diag(scale), aim, noise))
-    return out
-
-
-def residuals_of(factors: Sequence[Factor], values: gtsam.Values) -> dict[str, Residuals]:
-    """Residuals of all measurements, by family, in time order of the steps."""
-    gathered: dict[str, list[Residuals]] = {}
-    for f in factors:
-        if f.measurement is not None:
-            whitened = f.measurement.residuals(values)
-            used = f.measurement.used(values)
-            gathered.setdefault(f.family, []).append(Residuals(f.measurement.model.time, whitened, used))
-    return {
-        family: Residuals(
-            np.concatenate([p.time for p in parts]),
-            np.concatenate([p.whitened for p in parts]),
-            np.concatenate([p.used for p in parts]),
-        )
-        for family, parts in gathered.items()
-    }

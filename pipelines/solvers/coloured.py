@@ -112,15 +112,15 @@ def added_variance(found: Influence, colours: Mapping[str, Array]) -> dict[str, 
     """
     added = {family: np.zeros(len(found.names)) for family in colours}
     lengths = dict.fromkeys(colours, 0)
-    for f in found.factors:
+    for f in found.linear.system.factors:
         if f.family in colours and f.measurement is not None:
             lengths[f.family] += len(f.measurement.model.time)
     for start in range(0, len(found.names) if colours else 0, _AT_A_TIME):
         part = found.part(slice(start, start + _AT_A_TIME))
         rows: dict[str, list[Array]] = {family: [] for family in colours}
-        for i, row in part.rows():
-            if found.factors[i].family in colours:
-                rows[found.factors[i].family].append(row.T)
+        for factor, _, row in part.rows():
+            if factor.family in colours:
+                rows[factor.family].append(row.T)
         for family, correlation in colours.items():
             L = np.concatenate(rows[family]).reshape(lengths[family], -1, len(part.names))
             more = 2.0 * correlation @ _products(L, len(correlation))

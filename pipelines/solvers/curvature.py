@@ -16,10 +16,10 @@ import gtsam
 import numpy as np
 
 from pipelines.graph.problem import Array, Problem
-from pipelines.solvers.marginals import IndeterminateError, drawn, eliminated, prior_units, reduced
+from pipelines.solvers.marginals import IndeterminateError, prior_units, reduced
 
 if TYPE_CHECKING:
-    from pipelines.solvers.batch import System
+    from pipelines.solvers.system import System
 
 # Directions of which sigma is beyond this share of the prior are drawn, the others follow.
 _WEAK = 0.1
@@ -57,13 +57,13 @@ def second_order(
     free, scale, unit = prior_units(problem.parameters, values, keys)
     # Far from the solution the loss would reject what is good.
     system, ordering = system.without_rejected(values), system.ordering
-    linear = system.linearize(values)
     try:
-        information, slope = reduced(linear, ordering, keys)
+        linear = system.linearized(values)
+        information, slope = reduced(linear.graph, ordering, keys)
         eigenvalues, vectors = np.linalg.eigh(unit.T @ information @ unit)
         if eigenvalues[0] < _ANYWHERE:
             return None
-        moved = drawn(eliminated(linear, ordering), values, keys, _DRAWS)
+        moved = linear.drawn(keys, _DRAWS)
         told = eigenvalues >= _WEAK**-2.0
         steps: list[Array] = []
         known = unit @ vectors[:, told]

@@ -17,7 +17,7 @@ from pipelines.solvers.assembly import StepBoundary
 from pipelines.solvers.marginals import coordinate_inverse, ordering_of, reported, reported_covariance
 
 # Moments at which the recording is looked back upon.
-_MOMENTS = 50
+MOMENTS = 50
 
 
 def sequential_history(
@@ -71,7 +71,7 @@ def sequential_history(
 def _moments(boundaries: Sequence[StepBoundary]) -> list[StepBoundary]:
     """Boundaries spread over the recording, the last one among them."""
     times = np.array([boundary.time for boundary in boundaries])
-    wanted = np.linspace(times[0], times[-1], _MOMENTS + 1)[1:]
+    wanted = np.linspace(times[0], times[-1], MOMENTS + 1)[1:]
     chosen: NDArray[np.intp] = np.unique(np.searchsorted(times, wanted).clip(max=len(boundaries) - 1))
     return [boundaries[i] for i in chosen]
 

@@ -342,7 +342,7 @@ class Run:
         weighed = weigh(whole.factors, self.levels)
         solution = optimize(weighed, whole.initial, self.keys, self.problem.loss, held=self.problem.assumed)
         if solution.converged:
-            solution, self.levels, _ = with_levels(self.problem, whole.factors, solution, self.levels)
+            solution, self.levels, *_ = with_levels(self.problem, whole.factors, solution, self.levels)
         if not solution.converged:
             require_sound(whole.factors, whole.initial, self.time)
         self._trouble = "" if solution.converged else f"the first {self.time:.1f} s: {solution.message}"
@@ -361,9 +361,7 @@ class Run:
         system, current = solution.system, self.current_keys
         if self._young:
             covariance = self.covariance()
-            self._noise = information_of_noise(
-                self.problem, system.linearize, system.ordering, values, covariance, current
-            )
+            self._noise = information_of_noise(self.problem, system, values, covariance, current)
             if self._noise is not None:
                 covariance = self.covariance()
             self._bent = second_order(self.problem, system, values, covariance, current)

@@ -9,20 +9,22 @@ At the minimum a small change r of the whitened residuals moves the reported num
 
 A the linearised, whitened system, J the Jacobian of the reported numbers. Residuals of unit variance give the
 covariance L L^T = J N^-1 J^T: the squares of a row of L are the parts that each residual has in a parameter's variance.
-One solution of N x = J_j^T for each parameter is kept, two back-substitutions with the triangular factor of A; rows of
-L come one factor after the other as A x, so that no matrix of all rows is ever there.
+One solution of N x = J_j^T for each parameter is kept, two back-substitutions with the triangular factor of A, of the
+variables that stretches share; rows of L come stretch by stretch and one factor after the other as A x, so that no
+matrix of all rows is ever there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
 from pipelines.graph.problem import Array, Factor, Problem, Pull
-from pipelines.solvers.marginals import places_of, solved
+from pipelines.solvers.system import Linear
+from pipelines.solvers.triangular import rows_of
 
 # Family of the priors, which are told one by one.
 _PRIOR = "prior"
@@ -34,31 +36,29 @@ class Influence:
 
     Attributes:
         names: (n,) of the numbers, fixed ones left out.
-        factors: of the graph, in its order.
-        linear: the factors linearised.
-        solutions: variable -> (d, n), its rows of N^-1 J^T.
+        linear: the graph about its solution.
+        solutions: (D, n) rows of N^-1 J^T, of the variables that stretches share; those of the others follow.
         covariance: (n, n) of the numbers, errors that the graph does not model left out.
     """
 
     names: tuple[str, ...]
-    factors: Sequence[Factor]
-    linear: gtsam.GaussianFactorGraph
-    solutions: Mapping[int, Array]
+    linear: Linear
+    solutions: Array
     covariance: Array
 
     def part(self, of: slice) -> Influence:
         """The same of some of the numbers."""
-        solutions = {key: columns[:, of] for key, columns in self.solutions.items()}
-        return Influence(self.names[of], self.factors, self.linear, solutions, self.covariance[of, of])
+        return Influence(self.names[of], self.linear, self.solutions[:, of], self.covariance[of, of])
 
-    def rows(self) -> Iterator[tuple[int, Array]]:
-        """Index of a factor and the derivative (n, m) of the numbers by its m whitened residuals, factor by factor."""
-        for i in range(self.linear.size()):
-            factor = self.linear.at(i)
-            A, _ = factor.jacobian()
-            yield i, (A @ np.concatenate([self.solutions[key] for key in factor.keys()])).T
+    def rows(self) -> Iterator[tuple[Factor, gtsam.GaussianFactor, Array]]:
+        """Each factor, it linearised, and the derivative (n, m) of the numbers by its m whitened residuals."""
+        for part, solutions in self.linear.solved(self.solutions):
+            places = part.triangular.places
+            for i, factor in enumerate(part.factors):
+                linear = part.graph.at(i)
+                yield factor, linear, (linear.jacobian()[0] @ solutions[rows_of(places, linear.keys())]).T
 
-    def moves(self, changed: gtsam.GaussianFactorGraph) -> Array:
+    def moves(self, changed: Linear) -> Array:
         """(n,) by how much the numbers are elsewhere at the minimum of a graph that is a little different.
 
         To first order that is J N^-1 times the difference of the gradients A^T r, and the rows of the two graphs need
@@ -67,47 +67,40 @@ class Influence:
         Args:
             changed: that graph, linearised where this one is.
         """
-        before, after = self.linear.gradientAtZero(), changed.gradientAtZero()
         moved = np.zeros(len(self.names))
-        for key, columns in self.solutions.items():
-            moved -= columns.T @ (after.at(key) - before.at(key))
+        for (part, solutions), other in zip(self.linear.solved(self.solutions), changed.parts(), strict=True):
+            keys = list(part.triangular.places)
+            before, after = part.graph.gradientAtZero(), other.graph.gradientAtZero()
+            moved -= solutions.T @ (after.vector(keys) - before.vector(keys))
         return moved
 
 
-def influence(
-    problem: Problem,
-    factors: Sequence[Factor],
-    linear: gtsam.GaussianFactorGraph,
-    bayes_net: gtsam.GaussianBayesNet,
-    values: gtsam.Values,
-    current_keys: Mapping[int, int],
-) -> Influence:
+def influence(problem: Problem, linear: Linear, current_keys: Mapping[int, int]) -> Influence:
     """The influence of a graph's residuals at an estimate.
 
     Args:
         problem: names the reported numbers.
-        factors: of the graph.
-        linear: the same, linearised and whitened.
-        bayes_net: their triangular factor.
-        values: the estimate.
+        linear: the graph about the estimate.
         current_keys: parameter key -> variable that holds its value, for parameters that move along.
+
+    Raises:
+        IndeterminateError: a variable is not determined.
     """
-    places = places_of(linear)
+    triangular = linear.triangular
     names: list[str] = []
-    gradients: list[tuple[int, Array]] = []
+    rights: list[Array] = []
     for p in problem.parameters:
         key = current_keys.get(p.key, p.key)
-        for quantity, gradient in zip(p.quantities, p.coordinates(values, key)[1], strict=True):
+        for quantity, gradient in zip(p.quantities, p.coordinates(linear.values, key)[1], strict=True):
             if quantity.prior_sigma != 0.0:
+                right = np.zeros(triangular.size)
+                right[triangular.places[key]] = gradient
                 names.append(quantity.name)
-                gradients.append((key, gradient))
-    right = np.zeros((max(place.stop for place in places.values()), len(names)))
-    for j, (key, gradient) in enumerate(gradients):
-        right[places[key], j] = gradient
-    whole = solved(bayes_net, places, right)
-    solutions = {key: whole[place] for key, place in places.items()}
-    covariance = np.array([gradient @ solutions[key] for key, gradient in gradients]).reshape(len(names), -1)
-    return Influence(tuple(names), factors, linear, solutions, 0.5 * (covariance + covariance.T))
+                rights.append(right)
+    J = np.array(rights).reshape(len(names), -1)
+    solutions = triangular.back(triangular.forward(J.T))
+    covariance = J @ solutions
+    return Influence(tuple(names), linear, solutions, 0.5 * (covariance + covariance.T))
 
 
 def uncertainty_budget(problem: Problem, found: Influence, added: Mapping[str, Array]) -> dict[str, dict[str, float]]:
@@ -123,9 +116,8 @@ def uncertainty_budget(problem: Problem, found: Influence, added: Mapping[str, A
     """
     by_key = {p.key: p for p in problem.parameters}
     variances: dict[str, Array] = {}
-    for i, rows in found.rows():
-        factor = found.factors[i]
-        keys = found.linear.at(i).keys()
+    for factor, linear, rows in found.rows():
+        keys = linear.keys()
         parameter = by_key.get(keys[0]) if factor.family == _PRIOR and len(keys) == 1 else None
         squares = rows**2
         if parameter is not None and squares.shape[1] == len(parameter.quantities):
@@ -166,16 +158,16 @@ def strongest(found: Influence, sigmas: Mapping[str, float], most: int) -> tuple
     columns = [found.names.index(name) for name in names]
     scale = np.array([1.0 / sigmas[name] for name in names])
     pulls: list[Pull] = []
-    for i, rows in found.rows():
-        vectorized = found.factors[i].vectorized
+    for factor, linear, rows in found.rows():
+        vectorized = factor.vectorized
         if vectorized is None or not names:
             continue
         time = vectorized.model.time[-1:] if vectorized.compress else vectorized.model.time
-        _, r = found.linear.at(i).jacobian()
+        _, r = linear.jacobian()
         moves = (rows[columns] * scale[:, None] * r).reshape(len(names), len(time), -1).sum(axis=2)
         largest = np.abs(moves).argmax(axis=0)
         pulls += [
-            Pull(found.factors[i].family, float(t), names[j], float(moves[j, k]))
+            Pull(factor.family, float(t), names[j], float(moves[j, k]))
             for k, (t, j) in enumerate(zip(time, largest, strict=True))
         ]
     return tuple(sorted(pulls, key=lambda pull: -abs(pull.sigmas))[:most])

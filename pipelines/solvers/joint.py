@@ -21,7 +21,6 @@ from pipelines.graph.noise import Level
 from pipelines.graph.problem import Array, Problem, Told
 from pipelines.solvers.assembly import Assembly
 from pipelines.solvers.batch import CHUNK, optimize
-from pipelines.solvers.marginals import eliminated
 from pipelines.solvers.noise_levels import weigh
 from pipelines.solvers.told import fewest, told
 
@@ -220,12 +219,18 @@ def tell(problem: Problem, levels: Sequence[Level], device: Collection[str]) -> 
     """
     whole = Assembly.of(problem.steps(CHUNK))
     factors = weigh(whole.factors, levels or problem.noises)
-    solution = optimize(factors, whole.initial, whole.shared(problem), problem.loss, held=problem.assumed)
+    solution = optimize(
+        factors,
+        whole.initial,
+        whole.shared(problem),
+        problem.loss,
+        held=problem.assumed,
+        boundaries=whole.boundaries,
+    )
     # The solution is where its error is, to 0.005 sigmas; a last step is nearer to where it is linear about.
     system = solution.system
-    last = eliminated(system.linearize(solution.values), system.ordering).optimize()
-    values = solution.values.retract(last)
-    return told(problem, factors, system.linearize(values), values, whole.current_keys, device)
+    values = solution.values.retract(system.linearized(solution.values).solution())
+    return told(problem, system.linearized(values), whole.current_keys, device)
 
 
 def join(tellings: Sequence[Told], rates: Mapping[str, float], days: Sequence[float]) -> Joined:

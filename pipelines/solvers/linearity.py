@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import gtsam
 import numpy as np
 
 from pipelines.graph.problem import Problem
-from pipelines.solvers.batch import HELD, Solution, held
+from pipelines.solvers.batch import Solution
 from pipelines.solvers.marginals import IndeterminateError, coordinate_inverse, joint_information
 
 # So many points about the estimate are tried, in pairs.
@@ -28,11 +27,11 @@ def is_linear(problem: Problem, solution: Solution, keys: Sequence[int]) -> bool
         keys: variables that hold the parameters.
     """
     values, system = solution.values, solution.system
-    linear, error = system.linearize(values), system.error(values)
+    linear, error = system.linearized(values), system.error(values)
     ends = np.cumsum([values.dims()[key] for key in keys])
     generator = np.random.default_rng(0)
     try:
-        information = joint_information(linear, system.ordering, keys)
+        information = joint_information(linear.graph, system.ordering, keys)
         free = np.flatnonzero([q.prior_sigma != 0.0 for q in problem.quantities])
         scale = np.array([q.scale for q in problem.quantities])[free]
         unit = coordinate_inverse(problem.parameters, values, keys)[:, free] * scale
@@ -41,7 +40,7 @@ def is_linear(problem: Problem, solution: Solution, keys: Sequence[int]) -> bool
         for drawn in generator.standard_normal((_PAIRS, len(free))):
             for z in (drawn, -drawn):
                 moves = dict(zip(keys, np.split(root @ z, ends[:-1]), strict=True))
-                delta = held(linear, HELD, moves).optimize(system.ordering, gtsam.EliminateQR)
+                delta, _ = linear.holding(moves).step()
                 foreseen = 0.5 * float(z @ z)
                 if not abs(system.error(values.retract(delta)) - error - foreseen) < _BENT * foreseen:
                     return False

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
-from scipy.sparse import csr_array
 
 from pipelines.graph.problem import Array, ChiSquare, Factor, History, Parameter, Problem
 
 # A direction the data and priors say nothing about gets this many times its prior scale as sigma, so that it can be
 # named with the others instead of making the system unsolvable.
 _UNKNOWN = 1e4
-# Random right sides that tell traces: many where that costs little, few where every one tells enough.
-_SAMPLES, _MOST_SAMPLES, _SAMPLED_ROWS = 6, 60, 30_000
 # Families whose residuals say nothing about the noise of the recording.
 _NO_MEASUREMENTS = ("prior", "definition")
 
@@ -193,80 +189,6 @@ def coordinate_inverse(
     return inverse
 
 
-def eliminated(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.GaussianBayesNet:
-    """The triangular factor of a linear system, cliques of variables together in the order of their elimination.
-
-    One variable at a time would take a factor on many of them apart as many times.
-
-    Raises:
-        IndeterminateError: names a variable that is not determined.
-    """
-    bayes_net = gtsam.GaussianBayesNet()
-
-    # gtsam's tree does not hand out its cliques, but asks for each to be eliminated, children before parents.
-    def kept(
-        graph: gtsam.GaussianFactorGraph, keys: gtsam.Ordering
-    ) -> tuple[gtsam.GaussianConditional, gtsam.GaussianFactor]:
-        # By QR: tight processes beside loose priors cost Cholesky its digits, and with them the whole system.
-        conditional, rest = gtsam.EliminateQR(graph, keys)
-        bayes_net.push_back(conditional)
-        return conditional, rest
-
-    try:
-        linear.eliminateMultifrontal(ordering, kept)
-        bayes_net.optimize()
-        return bayes_net
-    except RuntimeError as error:
-        raise IndeterminateError(explain(str(error))) from None
-
-
-def solved(bayes_net: gtsam.GaussianBayesNet, places: Mapping[int, slice], right: Array) -> Array:
-    """N^-1 times right sides (d, k), N the information of a whole system.
-
-    Args:
-        bayes_net: the system's triangular factor.
-        places: variable -> its rows among the d.
-        right: by columns.
-    """
-    x = right.copy()
-    cliques = []
-    for i in range(bayes_net.size()):
-        conditional = bayes_net.at(i)
-        rows = np.concatenate([np.arange(places[key].start, places[key].stop) for key in conditional.keys()])
-        R, S = conditional.R(), conditional.S()
-        cliques.append((R, S, rows[: len(R)], rows[len(R) :]))
-    for R, S, own, parents in cliques:
-        x[own] = solve_triangular(R, x[own], trans="T", check_finite=False)
-        x[parents] -= S.T @ x[own]
-    for R, S, own, parents in reversed(cliques):
-        x[own] = solve_triangular(R, x[own] - S @ x[parents], check_finite=False)
-    return x
-
-
-def places_of(linear: gtsam.GaussianFactorGraph) -> dict[int, slice]:
-    """Variable -> its rows in vectors over all variables of a linear system, which stand there by their keys."""
-    gradient = linear.gradientAtZero()
-    keys = sorted(linear.keyVector())
-    ends = np.cumsum([len(gradient.at(key)) for key in keys]).tolist()
-    return {key: slice(start, stop) for key, start, stop in zip(keys, [0, *ends[:-1]], ends, strict=True)}
-
-
-def drawn(
-    bayes_net: gtsam.GaussianBayesNet, values: gtsam.Values, keys: Collection[int], count: int
-) -> list[gtsam.Values]:
-    """Values drawn from their covariance about the estimate, by what some variables add to it."""
-    generator = np.random.default_rng(0)
-    zero = gtsam.VectorValues.Zero(bayes_net.optimize())
-    found = []
-    for _ in range(count):
-        unit = gtsam.VectorValues()
-        for key in values.keys():
-            size = len(zero.at(key))
-            unit.insert(key, generator.standard_normal(size) if key in keys else np.zeros(size))
-        found.append(values.retract(bayes_net.backSubstitute(unit)))
-    return found
-
-
 def chi_square(
     problem: Problem,
     factors: Sequence[Factor],
@@ -284,7 +206,7 @@ def chi_square(
         factors: of the graph.
         values: the estimate.
         covariance: of the reported numbers.
-        expected: see `expected_squares`.
+        expected: see redundancy.expected_squares.
     """
     value: dict[str, float] = {}
     rows = rows_used(factors, values)
@@ -326,58 +248,6 @@ def _from_priors(problem: Problem, covariance: Array) -> float:
         elif q.prior_sigma is not None:
             share += min((variance - q.extra_sigma**2) / q.prior_sigma**2, 1.0)
     return share
-
-
-def expected_squares(
-    factors: Sequence[Factor],
-    linear: gtsam.GaussianFactorGraph,
-    bayes_net: gtsam.GaussianBayesNet,
-    values: gtsam.Values,
-) -> dict[tuple[str, int], float]:
-    """(family, row of its measurements) -> expected sum of squares, of random signs after solving for the unknowns.
-
-    Noise of variance one would do too; signs tell the traces of projections with less scatter (Hutchinson 1989). The
-    rows of what is no measurement, or compressed, count as one.
-
-    Args:
-        factors: of the graph.
-        linear: the same, linearised; a compressed one has fewer rows than it stands for.
-        bayes_net: the system's triangular factor.
-        values: the estimate.
-    """
-    places = places_of(linear)
-    width = max(place.stop for place in places.values())
-    # Nonzero elements of the system: rows in the order of the factors, columns in that of the keys, then those of b.
-    elements = linear.sparseJacobian_()
-    elements = elements[:, elements[1] <= width]
-    row, column, element = elements[0].astype(int) - 1, elements[1].astype(int) - 1, elements[2]
-    sizes = [len(linear.at(i).jacobian()[1]) for i in range(linear.size())]
-    labels: dict[tuple[str, int], int] = {}
-    group = np.concatenate([_labelled(f, size, labels) for f, size in zip(factors, sizes, strict=True)])
-    # Rejected measurements and free priors have empty rows, which are no measurements.
-    counted = np.bincount(row, minlength=len(group)) > 0
-    held = np.bincount(np.repeat(np.arange(len(sizes)), sizes), counted, len(sizes))
-    measured = np.array([f.measurement is not None for f in factors])
-    # What compression took out of the system holds no unknowns: each such row is expected to be one.
-    first = group[np.append(0, np.cumsum(sizes))[:-1]]
-    stands = np.array(rows_used(factors, values), dtype=float)
-    square: Array = np.bincount(first, np.where(measured, stands - held, 0.0), len(labels)).astype(float)
-    generator = np.random.default_rng(0)
-    samples = int(np.clip(_SAMPLED_ROWS // len(group), _SAMPLES, _MOST_SAMPLES))
-    signs = np.array([generator.choice([-1.0, 1.0], len(group)) for _ in range(samples)]).T
-    noise = np.where(counted[:, None], signs, 0.0)
-    A = csr_array((element, (row, column)), shape=(len(group), width))
-    left = A @ solved(bayes_net, places, A.T @ noise) - noise
-    square = square + np.bincount(group, (left**2).sum(axis=1) / samples, len(labels))
-    return dict(zip(labels, square.tolist(), strict=True))
-
-
-def _labelled(factor: Factor, size: int, labels: dict[tuple[str, int], int]) -> NDArray[np.intp]:
-    """(size,) number of the label of each row of a linearised factor; new labels are added."""
-    measurement = factor.measurement
-    rows = 1 if measurement is None or measurement.compress else measurement.model.rows
-    own = [labels.setdefault((factor.family, row), len(labels)) for row in range(rows)]
-    return np.resize(np.array(own, dtype=np.intp), size)
 
 
 def explain(message: str) -> str:

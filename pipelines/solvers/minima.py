@@ -19,7 +19,8 @@ from pipelines.solvers.marginals import reported
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from pipelines.solvers.batch import Solution, System
+    from pipelines.solvers.batch import Solution
+    from pipelines.solvers.system import System
 
 # By so much less than this, in chi-square, another minimum is told.
 CLOSE = float(chi2.ppf(0.99, 1))

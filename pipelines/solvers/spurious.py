@@ -12,13 +12,14 @@ Introduction to the Bootstrap", 1993, chapter 10).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import gtsam
 import numpy as np
 
 from pipelines.graph.problem import Array, Problem
-from pipelines.solvers.marginals import IndeterminateError, drawn, eliminated, joint_information, prior_units
+from pipelines.solvers.marginals import IndeterminateError, joint_information, prior_units
+from pipelines.solvers.system import System
 
 # Directions in which sigma is beyond this share of the prior are looked at; in others noise adds next to nothing.
 _WEAK = 0.3
@@ -29,8 +30,7 @@ _DRAWS = 3
 
 def information_of_noise(
     problem: Problem,
-    linearize: Callable[[gtsam.Values], gtsam.GaussianFactorGraph],
-    ordering: gtsam.Ordering,
+    system: System,
     values: gtsam.Values,
     covariance: Array,
     current_keys: Mapping[int, int],
@@ -41,8 +41,7 @@ def information_of_noise(
 
     Args:
         problem: the graph's.
-        linearize: the graph about some values.
-        ordering: of its elimination, the parameters' variables last.
+        system: of the same.
         values: the solution.
         covariance: (n, n) of the reported numbers as the linearised graph has it.
         current_keys: parameter key -> variable that holds its value.
@@ -51,10 +50,11 @@ def information_of_noise(
     doubtful = _doubtful(problem, keys, covariance)
     if not doubtful:
         return None
-    linear = linearize(values)
     try:
-        moved = drawn(eliminated(linear, ordering), values, set(values.keys()) - set(doubtful), _DRAWS)
-        own, *elsewhere = (joint_information(graph, ordering, keys) for graph in (linear, *map(linearize, moved)))
+        linear = system.linearized(values)
+        moved = linear.drawn(set(values.keys()) - set(doubtful), _DRAWS)
+        graphs = (linear.graph, *map(system.linearize, moved))
+        own, *elsewhere = (joint_information(graph, system.ordering, keys) for graph in graphs)
     except (RuntimeError, IndeterminateError):
         return None
     noise = np.mean(elsewhere, axis=0) - own

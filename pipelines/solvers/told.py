@@ -9,39 +9,31 @@ import numpy as np
 
 from pipelines.belief import Belief, root_of_information
 from pipelines.graph.believing import about_alone
-from pipelines.graph.problem import Array, Factor, Problem, Told
+from pipelines.graph.problem import Array, Problem, Told
 from pipelines.solvers.marginals import IndeterminateError, coordinate_inverse, explain, reported
+from pipelines.solvers.system import Linear
 
 # Combinations whose sigma would be so many times their prior's are not told at all.
 _UNKNOWN = 1e6
 
 
-def told(
-    problem: Problem,
-    factors: Sequence[Factor],
-    linear: gtsam.GaussianFactorGraph,
-    values: gtsam.Values,
-    current_keys: Mapping[int, int],
-    device: Collection[str],
-) -> Told:
+def told(problem: Problem, linear: Linear, current_keys: Mapping[int, int], device: Collection[str]) -> Told:
     """States are eliminated; what is left are rows about the parameters.
 
     Args:
         problem: the graph's.
-        factors: of the graph.
-        linear: the same, linearised and whitened.
-        values: about which it is.
+        linear: the graph about some values.
         current_keys: parameter key -> variable that holds its value, for parameters that move along.
         device: names of the numbers whose priors are set apart.
 
     Raises:
         IndeterminateError: a state is not determined.
     """
-    keys = [current_keys.get(p.key, p.key) for p in problem.parameters]
+    values, keys = linear.values, [current_keys.get(p.key, p.key) for p in problem.parameters]
     rest, priors, alone = gtsam.GaussianFactorGraph(), [], [np.empty(0, dtype=bool)]
-    for i, f in enumerate(factors):
-        factor = linear.at(i)
-        if f.family == "prior" and set(keys).issuperset(factor.keys()):
+    for i, family in enumerate(linear.families):
+        factor = linear.graph.at(i)
+        if family == "prior" and set(keys).issuperset(factor.keys()):
             priors.append(factor)
             alone.append(about_alone(factor, problem.parameters, values, device))
         else:

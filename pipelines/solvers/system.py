@@ -1,0 +1,491 @@
+"""A graph as the batch solver has it: factors to be evaluated and linearised, whole or stretch by stretch.
+
+A long recording is divided into stretches of time. The variables that only one of them holds are eliminated there,
+which leaves, as square root of information, what the stretch says of the others; these rows of all stretches are the
+system that is solved. Where the others are known, a stretch's own variables follow by back substitution. That is the
+whole system's elimination in another order, hence exact, and only one stretch is linearised at a time: what memory
+holds of a state is its value and residuals. A stretch is linearised and eliminated anew whenever it is needed.
+
+A short recording is one stretch of which nothing is eliminated in advance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise, product
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.loss import TruncatedLoss
+from factors.vectorized import Ensemble, VectorizedFactor, residuals_at
+from pipelines.graph.problem import Array, Factor, Residuals
+from pipelines.solvers.assembly import StepBoundary
+from pipelines.solvers.history import MOMENTS
+from pipelines.solvers.marginals import IndeterminateError, explain, ordering_of
+from pipelines.solvers.triangular import Triangular, places_of, rows_of
+
+# Shared variables are held by so many times their information.
+HELD = 1e6
+# A graph of more variables is divided, and into stretches of about so many, or fewer where that gives the history too
+# few moments.
+_UNDIVIDED, _STRETCH = 60_000, 3_000
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """Consecutive factors of a graph.
+
+    Attributes:
+        factors: as they are.
+        graph: the same for gtsam.
+        inner: variables that no other stretch holds, in the order of their elimination; of a graph in one piece none.
+        outer: which of the factors hold none of these.
+        ensemble: the vectorised ones among the factors, kept where there is but one stretch.
+    """
+
+    factors: Sequence[Factor]
+    graph: gtsam.NonlinearFactorGraph
+    inner: gtsam.Ordering
+    outer: Sequence[int]
+    ensemble: Ensemble | None
+
+    @classmethod
+    def alone(cls, factors: Sequence[Factor]) -> Stretch:
+        """A graph in one piece."""
+        return cls(factors, graph_of(factors), gtsam.Ordering(), range(len(factors)), Ensemble(_vectorized(factors)))
+
+    @classmethod
+    def of(cls, factors: Sequence[Factor], joint: set[int]) -> Stretch:
+        """One of several, `joint` the variables that are not its own."""
+        graph = graph_of(factors)
+        outer = [i for i, f in enumerate(factors) if joint.issuperset(f.factor.keys())]
+        held = joint.intersection(graph.keyVector())
+        whole = elimination_ordering(graph, sorted(held))
+        inner = ordering_of(whole.at(i) for i in range(whole.size() - len(held)))
+        return cls(factors, graph, inner, outer, None)
+
+    def made_of(self, factors: Sequence[Factor]) -> Stretch:
+        """The same with other noise."""
+        ensemble = None if self.ensemble is None else Ensemble(_vectorized(factors))
+        return replace(self, factors=factors, graph=graph_of(factors), ensemble=ensemble)
+
+    def at(self, values: gtsam.Values, loss: TruncatedLoss | None) -> AbstractContextManager[None]:
+        """Within the block the factors answer for these values, under the loss."""
+        return (self.ensemble or Ensemble(_vectorized(self.factors))).at(values, loss)
+
+    def error(self, values: gtsam.Values, loss: TruncatedLoss | None) -> float:
+        """Half the sum of squares."""
+        with self.at(values, loss):
+            return float(self.graph.error(values))
+
+    def linearize(self, values: gtsam.Values, loss: TruncatedLoss | None) -> gtsam.GaussianFactorGraph:
+        """The linear system about the values."""
+        with self.at(values, loss):
+            return self.graph.linearize(values)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A stretch about some values.
+
+    Attributes:
+        factors: of it.
+        graph: the same, linearised.
+        inner: as the stretch has it.
+    """
+
+    factors: Sequence[Factor]
+    graph: gtsam.GaussianFactorGraph
+    inner: gtsam.Ordering
+
+    @cached_property
+    def triangular(self) -> Triangular:
+        """The triangular factor of its own variables. Raises IndeterminateError, naming one that is not determined."""
+        return Triangular.of(self.graph, self.inner) if self.inner.size() else Triangular(places_of(self.graph), [])
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """A graph about some values, linearised.
+
+    Attributes:
+        system: the graph.
+        values: about which.
+        damping: with which a stretch's own variables are held where they are.
+        graph: what the stretches say of the variables that they share, all of it for a graph in one piece.
+        families: of its factors, empty for those left of an elimination.
+        boundaries: ends of stretches, counted in its factors; of a graph in one piece the ends of the steps.
+    """
+
+    system: System
+    values: gtsam.Values
+    damping: float
+    graph: gtsam.GaussianFactorGraph
+    families: Sequence[str]
+    boundaries: Sequence[StepBoundary]
+
+    @cached_property
+    def triangular(self) -> Triangular:
+        """The triangular factor of `graph`. Raises IndeterminateError, naming a variable that is not determined."""
+        return Triangular.of(self.graph, self.system.ordering)
+
+    def part(self, i: int) -> Part:
+        """A stretch; the only one of a graph in one piece is this system itself."""
+        stretch = self.system.stretches[i]
+        if len(self.system.stretches) == 1:
+            return Part(stretch.factors, self.graph, stretch.inner)
+        return self.system.part(stretch, self.values, self.damping)
+
+    def parts(self) -> Iterator[Part]:
+        """The stretches, one after the other."""
+        return (self.part(i) for i in range(len(self.system.stretches)))
+
+    def shared(self, part: Part) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """The rows that the variables of `graph` which a part holds have in its vectors, and in the part's."""
+        ours, its = self.triangular.places, part.triangular.places
+        keys = [key for key in its if key in ours]
+        return rows_of(ours, keys), rows_of(its, keys)
+
+    def solved(self, joint: Array) -> Iterator[tuple[Part, Array]]:
+        """Every part with a vector of its variables that solves its own equations, without right side.
+
+        Args:
+            joint: (D, k) of the variables of `graph`.
+        """
+        for part in self.parts():
+            ours, its = self.shared(part)
+            right = np.zeros((part.triangular.size, joint.shape[1]))
+            right[its] = joint[ours]
+            yield part, part.triangular.back(right)
+
+    def drawn(self, keys: Collection[int], count: int) -> list[gtsam.Values]:
+        """Values drawn from their covariance about these, by what some variables add to it.
+
+        Raises:
+            IndeterminateError: a variable is not determined.
+        """
+        generator = np.random.default_rng(0)
+        dims = self.values.dims()
+        units = {key: np.zeros((dims[key], count)) for key in self.values.keys()}
+        for k, (key, unit) in product(range(count), units.items()):
+            if key in keys:
+                unit[:, k] = generator.standard_normal(len(unit))
+
+        def of(places: Mapping[int, slice]) -> Array:
+            return np.concatenate([units[key] for key in places])
+
+        joint = self.triangular.back(of(self.triangular.places))
+        moves = [gtsam.VectorValues() for _ in range(count)]
+        inserted: set[int] = set()
+        for part in self.parts():
+            ours, its = self.shared(part)
+            right = of(part.triangular.places)
+            right[its] = joint[ours]
+            x = part.triangular.back(right)
+            for key in part.triangular.places.keys() - inserted:
+                for move, column in zip(moves, x[part.triangular.places[key]].T, strict=True):
+                    move.insert(key, column)
+            inserted.update(key for key in part.triangular.places if key in self.triangular.places)
+        return [self.values.retract(move) for move in moves]
+
+    def damped(self, damping: float) -> Linear:
+        """With each unknown held where it is by so many times its own information."""
+        if len(self.system.stretches) > 1:
+            return self.system.linearized(self.values, damping)
+        return replace(self, graph=held(self.graph, damping))
+
+    def holding(self, at: Mapping[int, Array]) -> Linear:
+        """With some of the variables that all share held at moves (d,)."""
+        return replace(self, graph=held(self.graph, HELD, at))
+
+    def holding_shared(self) -> Linear:
+        """With the variables that all measurements share held where they are."""
+        return self.holding({key: np.zeros(self.values.dims()[key]) for key in self.system.shared})
+
+    def solution(self) -> gtsam.VectorValues:
+        """The move to the minimum. Raises IndeterminateError, naming a variable that is not determined."""
+        solution = self.triangular.back(self.triangular.right)[:, 0]
+        delta = gtsam.VectorValues()
+        for key, place in self.triangular.places.items():
+            delta.insert(key, solution[place])
+        for part in self.parts():
+            _follow(part, delta)
+        return delta
+
+    def step(self) -> tuple[gtsam.VectorValues, float]:
+        """The same, by gtsam's own solution, and by how much it lowers the error. Raises RuntimeError if singular."""
+        delta = self.graph.optimize(self.system.ordering, gtsam.EliminateQR)
+        foreseen = 0.0
+        for part in self.parts():
+            _follow(part, delta)
+            gradient, keys = part.graph.gradientAtZero(), list(part.graph.keyVector())
+            foreseen -= 0.5 * float(gradient.vector(keys) @ delta.vector(keys))
+        return delta, foreseen
+
+
+def _follow(part: Part, delta: gtsam.VectorValues) -> None:
+    """Add a part's own variables to a solution that has all others."""
+    own = set(_keys(part.inner))
+    if not own:
+        return
+    triangular = part.triangular
+    known = triangular.right
+    for key, place in triangular.places.items():
+        if key not in own:
+            known[place, 0] = delta.at(key)
+    solution = triangular.back(known)[:, 0]
+    for key in own:
+        delta.insert(key, solution[triangular.places[key]])
+
+
+@dataclass(frozen=True, eq=False)
+class System:
+    """A graph, its stretches, and the order in which variables are eliminated.
+
+    Attributes:
+        stretches: its factors, in time order.
+        boundaries: the stretches' ends; of a graph in one piece those of all steps.
+        ordering: of the elimination of the variables that stretches share, those of all of them last.
+        shared: the variables that all measurements share.
+        loss: how those that may be outliers are weighed; None counts all in full.
+    """
+
+    stretches: Sequence[Stretch]
+    boundaries: Sequence[StepBoundary]
+    ordering: gtsam.Ordering
+    shared: Sequence[int]
+    loss: TruncatedLoss | None
+
+    @classmethod
+    def of(
+        cls,
+        factors: Sequence[Factor],
+        shared: Sequence[int],
+        loss: TruncatedLoss | None,
+        boundaries: Sequence[StepBoundary] = (),
+    ) -> System:
+        """The system of some factors, divided at some of the boundaries if it is long."""
+        ends = _divided(factors, boundaries)
+        if len(ends) < 2:
+            alone = Stretch.alone(factors)
+            return cls([alone], boundaries, elimination_ordering(alone.graph, shared), shared, loss)
+        pieces = _pieces(factors, ends)
+        joint = _joint(pieces, boundaries, shared)
+        stretches = [Stretch.of(piece, set(joint)) for piece in pieces]
+        return cls(stretches, ends, ordering_of(joint), shared, loss)
+
+    @property
+    def factors(self) -> Sequence[Factor]:
+        """All of them."""
+        if len(self.stretches) == 1:
+            return self.stretches[0].factors
+        return [f for stretch in self.stretches for f in stretch.factors]
+
+    def made_of(self, factors: Sequence[Factor]) -> System:
+        """The same system with other noise: of factors on the same variables, one for one."""
+        begin, made = 0, []
+        for stretch in self.stretches:
+            made.append(stretch.made_of(factors[begin : begin + len(stretch.factors)]))
+            begin += len(stretch.factors)
+        return replace(self, stretches=made)
+
+    def under(self, loss: TruncatedLoss | None) -> System:
+        """The same system with another loss."""
+        return replace(self, loss=loss)
+
+    @contextmanager
+    def at(self, values: gtsam.Values) -> Iterator[None]:
+        """Within the block the factors answer for these values, under the system's loss; residuals alone if divided."""
+        if len(self.stretches) == 1:
+            with self.stretches[0].at(values, self.loss):
+                yield
+        else:
+            with residuals_at([_vectorized(stretch.factors) for stretch in self.stretches], values, self.loss):
+                yield
+
+    def error(self, values: gtsam.Values) -> float:
+        """Half the sum of squares."""
+        return sum(stretch.error(values, self.loss) for stretch in self.stretches)
+
+    def part(self, stretch: Stretch, values: gtsam.Values, damping: float = 0.0) -> Part:
+        """One of several stretches about the values, damped as `Linear.damping` says."""
+        graph = stretch.linearize(values, self.loss)
+        if damping > 0.0:
+            gradient = graph.gradientAtZero()
+            graph = held(graph, damping, {key: np.zeros(len(gradient.at(key))) for key in _keys(stretch.inner)})
+        return Part(stretch.factors, graph, stretch.inner)
+
+    def linearized(self, values: gtsam.Values, damping: float = 0.0) -> Linear:
+        """About the values, each unknown held there by so many times its information.
+
+        Raises:
+            IndeterminateError: one of several stretches does not determine a variable of its own; names it.
+        """
+        if len(self.stretches) == 1:
+            (alone,) = self.stretches
+            graph, families = alone.linearize(values, self.loss), [f.family for f in alone.factors]
+            if damping > 0.0:
+                graph = held(graph, damping)
+            return Linear(self, values, damping, graph, families, self.boundaries)
+        graph, families, boundaries = gtsam.GaussianFactorGraph(), [], []
+        for stretch, end in zip(self.stretches, self.boundaries, strict=True):
+            part, outer = self.part(stretch, values, damping), set(stretch.outer)
+            own = gtsam.GaussianFactorGraph()
+            for i in range(part.graph.size()):
+                if i in outer:
+                    graph.push_back(part.graph.at(i))
+                    families.append(stretch.factors[i].family)
+                else:
+                    own.push_back(part.graph.at(i))
+            left = _without(own, stretch.inner)
+            for i in range(left.size()):
+                graph.push_back(left.at(i))
+                families.append("")
+            boundaries.append(end._replace(factors=graph.size()))
+        if damping > 0.0:
+            graph = held(graph, damping)
+        return Linear(self, values, damping, graph, families, boundaries)
+
+    def linearize(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
+        """What `linearized` says of the variables that stretches share, all of it for a graph in one piece."""
+        return self.linearized(values).graph
+
+    def without_rejected(self, values: gtsam.Values) -> System:
+        """The same system with the measurements alone that count at the values, wherever it is asked from then on."""
+        with self.at(values):
+            return self.made_of([without_rejected(f, f, values) for f in self.factors]).under(None)
+
+    def residuals(self, values: gtsam.Values) -> dict[str, Residuals]:
+        """Residuals of all measurements, by family."""
+        with self.at(values):
+            return residuals_of(self.factors, values)
+
+
+def _divided(factors: Sequence[Factor], boundaries: Sequence[StepBoundary]) -> list[StepBoundary]:
+    """Ends of stretches, each with about as many new variables as the others; none for a short graph."""
+    seen: set[int] = set()
+    count, begin = [], 0
+    for boundary in boundaries:
+        for f in factors[begin : boundary.factors]:
+            seen.update(f.factor.keys())
+        begin = boundary.factors
+        count.append(len(seen))
+    if not count or len(seen) <= _UNDIVIDED:
+        return []
+    stretch = np.array(count) // min(_STRETCH, -(-len(seen) // MOMENTS))
+    return [boundaries[i] for i in (*np.flatnonzero(np.diff(stretch)), len(boundaries) - 1)]
+
+
+def _pieces(factors: Sequence[Factor], ends: Sequence[StepBoundary]) -> list[Sequence[Factor]]:
+    """The factors of each stretch; what comes after the last end belongs to the last."""
+    cuts = [0, *(end.factors for end in ends[:-1]), len(factors)]
+    return [factors[begin:end] for begin, end in pairwise(cuts)]
+
+
+def _joint(
+    pieces: Sequence[Sequence[Factor]], boundaries: Sequence[StepBoundary], shared: Sequence[int]
+) -> dict[int, None]:
+    """Variables of several stretches and those that ever hold a parameter, in order of time, the shared ones last."""
+    own = [np.unique([key for f in piece for key in f.factor.keys()]).tolist() for piece in pieces]
+    joint = {key for boundary in boundaries for key in boundary.current_keys.values()}
+    seen: set[int] = set()
+    for keys in own:
+        joint.update(seen.intersection(keys))
+        seen.update(keys)
+    last = set(shared)
+    found = dict.fromkeys(key for keys in own for key in keys if key in joint and key not in last)
+    return {**found, **dict.fromkeys(shared)}
+
+
+def _keys(ordering: gtsam.Ordering) -> list[int]:
+    return [ordering.at(i) for i in range(ordering.size())]
+
+
+def _vectorized(factors: Sequence[Factor]) -> list[VectorizedFactor]:
+    return [v for f in factors if (v := f.vectorized) is not None]
+
+
+def _without(linear: gtsam.GaussianFactorGraph, inner: gtsam.Ordering) -> gtsam.GaussianFactorGraph:
+    """What a stretch says of variables that are not its own. Raises IndeterminateError, naming one that is."""
+    try:
+        return linear.eliminatePartialMultifrontal(inner, gtsam.EliminateQR)[1]
+    except RuntimeError as error:
+        raise IndeterminateError(explain(str(error))) from None
+
+
+def without_rejected(factor: Factor, like: Factor, values: gtsam.Values) -> Factor:
+    """A factor with no weight on the measurements that another one, of the same, rejects at the values."""
+    if factor.measurement is None or like.measurement is None or (used := like.measurement.used(values)).all():
+        return factor
+    weights = np.ones(1) if factor.measurement.weights is None else factor.measurement.weights
+    return Factor.of(factor.family, factor.measurement.weighed(weights * used[:, None]))
+
+
+def graph_of(factors: Sequence[Factor]) -> gtsam.NonlinearFactorGraph:
+    """The gtsam graph of the factors, in their order."""
+    graph = gtsam.NonlinearFactorGraph()
+    for f in factors:
+        graph.add(f.factor)
+    return graph
+
+
+def elimination_ordering(graph: gtsam.NonlinearFactorGraph, shared: Sequence[int]) -> gtsam.Ordering:
+    """Nested dissection of the chain with the shared variables last, which suits chains with a few common variables."""
+    # METIS wants variables that share a factor with another, or it brings the process down.
+    joined = gtsam.NonlinearFactorGraph()
+    alone = dict.fromkeys(shared)
+    for i in range(graph.size()):
+        keys = graph.at(i).keys()
+        if len(keys) > 1:
+            joined.push_back(graph.at(i))
+        else:
+            alone.update(dict.fromkeys(keys))
+    last = set(shared)
+    metis = gtsam.Ordering.MetisNonlinearFactorGraph(joined) if joined.size() else gtsam.Ordering()
+    chain = [metis.at(i) for i in range(metis.size()) if metis.at(i) not in last]
+    return ordering_of([*(alone.keys() - last - set(chain)), *chain, *shared])
+
+
+def held(
+    linear: gtsam.GaussianFactorGraph, weight: float, at: Mapping[int, Array] | None = None
+) -> gtsam.GaussianFactorGraph:
+    """The system with each unknown held where it is by `weight` times its own information, or some at moves (d,)."""
+    gradient = linear.gradientAtZero()
+    diagonal = {key: np.zeros(len(gradient.at(key))) for key in linear.keyVector()}
+    for i in range(linear.size()):
+        factor = linear.at(i)
+        squares = (factor.jacobian()[0] ** 2).sum(axis=0)
+        for key in factor.keys():
+            size = len(diagonal[key])
+            diagonal[key] += squares[:size]
+            squares = squares[size:]
+    out = linear.clone()
+    for key in diagonal if at is None else at:
+        scale = np.sqrt(weight * np.maximum(diagonal[key], 1e-6))
+        noise = gtsam.noiseModel.Unit.Create(len(scale))
+        aim = np.zeros(len(scale)) if at is None else scale * at[key]
+        out.add(gtsam.JacobianFactor(key, np.diag(scale), aim, noise))
+    return out
+
+
+def residuals_of(factors: Sequence[Factor], values: gtsam.Values) -> dict[str, Residuals]:
+    """Residuals of all measurements, by family, in time order of the steps."""
+    gathered: dict[str, list[Residuals]] = {}
+    for f in factors:
+        if f.measurement is not None:
+            whitened = f.measurement.residuals(values)
+            used = f.measurement.used(values)
+            gathered.setdefault(f.family, []).append(Residuals(f.measurement.model.time, whitened, used))
+    return {
+        family: Residuals(
+            np.concatenate([p.time for p in parts]),
+            np.concatenate([p.whitened for p in parts]),
+            np.concatenate([p.used for p in parts]),
+        )
+        for family, parts in gathered.items()
+    }

@@ -1,0 +1,116 @@
+"""The triangular factor of a linear system, or of some of its variables, and solutions with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import accumulate
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from pipelines.graph.problem import Array
+from pipelines.solvers.marginals import IndeterminateError, explain
+
+
+@dataclass(frozen=True)
+class _Clique:
+    """R x + S a = d, x the variables eliminated together, a those above them, by their places in a whole vector."""
+
+    own: NDArray[np.intp]
+    above: NDArray[np.intp]
+    R: Array
+    S: Array
+    d: Array
+
+
+@dataclass(frozen=True)
+class Triangular:
+    """R of a linear system A = Q R, clique by clique; variables that were not eliminated stay at the end of it.
+
+    Vectors have one column a solution, (D, k), with all variables of the system in the order of their keys.
+
+    Attributes:
+        places: variable -> its rows in a vector.
+        cliques: in the order of their elimination.
+    """
+
+    places: Mapping[int, slice]
+    cliques: list[_Clique]
+
+    @classmethod
+    def of(cls, linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> Triangular:
+        """Eliminate all or some variables of a system, in order.
+
+        By QR: tight processes beside loose priors cost Cholesky its digits, and with them the whole system.
+
+        Raises:
+            IndeterminateError: a variable is not determined; names it.
+        """
+        places = places_of(linear)
+        try:
+            tree, _ = linear.eliminatePartialMultifrontal(ordering, gtsam.EliminateQR)
+        except RuntimeError as error:
+            raise IndeterminateError(explain(str(error))) from None
+        # What is eliminated last in a clique is eliminated before anything above it.
+        conditionals: dict[int, gtsam.GaussianConditional] = {}
+        for i in range(ordering.size()):
+            conditional = tree[ordering.at(i)].conditional()
+            first = conditional.firstFrontalKey()
+            conditionals.pop(first, None)
+            conditionals[first] = conditional
+        return cls(places, [_clique(each, places) for each in conditionals.values()])
+
+    @property
+    def size(self) -> int:
+        """Rows of a vector."""
+        return max((place.stop for place in self.places.values()), default=0)
+
+    @property
+    def right(self) -> Array:
+        """(D, 1) the right side, zero where nothing was eliminated."""
+        out = np.zeros((self.size, 1))
+        for clique in self.cliques:
+            out[clique.own, 0] = clique.d
+        return out
+
+    def forward(self, right: Array) -> Array:
+        """(D, k) y with R'y = right where variables were eliminated, elsewhere what that leaves of the right side."""
+        y = right.copy()
+        for clique in self.cliques:
+            if y[clique.own].any():
+                y[clique.own] = own = solve_triangular(clique.R, y[clique.own], trans="T", check_finite=False)
+                y[clique.above] -= clique.S.T @ own
+        return y
+
+    def back(self, given: Array) -> Array:
+        """(D, k) x with R x = given where variables were eliminated; elsewhere it is as given."""
+        x = given.copy()
+        for clique in reversed(self.cliques):
+            right = x[clique.own] - clique.S @ x[clique.above]
+            x[clique.own] = solve_triangular(clique.R, right, check_finite=False)
+        return x
+
+
+def places_of(linear: gtsam.GaussianFactorGraph) -> dict[int, slice]:
+    """The rows of each variable of a system in a vector of all of them, in the order of their keys."""
+    gradient, keys = linear.gradientAtZero(), sorted(linear.keyVector())
+    ends = list(accumulate(len(gradient.at(key)) for key in keys))
+    return {key: slice(start, stop) for key, start, stop in zip(keys, [0, *ends], ends, strict=False)}
+
+
+def rows_of(places: Mapping[int, slice], keys: list[int]) -> NDArray[np.intp]:
+    """Rows of some variables, one after the other."""
+    return np.array([row for key in keys for row in range(places[key].start, places[key].stop)], dtype=np.intp)
+
+
+def _clique(conditional: gtsam.GaussianConditional, places: Mapping[int, slice]) -> _Clique:
+    # What the binding returns is memory of the conditional, which goes with its tree.
+    R, S, d = (np.array(each) for each in (conditional.R(), conditional.S(), conditional.d()))
+    keys = list(conditional.keys())
+    if not (np.abs(np.diag(R)) > 0.0).all():
+        raise IndeterminateError(explain(f"near variable {keys[0]}"))
+    rows = rows_of(places, keys)
+    return _Clique(rows[: len(R)], rows[len(R) :], R, S, d)

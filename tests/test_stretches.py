@@ -1,0 +1,70 @@
+"""A graph divided into stretches of time against the same in one piece."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from pipelines.graph.problem import Estimate, Problem
+from pipelines.solvers import system
+from pipelines.solvers.assembly import Assembly
+from pipelines.solvers.batch import CHUNK, solve_batch
+from tests.short_problems import head_problem, los_problem
+
+
+def divided(monkeypatch: pytest.MonkeyPatch, problem: Problem) -> Estimate:
+    """The solution in stretches of a hundred variables."""
+    monkeypatch.setattr(system, "_UNDIVIDED", 100)
+    monkeypatch.setattr(system, "_STRETCH", 100)
+    whole = Assembly.of(problem.steps(CHUNK))
+    found = system.System.of(whole.factors, whole.shared(problem), problem.loss, whole.boundaries)
+    assert len(found.stretches) > 3
+    assert sum(len(stretch.factors) for stretch in found.stretches) == len(whole.factors)
+    return solve_batch(problem, budget=True, device=[problem.quantities[0].name])
+
+
+@pytest.mark.parametrize("make", [los_problem, head_problem])
+def test_it_is_the_same_solution(make: Callable[[], Problem], monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = solve_batch(make(), budget=True, device=[make().quantities[0].name])
+    parts = divided(monkeypatch, make())
+    sigmas = np.maximum(whole.sigmas, 1e-12)
+    np.testing.assert_allclose(parts.values / sigmas, whole.values / sigmas, atol=1e-6)
+    scale = np.outer(sigmas, sigmas)
+    np.testing.assert_allclose(parts.covariance / scale, whole.covariance / scale, atol=1e-6)
+    assert whole.chi_square is not None
+    assert parts.chi_square is not None
+    assert parts.chi_square.value == pytest.approx(whole.chi_square.value, rel=1e-9)
+    assert parts.chi_square.dof == pytest.approx(whole.chi_square.dof, rel=1e-9)
+    for family, (square, dof) in whole.chi_square.families.items():
+        # The families' shares of the degrees of freedom are sampled.
+        assert parts.chi_square.families[family][0] == pytest.approx(square, rel=1e-6)
+        assert parts.chi_square.families[family][1] == pytest.approx(dof, abs=4.0 * dof**0.5)
+    assert parts.rejected == whole.rejected
+    assert whole.budget is not None
+    assert parts.budget is not None
+    for name, shares in whole.budget.items():
+        assert parts.budget[name] == pytest.approx(shares, abs=1e-6)
+    assert whole.strongest is not None
+    assert parts.strongest is not None
+    assert [(p.family, p.time, p.parameter) for p in parts.strongest] == [
+        (p.family, p.time, p.parameter) for p in whole.strongest
+    ]
+    assert whole.told is not None
+    assert parts.told is not None
+    np.testing.assert_allclose(parts.told.R.T @ parts.told.R, whole.told.R.T @ whole.told.R, rtol=1e-6)
+    for family, residuals in whole.residuals.items():
+        np.testing.assert_allclose(parts.residuals[family].whitened, residuals.whitened, atol=1e-6)
+    if whole.smoothed is not None:
+        assert parts.smoothed is not None
+        np.testing.assert_allclose(parts.smoothed.sigmas, whole.smoothed.sigmas, rtol=1e-6)
+    assert whole.course is not None
+    assert parts.course is not None
+    # Moments are ends of stretches: the last is that of the recording, and those of both are known alike.
+    same = [(i, int(j)) for i, t in enumerate(parts.course.time) for j in np.flatnonzero(whole.course.time == t)]
+    assert len(same) > 1
+    for i, j in same:
+        np.testing.assert_allclose(parts.course.values[i] / sigmas, whole.course.values[j] / sigmas, atol=1e-5)
+        got, expected = (np.diag(c) for c in (parts.course.covariance[i], whole.course.covariance[j]))
+        np.testing.assert_allclose(got, expected, rtol=1e-6)
