@@ -17,6 +17,8 @@ SMOOTHING = 0.2
 _STEP = 1e-4
 # Moments whose samples are held at a time: few enough for the processor's cache.
 _TOGETHER = 500
+# Times worked on at once.
+_BLOCK = 100_000
 
 
 class GimbalPath:
@@ -45,8 +47,13 @@ class GimbalPath:
 
     def at(self, at: ArrayLike) -> Array:
         """Angles (n, 2), rad, at the times."""
-        samples, weights = self.weights(at)
-        return np.einsum("nk,nki->ni", weights, self.angles[samples])
+        at = np.asarray(at, dtype=float)
+        out = np.empty((len(at), 2))
+        # Weights of all at once would take fifty times the memory of the times.
+        for i in range(0, len(at), _BLOCK):
+            samples, weights = self.weights(at[i : i + _BLOCK])
+            out[i : i + _BLOCK] = np.einsum("nk,nki->ni", weights, self.angles[samples])
+        return out
 
 
 @dataclass(frozen=True)

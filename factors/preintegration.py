@@ -9,6 +9,7 @@ expansion of a linear rate (Iserles et al., Acta Numerica 2000).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -24,6 +25,8 @@ Array = NDArray[np.float64]
 _UNEVEN = 0.05
 # A pause between samples longer than this many intervals is a gap.
 _GAP = 1.5
+# Sample intervals worked on at a time.
+_BLOCK = 100_000
 
 
 @dataclass(frozen=True)
@@ -90,26 +93,43 @@ class GyroPath:
                 raise ValueError(f"needs drivers for each rate; got {driving.shape} and {mean.shape}")
             self._drivers = driving - trapezoid_excess(self.t, driving)
         self._rate = mean - self.bias_hat - trapezoid_excess(self.t, mean)
-        self._slope = np.diff(self._rate, axis=0) / np.diff(self.t)[:, None]
-        self._arcs = _arc(self._rate[:-1], self._slope, np.diff(self.t)[:, None])
-        self._attitude = np.concatenate([so3.identity(1), _running_product(so3.exp(self._arcs))])
+        turns = np.empty((len(self.t) - 1, 4))
+        for some in self._blocks():
+            turns[some] = so3.exp(self._arcs(some))
+        self._attitude = np.concatenate([so3.identity(1), _running_product(turns)])
         self._unseen = np.append(0.0, np.cumsum(_gap_variance(self.t, mean)))
 
     @cached_property
     def _integral(self) -> Array:
         """Integral (N, 3, 3) of the attitude matrix until each stamp: every window's bias Jacobian follows from it."""
-        pieces = np.diff(self.t)[:, None, None] * so3.right_jacobian(-self._arcs)
-        return np.concatenate([np.zeros((1, 3, 3)), np.cumsum(so3.matrix(self._attitude[:-1]) @ pieces, axis=0)])
+        integral = np.zeros((len(self.t), 3, 3))
+        for some in self._blocks():
+            pieces = np.diff(self.t[some.start : some.stop + 1])[:, None, None] * so3.right_jacobian(-self._arcs(some))
+            integral[some.start + 1 : some.stop + 1] = so3.matrix(self._attitude[some]) @ pieces
+        return np.cumsum(integral, axis=0, out=integral)
+
+    def _blocks(self) -> Iterator[slice]:
+        """The sample intervals, some at a time: what is worked out for all of them takes many times their memory."""
+        return (slice(i, min(i + _BLOCK, len(self.t) - 1)) for i in range(0, len(self.t) - 1, _BLOCK))
+
+    def _arcs(self, some: slice) -> Array:
+        """Rotation vectors (n, 3) over sample intervals."""
+        rate, step = self._rate[some.start : some.stop + 1], np.diff(self.t[some.start : some.stop + 1])[:, None]
+        return _arc(rate[:-1], np.diff(rate, axis=0) / step, step)
+
+    def _slope(self, i: NDArray[np.intp]) -> Array:
+        """Slopes (n, 3) of the rate over sample intervals (n,), rad/s^2."""
+        return np.asarray((self._rate[i + 1] - self._rate[i]) / (self.t[i + 1] - self.t[i])[:, None])
 
     def attitude(self, at: ArrayLike) -> Array:
         """Attitude (n, 4) of the sensor at the times, in its frame at the first stamp."""
         i, s = self._place(np.asarray(at, dtype=float))
-        return so3.multiply(self._attitude[i], so3.exp(_arc(self._rate[i], self._slope[i], s)))
+        return so3.multiply(self._attitude[i], so3.exp(_arc(self._rate[i], self._slope(i), s)))
 
     def rate(self, at: ArrayLike) -> Array:
         """Rate (n, 3) at the times, linear between samples, bias_hat taken off, rad/s."""
         i, s = self._place(np.asarray(at, dtype=float))
-        return self._rate[i] + self._slope[i] * s
+        return np.asarray(self._rate[i] + self._slope(i) * s)
 
     def drivers(self, at: ArrayLike) -> Array | None:
         """The drivers (n, d) at the times; None without."""
@@ -133,7 +153,7 @@ class GyroPath:
         # Both ends in one call: what a few windows cost is calls.
         ends = np.concatenate([start, stop])
         i, s = self._place(ends)
-        w0, a = self._rate[i], self._slope[i]
+        w0, a = self._rate[i], self._slope(i)
         arc = _arc(w0, a, s)
         attitude = so3.multiply(self._attitude[i], so3.exp(arc))
         # The attitude matrix's integral since the samples before the ends.
@@ -168,13 +188,14 @@ class GyroPath:
         slope = (vector[i + 1] - vector[i]) / (self.t[i + 1] - self.t[i])[:, None]
         at_ends = np.einsum("nia,nb->niab", begun, vector[i] + 0.5 * s * slope).reshape(-1, 3, 3 * d)
         start, stop = np.split(i, 2)
-        attitude = np.ascontiguousarray(np.diff(self._integral, axis=0).reshape(-1, 9).T)
         mean = np.ascontiguousarray(0.5 * (vector[1:] + vector[:-1]).T)
         out = at_ends[len(start) :] - at_ends[: len(start)]
         until = np.zeros(len(self.t))
-        for row, column in np.ndindex(9, d):
-            np.cumsum(attitude[row] * mean[column], out=until[1:])
-            out[:, row // 3, d * (row % 3) + column] += until[stop] - until[start]
+        for row in range(9):
+            attitude = np.diff(self._integral[:, row // 3, row % 3])
+            for column in range(d):
+                np.cumsum(attitude * mean[column], out=until[1:])
+                out[:, row // 3, d * (row % 3) + column] += until[stop] - until[start]
         return out
 
     def _place(self, at: Array) -> tuple[NDArray[np.intp], Array]:

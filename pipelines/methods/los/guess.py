@@ -91,10 +91,38 @@ def foreseen(chains: Sequence[NDArray[np.intp]], time: Array, cRm: Array, measur
     for chain in chains:
         t = time[chain]
         carried = carried_errors(t, cRm[chain], measured[chain], gyro, np.zeros(3))
-        knots = np.linspace(t[0], t[-1], 2 + int((t[-1] - t[0]) / _SLOW))
-        hats = np.stack([np.interp(t, knots, each) for each in np.eye(len(knots))], axis=1)
-        out[chain] = carried + hats @ np.linalg.lstsq(hats, measured[chain, :2] - carried)[0]
+        out[chain] = carried + _broken_line(t, measured[chain, :2] - carried)
     return out
+
+
+def _broken_line(t: Array, values: Array) -> Array:
+    """(n, d) the least-squares fit to values (n, d) at times (n,) of a line that bends at knots alone.
+
+    Its normal equations are tridiagonal: knots and times without the product of their numbers.
+    """
+    count = 2 + int((t[-1] - t[0]) / _SLOW)
+    at = np.clip((t - t[0]) / max(t[-1] - t[0], 1e-9) * (count - 1), 0.0, count - 1.0)
+    i = np.minimum(at.astype(int), count - 2)
+    after = at - i
+    before = 1.0 - after
+
+    def summed(left: Array, right: Array) -> Array:
+        return np.bincount(i, left, count) + np.bincount(i + 1, right, count)
+
+    diagonal = summed(before**2, after**2)
+    beside = np.bincount(i, before * after, count)[:-1]
+    right = np.stack([summed(before * column, after * column) for column in values.T], axis=1)
+    # A knot that no time is near stays at zero.
+    diagonal += 1e-12 * diagonal.max()
+    for k in range(1, count):
+        share = beside[k - 1] / diagonal[k - 1]
+        diagonal[k] -= share * beside[k - 1]
+        right[k] -= share * right[k - 1]
+    knots = np.zeros_like(right)
+    for k in reversed(range(count)):
+        following = beside[k] * knots[k + 1] if k + 1 < count else 0.0
+        knots[k] = (right[k] - following) / diagonal[k]
+    return np.asarray(before[:, None] * knots[i] + after[:, None] * knots[i + 1])
 
 
 def guess(
