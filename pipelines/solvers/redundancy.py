@@ -57,7 +57,7 @@ class _Rows:
 
     def squares(self, left: Array) -> Array:
         """By label, the mean over k of the squares of rows (m, k)."""
-        return np.bincount(self.group, (left**2).mean(axis=1), len(self.beside))
+        return np.asarray(np.bincount(self.group, (left**2).mean(axis=1), len(self.beside)), dtype=float)
 
 
 def expected_squares(linear: Linear, stands: Sequence[Array]) -> dict[tuple[str, int], float]:

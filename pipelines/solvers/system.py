@@ -33,7 +33,7 @@ from pipelines.solvers.triangular import Triangular, places_of, rows_of
 HELD = 1e6
 # A graph of more variables is divided, and into stretches of about so many, or fewer where that gives the history too
 # few moments.
-_UNDIVIDED, _STRETCH = 60_000, 3_000
+_UNDIVIDED, _STRETCH = 100_000, 3_000
 
 
 @dataclass(frozen=True, eq=False)

@@ -107,7 +107,7 @@ def _broken_line(t: Array, values: Array) -> Array:
     before = 1.0 - after
 
     def summed(left: Array, right: Array) -> Array:
-        return np.bincount(i, left, count) + np.bincount(i + 1, right, count)
+        return np.asarray(np.bincount(i, left, count) + np.bincount(i + 1, right, count), dtype=float)
 
     diagonal = summed(before**2, after**2)
     beside = np.bincount(i, before * after, count)[:-1]
