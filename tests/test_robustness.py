@@ -26,9 +26,9 @@ from pipelines.methods.los.simulation import LosAngles, LosScenario, los_config,
 from pipelines.methods.triads import triad_names
 from pipelines.session import calibrate
 from pipelines.simulation.motion import EulerMotion, Swing
-from pipelines.solvers import batch
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.incremental import solve_incremental
+from pipelines.solvers.system import System
 
 SWAY = EulerMotion(
     yaw=[Swing(amplitude_deg=20, frequency_hz=0.15)],
@@ -142,7 +142,7 @@ def test_an_estimate_that_is_no_solution_is_never_calibrated(monkeypatch: pytest
     data, truth = simulate_los(LOS, 1)
     write_los(tmp_path / "s.mcap", data, truth, los_config(LOS))
     # What gtsam's own optimizers return silently as if it was a solution.
-    monkeypatch.setattr(batch.System, "error", lambda *_: np.nan)
+    monkeypatch.setattr(System, "error", lambda *_: np.nan)
     monkeypatch.setattr(session, "find_causes", lambda *_: ())
     (found,) = calibrate(tmp_path / "s.mcap", ["batch"])
     assert found.assessment.status == "inconsistent"

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from pipelines import progress
 from pipelines.graph.problem import Estimate, Problem
 from pipelines.solvers import system
 from pipelines.solvers.assembly import Assembly
@@ -23,6 +27,13 @@ def divided(monkeypatch: pytest.MonkeyPatch, problem: Problem) -> Estimate:
     assert len(found.stretches) > 3
     assert sum(len(stretch.factors) for stretch in found.stretches) == len(whole.factors)
     return solve_batch(problem, budget=True, device=[problem.quantities[0].name])
+
+
+def test_progress_is_shown(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(Console, "is_terminal", True)
+    with progress.shown():
+        divided(monkeypatch, los_problem())
+    assert "stretch by stretch" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("make", [los_problem, head_problem])
@@ -68,3 +79,31 @@ def test_it_is_the_same_solution(make: Callable[[], Problem], monkeypatch: pytes
         np.testing.assert_allclose(parts.course.values[i] / sigmas, whole.course.values[j] / sigmas, atol=1e-5)
         got, expected = (np.diag(c) for c in (parts.course.covariance[i], whole.course.covariance[j]))
         np.testing.assert_allclose(got, expected, rtol=1e-6)
+
+
+# Solving may take so much, MiB, of what 8 GiB allow for 20 minutes of ten hours.
+ALLOWED = 8192.0 * 20.0 / 600.0
+
+LONG = """
+from pathlib import Path
+
+import alidade
+from benchmarks.measure import peak_mib, resident_mib
+from pipelines.solvers import system
+from pipelines.solvers.batch import solve_batch
+
+system._UNDIVIDED = 10_000
+scenario = {"duration_s": 1200.0, "gyro_rate_hz": 100.0, "gimbal_rate_hz": 100.0}
+problem = alidade.open(alidade.simulate("los", scenario)).problem()
+before = resident_mib()
+Path("/proc/self/clear_refs").write_text("5")
+assert solve_batch(problem, budget=True).converged
+print(peak_mib() - before)
+"""
+
+
+@pytest.mark.slow
+def test_twenty_minutes_in_little_memory() -> None:
+    """In a process of its own, since a process does not give back what it once had."""
+    done = subprocess.run([sys.executable, "-c", LONG], capture_output=True, text=True, check=True)
+    assert float(done.stdout.split()[-1]) < ALLOWED

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from pipelines.graph.problem import Array, Factor
-from pipelines.solvers.system import Linear, Part
+from pipelines.solvers.system import Linear, Part, shown
 
 # Random right sides that tell traces: many where that costs little, few where every one tells enough.
 _SAMPLES, _MOST_SAMPLES, _SAMPLED_ROWS = 6, 60, 30_000
@@ -82,16 +82,16 @@ def expected_squares(linear: Linear, stands: Sequence[Array]) -> dict[tuple[str,
     drawn = [generator.choice([-1.0, 1.0], ends[-1]).astype(np.int8) for _ in range(samples)]
     signs = np.split(np.stack(drawn, axis=1), ends[:-1])
     joint = np.zeros((linear.triangular.size, samples))
-    for i, stood in enumerate(stands):
-        part = linear.part(i)
+    for part, stood, its_signs in zip(linear.parts(), stands, signs, strict=True):
         rows = _Rows.of(part, stood, labels)
-        reduced = part.triangular.forward(rows.A.T @ rows.noise(signs[i]))
+        reduced = part.triangular.forward(rows.A.T @ rows.noise(its_signs))
         ours, its = linear.shared(part)
         joint[ours] += reduced[its]
         found.append(rows.beside)
         halfway.append(reduced)
     joint = linear.triangular.back(linear.triangular.forward(joint))
-    for i in reversed(range(len(stands))):
+    for i in shown(range(len(stands))[::-1]):
+        # The last one is still at hand.
         if i < len(stands) - 1:
             part = linear.part(i)
             rows = _Rows.of(part, stands[i], labels)

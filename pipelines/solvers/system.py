@@ -11,11 +11,12 @@ A short recording is one stretch of which nothing is eliminated in advance.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise, product
+from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -23,17 +24,25 @@ from numpy.typing import NDArray
 
 from factors.loss import TruncatedLoss
 from factors.vectorized import Ensemble, VectorizedFactor, residuals_at
+from pipelines import progress
 from pipelines.graph.problem import Array, Factor, Residuals
 from pipelines.solvers.assembly import StepBoundary
 from pipelines.solvers.history import MOMENTS
 from pipelines.solvers.marginals import IndeterminateError, explain, ordering_of
 from pipelines.solvers.triangular import Triangular, places_of, rows_of
 
+Shown = TypeVar("Shown")
+
 # Shared variables are held by so many times their information.
 HELD = 1e6
 # A graph of more variables is divided, and into stretches of about so many, or fewer where that gives the history too
 # few moments.
 _UNDIVIDED, _STRETCH = 100_000, 3_000
+
+
+def shown(stretches: Sequence[Shown]) -> Iterable[Shown]:
+    """Stretches, or their numbers, shown as they are taken where there are several."""
+    return stretches if len(stretches) == 1 else progress.track(stretches, "stretch by stretch", len(stretches))
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +152,7 @@ class Linear:
 
     def parts(self) -> Iterator[Part]:
         """The stretches, one after the other."""
-        return (self.part(i) for i in range(len(self.system.stretches)))
+        return map(self.part, shown(range(len(self.system.stretches))))
 
     def shared(self, part: Part) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """The rows that the variables of `graph` which a part holds have in its vectors, and in the part's."""
@@ -333,7 +342,7 @@ class System:
                 graph = held(graph, damping)
             return Linear(self, values, damping, graph, families, self.boundaries)
         graph, families, boundaries = gtsam.GaussianFactorGraph(), [], []
-        for stretch, end in zip(self.stretches, self.boundaries, strict=True):
+        for stretch, end in zip(shown(self.stretches), self.boundaries, strict=True):
             part, outer = self.part(stretch, values, damping), set(stretch.outer)
             own = gtsam.GaussianFactorGraph()
             for i in range(part.graph.size()):
