@@ -87,7 +87,6 @@ def sheets(text: str, folder: Path) -> int:
     (folder / "page.html").write_text(text, encoding="utf-8")
     tab = running()
     look(tab, folder / "page.html", DESKTOP)
-    tab.print()
     tab.pdf(folder / "page.pdf")
     return len(re.findall(rb"/Type\s*/Page\b", (folder / "page.pdf").read_bytes()))
 

@@ -79,7 +79,8 @@ class Tab:
         self._call("Emulation.setEmulatedMedia", media="print")
 
     def pdf(self, path: Path) -> None:
-        """What is shown, on paper."""
+        """What is shown, on paper: as a browser prints it, without figures being told of another width before."""
+        self._call("Emulation.setEmulatedMedia", media="", features=[])
         content = self._call("Page.printToPDF", preferCSSPageSize=True, printBackground=True)
         path.write_bytes(base64.b64decode(content["data"]))
 

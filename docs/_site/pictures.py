@@ -31,7 +31,7 @@ _GAP, _COLOURS = 10, 48
 _DRAWN = "document.readyState == 'complete' && !document.querySelector('.plot:not([data-drawn])')"
 # Units of a fleet: mounting angles at two dates, of which one has moved.
 _UNITS = {"U1": (0.50, 0.50), "U2": (0.42, 0.42), "U3": (0.57, 0.57), "U4": (0.47, 0.47), "U5": (0.52, 0.90)}
-_SHORT = "{{duration_s: 20, gyro_rate_hz: 100, image_rate_hz: 20, sensors: ideal, angles_deg: {{px: {0}}}}}"
+_SHORT = "{{duration_s: 20, gyro_rate_hz: 100, image_rate_hz: 20, sensors: ideal, angles_deg: {{delta_px: {0}}}}}"
 
 
 def main(wanted: list[str]) -> None:
@@ -39,7 +39,7 @@ def main(wanted: list[str]) -> None:
     from tests.devtools import Tab
 
     FOLDER.mkdir(exist_ok=True)
-    with tempfile.TemporaryDirectory() as scratch, Tab(Path(scratch)) as tab:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch, Tab(Path(scratch)) as tab:
         for name, make in _pages(Path(scratch)).items():
             if not wanted or name in wanted:
                 _write(name, _looks(tab, make().as_uri(), Path(scratch)))
@@ -126,7 +126,6 @@ def _looks(tab: Tab, url: str, scratch: Path) -> list[Image.Image]:
     tab.size(_DESKTOP[0])
     tab.open(url)
     tab.wait(_DRAWN, 60.0)
-    tab.print()
     tab.pdf(scratch / "page.pdf")
     sheet = scratch / "sheet"
     subprocess.run(["pdftoppm", "-r", "110", "-f", "1", "-l", "1", "-singlefile", "-png", scratch / "page.pdf", sheet])

@@ -68,7 +68,8 @@ def sentence(units: Sequence[Unit]) -> str:
         return "no unit needs attention"
     more = len(units) - _MOST_NAMED
     named = ", ".join(unit.name for unit in units[:_MOST_NAMED])
-    return f"{len(units)} units need attention: {named}{f' and {more} more' if more > 0 else ''}"
+    need = "unit needs" if len(units) == 1 else "units need"
+    return f"{len(units)} {need} attention: {named}{f' and {more} more' if more > 0 else ''}"
 
 
 def readable(p: Population) -> tuple[str, float]:
