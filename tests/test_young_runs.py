@@ -82,12 +82,11 @@ def test_a_second_axis_after_the_run_was_folded() -> None:
     assert np.abs((incremental.values - truth) / np.maximum(incremental.sigmas, 1e-12))[MOUNT].max() < 4.0
 
 
-@pytest.mark.parametrize(("seed", "until_s"), [(4001, 3.4), (4002, 1.35)])
-def test_outliers_among_few_pictures_lead_to_no_far_minimum(seed: int, until_s: float) -> None:
+def test_outliers_among_few_pictures_lead_to_no_far_minimum() -> None:
     """Plain least squares ends where assumptions are tens of their priors' sigmas off."""
-    settings, _ = CASES["los"]["outliers"](seed)
-    problem, truth = made("los", settings.model_copy(update={"duration_s": 5.0}), seed)
-    first = [step for step in problem.steps(1) if step.time <= until_s]
+    settings, _ = CASES["los"]["outliers"](4001)
+    problem, truth = made("los", settings.model_copy(update={"duration_s": 5.0}), 4001)
+    first = [step for step in problem.steps(1) if step.time <= 3.4]
     estimate = solve_batch(replace(problem, steps=lambda _: iter(first)))
     size, numbers = nees(estimate.values, estimate.covariance, truth)
     assert estimate.converged
