@@ -26,7 +26,6 @@ SUITE = (
     "command",
     "montecarlo",
     "pages",
-    "demo",
 )
 # One thread each, or the ratio tells how many cores there are.
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
