@@ -74,6 +74,16 @@ def test_errors_fit_their_covariance_at_all_times() -> None:
 
 
 @pytest.mark.slow
+def test_a_minute_at_rest_is_not_folded_while_noise_moves_the_mount() -> None:
+    """Folded after 55 s it was 1500 sigmas off when motion began."""
+    settings, _ = CASES["head"]["rest"](3)
+    problem, truth = made("head", settings.model_copy(update={"duration_s": 64.0}), 3)
+    found = followed(problem, truth, np.array([30.0, 57.0, 63.5]))
+    assert not found.message
+    assert max(found.nees) < chi2.ppf(0.999, found.numbers)
+
+
+@pytest.mark.slow
 def test_a_second_axis_after_the_run_was_folded() -> None:
     since = {"yaw": 0.0, "pitch": 45.0, "roll": 45.0}
     problem, truth = _made(4, duration_s=60.0, head=beginning(SCENARIO.head, since))

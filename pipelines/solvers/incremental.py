@@ -352,19 +352,19 @@ class Run:
                 self.innovations.revise(solution.system.factors, values)
         last = self.past[-1].keyframes if self.past else range(0)
         since = 0.0 if self.base is not None or not self.past else self.time - self.past[0].time
-        if self._young and since >= max(_YOUNG, self._looked) and len(self.past) >= _FEW_STEPS:
-            self._looked = _GROWTH * since
-            foldable = self.window is None or since >= _OLDEST
-            self._young = not (foldable or is_linear(self.problem, solution, self.keys))
+        grown = self._young and since >= max(_YOUNG, self._looked) and len(self.past) >= _FEW_STEPS
         self._restart(solution, whole.timestamps)
-        self._noise = self._bent = None
-        system, current = solution.system, self.current_keys
-        if self._young:
-            covariance = self.covariance()
-            self._noise = information_of_noise(self.problem, system, values, covariance, current)
-            if self._noise is not None:
-                covariance = self.covariance()
-            self._bent = second_order(self.problem, system, values, covariance, current)
+        self._correct(solution)
+        if grown:
+            self._looked = _GROWTH * since
+            # Neither correction is carried on once the past is folded.
+            corrected = self._noise is not None or self._bent is not None
+            foldable = self.window is None or since >= _OLDEST
+            if foldable or (not corrected and is_linear(self.problem, solution, self.keys)):
+                self._young = False
+                self._restart(solution, whole.timestamps)
+                self._correct(solution)
+        system = solution.system
         if from_start:
             self.moments += 1
             self._course = cache(
@@ -378,6 +378,18 @@ class Run:
         self._record(whole.keyframes if from_start else last, values)
         self._solved = _Solved(since, len(self.past), self.values(), np.sqrt(np.diag(self.covariance())))
         self.innovations.begin_count()
+
+    def _correct(self, solution: Solution) -> None:
+        """Find what of a young run's covariance its linear system has wrong; of another nothing is known."""
+        self._noise = self._bent = None
+        if not self._young:
+            return
+        system, values, current = solution.system, solution.values, self.current_keys
+        covariance = self.covariance()
+        self._noise = information_of_noise(self.problem, system, values, covariance, current)
+        if self._noise is not None:
+            covariance = self.covariance()
+        self._bent = second_order(self.problem, system, values, covariance, current)
 
     def _due(self, since: float) -> bool:
         """Whether a young run is to be solved in batch again, `since` s after its first step."""
