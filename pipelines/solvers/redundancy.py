@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from pipelines.graph.problem import Array, Factor
 from pipelines.solvers.system import Linear, Part, shown
@@ -21,13 +20,17 @@ class _Rows:
     """The rows of a stretch's linear system.
 
     Attributes:
-        A: (m, D), columns in the order of the variables' keys.
+        row, column, element: of the matrix A (m, D), what is not zero; columns in the order of the variables' keys.
+        width: D.
         group: (m,) the label of each row.
         counted: (m,) rejected measurements and free priors have empty rows, which are no measurements.
         beside: by label, what compression took out of the system.
     """
 
-    A: csr_array
+    row: NDArray[np.intp]
+    column: NDArray[np.intp]
+    element: Array
+    width: int
     group: NDArray[np.intp]
     counted: NDArray[np.bool_]
     beside: Array
@@ -48,8 +51,17 @@ class _Rows:
         # What compression took out of the system holds no unknowns: each such row is expected to be one.
         first = group[np.append(0, np.cumsum(sizes))[:-1]]
         beside = np.bincount(first, np.where(measured, stands - held, 0.0), len(labels)).astype(float)
-        A = csr_array((element, (row, column)), shape=(len(group), width))
-        return cls(A, group, counted, beside)
+        return cls(row, column, element, width, group, counted, beside)
+
+    def across(self, x: Array) -> Array:
+        """(m, k) A x of x (D, k)."""
+        each = [np.bincount(self.row, self.element * own[self.column], len(self.group)) for own in x.T]
+        return np.stack(each, axis=1)
+
+    def back(self, y: Array) -> Array:
+        """(D, k) A'y of y (m, k)."""
+        each = [np.bincount(self.column, self.element * own[self.row], self.width) for own in y.T]
+        return np.stack(each, axis=1)
 
     def noise(self, signs: NDArray[np.int8]) -> Array:
         """(m, k) of signs (m, k), none where nothing was measured."""
@@ -84,7 +96,7 @@ def expected_squares(linear: Linear, stands: Sequence[Array]) -> dict[tuple[str,
     joint = np.zeros((linear.triangular.size, samples))
     for part, stood, its_signs in zip(linear.parts(), stands, signs, strict=True):
         rows = _Rows.of(part, stood, labels)
-        reduced = part.triangular.forward(rows.A.T @ rows.noise(its_signs))
+        reduced = part.triangular.forward(rows.back(rows.noise(its_signs)))
         ours, its = linear.shared(part)
         joint[ours] += reduced[its]
         found.append(rows.beside)
@@ -98,7 +110,7 @@ def expected_squares(linear: Linear, stands: Sequence[Array]) -> dict[tuple[str,
         ours, its = linear.shared(part)
         right = halfway.pop()
         right[its] = joint[ours]
-        found.append(rows.squares(rows.A @ part.triangular.back(right) - rows.noise(signs[i])))
+        found.append(rows.squares(rows.across(part.triangular.back(right)) - rows.noise(signs[i])))
     square = np.sum([np.pad(each, (0, len(labels) - len(each))) for each in found], axis=0)
     return dict(zip(labels, square.tolist(), strict=True))
 

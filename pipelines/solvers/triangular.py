@@ -9,7 +9,6 @@ from itertools import accumulate
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from pipelines.graph.problem import Array
 from pipelines.solvers.marginals import IndeterminateError, explain
@@ -81,7 +80,7 @@ class Triangular:
         y = right.copy()
         for clique in self.cliques:
             if y[clique.own].any():
-                y[clique.own] = own = solve_triangular(clique.R, y[clique.own], trans="T", check_finite=False)
+                y[clique.own] = own = _solved_transposed(clique.R, y[clique.own])
                 y[clique.above] -= clique.S.T @ own
         return y
 
@@ -90,7 +89,7 @@ class Triangular:
         x = given.copy()
         for clique in reversed(self.cliques):
             right = x[clique.own] - clique.S @ x[clique.above]
-            x[clique.own] = solve_triangular(clique.R, right, check_finite=False)
+            x[clique.own] = np.linalg.solve(clique.R, right)
         return x
 
 
@@ -104,6 +103,11 @@ def places_of(linear: gtsam.GaussianFactorGraph) -> dict[int, slice]:
 def rows_of(places: Mapping[int, slice], keys: list[int]) -> NDArray[np.intp]:
     """Rows of some variables, one after the other."""
     return np.array([row for key in keys for row in range(places[key].start, places[key].stop)], dtype=np.intp)
+
+
+def _solved_transposed(R: Array, right: Array) -> Array:
+    """(n, k) y with R'y = right; from the last row on R' is upper triangular too, where nothing is pivoted."""
+    return np.asarray(np.linalg.solve(R.T[::-1, ::-1], right[::-1])[::-1])
 
 
 def _clique(conditional: gtsam.GaussianConditional, places: Mapping[int, slice]) -> _Clique:
