@@ -34,7 +34,9 @@ BRISK = EulerMotion(
 )
 
 
-def record(path: Path, seconds: float, images_hz: float, rate_hz: float, sensors: Sensors = IDEAL) -> tuple[Path, Path]:
+def record(
+    path: Path, seconds: float, images_hz: float, rate_hz: float, sensors: Sensors | None = IDEAL
+) -> tuple[Path, Path]:
     """A recording, and its config, which streams do not carry."""
     scenario = LosScenario(
         duration_s=seconds,
@@ -131,7 +133,7 @@ def test_five_seconds_as_they_come(kind: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["file", "folder", "bridge", "standard input"])
 def test_ninety_seconds_as_they_come(kind: str, tmp_path: Path) -> None:
     """In the end what the finished file says; how long a message takes to be in the estimate is printed."""
-    whole, config = record(tmp_path, 90.0, 10.0, 100.0, Sensors())
+    whole, config = record(tmp_path, 90.0, 10.0, 100.0, None)
     calibration, late, upto = follow_live(kind, whole, config, tmp_path)
     print(f"{kind}: median delay {np.median(late):.3f} s, 95 % below {np.percentile(late, 95):.3f} s")
     assert upto[-1] > 89.0
