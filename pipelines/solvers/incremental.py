@@ -353,17 +353,17 @@ class Run:
         last = self.past[-1].keyframes if self.past else range(0)
         since = 0.0 if self.base is not None or not self.past else self.time - self.past[0].time
         grown = self._young and since >= max(_YOUNG, self._looked) and len(self.past) >= _FEW_STEPS
+        if grown and (self.window is None or since >= _OLDEST):
+            self._young = False
         self._restart(solution, whole.timestamps)
         self._correct(solution)
-        if grown:
+        if grown and self._young:
             self._looked = _GROWTH * since
             # Neither correction is carried on once the past is folded.
             corrected = self._noise is not None or self._bent is not None
-            foldable = self.window is None or since >= _OLDEST
-            if foldable or (not corrected and is_linear(self.problem, solution, self.keys)):
+            if not corrected and is_linear(self.problem, solution, self.keys):
                 self._young = False
                 self._restart(solution, whole.timestamps)
-                self._correct(solution)
         system = solution.system
         if from_start:
             self.moments += 1

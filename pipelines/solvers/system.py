@@ -11,7 +11,7 @@ A short recording is one stretch of which nothing is eliminated in advance.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -160,15 +160,16 @@ class Linear:
         keys = [key for key in its if key in ours]
         return rows_of(ours, keys), rows_of(its, keys)
 
-    def solved(self, joint: Array) -> Iterator[tuple[Part, Array]]:
-        """Every part with a vector of its variables that solves its own equations, without right side.
+    def solved(self, joint: Array, own: Callable[[Part], Array] | None = None) -> Iterator[tuple[Part, Array]]:
+        """Every part with a vector of its variables that solves its own equations.
 
         Args:
             joint: (D, k) of the variables of `graph`.
+            own: a part's right side, all of its rows; without it is zero.
         """
         for part in self.parts():
             ours, its = self.shared(part)
-            right = np.zeros((part.triangular.size, joint.shape[1]))
+            right = np.zeros((part.triangular.size, joint.shape[1])) if own is None else own(part)
             right[its] = joint[ours]
             yield part, part.triangular.back(right)
 
@@ -191,11 +192,7 @@ class Linear:
         joint = self.triangular.back(of(self.triangular.places))
         moves = [gtsam.VectorValues() for _ in range(count)]
         inserted: set[int] = set()
-        for part in self.parts():
-            ours, its = self.shared(part)
-            right = of(part.triangular.places)
-            right[its] = joint[ours]
-            x = part.triangular.back(right)
+        for part, x in self.solved(joint, lambda part: of(part.triangular.places)):
             for key in part.triangular.places.keys() - inserted:
                 for move, column in zip(moves, x[part.triangular.places[key]].T, strict=True):
                     move.insert(key, column)
