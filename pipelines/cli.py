@@ -1,6 +1,8 @@
-"""The command `alidade`: parses, calls, prints."""
+"""The command `alidade`: parses, calls, prints.
 
-from __future__ import annotations
+The help asks for the options of all commands: annotations are objects, since strings would have to be compiled, and
+what a command works with is imported by the command.
+"""
 
 import os
 import re
@@ -9,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from functools import cache, partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
@@ -34,6 +35,13 @@ class _WithMethods(TyperGroup):
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         return super().get_command(ctx, cmd_name) or _of_methods().get(cmd_name)
+
+    def get_params(self, ctx: Any) -> Any:
+        """Flags all of them: those of typer default to None, and typer imports pydantic to check that; not False."""
+        params = super().get_params(ctx)
+        for flag in params:
+            flag.default = flag.default or False
+        return params
 
 
 @cache
@@ -137,6 +145,8 @@ def calibrate(
 
     Exit code 0 calibrated, 2 unusable input, 3 weak or unobservable, 4 inconsistent.
     """
+    from tempfile import TemporaryDirectory
+
     from pipelines import progress, terminal
     from pipelines.errors import InputError
     from pipelines.recording.opening import recordings_of, told
@@ -579,7 +589,7 @@ def _file_name(source: str) -> str:
     return re.sub(r"\W+", "-", source.partition("://")[2]).strip("-") if "://" in source else source
 
 
-def _tell(calibration: Calibration, folder: Path, written: Sequence[Path], as_json: bool = False) -> NoReturn:
+def _tell(calibration: "Calibration", folder: Path, written: Sequence[Path], as_json: bool = False) -> NoReturn:
     """Show a calibration and where its results are; its status is the exit code."""
     from pipelines import terminal
 

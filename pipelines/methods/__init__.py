@@ -43,15 +43,12 @@ Scenario = dict[str, Any]
 class Method(ABC):
     """One method of calibration; `Any` stands for its data, a frozen dataclass of arrays that only it knows.
 
-    Modules that take long to import are imported by the functions that need them: every command asks all methods for
-    the attributes below.
+    Modules that take long to import, numpy and pydantic among them, are imported by the functions that need them: the
+    help asks all methods for their commands, and every command asks them for the attributes below.
 
     Attributes:
         name: as in configs and on the command line.
         title: what people call it.
-        topics: what it reads, the optional ones included.
-        needs: what it cannot do without.
-        section: the model of its own section of the config, if it has one.
         sheets: the data sheets it uses, as under `sensors` in the config -> their figures.
         of_recording: patterns of the parameters that belong to a recording; the others are the device's.
         rotations: parameters that are rotation vectors, without their _x, _y, _z -> the rotation each is.
@@ -68,9 +65,6 @@ class Method(ABC):
 
     name: ClassVar[str]
     title: ClassVar[str]
-    topics: ClassVar[tuple[Topic, ...]]
-    needs: ClassVar[tuple[Need, ...]]
-    section: ClassVar[type[MethodSection] | None] = None
     sheets: ClassVar[Mapping[str, tuple[str, ...]]] = {}
     of_recording: ClassVar[tuple[str, ...]] = ()
     rotations: ClassVar[Mapping[str, str]] = {}
@@ -82,6 +76,21 @@ class Method(ABC):
     yields: ClassVar[bool] = False
 
     # -- from a recording to estimates
+
+    @property
+    @abstractmethod
+    def topics(self) -> tuple[Topic, ...]:
+        """What it reads, the optional ones included."""
+
+    @property
+    @abstractmethod
+    def needs(self) -> tuple[Need, ...]:
+        """What it cannot do without."""
+
+    @property
+    def section(self) -> type[MethodSection] | None:
+        """The model of its own section of the config, if it has one."""
+        return None
 
     @property
     @abstractmethod

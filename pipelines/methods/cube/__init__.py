@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from pipelines.methods import Method, Scenario
-from pipelines.methods.cube.topics import NEEDS, TOPICS, CubeConfig
 
 if TYPE_CHECKING:
     from pipelines.graph.problem import Array, Estimate, Findings, Problem
@@ -16,8 +15,10 @@ if TYPE_CHECKING:
     from pipelines.judgement.validation import Validation
     from pipelines.methods.cube.data import CubeData
     from pipelines.methods.cube.scenario import CubeScenario
+    from pipelines.methods.cube.topics import CubeConfig
     from pipelines.methods.formula import Formula
     from pipelines.recording.reading import Recording
+    from pipelines.recording.topics import Need, Topic
     from pipelines.reports.calibration import SavedCalibration
     from pipelines.reports.result import Calibration, Plot, Table
     from pipelines.settings import Config
@@ -29,9 +30,6 @@ class Cube(Method):
 
     name = "cube"
     title = "Tag cube"
-    topics = TOPICS
-    needs = NEEDS
-    section = CubeConfig
     sheets: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "gyro": ("g_sensitivity", "temperature"),
         "accel": ("square", "cube", "temperature"),
@@ -53,6 +51,24 @@ class Cube(Method):
         r"camera_centre_([xy])": "How far the picture's centre is off along {0}.",
     }
     rotations: ClassVar[Mapping[str, str]] = {"camera_mount": "correction of BRC"}
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        from pipelines.methods.cube.topics import TOPICS
+
+        return TOPICS
+
+    @property
+    def needs(self) -> tuple[Need, ...]:
+        from pipelines.methods.cube.topics import NEEDS
+
+        return NEEDS
+
+    @property
+    def section(self) -> type[CubeConfig]:
+        from pipelines.methods.cube.topics import CubeConfig
+
+        return CubeConfig
 
     @property
     def data(self) -> type[CubeData]:

@@ -1,13 +1,10 @@
 """The cube's own commands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipelines import terminal
 from pipelines.errors import InputError
 from pipelines.options import ConfigFile, Json, Quiet
 
@@ -26,7 +23,7 @@ def cube_layout(
     quiet: Quiet = False,
 ) -> None:
     """Where the tags are on a cube, from pictures of it on all sides; the config gives their ids and sizes."""
-    from pipelines import progress
+    from pipelines import progress, terminal
     from pipelines.config import recorded_config
     from pipelines.methods.cube.layout import cube_layout as estimate
     from pipelines.methods.cube.layout import layout_yaml
@@ -49,11 +46,12 @@ def cube_layout(
     terminal.say(f"Wrote {out} for calibrate --config, and {page}")
 
 
-def _show(layout: Layout) -> None:
+def _show(layout: "Layout") -> None:
     """A table of the tags, what became of them, and what to do."""
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
+    from pipelines import terminal
     from pipelines.methods.cube.layout_page import COLUMNS, advice, camera_rows, headline, rows
 
     table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
@@ -77,6 +75,7 @@ def cube_print(
     first_id: Annotated[int, typer.Option(help="Tag on the top face; the others follow.")] = 16,
 ) -> None:
     """Sheets with the six faces of a tag cube, true to scale."""
+    from pipelines import terminal
     from pipelines.methods.cube.printing import print_cube
 
     print_cube(out, edge, first_id)

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from pipelines.methods import Method, Scenario
-from pipelines.methods.head.topics import NEEDS, TOPICS, HeadConfig
 
 if TYPE_CHECKING:
     from pipelines.graph.problem import Estimate, Findings, Problem
@@ -17,7 +16,9 @@ if TYPE_CHECKING:
     from pipelines.methods.formula import Formula
     from pipelines.methods.head.recording import HeadData
     from pipelines.methods.head.simulation import HeadScenario
+    from pipelines.methods.head.topics import HeadConfig
     from pipelines.recording.reading import Recording
+    from pipelines.recording.topics import Need, Topic
     from pipelines.reports.result import Calibration, Plot
     from pipelines.settings import Config
     from pipelines.simulation.simulated import Simulated
@@ -28,9 +29,6 @@ class Head(Method):
 
     name = "head"
     title = "Helmet"
-    topics = TOPICS
-    needs = NEEDS
-    section = HeadConfig
     sheets: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "gyro": ("scale", "skew", "g_sensitivity", "temperature"),
         "platform_gyro": ("bias", "scale", "skew"),
@@ -45,6 +43,24 @@ class Head(Method):
         r"vision_scale": "Part by which the angles that the camera tells are too large.",
     }
     rotations: ClassVar[Mapping[str, str]] = {"helmet_mount": "vRh", "camera_mount": "cRb"}
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        from pipelines.methods.head.topics import TOPICS
+
+        return TOPICS
+
+    @property
+    def needs(self) -> tuple[Need, ...]:
+        from pipelines.methods.head.topics import NEEDS
+
+        return NEEDS
+
+    @property
+    def section(self) -> type[HeadConfig]:
+        from pipelines.methods.head.topics import HeadConfig
+
+        return HeadConfig
 
     @property
     def data(self) -> type[HeadData]:

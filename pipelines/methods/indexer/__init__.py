@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from pipelines.methods import Method, Scenario
-from pipelines.methods.indexer.topics import NEEDS, TOPICS, IndexerConfig
 
 if TYPE_CHECKING:
     from pipelines.graph.problem import Estimate, Problem
@@ -17,7 +16,9 @@ if TYPE_CHECKING:
     from pipelines.methods.formula import Formula
     from pipelines.methods.indexer.recording import IndexerData
     from pipelines.methods.indexer.simulation import IndexerScenario
+    from pipelines.methods.indexer.topics import IndexerConfig
     from pipelines.recording.reading import Recording
+    from pipelines.recording.topics import Need, Topic
     from pipelines.reports.result import Calibration, Plot
     from pipelines.settings import Config
     from pipelines.simulation.simulated import Simulated
@@ -28,9 +29,6 @@ class Indexer(Method):
 
     name = "indexer"
     title = "Indexer"
-    topics = TOPICS
-    needs = NEEDS
-    section = IndexerConfig
     sheets: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "gyro": ("scale", "skew", "temperature"),
         "encoder": ("once_per_turn", "delay"),
@@ -41,6 +39,24 @@ class Indexer(Method):
         r"theta_([xyz])": "IMU mounted turned about {0} of the platform.",
         r"axis_nonperpendicularity": "Inner axis not square to the outer axis, by this angle.",
     }
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        from pipelines.methods.indexer.topics import TOPICS
+
+        return TOPICS
+
+    @property
+    def needs(self) -> tuple[Need, ...]:
+        from pipelines.methods.indexer.topics import NEEDS
+
+        return NEEDS
+
+    @property
+    def section(self) -> type[IndexerConfig]:
+        from pipelines.methods.indexer.topics import IndexerConfig
+
+        return IndexerConfig
 
     @property
     def data(self) -> type[IndexerData]:

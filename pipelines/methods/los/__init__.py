@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from pipelines.methods import Method, Scenario
-from pipelines.methods.los.topics import NEEDS, TOPICS
 
 if TYPE_CHECKING:
     from pipelines.graph.problem import Estimate, Findings, Problem
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
     from pipelines.methods.los.recording import LosData
     from pipelines.methods.los.simulation import LosScenario
     from pipelines.recording.reading import Recording
+    from pipelines.recording.topics import Need, Topic
     from pipelines.reports.result import Calibration, Plot
     from pipelines.settings import Config
     from pipelines.simulation.simulated import Simulated
@@ -28,8 +28,6 @@ class Los(Method):
 
     name = "los"
     title = "Line of sight"
-    topics = TOPICS
-    needs = NEEDS
     sheets: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "gyro": ("scale", "skew", "g_sensitivity", "temperature"),
         "camera": ("scale", "roll"),
@@ -55,6 +53,18 @@ class Los(Method):
     components: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "los": ("phx, angle to the target below", "phz, angle to the target to the right", "roll of the picture")
     }
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        from pipelines.methods.los.topics import TOPICS
+
+        return TOPICS
+
+    @property
+    def needs(self) -> tuple[Need, ...]:
+        from pipelines.methods.los.topics import NEEDS
+
+        return NEEDS
 
     @property
     def data(self) -> type[LosData]:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from pipelines.methods import Method, Scenario
-from pipelines.methods.tumble.topics import NEEDS, TOPICS
 
 if TYPE_CHECKING:
     from pipelines.graph.problem import Estimate, Findings, Problem
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
     from pipelines.methods.tumble.recording import TumbleData
     from pipelines.methods.tumble.scenario import TumbleScenario
     from pipelines.recording.reading import Recording
+    from pipelines.recording.topics import Need, Topic
     from pipelines.reports.calibration import SavedCalibration
     from pipelines.reports.result import Calibration, Plot, Table
     from pipelines.settings import Config
@@ -29,8 +29,6 @@ class Tumble(Method):
 
     name = "tumble"
     title = "Tumbled magnetometer and accelerometer"
-    topics = TOPICS
-    needs = NEEDS
     sheets: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "gyro": ("scale", "skew", "g_sensitivity", "temperature"),
         "accel": ("temperature",),
@@ -41,6 +39,18 @@ class Tumble(Method):
     sketch = Path(__file__).with_name("frames.svg")
     drawn = True
     yields = True
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        from pipelines.methods.tumble.topics import TOPICS
+
+        return TOPICS
+
+    @property
+    def needs(self) -> tuple[Need, ...]:
+        from pipelines.methods.tumble.topics import NEEDS
+
+        return NEEDS
 
     @property
     def data(self) -> type[TumbleData]:

@@ -10,18 +10,19 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from gyro_pair.topics import NEEDS, TOPICS, GyroPairConfig
 from pipelines.methods import Method, Scenario
 
 if TYPE_CHECKING:
     from gyro_pair.recording import GyroPairData
     from gyro_pair.simulation import GyroPairScenario
+    from gyro_pair.topics import GyroPairConfig
     from pipelines.graph.problem import Estimate, Problem
     from pipelines.judgement.checklist import ChecklistItem
     from pipelines.judgement.hypotheses import Hypotheses
     from pipelines.judgement.validation import Validation
     from pipelines.methods.formula import Formula
     from pipelines.recording.reading import Recording
+    from pipelines.recording.topics import Need, Topic
     from pipelines.reports.result import Calibration, Plot
     from pipelines.settings import Config
     from pipelines.simulation.simulated import Simulated
@@ -32,9 +33,6 @@ class GyroPair(Method):
 
     name = "gyro_pair"
     title = "Two gyros"
-    topics = TOPICS
-    needs = NEEDS
-    section = GyroPairConfig
     rotations: ClassVar[Mapping[str, str]] = {"rotation": "aRb"}
     of_recording = ("bias_difference_*",)
     meanings: ClassVar[Mapping[str, str]] = {
@@ -43,6 +41,24 @@ class GyroPair(Method):
         r"time_offset": "How much later than gyro b's stamps its readings are, on gyro a's clock.",
     }
     scenarios = Path(__file__).parent / "scenarios"
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        from gyro_pair.topics import TOPICS
+
+        return TOPICS
+
+    @property
+    def needs(self) -> tuple[Need, ...]:
+        from gyro_pair.topics import NEEDS
+
+        return NEEDS
+
+    @property
+    def section(self) -> type[GyroPairConfig]:
+        from gyro_pair.topics import GyroPairConfig
+
+        return GyroPairConfig
 
     @property
     def data(self) -> type[GyroPairData]:
