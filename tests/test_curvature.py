@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from benchmarks.young import LOS, beginning, drawn_los, followed, made, nees
+from benchmarks.young import CASES, LOS, beginning, drawn_los, followed, made, nees
 from pipelines.graph.problem import Array, Estimate, Problem
 from pipelines.settings import Sensors
 from pipelines.solvers import batch
@@ -54,3 +54,15 @@ def test_joint_errors_fit_at_rest_and_when_motion_begins() -> None:
     found = [followed(*recording(seed, 10.0, 21.0, Sensors()), moments) for seed in range(4)]
     sums = np.sum([each.nees for each in found], axis=0)
     assert (sums < chi2.ppf(0.999, 4 * found[0].numbers)).all(), sums / 4.0
+
+
+def test_numbers_that_measurements_are_not_linear_in_are_covered() -> None:
+    """Turns about one axis: gains about the others stay unknown, and with them b = -K c, however well c is known.
+
+    Along the tangent of K and b alone it is 5,400.
+    """
+    settings, _ = CASES["cube"]["one axis"](1000)
+    problem, truth = made("cube", settings, 1000)
+    estimate = solve_batch(problem)
+    size, dof = nees(estimate.values, estimate.covariance, truth)
+    assert size < chi2.ppf(0.999, dof), (size, dof)

@@ -5,11 +5,15 @@ system knows the sum along the tangent at the estimate alone: at the true values
 what is of second order, which is thousands of its sigmas. So the directions that are known have, beside the variance
 that the linear system gives them, that of how far they follow the ones that are not: of the way from the tangent back
 to the floor of the error, at values drawn from their covariance.
+
+Variables that measurements are linear in may be reported as numbers that are not: an offset c of raw readings is known
+to the last digit where b = -K c, with a K that is not, is reported. Of that the same draws tell, by the way from the
+numbers' own tangent.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import gtsam
@@ -72,7 +76,8 @@ def second_order(
             # As far as the linear system goes back itself, its covariance has it already.
             tangent = slope - information @ np.concatenate([move.at(key) for key in keys])
             back = _back(*reduced(system.linearize(each), ordering, keys), known)
-            steps.append(back - _back(information, tangent, known))
+            bent = _numbers_bent(problem, values, each, keys)[free] / scale
+            steps.append(back - _back(information, tangent, known) + vectors[:, told].T @ bent)
             if len(steps) == _TRIED and (eigenvalues[told] * np.square(steps)).sum(axis=1).max() < _SLIGHT:
                 return None
     except (RuntimeError, IndeterminateError, np.linalg.LinAlgError):
@@ -86,3 +91,12 @@ def second_order(
 def _back(information: Array, slope: Array, known: Array) -> Array:
     """The step (k,) to the floor along some directions, by columns, of parameters with these normal equations."""
     return np.asarray(np.linalg.solve(known.T @ information @ known, known.T @ slope))
+
+
+def _numbers_bent(problem: Problem, values: gtsam.Values, moved: gtsam.Values, keys: Sequence[int]) -> Array:
+    """How far the reported numbers (n,) of moved values are from what their Jacobian foresees."""
+    found, move = [], values.localCoordinates(moved)
+    for p, key in zip(problem.parameters, keys, strict=True):
+        numbers, J = p.coordinates(values, key)
+        found.append(p.coordinates(moved, key)[0] - numbers - J @ move.at(key))
+    return np.concatenate(found)
