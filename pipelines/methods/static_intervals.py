@@ -20,6 +20,9 @@ _SHORTEST = 0.5
 _QUIET, _STILL = 3.0, 6.0
 # A motion starts slower than the test can see: this much, s, is cut off at both ends.
 _MARGIN = 0.25
+# ... and more where the sum of what the readings differ from the middle of the interval by, from there on, comes out
+# beyond the first many of its sigmas: back to where it was last within the second.
+_MOVED, _UNMOVED = 5.0, 1.0
 # The noise is what the quietest twentieth of the recording shows, between these multiples of the stated one.
 _FLOOR_SHARE, _FLOOR_LIMITS = 0.05, (0.2, 10.0)
 # A steady turn is as quiet; its mean rate departs from that of the static intervals by more than this, rad/s, when what
@@ -97,8 +100,38 @@ def _quiet_runs(t: Array, streams: Sequence[tuple[Array, float]]) -> tuple[NDArr
     edges = edges[counted[edges[:, 1]] > counted[edges[:, 0]]]
     margin = round(_MARGIN / interval)
     runs = edges + np.array([margin, -1 - margin])
-    runs = runs[runs[:, 1] > runs[:, 0]]
+    runs = runs[t[runs[:, 1].clip(0)] - t[runs[:, 0].clip(max=len(t) - 1)] >= _SHORTEST]
+    noisy = [(values, least) for (values, _), least in zip(streams, floor.tolist(), strict=True)]
+    runs = np.array([_unmoved(run, noisy) for run in runs], dtype=np.intp).reshape(-1, 2)
     return runs[t[runs[:, 1]] - t[runs[:, 0]] >= _SHORTEST], scatter, floor
+
+
+def _unmoved(run: NDArray[np.intp], streams: Sequence[tuple[Array, float]]) -> tuple[int, int]:
+    """First and last sample of a quiet run of vectors, each with its noise, but for ends in which motion is slow."""
+    first, last = run.tolist()
+    quarter = (last - first) // 4
+    middle = slice(first + quarter, last - quarter + 1)
+    before, after = [], []
+    for values, noise in streams:
+        still = values[middle]
+        mean, sigma = still.mean(axis=0), np.maximum(still.std(axis=0), noise)
+        before.append((values[first : middle.start] - mean)[::-1] / sigma)
+        after.append((values[middle.stop : last + 1] - mean) / sigma)
+    count = middle.stop - middle.start
+    return (
+        middle.start - _still_for(np.hstack(before), count),
+        middle.stop - 1 + _still_for(np.hstack(after), count),
+    )
+
+
+def _still_for(off: Array, count: int) -> int:
+    """How many of some samples (n, d), in units of their noise about a mean of `count` others, stay at that mean."""
+    n = np.arange(1, len(off) + 1)
+    drift = np.abs(np.cumsum(off, axis=0)).max(axis=1, initial=0.0) / np.sqrt(n * (1.0 + n / count))
+    moved = np.flatnonzero(drift > _MOVED)
+    if not len(moved):
+        return len(off)
+    return int(np.max(np.flatnonzero(drift[: moved[0]] < _UNMOVED) + 1, initial=0))
 
 
 def _scatter(values: Array, half: int) -> Array:
