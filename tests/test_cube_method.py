@@ -38,6 +38,7 @@ from pipelines.methods.cube.simulation import simulate_cube
 from pipelines.methods.cube.static_intervals import static_intervals
 from pipelines.methods.cube.topics import CubeConfig, Raw, RawConversion
 from pipelines.methods.cube.validation import validate
+from pipelines.methods.static_intervals import find_static_intervals
 from pipelines.recording.reading import open_recording
 from pipelines.settings import Config
 from pipelines.solvers.batch import solve_batch
@@ -177,6 +178,19 @@ def test_a_magnetometer_of_unknown_field_is_left_out_and_that_is_told() -> None:
     assert "The magnetometer is not calibrated" in " ".join(built.premises)
     assert estimate.converged
     assert not [name for name in estimate.names if name.startswith("mag")]
+
+
+def test_a_rest_ends_where_a_slow_motion_begins() -> None:
+    """A turn that takes seconds to gather speed is quieter than any threshold on scatter at first."""
+    t, rng = np.arange(0.0, 12.0, 0.01), np.random.default_rng(3)
+    rate, noise = 0.01 * np.clip(t - 6.0, 0.0, None) ** 2, 1e-3
+    gyro = noise * rng.standard_normal((len(t), 3)) + rate[:, None] * (0.0, 0.6, 0.8)
+    accel = 0.01 * rng.standard_normal((len(t), 3)) + (0.0, 0.0, 9.81)
+    ((start, stop),) = find_static_intervals(t, gyro, accel, noise, 0.01)
+    assert start < 0.5
+    assert 5.5 < stop < 6.8
+    still = gyro[(t >= start) & (t <= stop)]
+    assert (np.abs(still.mean(axis=0)) < 4.0 * noise / np.sqrt(len(still))).all()
 
 
 def test_poses_near_iron_are_named() -> None:

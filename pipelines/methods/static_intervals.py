@@ -20,8 +20,8 @@ _SHORTEST = 0.5
 _QUIET, _STILL = 3.0, 6.0
 # A motion starts slower than the test can see: this much, s, is cut off at both ends.
 _MARGIN = 0.25
-# ... and more where the sum of what the readings differ from the middle of the interval by, from there on, comes out
-# beyond the first many of its sigmas: back to where it was last within the second.
+# ... and more where the sum of what the readings differ by from the quietest half of the interval, from there on, comes
+# out beyond the first many of its sigmas: back to where it was last within the second.
 _MOVED, _UNMOVED = 5.0, 1.0
 # The noise is what the quietest twentieth of the recording shows, between these multiples of the stated one.
 _FLOOR_SHARE, _FLOOR_LIMITS = 0.05, (0.2, 10.0)
@@ -110,7 +110,11 @@ def _unmoved(run: NDArray[np.intp], streams: Sequence[tuple[Array, float]]) -> t
     """First and last sample of a quiet run of vectors, each with its noise, but for ends in which motion is slow."""
     first, last = run.tolist()
     quarter = (last - first) // 4
-    middle = slice(first + quarter, last - quarter + 1)
+    if quarter == 0:
+        return first, last
+    stirring = np.sum([(_scatter(values[first : last + 1], quarter) / noise) ** 2 for values, noise in streams], axis=0)
+    centre = first + quarter + int(np.argmin(stirring[quarter:-quarter]))
+    middle = slice(centre - quarter, centre + quarter + 1)
     before, after = [], []
     for values, noise in streams:
         still = values[middle]
