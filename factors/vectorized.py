@@ -24,6 +24,10 @@ from factors.model import POSE3, ROT3, Array, Block, Keys, Model, Residuals, che
 _CHECKED: set[Hashable] = set()
 
 
+# Factors whose Jacobians are laid out at a time: few enough for the processor's cache.
+_LAID_OUT = 64
+
+
 class _Evaluation:
     """A model's residuals at some values, and its Jacobians once asked for."""
 

@@ -149,7 +149,7 @@ def solve_batch(
     changes = [
         (b.time, b.current_keys) for i, b in enumerate(ends) if i == 0 or b.current_keys != ends[i - 1].current_keys
     ]
-    smooth = smoothed(problem, linear, ordering, values, changes[:-1], marginal) if len(changes) > 2 else None
+    smooth = smoothed(problem, about.triangular.tree, values, changes[:-1], marginal) if len(changes) > 2 else None
     done = time.perf_counter()
     return Estimate(
         solver="batch",

@@ -24,7 +24,6 @@ import numpy as np
 
 from pipelines.graph.problem import Array, Factor, Problem, Pull
 from pipelines.solvers.system import Linear
-from pipelines.solvers.triangular import rows_of
 
 # Family of the priors, which are told one by one.
 _PRIOR = "prior"
@@ -53,10 +52,8 @@ class Influence:
     def rows(self) -> Iterator[tuple[Factor, gtsam.GaussianFactor, Array]]:
         """Each factor, it linearised, and the derivative (n, m) of the numbers by its m whitened residuals."""
         for part, solutions in self.linear.solved(self.solutions):
-            places = part.triangular.places
-            for i, factor in enumerate(part.factors):
-                linear = part.graph.at(i)
-                yield factor, linear, (linear.jacobian()[0] @ solutions[rows_of(places, linear.keys())]).T
+            for i, (factor, (A, rows)) in enumerate(zip(part.factors, part.blocks(), strict=True)):
+                yield factor, part.graph.at(i), (A @ solutions[rows]).T
 
     def moves(self, changed: Linear) -> Array:
         """(n,) by how much the numbers are elsewhere at the minimum of a graph that is a little different.
@@ -157,17 +154,24 @@ def strongest(found: Influence, sigmas: Mapping[str, float], most: int) -> tuple
     names = [name for name in found.names if name in sigmas]
     columns = [found.names.index(name) for name in names]
     scale = np.array([1.0 / sigmas[name] for name in names])
-    pulls: list[Pull] = []
+    if not names:
+        return ()
+    families: list[str] = []
+    times: list[float] = []
+    largest: list[tuple[Array, Array]] = []
     for factor, linear, rows in found.rows():
         vectorized = factor.vectorized
-        if vectorized is None or not names:
+        if vectorized is None:
             continue
         time = vectorized.model.time[-1:] if vectorized.compress else vectorized.model.time
         _, r = linear.jacobian()
         moves = (rows[columns] * scale[:, None] * r).reshape(len(names), len(time), -1).sum(axis=2)
-        largest = np.abs(moves).argmax(axis=0)
-        pulls += [
-            Pull(factor.family, float(t), names[j], float(moves[j, k]))
-            for k, (t, j) in enumerate(zip(time, largest, strict=True))
-        ]
-    return tuple(sorted(pulls, key=lambda pull: -abs(pull.sigmas))[:most])
+        which = np.abs(moves).argmax(axis=0)
+        largest.append((which, moves[which, np.arange(len(time))]))
+        families += [factor.family] * len(time)
+        times += time.tolist()
+    if not times:
+        return ()
+    numbers, moved = (np.concatenate(each) for each in zip(*largest, strict=True))
+    first = np.argsort(-np.abs(moved), kind="stable")[:most]
+    return tuple(Pull(families[i], times[i], names[numbers[i]], float(moved[i])) for i in first.tolist())

@@ -82,8 +82,7 @@ def reduced(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, keys: S
 
 def smoothed(
     problem: Problem,
-    linear: gtsam.GaussianFactorGraph,
-    ordering: gtsam.Ordering,
+    tree: gtsam.GaussianBayesTree,
     values: gtsam.Values,
     held: Sequence[tuple[float, Mapping[int, int]]],
     covariance: Array,
@@ -91,13 +90,15 @@ def smoothed(
     """Smoothed values and sigmas over time of parameters that move along; the others as they are at the end.
 
     Args:
+        problem: the graph's.
+        tree: the graph linearised at the values, eliminated.
+        values: of all variables.
         held: time and, from then on, parameter key -> variable that held it.
         covariance: (n, n) of the reported numbers, for those that do not move.
 
     Returns None when the system is singular.
     """
     try:
-        tree = linear.eliminateMultifrontal(ordering, gtsam.EliminateQR)
         sigmas = [_sigmas_of(problem, tree, values, current_keys, covariance) for _, current_keys in held]
     except RuntimeError:
         return None

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from pipelines.graph.problem import Array, Factor
 from pipelines.solvers.system import Linear, Part, shown
 
+# Elements of a row of a rejected measurement or a free prior.
+_EMPTY = 1e-12
 # Random right sides that tell traces: many where that costs little, few where every one tells enough.
 _SAMPLES, _MOST_SAMPLES, _SAMPLED_ROWS = 6, 60, 30_000
 
@@ -20,17 +22,15 @@ class _Rows:
     """The rows of a stretch's linear system.
 
     Attributes:
-        row, column, element: of the matrix A (m, D), what is not zero; columns in the order of the variables' keys.
-        width: D.
+        part: the stretch, whose matrix is A (m, D).
+        ends: (factors,) of the rows of each factor.
         group: (m,) the label of each row.
         counted: (m,) rejected measurements and free priors have empty rows, which are no measurements.
         beside: by label, what compression took out of the system.
     """
 
-    row: NDArray[np.intp]
-    column: NDArray[np.intp]
-    element: Array
-    width: int
+    part: Part
+    ends: NDArray[np.intp]
     group: NDArray[np.intp]
     counted: NDArray[np.bool_]
     beside: Array
@@ -38,30 +38,27 @@ class _Rows:
     @classmethod
     def of(cls, part: Part, stands: Array, labels: dict[tuple[str, int], int]) -> _Rows:
         """Of a part whose factors stand for so many rows; new labels are added."""
-        linear, factors, width = part.graph, part.factors, part.triangular.size
-        elements = linear.sparseJacobian_()
-        # Its last columns are the right side.
-        elements = elements[:, elements[1] <= width]
-        row, column, element = elements[0].astype(int) - 1, elements[1].astype(int) - 1, elements[2]
-        sizes = [len(linear.at(i).jacobian()[1]) for i in range(linear.size())]
-        group = np.concatenate([_labelled(f, size, labels) for f, size in zip(factors, sizes, strict=True)])
-        counted = np.bincount(row, minlength=len(group)) > 0
-        held = np.bincount(np.repeat(np.arange(len(sizes)), sizes), counted, len(sizes))
-        measured = np.array([f.measurement is not None for f in factors])
+        some = [np.asarray((np.abs(A) > _EMPTY).any(axis=1)) for A, _ in part.blocks()]
+        sizes, counted = [len(each) for each in some], np.concatenate(some)
+        group = np.concatenate([_labelled(f, size, labels) for f, size in zip(part.factors, sizes, strict=True)])
+        held = np.array([each.sum() for each in some])
+        measured = np.array([f.measurement is not None for f in part.factors])
         # What compression took out of the system holds no unknowns: each such row is expected to be one.
-        first = group[np.append(0, np.cumsum(sizes))[:-1]]
+        ends = np.cumsum(sizes)
+        first = group[np.append(0, ends)[:-1]]
         beside = np.bincount(first, np.where(measured, stands - held, 0.0), len(labels)).astype(float)
-        return cls(row, column, element, width, group, counted, beside)
+        return cls(part, ends, group, counted, beside)
 
     def across(self, x: Array) -> Array:
         """(m, k) A x of x (D, k)."""
-        each = [np.bincount(self.row, self.element * own[self.column], len(self.group)) for own in x.T]
-        return np.stack(each, axis=1)
+        return np.concatenate([A @ x[rows] for A, rows in self.part.blocks()])
 
     def back(self, y: Array) -> Array:
         """(D, k) A'y of y (m, k)."""
-        each = [np.bincount(self.column, self.element * own[self.row], self.width) for own in y.T]
-        return np.stack(each, axis=1)
+        out = np.zeros((self.part.triangular.size, y.shape[1]))
+        for (A, rows), own in zip(self.part.blocks(), np.split(y, self.ends[:-1]), strict=True):
+            out[rows] += A.T @ own
+        return out
 
     def noise(self, signs: NDArray[np.int8]) -> Array:
         """(m, k) of signs (m, k), none where nothing was measured."""

@@ -29,7 +29,7 @@ from pipelines.graph.problem import Array, Factor, Residuals
 from pipelines.solvers.assembly import StepBoundary
 from pipelines.solvers.history import MOMENTS
 from pipelines.solvers.marginals import IndeterminateError, explain, ordering_of
-from pipelines.solvers.triangular import Triangular, places_of, rows_of
+from pipelines.solvers.triangular import Triangular, rows_of
 
 Shown = TypeVar("Shown")
 
@@ -115,7 +115,16 @@ class Part:
     @cached_property
     def triangular(self) -> Triangular:
         """The triangular factor of its own variables. Raises IndeterminateError, naming one that is not determined."""
-        return Triangular.of(self.graph, self.inner) if self.inner.size() else Triangular(places_of(self.graph), [])
+        return Triangular.of(self.graph, self.inner) if self.inner.size() else Triangular.none(self.graph)
+
+    @cached_property
+    def _rows(self) -> list[NDArray[np.intp]]:
+        """The rows that the variables of each factor have in a vector."""
+        return [rows_of(self.triangular.places, self.graph.at(i).keys()) for i in range(self.graph.size())]
+
+    def blocks(self) -> Iterator[tuple[Array, NDArray[np.intp]]]:
+        """The rows of each linearised factor (m, d), and where in a vector its d numbers are."""
+        return ((self.graph.at(i).jacobian()[0], rows) for i, rows in enumerate(self._rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,10 +154,14 @@ class Linear:
 
     def part(self, i: int) -> Part:
         """A stretch; the only one of a graph in one piece is this system itself."""
-        stretch = self.system.stretches[i]
         if len(self.system.stretches) == 1:
-            return Part(stretch.factors, self.graph, stretch.inner)
-        return self.system.part(stretch, self.values, self.damping)
+            return self._alone
+        return self.system.part(self.system.stretches[i], self.values, self.damping)
+
+    @cached_property
+    def _alone(self) -> Part:
+        (stretch,) = self.system.stretches
+        return Part(stretch.factors, self.graph, stretch.inner)
 
     def parts(self) -> Iterator[Part]:
         """The stretches, one after the other."""

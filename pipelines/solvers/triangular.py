@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import accumulate
 
 import gtsam
@@ -34,10 +35,12 @@ class Triangular:
     Attributes:
         places: variable -> its rows in a vector.
         cliques: in the order of their elimination.
+        tree: the same as gtsam has it, which holds their memory.
     """
 
     places: Mapping[int, slice]
     cliques: list[_Clique]
+    tree: gtsam.GaussianBayesTree
 
     @classmethod
     def of(cls, linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> Triangular:
@@ -60,9 +63,14 @@ class Triangular:
             first = conditional.firstFrontalKey()
             conditionals.pop(first, None)
             conditionals[first] = conditional
-        return cls(places, [_clique(each, places) for each in conditionals.values()])
+        return cls(places, [_clique(each, places) for each in conditionals.values()], tree)
 
-    @property
+    @classmethod
+    def none(cls, linear: gtsam.GaussianFactorGraph) -> Triangular:
+        """Of a system of which nothing is eliminated."""
+        return cls(places_of(linear), [], gtsam.GaussianBayesTree())
+
+    @cached_property
     def size(self) -> int:
         """Rows of a vector."""
         return max((place.stop for place in self.places.values()), default=0)
@@ -111,8 +119,8 @@ def _solved_transposed(R: Array, right: Array) -> Array:
 
 
 def _clique(conditional: gtsam.GaussianConditional, places: Mapping[int, slice]) -> _Clique:
-    # What the binding returns is memory of the conditional, which goes with its tree.
-    R, S, d = (np.array(each) for each in (conditional.R(), conditional.S(), conditional.d()))
+    # The first two are memory of the conditional, which goes with its tree.
+    R, S, d = conditional.R(), conditional.S(), conditional.d()
     keys = list(conditional.keys())
     if not (np.abs(np.diag(R)) > 0.0).all():
         raise IndeterminateError(explain(f"near variable {keys[0]}"))
