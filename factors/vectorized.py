@@ -24,10 +24,6 @@ from factors.model import POSE3, ROT3, Array, Block, Keys, Model, Residuals, che
 _CHECKED: set[Hashable] = set()
 
 
-# Factors whose Jacobians are laid out at a time: few enough for the processor's cache.
-_LAID_OUT = 64
-
-
 class _Evaluation:
     """A model's residuals at some values, and its Jacobians once asked for."""
 
@@ -230,8 +226,9 @@ class VectorizedFactor:
         """The columns of each key in the whole Jacobian (n, m, width), and the elements each block is added to."""
         widths = [0] * len(self.keys)
         for slots, block in zip(self._slots, self.blocks, strict=True):
+            width = dimension(block)
             for slot in [slots] if isinstance(slots, int) else slots:
-                widths[slot] = dimension(block)
+                widths[slot] = width
         ends = np.cumsum(widths)
         columns = [slice(int(end) - width, int(end)) for end, width in zip(ends, widths, strict=True)]
         n, m = len(self.model.time), self.model.rows
