@@ -19,6 +19,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
+from factors import so3
+from factors.indexer import mounting_angles
 from pipelines import methods
 from pipelines.graph.problem import Array, Problem, rotation_vector_coordinates
 from pipelines.methods.cube.scenario import CubeScenario
@@ -120,6 +122,12 @@ def _mount(seed: int) -> tuple[float, float, float]:
     return x, y, z
 
 
+def _angles(rotation_deg: tuple[float, float, float]) -> tuple[float, float, float]:
+    """The indexer's mounting angles, deg, of a rotation vector."""
+    x, y, z = np.rad2deg(mounting_angles(so3.exp(np.deg2rad(rotation_deg)))).tolist()
+    return x, y, z
+
+
 def _resting(drawn: Callable[..., HeadScenario | LosScenario], motion: EulerMotion, seed: int) -> tuple[object, Array]:
     rest = RESTS[seed % len(RESTS)]
     since = beginning(motion, dict.fromkeys(_AXES, rest))
@@ -169,7 +177,7 @@ CASES: dict[str, dict[str, Case]] = {
         "rest": lambda seed: _indexer(seed, dwell_s=RESTS[seed % len(RESTS)]),
         "one axis": lambda seed: _indexer(seed, positions=INDEXER.positions[:2]),
         "slow": lambda seed: _indexer(seed, acceleration_deg_s2=2.0),
-        "mount": lambda seed: _indexer(seed, mounting_deg=_mount(seed), priors=_free(THETA)),
+        "mount": lambda seed: _indexer(seed, mounting_deg=_angles(_mount(seed)), priors=_free(THETA)),
     },
     "cube": {
         "rest": lambda _: (CUBE.model_copy(update={"static_s": 12.0}), _LATER),

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 # Directions of which sigma is beyond this share of the prior are drawn, the others follow.
 _WEAK = 0.1
+# Where no sigma of what is calibrated is beyond this share nothing is drawn.
+_SURE = 0.01
 _DRAWS = 16
 # The first few suffice to see that none makes up this much of a squared sigma in all.
 _TRIED, _SLIGHT = 3, 0.1
@@ -55,7 +57,7 @@ def second_order(
     calibrated = [q.prior_sigma != 0.0 and not q.assumed for q in problem.quantities]
     scales = np.array([q.scale for q in problem.quantities])
     scaled = (covariance / np.outer(scales, scales))[np.ix_(calibrated, calibrated)]
-    if not len(scaled) or np.linalg.eigvalsh(scaled)[-1] < _WEAK**2:
+    if not len(scaled) or np.linalg.eigvalsh(scaled)[-1] < _SURE**2:
         return None
     keys = [current_keys.get(p.key, p.key) for p in problem.parameters]
     free, scale, unit = prior_units(problem.parameters, values, keys)

@@ -11,7 +11,7 @@ from factors.indexer import mounting_angles
 from pipelines.errors import InputError
 from pipelines.graph.problem import Array, Parameter
 from pipelines.methods.indexer.groups import Group
-from pipelines.methods.indexer.parameters import SCALE
+from pipelines.methods.indexer.parameters import SCALE, THETA
 
 # A gyro that departs from the encoders by more than this share of the rate is not the gyro of this axis.
 _DISAGREEMENT = 0.01
@@ -25,8 +25,8 @@ def agreeing(
     Fits gyro = A w + b over all groups, so that neither mounting nor bias counts as disagreement.
 
     Raises:
-        InputError: the gyro turns against the encoder of an axis, or at a rate that differs by more than 1 % and by
-            more than the priors of the gyro's scale allow.
+        InputError: the gyro turns against the encoder of an axis though the mounting's priors exclude that it is upside
+            down, or at a rate that differs by more than 1 % and by more than the priors of the gyro's scale allow.
     """
     w = np.array([g.mean_platform for g in groups])
     gyro = np.array([g.mean_gyro for g in groups])
@@ -38,8 +38,11 @@ def agreeing(
         misfit = np.linalg.norm(gyro - w @ A.T - b, axis=1)
         # Least absolute misfit: one damaged turn does not bend the fit.
         weight = np.array([g.duration for g in groups]) / np.maximum(misfit, 1e-4 * speed.max())
-    scales = [q.prior_sigma or 0.0 for p in parameters for q in p.quantities if q.name in SCALE.names]
+    quantities = [q for p in parameters for q in p.quantities]
+    scales = [q.prior_sigma or 0.0 for q in quantities if q.name in SCALE.names]
     allowed = _DISAGREEMENT + 3.0 * max(scales, default=0.0)
+    angles = [np.inf if q.prior_sigma is None else q.prior_sigma for q in quantities if q.name in THETA]
+    upright = 3.0 * max(angles, default=0.0) < 0.5 * np.pi
     for axis, name in (("outer", "outer_x"), ("inner", "inner_z")):
         mine = [i for i, g in enumerate(groups) if g.run.axis == axis]
         if not mine:
@@ -47,7 +50,7 @@ def agreeing(
         unit = w[mine] / speed[mine, None]
         along = float(np.median(((unit @ A.T) * unit).sum(axis=1)))
         gain = float(np.median(np.linalg.norm(unit @ A.T, axis=1)))
-        if along < 0.0:
+        if along < 0.0 and upright:
             raise InputError(
                 f"indexer: gyro and encoder of the axis {name} disagree in sign; check the directions of both"
             )
