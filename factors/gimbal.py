@@ -84,9 +84,8 @@ class LocalMotion:
     ) -> LocalMotion:
         """From polynomials fitted to the samples within about SMOOTHING s: of degree 2 to rates, 3 to angles."""
         rates = _local_polynomials(at, gyro_t, gyro, 2)
-        driving = None if drivers is None else _local_polynomials(at, gyro_t, drivers, 2)[:, 0]
-        steps = 0.5 * np.diff(gyro_t)[:, None] * _pairs(command(gyro, gimbal.at(gyro_t)))
-        commanded = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+        driving = None if drivers is None else _local_polynomials(at, gyro_t, drivers, 2)[:, 0].copy()
+        commanded = _commanded(gyro_t, gyro, gimbal)
         on_the_way, reached = (
             np.stack([np.interp(t, gyro_t, each) for each in commanded.T], axis=1) for t in (gimbal.t, at)
         )
@@ -121,9 +120,15 @@ def command(rate: Array, angles: Array) -> Array:
     return np.stack([np.tan(angles[:, 1]) * (c * wy - s * wx) - wz, -c * wx - s * wy], axis=1)
 
 
-def _pairs(values: Array) -> Array:
-    """Sums of neighbours."""
-    return np.asarray(values[1:] + values[:-1])
+def _commanded(t: Array, rate: Array, gimbal: GimbalPath) -> Array:
+    """Angles (n, 2), rad, through which the gimbal has been commanded since the first of the gyro's samples."""
+    out = np.zeros((len(t), 2))
+    for i in range(0, len(t) - 1, _BLOCK):
+        some = slice(i, i + _BLOCK + 1)
+        rates = command(rate[some], gimbal.at(t[some]))
+        steps = 0.5 * np.diff(t[some])[:, None] * (rates[1:] + rates[:-1])
+        out[i + 1 : i + _BLOCK + 1] = out[i] + np.cumsum(steps, axis=0)
+    return out
 
 
 def _local_polynomials(at: Array, t: Array, values: Array, degree: int) -> Array:

@@ -9,9 +9,11 @@ expansion of a linear rate (Iserles et al., Acta Numerica 2000).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
+from operator import attrgetter
 from typing import Any, ClassVar
 
 import numpy as np
@@ -25,8 +27,10 @@ Array = NDArray[np.float64]
 _UNEVEN = 0.05
 # A pause between samples longer than this many intervals is a gap.
 _GAP = 1.5
-# Sample intervals worked on at a time.
-_BLOCK = 100_000
+# Sample intervals integrated together, and how many such blocks are kept.
+_BLOCK, _KEPT = 1 << 16, 32
+# Windows looked up together.
+_TOGETHER = 20_000
 
 
 @dataclass(frozen=True)
@@ -66,6 +70,9 @@ class Increments:
 class GyroPath:
     """A gyro stream integrated once; the rotation over any window then costs the same as a look-up.
 
+    It is integrated block by block. The last blocks looked at are kept, half an hour at 1 kHz, and those of a longer
+    stream are integrated anew when they are needed.
+
     Args:
         t: (N,) stamps, s, increasing, N >= 2.
         rate: (N, 3) angular rate, rad/s.
@@ -83,61 +90,83 @@ class GyroPath:
     ) -> None:
         self.t = np.asarray(t, dtype=float)
         self.bias_hat = np.asarray(bias_hat, dtype=float)
-        mean = np.asarray(rate, dtype=float)
-        if len(self.t) < 2 or mean.shape != (len(self.t), 3):
-            raise ValueError(f"needs stamps (N,) and rates (N, 3), N >= 2; got {self.t.shape} and {mean.shape}")
-        self._drivers: Array | None = None
-        if drivers is not None:
-            driving = np.asarray(drivers, dtype=float)
-            if driving.ndim != 2 or len(driving) != len(mean):
-                raise ValueError(f"needs drivers for each rate; got {driving.shape} and {mean.shape}")
-            self._drivers = driving - trapezoid_excess(self.t, driving)
-        self._rate = mean - self.bias_hat - trapezoid_excess(self.t, mean)
-        turns = np.empty((len(self.t) - 1, 4))
-        for some in self._blocks():
-            turns[some] = so3.exp(self._arcs(some))
-        self._attitude = np.concatenate([so3.identity(1), _running_product(turns)])
-        self._unseen = np.append(0.0, np.cumsum(_gap_variance(self.t, mean)))
+        self._mean = np.asarray(rate, dtype=float)
+        if len(self.t) < 2 or self._mean.shape != (len(self.t), 3):
+            raise ValueError(f"needs stamps (N,) and rates (N, 3), N >= 2; got {self.t.shape} and {self._mean.shape}")
+        self._driving = np.empty((len(self.t), 0)) if drivers is None else np.asarray(drivers, dtype=float)
+        if self._driving.ndim != 2 or len(self._driving) != len(self._mean):
+            raise ValueError(f"needs drivers for each rate; got {self._driving.shape} and {self._mean.shape}")
+        self._unseen = _gap_variance(self.t, self._mean)
+        self._last = (len(self.t) - 2) // _BLOCK
+        self._kept: dict[int, _Block] = {}
+        # Attitudes at the blocks' starts.
+        self._starts = [so3.identity(1)]
+        for number in range(self._last + 1):
+            self._starts.append(self._block(number).attitude[-1:].copy())
 
-    @cached_property
-    def _integral(self) -> Array:
-        """Integral (N, 3, 3) of the attitude matrix until each stamp: every window's bias Jacobian follows from it."""
-        integral = np.zeros((len(self.t), 3, 3))
-        for some in self._blocks():
-            pieces = np.diff(self.t[some.start : some.stop + 1])[:, None, None] * so3.right_jacobian(-self._arcs(some))
-            integral[some.start + 1 : some.stop + 1] = so3.matrix(self._attitude[some]) @ pieces
-        return np.cumsum(integral, axis=0, out=integral)
+    def _block(self, number: int) -> _Block:
+        """A block of sample intervals."""
+        if number not in self._kept:
+            begin = number * _BLOCK
+            end = min(begin + _BLOCK, len(self.t) - 1)
+            # One sample more on either side tells what trapezoids count too much.
+            some = slice(max(begin - 1, 0), end + 2)
+            inner = slice(begin - some.start, end + 1 - some.start)
+            t, mean = self.t[some], self._mean[some]
+            driving = self._driving[some]
+            rate = (mean - self.bias_hat - trapezoid_excess(t, mean))[inner]
+            drivers = (driving - trapezoid_excess(t, driving))[inner]
+            if len(self._kept) == _KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[number] = _Block(t[inner], rate, drivers, self._starts[number])
+        return self._kept[number]
 
-    def _blocks(self) -> Iterator[slice]:
-        """The sample intervals, some at a time: what is worked out for all of them takes many times their memory."""
-        return (slice(i, min(i + _BLOCK, len(self.t) - 1)) for i in range(0, len(self.t) - 1, _BLOCK))
+    def _found(self, i: NDArray[np.intp], of: Callable[[_Block], Array], adds: bool = False) -> Array:
+        """What blocks say of the samples (n,), (n, ...).
 
-    def _arcs(self, some: slice) -> Array:
-        """Rotation vectors (n, 3) over sample intervals."""
-        rate, step = self._rate[some.start : some.stop + 1], np.diff(self.t[some.start : some.stop + 1])[:, None]
-        return _arc(rate[:-1], np.diff(rate, axis=0) / step, step)
-
-    def _slope(self, i: NDArray[np.intp]) -> Array:
-        """Slopes (n, 3) of the rate over sample intervals (n,), rad/s^2."""
-        return np.asarray((self._rate[i + 1] - self._rate[i]) / (self.t[i + 1] - self.t[i])[:, None])
+        Args:
+            i: the samples.
+            of: a block's answer, a row for each of its samples.
+            adds: what it says is a running sum from its start on; from the first of the blocks looked at then.
+        """
+        block = np.minimum(i // _BLOCK, self._last)
+        first, last = int(block.min(initial=self._last)), int(block.max(initial=0))
+        if first >= last:
+            return of(self._block(first))[i - first * _BLOCK]
+        order = np.argsort(block, kind="stable")
+        cuts = np.searchsorted(block[order], np.arange(first, last + 2))
+        out, before = np.empty(0), np.zeros(())
+        for number, (begin, end) in enumerate(pairwise(cuts), start=first):
+            if not adds and begin == end:
+                continue
+            rows, own = order[begin:end], of(self._block(number))
+            if not len(out):
+                out = np.empty((len(i), *own.shape[1:]))
+            out[rows] = own[i[rows] - number * _BLOCK]
+            if adds:
+                out[rows] += before
+                before = before + own[-1]
+        return out
 
     def attitude(self, at: ArrayLike) -> Array:
         """Attitude (n, 4) of the sensor at the times, in its frame at the first stamp."""
         i, s = self._place(np.asarray(at, dtype=float))
-        return so3.multiply(self._attitude[i], so3.exp(_arc(self._rate[i], self._slope(i), s)))
+        rate, slope = self._line(i, _rates)
+        return so3.multiply(self._found(i, _attitudes), so3.exp(_arc(rate, slope, s)))
 
     def rate(self, at: ArrayLike) -> Array:
         """Rate (n, 3) at the times, linear between samples, bias_hat taken off, rad/s."""
         i, s = self._place(np.asarray(at, dtype=float))
-        return np.asarray(self._rate[i] + self._slope(i) * s)
+        rate, slope = self._line(i, _rates)
+        return np.asarray(rate + slope * s)
 
     def drivers(self, at: ArrayLike) -> Array | None:
         """The drivers (n, d) at the times; None without."""
-        if self._drivers is None:
+        if not self._driving.shape[1]:
             return None
         i, s = self._place(np.asarray(at, dtype=float))
-        before, after = self._drivers[i], self._drivers[i + 1]
-        return np.asarray(before + (after - before) * (s / (self.t[i + 1] - self.t[i])[:, None]))
+        before, slope = self._line(i, _drivers)
+        return np.asarray(before + slope * s)
 
     def increments(self, start: ArrayLike, stop: ArrayLike, scale: bool = False) -> Increments:
         """Rotations over the windows [start, stop], (n,) each, s; a window may be empty or run backwards.
@@ -147,18 +176,28 @@ class GyroPath:
         Args:
             start, stop: the windows' ends.
             scale: also the derivatives by the gyro's scale and, with drivers, by what they add to it. They cost as much
-                as the rest and one pass over the whole stream.
+                as the rest and one pass over the stream.
         """
         start, stop = np.asarray(start, dtype=float), np.asarray(stop, dtype=float)
+        if len(start) <= _TOGETHER:
+            return self._increments(start, stop, scale)
+        begins = range(0, len(start), _TOGETHER)
+        pieces = [self._increments(start[k : k + _TOGETHER], stop[k : k + _TOGETHER], scale) for k in begins]
+        parts = zip(*([getattr(piece, name) for name in Increments.stacked] for piece in pieces), strict=True)
+        return Increments(*(None if part[0] is None else np.concatenate(part) for part in parts))
+
+    def _increments(self, start: Array, stop: Array, scale: bool) -> Increments:
         # Both ends in one call: what a few windows cost is calls.
         ends = np.concatenate([start, stop])
         i, s = self._place(ends)
-        w0, a = self._rate[i], self._slope(i)
+        w0, a = self._line(i, _rates)
         arc = _arc(w0, a, s)
-        attitude = so3.multiply(self._attitude[i], so3.exp(arc))
+        before = self._found(i, _attitudes)
+        attitude = so3.multiply(before, so3.exp(arc))
         # The attitude matrix's integral since the samples before the ends.
-        begun = so3.matrix(self._attitude[i]) @ (s[..., None] * so3.right_jacobian(-arc))
-        (q0, q1), (c0, c1), (p0, p1) = (np.split(each, 2) for each in (attitude, self._integral[i], begun))
+        begun = so3.matrix(before) @ (s[..., None] * so3.right_jacobian(-arc))
+        integral = self._found(i, _integrals, adds=True)
+        (q0, q1), (c0, c1), (p0, p1) = (np.split(each, 2) for each in (attitude, integral, begun))
         to_end = -so3.matrix(so3.inverse(q1))
         n = len(start)
         turned = Increments(
@@ -166,42 +205,90 @@ class GyroPath:
             wxyz=so3.multiply(so3.inverse(q0), q1),
             bias_jacobian=to_end @ ((c1 - c0) + (p1 - p0)),
             rate=_rate(w0[n:], a[n:], s[n:], arc[n:]),
-            unseen=np.abs(np.interp(stop, self.t, self._unseen) - np.interp(start, self.t, self._unseen)),
+            unseen=np.abs(np.interp(stop, *self._unseen) - np.interp(start, *self._unseen)),
         )
         if not scale:
             return turned
-        by = [to_end @ self._moments(i, s, begun, v) for v in (self._rate, self._drivers) if v is not None]
+        vectors = [_rates, _drivers] if self._driving.shape[1] else [_rates]
+        by = [to_end @ self._moments(i, s, begun, vector) for vector in vectors]
         return replace(turned, scale_jacobian=by[0], driver_jacobian=by[1] if len(by) == 2 else None)
 
-    def _moments(self, i: NDArray[np.intp], s: Array, begun: Array, vector: Array) -> Array:
+    def _moments(self, i: NDArray[np.intp], s: Array, begun: Array, vector: Callable[[_Block], Array]) -> Array:
         """Integral over windows of the attitude matrix times each component of a vector, (n, 3, 3 d): [i, d a + b].
 
         Within a sample interval the attitude's integral is taken with the vector's mean, which leaves out a twelfth of
-        how both change in it. Column by column: all at once would take 27 times the stream's memory.
+        how both change in it.
 
         Args:
             i, s: (2 n,), (2 n, 1) the samples before the windows' starts, then before their ends, and the times since.
             begun: (2 n, 3, 3) integral of the attitude matrix from the sample before each end.
-            vector: (N, d) at the stamps, linear in between.
+            vector: which of a block's, linear between samples.
         """
-        d = vector.shape[1]
-        slope = (vector[i + 1] - vector[i]) / (self.t[i + 1] - self.t[i])[:, None]
-        at_ends = np.einsum("nia,nb->niab", begun, vector[i] + 0.5 * s * slope).reshape(-1, 3, 3 * d)
-        start, stop = np.split(i, 2)
-        mean = np.ascontiguousarray(0.5 * (vector[1:] + vector[:-1]).T)
-        out = at_ends[len(start) :] - at_ends[: len(start)]
-        until = np.zeros(len(self.t))
-        for row in range(9):
-            attitude = np.diff(self._integral[:, row // 3, row % 3])
-            for column in range(d):
-                np.cumsum(attitude * mean[column], out=until[1:])
-                out[:, row // 3, d * (row % 3) + column] += until[stop] - until[start]
-        return out
+        before, slope = self._line(i, vector)
+        since = np.einsum("nia,nb->niab", begun, before + 0.5 * s * slope)
+        until = self._found(i, lambda block: block.moments(vector), adds=True) + since
+        start, stop = np.split(until.reshape(len(i), 3, -1), 2)
+        return np.asarray(stop - start)
+
+    def _line(self, i: NDArray[np.intp], vector: Callable[[_Block], Array]) -> tuple[Array, Array]:
+        """A vector (n, d) of the blocks' at samples, and its slope until the next."""
+        before = self._found(i, vector)
+        return before, (self._found(i + 1, vector) - before) / (self.t[i + 1] - self.t[i])[:, None]
 
     def _place(self, at: Array) -> tuple[NDArray[np.intp], Array]:
         """The sample intervals that hold the times, (n,), and the time since their start, (n, 1), s."""
         i = np.clip(np.searchsorted(self.t, at, side="right") - 1, 0, len(self.t) - 2)
         return i, (at - self.t[i])[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Block:
+    """Consecutive samples of a gyro.
+
+    Attributes:
+        t: (n,) s.
+        rate: (n, 3) point rates between which lines integrate to what was measured, rad/s.
+        drivers: (n, d) likewise.
+        start: (1, 4) attitude at the first.
+    """
+
+    t: Array
+    rate: Array
+    drivers: Array
+    start: Array
+
+    @property
+    def arc(self) -> Array:
+        """Rotation vectors (n - 1, 3) over the intervals."""
+        step = np.diff(self.t)[:, None]
+        return _arc(self.rate[:-1], np.diff(self.rate, axis=0) / step, step)
+
+    @cached_property
+    def attitude(self) -> Array:
+        """At the samples, (n, 4), in the sensor's frame at the stream's first."""
+        turned = so3.multiply(self.start, _running_product(so3.exp(self.arc)))
+        return np.concatenate([self.start, so3.normalize(turned)])
+
+    @cached_property
+    def integral(self) -> Array:
+        """Integral (n, 3, 3) of the attitude matrix until each sample: every window's bias Jacobian follows from it."""
+        integral = np.zeros((len(self.t), 3, 3))
+        pieces = np.diff(self.t)[:, None, None] * so3.right_jacobian(-self.arc)
+        np.cumsum(so3.matrix(self.attitude[:-1]) @ pieces, axis=0, out=integral[1:])
+        return integral
+
+    def moments(self, vector: Callable[[_Block], Array]) -> Array:
+        """Integral (n, 3, 3, d) of the attitude matrix times each component of a vector until each sample."""
+        values = vector(self)
+        mean = np.ascontiguousarray(0.5 * (values[1:] + values[:-1]).T)
+        turned = np.ascontiguousarray(np.diff(self.integral, axis=0).reshape(-1, 9).T)
+        until = np.zeros((9, len(mean), len(self.t)))
+        np.cumsum(turned[:, None] * mean, axis=2, out=until[..., 1:])
+        return until.reshape(3, 3, -1, len(self.t)).transpose(3, 0, 1, 2)
+
+
+# What blocks are asked for.
+_rates, _drivers, _attitudes, _integrals = map(attrgetter, ("rate", "drivers", "attitude", "integral"))
 
 
 def trapezoid_excess(t: Array, mean: Array) -> Array:
@@ -216,23 +303,29 @@ def trapezoid_excess(t: Array, mean: Array) -> Array:
     return excess
 
 
-def _gap_variance(t: Array, mean: Array) -> Array:
-    """(N - 1,) rad^2 per axis that a straight line across each interval may be off: zero where it is no gap.
+def _gap_variance(t: Array, mean: Array) -> tuple[Array, Array]:
+    """Times (m,), s, and at them rad^2 per axis that straight lines across the gaps until then may be off, in all.
 
-    A line over T is off by T^3 w'' / 12, w'' as bent as between samples; but never by more than T times the spread of
-    the rates.
+    Between these times it grows in proportion to time; there are none but the ends of gaps. A line over T is off by
+    T^3 w'' / 12, w'' as bent as between samples; but never by more than T times the spread of the rates.
     """
     step = np.diff(t)
     usual = float(np.median(step))
     gap = step > _GAP * usual
-    if not gap.any():
-        return np.zeros(len(step))
-    even = ~(gap[1:] | gap[:-1])
-    bends = (mean[2:] - 2.0 * mean[1:-1] + mean[:-2])[even] / usual**2
-    bent = float(np.sqrt((bends**2).mean())) if len(bends) else np.inf
+    found = np.flatnonzero(gap)
+    if not len(found):
+        return t[:1], np.zeros(1)
+    square, count = 0.0, 0
+    for begin in range(0, len(t) - 2, _BLOCK):
+        values, beside = mean[begin : begin + _BLOCK + 2], gap[begin : begin + _BLOCK + 1]
+        bends = (values[2:] - 2.0 * values[1:-1] + values[:-2])[~(beside[1:] | beside[:-1])] / usual**2
+        square, count = square + float((bends**2).sum()), count + bends.size
+    bent = float(np.sqrt(square / count)) if count else np.inf
     spread = float(np.sqrt(mean.var(axis=0).mean()))
-    sigma = np.minimum(step * spread, step**3 * bent / 12.0)
-    return np.where(gap, sigma**2, 0.0)
+    sigma = np.minimum(step[found] * spread, step[found] ** 3 * bent / 12.0)
+    until = np.cumsum(sigma**2)
+    ends = np.stack([t[found], t[found + 1]], axis=1).ravel()
+    return ends, np.stack([until - sigma**2, until], axis=1).ravel()
 
 
 def _arc(w0: Array, a: Array, s: Array) -> Array:

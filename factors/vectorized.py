@@ -10,7 +10,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import gtsam
@@ -223,24 +223,9 @@ class VectorizedFactor:
 
     @cached_property
     def _places(self) -> tuple[list[slice], list[Any]]:
-        """The columns of each key in the whole Jacobian (n, m, width), and the elements each block is added to."""
-        widths = [0] * len(self.keys)
-        for slots, block in zip(self._slots, self.blocks, strict=True):
-            width = dimension(block)
-            for slot in [slots] if isinstance(slots, int) else slots:
-                widths[slot] = width
-        ends = np.cumsum(widths)
-        columns = [slice(int(end) - width, int(end)) for end, width in zip(ends, widths, strict=True)]
-        n, m = len(self.model.time), self.model.rows
-        rows = (np.arange(n * m) * int(ends[-1])).reshape(n, m, 1)
-        targets: list[Any] = []
-        for slots in self._slots:
-            if isinstance(slots, int):
-                targets.append(columns[slots])
-            else:
-                first, width = (ends - widths)[slots], widths[slots[0]]
-                targets.append(rows + first[:, None, None] + np.arange(width))
-        return columns, targets
+        """As `_places` says."""
+        slots = tuple(each if isinstance(each, int) else tuple(each) for each in self._slots)
+        return _places(len(self.model.time), self.model.rows, slots, tuple(map(dimension, self.blocks)))
 
     def _lay_out(self, blocks: Sequence[Array], jacobians: list[Array]) -> None:
         n, m = blocks[0].shape[:2]
@@ -266,6 +251,34 @@ class VectorizedFactor:
             jacobians[slot] = np.vstack([R[:, start:stop], np.zeros((1, stop - start))])
             start = stop
         return np.append(d, rest)
+
+
+@lru_cache(maxsize=1000)
+def _places(
+    n: int, m: int, slots: tuple[int | tuple[int, ...], ...], dimensions: tuple[int, ...]
+) -> tuple[list[slice], list[Any]]:
+    """The columns of each key in the whole Jacobian (n, m, width), and the elements each block is added to.
+
+    Most factors of a graph have the same.
+
+    Args:
+        n, m: measurements, and the rows of each.
+        slots: of each block the position of its key, or of each measurement's, among the factor's keys.
+        dimensions: of each block.
+    """
+    widths: dict[int, int] = {}
+    for own, width in zip(slots, dimensions, strict=True):
+        widths |= dict.fromkeys([own] if isinstance(own, int) else own, width)
+    ends = np.cumsum([widths[slot] for slot in range(len(widths))])
+    columns = [slice(int(end) - widths[slot], int(end)) for slot, end in enumerate(ends)]
+    rows = (np.arange(n * m) * int(ends[-1])).reshape(n, m, 1)
+    targets: list[Any] = []
+    for own, width in zip(slots, dimensions, strict=True):
+        if isinstance(own, int):
+            targets.append(columns[own])
+        else:
+            targets.append(rows + (ends[list(own)] - width)[:, None, None] + np.arange(width))
+    return columns, targets
 
 
 class Ensemble:

@@ -114,7 +114,8 @@ def acting(errors: Parameter | None, drivers: Mapping[Assumption, Array | None])
     """Those of a gyro's drivers that its errors act on, side by side, (N, d): of (N, 3) and (N,); None: none."""
     names = {q.name for q in errors.quantities} if errors else set()
     found = [driver for each, driver in drivers.items() if driver is not None and each.names[0] in names]
-    return np.column_stack(found) if found else None
+    alone = len(found) == 1 and found[0].ndim == 2
+    return found[0] if alone else np.column_stack(found) if found else None
 
 
 def stamped(parameter: Parameter | None, name: str, sigma: float) -> Parameter | None:

@@ -42,6 +42,11 @@ def shared_keyframes(stamps: Array, origin: float, shared: float, longest: float
     return time[order], np.append(0, np.cumsum(count[order]))
 
 
+def as_slice(of: NDArray[np.intp]) -> NDArray[np.intp] | slice:
+    """Indexes; consecutive ones as a slice, so that what they take of an array is no copy."""
+    return slice(int(of[0]), int(of[-1]) + 1) if len(of) and (np.diff(of) == 1).all() else of
+
+
 @dataclass(frozen=True)
 class Trunk:
     """What a chain over the end of a recording that grows goes on from.
@@ -163,7 +168,9 @@ class GyroChain:
 
     def bias_keys(self, keyframes: Sequence[int] | NDArray[np.intp]) -> list[int]:
         """Variables of the bias in force up to keyframes."""
-        return [self.bias.key(int(n)) for n in self.nodes[keyframes]]
+        nodes = self.nodes[keyframes].tolist()
+        keys = {n: self.bias.key(n) for n in set(nodes)}
+        return [keys[n] for n in nodes]
 
     @property
     def error_keys(self) -> list[int]:
@@ -203,12 +210,12 @@ class GyroChain:
     def _increments(self, after: NDArray[np.intp]) -> list[Factor]:
         """Those that lead to keyframes: gtsam's native factors where all that they depend on is the bias."""
         states = [self.state(k - 1) for k in after], [self.state(k) for k in after]
-        bias, turns, variance = self.bias_keys(after), self.turns[after - 1], self.variance[after - 1]
+        bias, turns, variance = self.bias_keys(after), self.turns[as_slice(after - 1)], self.variance[after - 1]
         if self.errors is None and self.platform is None:
             native = ahrs_factors(*states, bias, turns, self.gyro.bias_hat, variance)
             return [Factor("gyro", f) for f in native]
-        carrying = None if self.platform_turns is None else self.platform_turns[after - 1]
-        model = GyroIncrementFactor(self.time[after], turns, self.gyro, np.sqrt(variance), carrying, self.platform)
+        carrying = None if self.platform_turns is None else self.platform_turns[as_slice(after - 1)]
+        model = GyroIncrementFactor(self.time[as_slice(after)], turns, self.gyro, np.sqrt(variance), carrying, self.platform)
         return [Factor.process_of("gyro", model.on(*states, bias, *self.error_keys))]
 
     def predict(

@@ -24,6 +24,8 @@ _ORDER = 6
 # Means of so many samples are looked at, one after the other, until two of them agree to this part: below a sensor's
 # own filter its noise is white.
 _MEANS, _ALIKE = (1, 2, 4, 8), 0.1
+# Differences worked out at a time.
+_BLOCK = 100_000
 # Fewer differences tell nothing; the best of them are not trusted to less than this, in the logarithm.
 _FEWEST, _TRUSTED = 200, 0.05
 # A walk is looked for in steps of this, in the logarithm, where the bias was seen so many times.
@@ -176,7 +178,8 @@ def white_density(time: Array, samples: Array) -> tuple[float, float] | None:
     before: float | None = None
     for count in _MEANS:
         pieces = np.split(samples, np.flatnonzero(~even) + 1)
-        differences = np.concatenate([_differences(piece, count) for piece in pieces])
+        found = [_differences(piece, count) for piece in pieces]
+        differences = found[0] if len(found) == 1 else np.concatenate(found)
         if differences.size < _FEWEST or np.mean(differences == 0.0) > 0.05:
             return None
         density = robust_sigma(differences) / comb(2 * _ORDER, _ORDER) ** 0.5 * (count * interval) ** 0.5
@@ -189,9 +192,12 @@ def white_density(time: Array, samples: Array) -> tuple[float, float] | None:
 
 def _differences(samples: Array, count: int) -> Array:
     """Of high order, of means of `count` samples (n, k)."""
-    whole = len(samples) // count * count
-    means = samples[:whole].reshape(-1, count, samples.shape[1]).mean(axis=1)
-    return np.diff(means, _ORDER, axis=0).ravel() if len(means) > _ORDER else np.empty(0)
+    out = np.empty((max(len(samples) // count - _ORDER, 0), samples.shape[1]))
+    for begin in range(0, len(out), _BLOCK):
+        end = min(begin + _BLOCK, len(out))
+        some = samples[begin * count : (end + _ORDER) * count]
+        out[begin:end] = np.diff(some.reshape(-1, count, samples.shape[1]).mean(axis=1), _ORDER, axis=0)
+    return out.ravel()
 
 
 def typical(covariance: Array | None, *components: int) -> float | None:

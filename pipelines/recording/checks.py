@@ -56,6 +56,14 @@ def clean(
     return seconds(t_ns[keep], epoch_ns), keep
 
 
+def taken(values: Array, rows: NDArray[np.int64]) -> Array:
+    """Rows of an array; of the array itself where they are all, or where it never changes and takes no memory."""
+    if values.strides[0] == 0:
+        return np.broadcast_to(values[0], (len(rows), *values.shape[1:]))
+    everything = len(rows) == len(values) and bool((rows[1:] > rows[:-1]).all())
+    return values if everything else values[rows]
+
+
 def seconds(t_ns: NDArray[np.int64], epoch_ns: int) -> Array:
     """Stamps as s from epoch_ns, correctly rounded over a hundred days."""
     return np.asarray((t_ns - epoch_ns) / 1e9)
@@ -125,13 +133,16 @@ def believed(topic: str, covariance: Array, least: float, dropped: dict[str, int
 
     Both are what drivers write that know nothing; they are counted in `dropped`.
     """
-    absent = covariance[:, 0, 0] == -1.0
-    variance = np.trace(covariance, axis1=1, axis2=2) / 3.0
+    # Those that never change are one in memory.
+    alike = len(covariance) if len(covariance) and covariance.strides[0] == 0 else 1
+    own = covariance[:1] if alike > 1 else covariance
+    absent = own[:, 0, 0] == -1.0
+    variance = np.trace(own, axis1=1, axis2=2) / 3.0
     tiny = ~absent & (variance > 0.0) & (variance < least)
-    count(dropped, f"{topic}: covariance of -1, not believed (kept)", int(np.count_nonzero(absent)))
-    count(dropped, f"{topic}: covariance too small for any sensor, not believed (kept)", int(np.count_nonzero(tiny)))
+    for mask, what in ((absent, "of -1"), (tiny, "too small for any sensor")):
+        count(dropped, f"{topic}: covariance {what}, not believed (kept)", alike * int(np.count_nonzero(mask)))
     unknown = absent | tiny
-    return np.where(unknown[:, None, None], 0.0, covariance) if unknown.any() else covariance
+    return np.broadcast_to(np.where(unknown[:, None, None], 0.0, own), covariance.shape) if unknown.any() else covariance
 
 
 def count(dropped: dict[str, int], reason: str, number: int) -> None:

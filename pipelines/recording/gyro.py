@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.recording.checks import LEAST_GYRO, check_gyro, clean, count, density
+from pipelines.recording.checks import LEAST_GYRO, check_gyro, clean, count, density, taken
 from pipelines.recording.faults import drop_faults
 from pipelines.recording.reading import Recording
 from pipelines.recording.series import ImuSeries
@@ -22,7 +22,7 @@ def read_gyro(
     """
     imu = recording.imu(topic)
     t, keep = usable(topic, imu, epoch_ns, dropped)
-    return t, imu.gyro[keep], density(topic, t, imu.gyro_cov[keep], LEAST_GYRO, dropped)
+    return t, taken(imu.gyro, keep), density(topic, t, taken(imu.gyro_cov, keep), LEAST_GYRO, dropped)
 
 
 def read_imu(
@@ -34,9 +34,10 @@ def read_imu(
     """
     imu = recording.imu(topic)
     t, keep = usable(topic, imu, epoch_ns, dropped)
-    force = imu.accel[keep]
+    force = taken(imu.accel, keep)
     told = np.isfinite(force).all() and force.any() and not (imu.accel_cov[keep, 0, 0] == -1.0).any()
-    return t, imu.gyro[keep], density(topic, t, imu.gyro_cov[keep], LEAST_GYRO, dropped), force if told else None
+    noise = density(topic, t, taken(imu.gyro_cov, keep), LEAST_GYRO, dropped)
+    return t, taken(imu.gyro, keep), noise, force if told else None
 
 
 def usable(
@@ -48,6 +49,7 @@ def usable(
     """
     count(dropped, f"{topic}: stamped by log time (kept)", imu.stamped_by_log)
     t, keep = clean(topic, imu.t_ns, epoch_ns, imu.gyro, dropped, least)
-    sound = drop_faults(topic, t, imu.gyro[keep], dropped, "rad/s")
-    check_gyro(topic, t[sound], imu.gyro[keep[sound]])
-    return t[sound], keep[sound]
+    sound = drop_faults(topic, t, taken(imu.gyro, keep), dropped, "rad/s")
+    t, keep = taken(t, sound), keep[sound]
+    check_gyro(topic, t, taken(imu.gyro, keep))
+    return t, keep

@@ -22,7 +22,7 @@ from factors.los import LosDirectionFactor, Surroundings
 from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
 from pipelines.graph.assumptions import acting
-from pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk
+from pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk, as_slice
 from pipelines.graph.motion import Motion
 from pipelines.graph.noise import Level
 from pipelines.graph.priors import vector_prior
@@ -252,21 +252,21 @@ def _picture_factors(model: _Model, keyframes: range) -> list[Factor]:
     k = np.array(keyframes)
     rolls = np.isfinite(model.measured[k, 2])
     return [
-        _picture_factor(model, k[mine], rows, family)
-        for rows, family, mine in ((2, _FAMILIES[0], ~rolls), (3, _FAMILIES[1], rolls))
+        _picture_factor(model, k[mine], count, family)
+        for count, family, mine in ((2, _FAMILIES[0], ~rolls), (3, _FAMILIES[1], rolls))
         if mine.any()
     ]
 
 
-def _picture_factor(model: _Model, k: NDArray[np.intp], rows: int, family: str) -> Factor:
-    p = model.parameters
+def _picture_factor(model: _Model, k: NDArray[np.intp], count: int, family: str) -> Factor:
+    p, some = model.parameters, as_slice(k)
     rows_model = LosDirectionFactor(
-        model.chain.time[k],
-        model.measured[k, :rows],
-        model.sqrt_information[k, :rows, :rows],
-        model.angles[k],
+        model.chain.time[some],
+        model.measured[some, :count],
+        model.sqrt_information[some, :count, :count],
+        model.angles[some],
         p.names,
-        None if model.around is None else model.around[k],
+        None if model.around is None else model.around[some],
         len(p.gyro.quantities) if p.gyro is not None and p.sight is not None else 0,
     )
     columns: list[int | list[int]] = [[model.chain.state(i) for i in k], p.angles.key]

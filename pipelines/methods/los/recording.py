@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise, product
 from pathlib import Path
@@ -34,6 +34,8 @@ _WIDEST_ERROR = 0.5
 _STRETCH, _MOVED = 2.0, 0.01
 # Pictures this far apart, s, and at least so many, tell the signs of the gyro's axes.
 _STRIDE, _FEWEST = 0.2, 20
+# Samples of the gyro looked at together.
+_BLOCK = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +132,9 @@ def check_gimbal(topic: str, data: LosData) -> None:
 
     A gimbal locked on purpose is told from a frozen encoder by the LOS error, which then moves with the carrier.
     """
-    turned = _turned_by_carrier(data).sum(axis=2)
+    turned = np.empty((len(data.gyro_t), 2))
+    for some, by_axes in _turned_by_carrier(data):
+        turned[some] = by_axes.sum(axis=2)
     for start, stop in pairwise(np.arange(data.gimbal_t[0], data.gimbal_t[-1], _STRETCH)):
         gimbal, turn, error = (
             _span(values[slice(*np.searchsorted(t, [start, stop]))])
@@ -158,8 +162,12 @@ def check_signs(topic: str, data: LosData) -> None:
     if len(at) < _FEWEST:
         return
     gimbal = np.stack([np.interp(at, data.gimbal_t, data.gimbal[:, k]) for k in range(2)], axis=1)
-    columns = _turned_by_carrier(data).reshape(len(data.gyro_t), 6).T
-    turned = np.stack([np.interp(at, data.gyro_t, column) for column in columns], axis=1).reshape(-1, 2, 3)
+    turned = np.empty((len(at), 2, 3))
+    for some, by_axes in _turned_by_carrier(data):
+        t = data.gyro_t[some]
+        mine = slice(np.searchsorted(at, t[0]), np.searchsorted(at, t[-1], side="right"))
+        columns = by_axes.reshape(len(t), 6).T
+        turned[mine] = np.stack([np.interp(at[mine], t, column) for column in columns], axis=1).reshape(-1, 2, 3)
     # The gimbal's own turn about the camera's z and x, less what the picture shows of it.
     middle = 0.5 * (gimbal[1:, 1] + gimbal[:-1, 1])
     held = np.diff(gimbal, axis=0) * np.stack([np.cos(middle), np.ones_like(middle)], axis=1) - np.diff(error, axis=0)
@@ -176,14 +184,25 @@ def check_signs(topic: str, data: LosData) -> None:
         )
 
 
-def _turned_by_carrier(data: LosData) -> Array:
-    """(N, 2, 3) rad: how far each gyro axis has turned the picture about the camera's z and x since the start."""
-    azimuth, elevation = (np.interp(data.gyro_t, data.gimbal_t, data.gimbal[:, k]) for k in range(2))
-    s, c, se, ce = np.sin(azimuth), np.cos(azimuth), np.sin(elevation), np.cos(elevation)
-    wx, wy, wz = data.gyro.T
-    about_z = np.stack([se * s * wx, -se * c * wy, ce * wz], axis=1)
-    about_x = np.stack([c * wx, s * wy, np.zeros_like(wz)], axis=1)
-    return np.cumsum(np.stack([about_z, about_x], axis=1) * np.gradient(data.gyro_t)[:, None, None], axis=0)
+def _turned_by_carrier(data: LosData) -> Iterator[tuple[slice, Array]]:
+    """Samples of the gyro, and (n, 2, 3) rad: how far each axis has turned the picture about the camera's z and x.
+
+    That is since the start. The samples come block by block, each with the last one of the block before.
+    """
+    step, before = np.gradient(data.gyro_t), np.zeros((1, 2, 3))
+    for begin in range(0, len(step), _BLOCK):
+        some = slice(max(begin - 1, 0), begin + _BLOCK)
+        t, (wx, wy, wz) = data.gyro_t[some], data.gyro[some].T
+        azimuth, elevation = (np.interp(t, data.gimbal_t, data.gimbal[:, k]) for k in range(2))
+        s, c, se, ce = np.sin(azimuth), np.cos(azimuth), np.sin(elevation), np.cos(elevation)
+        about_z = np.stack([se * s * wx, -se * c * wy, ce * wz], axis=1)
+        about_x = np.stack([c * wx, s * wy, np.zeros_like(wz)], axis=1)
+        moves = np.stack([about_z, about_x], axis=1) * step[some, None, None]
+        if begin:
+            moves[:1] = before
+        turned = np.cumsum(moves, axis=0)
+        before = turned[-1:]
+        yield some, turned
 
 
 def _span(values: Array) -> Array:
