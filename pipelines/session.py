@@ -91,8 +91,10 @@ class Recorded:
         return self.recording.sha256()
 
     def facts(self, config: Config) -> SessionFacts:
-        """Of the recording."""
-        return session_facts(self.recording, config)
+        """Of the recording, whose stamps are not kept then."""
+        facts = session_facts(self.recording, config)
+        self.recording.forget_times()
+        return facts
 
     def truth(self) -> dict[str, object] | None:
         """The attachment's. Raises InputError when it is no JSON object."""
@@ -266,7 +268,8 @@ class Session:
             check: hold incremental estimates against batch.
             report: with the method's findings.
         """
-        sha256, truth = self.origin.sha256(), self.origin.truth()
+        # The facts before anything is solved, so that the stamps need not be kept meanwhile.
+        sha256, truth, facts = self.origin.sha256(), self.origin.truth(), self.facts
         found = []
         causes: tuple[Cause, ...] | None = None
         for estimate, problem in solved:
@@ -318,7 +321,7 @@ class Session:
                     assessment=assessment,
                     recording=self.origin.name,
                     sha256=sha256,
-                    facts=self.facts,
+                    facts=facts,
                     config=self.config,
                     truth=truth,
                     seconds=seconds,

@@ -70,6 +70,8 @@ class MessageReader:
         self.topics = self._list_topics()
         self._at_hand: dict[tuple[str, tuple[str, ...]], TopicColumns] = {}
         self._times: dict[str, Times] = {}
+        # Of topics read by now, what their stamps tell: how late messages were logged at least, ns, and sentences.
+        self._told: dict[str, tuple[int | None, tuple[str, ...]]] = {}
 
     @cached_property
     def epoch_ns(self) -> int:
@@ -94,14 +96,26 @@ class MessageReader:
     @property
     def delay_ns(self) -> int:
         """How much later than their stamps messages were logged, at least, in the topics read by now; ns."""
-        delays = [int((log_ns - t_ns).min()) for t_ns, log_ns in self._times.values() if len(t_ns)]
-        return min(delays, default=0)
+        return min((delay for delay, _ in self._tell().values() if delay is not None), default=0)
 
     @property
     def stamp_notes(self) -> tuple[str, ...]:
         """Sentences about how the stamps came about in the topics read by now."""
-        timed = [name for name in self.topics if name in self._times and self.topics[name].type in TIMED]
-        return tuple(note for name in timed for note in stamp_notes(name, *self._times[name]))
+        told = self._tell()
+        return tuple(note for name in self.topics if name in told for note in told[name][1])
+
+    def _tell(self) -> Mapping[str, tuple[int | None, tuple[str, ...]]]:
+        for name in self._times.keys() - self._told.keys():
+            t_ns, log_ns = self._times[name]
+            timed = name in self.topics and self.topics[name].type in TIMED
+            delay = int((log_ns - t_ns).min()) if len(t_ns) else None
+            self._told[name] = delay, stamp_notes(name, t_ns, log_ns) if timed else ()
+        return self._told
+
+    def forget_times(self) -> None:
+        """Keep what the stamps read by now tell, and not the stamps: `times` reads them anew."""
+        self._tell()
+        self._times.clear()
 
     @property
     def times(self) -> Mapping[str, Times]:

@@ -153,6 +153,10 @@ class Recording:
         times = self._reader.times
         return {**times, **{name: times[base] for name, base in made.items() if base in times}}
 
+    def forget_times(self) -> None:
+        """Let go of the stamps read by now, which would stay as long as the recording; `times` reads them anew."""
+        self._reader.forget_times()
+
     def there(self) -> str:
         """A phrase that lists the topics of the recording, and what is lost of it."""
         return self._reader.there()
