@@ -183,8 +183,8 @@ class GyroPath:
             return self._increments(start, stop, scale)
         begins = range(0, len(start), _TOGETHER)
         pieces = [self._increments(start[k : k + _TOGETHER], stop[k : k + _TOGETHER], scale) for k in begins]
-        parts = zip(*([getattr(piece, name) for name in Increments.stacked] for piece in pieces), strict=True)
-        return Increments(*(None if part[0] is None else np.concatenate(part) for part in parts))
+        there = [name for name in Increments.stacked if getattr(pieces[0], name) is not None]
+        return replace(pieces[0], **{name: np.concatenate([getattr(p, name) for p in pieces]) for name in there})
 
     def _increments(self, start: Array, stop: Array, scale: bool) -> Increments:
         # Both ends in one call: what a few windows cost is calls.

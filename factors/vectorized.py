@@ -267,17 +267,17 @@ def _places(
         dimensions: of each block.
     """
     widths: dict[int, int] = {}
-    for own, width in zip(slots, dimensions, strict=True):
-        widths |= dict.fromkeys([own] if isinstance(own, int) else own, width)
+    for own, size in zip(slots, dimensions, strict=True):
+        widths |= dict.fromkeys([own] if isinstance(own, int) else own, size)
     ends = np.cumsum([widths[slot] for slot in range(len(widths))])
     columns = [slice(int(end) - widths[slot], int(end)) for slot, end in enumerate(ends)]
     rows = (np.arange(n * m) * int(ends[-1])).reshape(n, m, 1)
     targets: list[Any] = []
-    for own, width in zip(slots, dimensions, strict=True):
+    for own, size in zip(slots, dimensions, strict=True):
         if isinstance(own, int):
             targets.append(columns[own])
         else:
-            targets.append(rows + (ends[list(own)] - width)[:, None, None] + np.arange(width))
+            targets.append(rows + (ends[list(own)] - size)[:, None, None] + np.arange(size))
     return columns, targets
 
 

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import so3
+from factors import preintegration, so3
 from factors.preintegration import GyroPath
 
 
@@ -102,6 +102,30 @@ def test_long_streams_stay_unit_and_consistent() -> None:
         product = so3.multiply(product, q)
     whole = path.increments(edges[:1], edges[-1:]).wxyz[0]
     np.testing.assert_allclose(so3.log(so3.multiply(so3.inverse(whole), product)), 0.0, atol=1e-12)
+
+
+def test_a_long_stream_is_integrated_block_by_block(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few of many blocks are kept, and windows reach over several of them, forwards and backwards."""
+    t, rate = _stream(n=2_000)
+    t[700:] += 0.3
+    force = 9.8 + np.stack([np.cos(k * t) for k in (1.0, 2.0, 3.0)], axis=1)
+    start = np.concatenate([np.linspace(t[0], t[-1], 101), [t[-1], 1.0]])
+    stop = np.append(start[1:], 9.0)
+
+    def found() -> tuple[np.ndarray, ...]:
+        path = GyroPath(t, rate, [0.1, 0.2, -0.1], force)
+        turns = path.increments(start, stop, scale=True)
+        return *(getattr(turns, name) for name in turns.stacked), *(f(stop) for f in (path.attitude, path.rate))
+
+    whole = found()
+    monkeypatch.setattr(preintegration, "_BLOCK", 64)
+    monkeypatch.setattr(preintegration, "_KEPT", 3)
+    monkeypatch.setattr(preintegration, "_TOGETHER", 10)
+    for one, other in zip(whole, found(), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-13 * max(np.abs(one).max(), 1.0))
+    path = GyroPath(t, rate)
+    path.attitude(stop)
+    assert len(path._kept) == 3
 
 
 def test_names_wrong_shapes() -> None:

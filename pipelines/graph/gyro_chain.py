@@ -215,7 +215,9 @@ class GyroChain:
             native = ahrs_factors(*states, bias, turns, self.gyro.bias_hat, variance)
             return [Factor("gyro", f) for f in native]
         carrying = None if self.platform_turns is None else self.platform_turns[as_slice(after - 1)]
-        model = GyroIncrementFactor(self.time[as_slice(after)], turns, self.gyro, np.sqrt(variance), carrying, self.platform)
+        model = GyroIncrementFactor(
+            self.time[as_slice(after)], turns, self.gyro, np.sqrt(variance), carrying, self.platform
+        )
         return [Factor.process_of("gyro", model.on(*states, bias, *self.error_keys))]
 
     def predict(

@@ -142,7 +142,9 @@ def believed(topic: str, covariance: Array, least: float, dropped: dict[str, int
     for mask, what in ((absent, "of -1"), (tiny, "too small for any sensor")):
         count(dropped, f"{topic}: covariance {what}, not believed (kept)", alike * int(np.count_nonzero(mask)))
     unknown = absent | tiny
-    return np.broadcast_to(np.where(unknown[:, None, None], 0.0, own), covariance.shape) if unknown.any() else covariance
+    return (
+        np.broadcast_to(np.where(unknown[:, None, None], 0.0, own), covariance.shape) if unknown.any() else covariance
+    )
 
 
 def count(dropped: dict[str, int], reason: str, number: int) -> None:
