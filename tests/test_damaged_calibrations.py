@@ -23,11 +23,11 @@ from tests.command import Command
 from tests.damage import boundaries, cuts, flips, rewrite, spoilt
 
 LOS = LosScenario(
-    duration_s=12.0,
+    duration_s=7.0,
     carrier=EulerMotion(
-        yaw=[Swing(amplitude_deg=20, frequency_hz=0.15)],
-        pitch=[Swing(amplitude_deg=8, frequency_hz=0.31)],
-        roll=[Swing(amplitude_deg=12, frequency_hz=0.21)],
+        yaw=[Swing(amplitude_deg=20, frequency_hz=0.3)],
+        pitch=[Swing(amplitude_deg=8, frequency_hz=0.62)],
+        roll=[Swing(amplitude_deg=12, frequency_hz=0.42)],
     ),
     image_rate_hz=10.0,
     gyro_rate_hz=100.0,
@@ -121,7 +121,7 @@ def test_what_is_lost_is_in_the_result_the_report_and_the_terminal(
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert any(told in note for note in result["notes"])
     lost = result["session"]["dropped"]["/imu: lost with damaged bytes of the file"]
-    assert lost + result["session"]["counts"]["/imu"] == 12 * 100
+    assert lost + result["session"]["counts"]["/imu"] == 7 * 100
     assert (tmp_path / "out" / "report.html").read_text().count("is damaged: 1 chunk") == 2
     for command in (
         ["info", path],

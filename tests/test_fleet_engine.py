@@ -43,7 +43,7 @@ Start = Callable[..., subprocess.Popen[str]]
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recordings")
-    scenario = HeadScenario(duration_s=4.0, gyro_rate_hz=100.0, vision_rate_hz=20.0, truth_rate_hz=1.0, sensors=IDEAL)
+    scenario = HeadScenario(duration_s=4.0, gyro_rate_hz=100.0, vision_rate_hz=10.0, truth_rate_hz=1.0, sensors=IDEAL)
     for seed in range(COUNT):
         data, truth = simulate_head(scenario, seed)
         write_head(folder / f"U{seed:02}.mcap", data, truth, head_config(scenario))

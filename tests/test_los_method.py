@@ -85,7 +85,11 @@ def _mean_nees(scenario: LosScenario, solve: Solve, runs: int) -> tuple[float, i
 
 @pytest.mark.parametrize(
     ("scenario", "solve", "runs"),
-    [(REAL, solve_batch, 3), (SHORT, solve_batch, 5), (REAL, solve_incremental, 1)],
+    [
+        (REAL, solve_batch, 3),
+        (SHORT, solve_batch, 5),
+        (REAL.model_copy(update={"duration_s": 10.0}), solve_incremental, 1),
+    ],
     ids=["real", "ideal", "real, incremental"],
 )
 def test_errors_fit_their_covariance_in_a_few_short_runs(scenario: LosScenario, solve: Solve, runs: int) -> None:
@@ -139,8 +143,9 @@ def test_an_outlier_as_the_first_sight_of_a_target_does_not_mislead() -> None:
 
 
 def test_incremental_agrees_with_batch() -> None:
-    data, _ = simulate_los(SHORT, 5)
-    made = problem(data, _config(SHORT))
+    brief = SHORT.model_copy(update={"duration_s": 10.0})
+    data, _ = simulate_los(brief, 5)
+    made = problem(data, _config(brief))
     batch, incremental = solve_batch(made), solve_incremental(made)
     assert np.abs((incremental.values - batch.values) / batch.sigmas).max() < 0.2
     np.testing.assert_allclose(incremental.sigmas, batch.sigmas, rtol=0.1)

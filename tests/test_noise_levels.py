@@ -76,7 +76,7 @@ def test_all_noise_stated_wrong(method: str, factor: float) -> None:
 
 
 def test_the_incremental_solver_finds_them_too() -> None:
-    simulated = simulate("head", {"duration_s": 15.0, "vision_rate_hz": 15.0, "sensors": {}}, seed=1)
+    simulated = simulate("head", {"duration_s": 10.0, "vision_rate_hz": 12.0, "sensors": {}}, seed=1)
     right_config = load_config(simulated.config.encode())
     wrong_config = stated(right_config, {"vision_attitude": 3.0, "gyro_density": 1.0 / 3.0})
     configs = (right_config, wrong_config)
