@@ -8,6 +8,7 @@ following never takes more than a third of a core for reading.
 
 from __future__ import annotations
 
+import gc
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
@@ -118,6 +119,8 @@ class Follower:
                 another recording, config or version.
             IndeterminateError: states other than the parameters are not determined.
         """
+        # What is there by now stays: to look through it for garbage takes as long as dozens of updates, every minute.
+        gc.freeze()
         source, patience = self.source, self.settings.patience
         size, grown, due = -1, time.monotonic(), 0.0
         while True:

@@ -53,6 +53,8 @@ _MORE, _MOVED, _FAR = 1.02, 0.2, 0.02
 _DOUBTED, _TOO_MANY = 5, 0.25
 # Later the past is marginalised out this often, s.
 MARGINALIZE_EVERY = 20.0
+# Of the steps marginalised out so many are freed with each new one: a thousand at once take longer than an update.
+_FREED = 10
 # Estimates kept for plots, at most so many a second.
 _HISTORY_RATE = 5.0
 
@@ -132,6 +134,7 @@ class Run:
         self.way = Way()
         self.moments = 0
         self.walked: set[int] = set()
+        self._outdated: list[Step] = []  # steps no longer needed, yet to be freed
         self._smoother: Smoother | None = None  # None before the first batch solution
         self._stamps: dict[int, float] = {}  # of the variables held that age, in the window's unit
         self._times: list[float] = []  # of the steps, where the window's unit is keyframes
@@ -187,6 +190,7 @@ class Run:
         self.current_keys.update(step.current_keys)
         self.keyframes = max(self.keyframes, step.keyframes.stop)
         self.past.append(step)
+        del self._outdated[-_FREED:]
         if isinstance(self.window, Keyframes):
             self._times.append(step.time)
         if self._smoother is not None:
@@ -436,7 +440,8 @@ class Run:
 
     def _continue_from(self, state: State) -> None:
         """Go on from a state alone."""
-        self.base, self.past, self._noise, self._bent = state, [], None, None
+        self.base, self._outdated, self.past = state, self.past, []
+        self._noise = self._bent = None
         self._start([state.factor], state.estimate, state.stamps)
 
     def _start(self, factors: Sequence[Factor], values: gtsam.Values, stamps: Mapping[int, float]) -> None:
