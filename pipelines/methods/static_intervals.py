@@ -23,6 +23,8 @@ _MARGIN = 0.25
 # ... and more where the sum of what the readings differ by from the quietest half of the interval, from there on, comes
 # out beyond the first many of its sigmas: back to where it was last within the second.
 _MOVED, _UNMOVED = 5.0, 1.0
+# Samples whose means tell whether noise is white, and how many such means it takes.
+_TOGETHER, _FEWEST_BLOCKS, _TINY = 8, 4, np.finfo(float).tiny
 # The noise is what the quietest twentieth of the recording shows, between these multiples of the stated one.
 _FLOOR_SHARE, _FLOOR_LIMITS = 0.05, (0.2, 10.0)
 # A steady turn is as quiet; its mean rate departs from that of the static intervals by more than this, rad/s, when what
@@ -51,6 +53,8 @@ def find_static_intervals(t: Array, gyro: Array, accel: Array, gyro_sigma: float
         InputError: there is none.
     """
     runs, scatter, floor = _quiet_runs(t, [(gyro, gyro_sigma), (accel, accel_sigma)])
+    ends = [_unmoved(run, [(gyro, float(floor[0])), (accel, float(floor[1]))]) for run in runs]
+    runs = np.array([run for run in ends if t[run[1]] - t[run[0]] >= _SHORTEST], dtype=np.intp).reshape(-1, 2)
     means, forces = (
         np.array([values[a : b + 1].mean(axis=0) for a, b in runs]).reshape(-1, 3) for values in (gyro, accel)
     )
@@ -100,9 +104,7 @@ def _quiet_runs(t: Array, streams: Sequence[tuple[Array, float]]) -> tuple[NDArr
     edges = edges[counted[edges[:, 1]] > counted[edges[:, 0]]]
     margin = round(_MARGIN / interval)
     runs = edges + np.array([margin, -1 - margin])
-    runs = runs[t[runs[:, 1].clip(0)] - t[runs[:, 0].clip(max=len(t) - 1)] >= _SHORTEST]
-    noisy = [(values, least) for (values, _), least in zip(streams, floor.tolist(), strict=True)]
-    runs = np.array([_unmoved(run, noisy) for run in runs], dtype=np.intp).reshape(-1, 2)
+    runs = runs[runs[:, 1] > runs[:, 0]]
     return runs[t[runs[:, 1]] - t[runs[:, 0]] >= _SHORTEST], scatter, floor
 
 
@@ -118,13 +120,24 @@ def _unmoved(run: NDArray[np.intp], streams: Sequence[tuple[Array, float]]) -> t
     before, after = [], []
     for values, noise in streams:
         still = values[middle]
-        mean, sigma = still.mean(axis=0), np.maximum(still.std(axis=0), noise)
+        mean, sigma = still.mean(axis=0), _colour(still) * np.maximum(still.std(axis=0), noise)
         before.append((values[first : middle.start] - mean)[::-1] / sigma)
         after.append((values[middle.stop : last + 1] - mean) / sigma)
     count = middle.stop - middle.start
     return (
         middle.start - _still_for(np.hstack(before), count),
         middle.stop - 1 + _still_for(np.hstack(after), count),
+    )
+
+
+def _colour(values: Array) -> float:
+    """By what sums of some samples (n, d) scatter more than those of white noise: a filtered sensor's are alike."""
+    blocks = len(values) // _TOGETHER
+    means = values[: blocks * _TOGETHER].reshape(blocks, _TOGETHER, -1).mean(axis=1)
+    if blocks < _FEWEST_BLOCKS:
+        return 1.0
+    return float(
+        np.sqrt(np.maximum(_TOGETHER * (means.var(axis=0) / np.maximum(values.var(axis=0), _TINY)).mean(), 1.0))
     )
 
 
