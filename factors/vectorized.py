@@ -222,7 +222,7 @@ class VectorizedFactor:
         return residuals.ravel()
 
     @cached_property
-    def _places(self) -> tuple[list[slice], list[Any]]:
+    def _places(self) -> tuple[list[slice], list[_Place]]:
         """As `_places` says."""
         slots = tuple(each if isinstance(each, int) else tuple(each) for each in self._slots)
         return _places(len(self.model.time), self.model.rows, slots, tuple(map(dimension, self.blocks)))
@@ -231,12 +231,12 @@ class VectorizedFactor:
         n, m = blocks[0].shape[:2]
         columns, targets = self._places
         whole = np.zeros((n * m, columns[-1].stop))
-        flat = whole.reshape(-1)
         for target, block in zip(targets, blocks, strict=True):
-            if isinstance(target, slice):
-                whole[:, target] += block.reshape(n * m, -1)
+            if isinstance(target, tuple):
+                place = np.ndarray(block.shape, whole.dtype, whole, *target)
+                place += block
             else:
-                flat[target] += block
+                whole.reshape(-1)[target] += block
         for slot, column in enumerate(columns):
             jacobians[slot] = whole[:, column]
 
@@ -253,11 +253,16 @@ class VectorizedFactor:
         return np.append(d, rest)
 
 
+# Where a block (n, m, d) is added to the whole Jacobian: offset and strides, bytes, where its keys follow each other
+# evenly, or the elements.
+_Place = tuple[int, tuple[int, int, int]] | NDArray[np.intp]
+
+
 @lru_cache(maxsize=1000)
 def _places(
     n: int, m: int, slots: tuple[int | tuple[int, ...], ...], dimensions: tuple[int, ...]
-) -> tuple[list[slice], list[Any]]:
-    """The columns of each key in the whole Jacobian (n, m, width), and the elements each block is added to.
+) -> tuple[list[slice], list[_Place]]:
+    """The columns of each key in the whole Jacobian (n, m, width), and where each block is added.
 
     Most factors of a graph have the same.
 
@@ -271,13 +276,17 @@ def _places(
         widths |= dict.fromkeys([own] if isinstance(own, int) else own, size)
     ends = np.cumsum([widths[slot] for slot in range(len(widths))])
     columns = [slice(int(end) - widths[slot], int(end)) for slot, end in enumerate(ends)]
-    rows = (np.arange(n * m) * int(ends[-1])).reshape(n, m, 1)
-    targets: list[Any] = []
+    width = int(ends[-1])
+    rows = (np.arange(n * m) * width).reshape(n, m, 1)
+    targets: list[_Place] = []
     for own, size in zip(slots, dimensions, strict=True):
-        if isinstance(own, int):
-            targets.append(columns[own])
+        first = ends[[own] * n if isinstance(own, int) else list(own)] - size
+        apart = int(first[min(1, n - 1)] - first[0])
+        if (np.diff(first) == apart).all():
+            one = np.dtype(float).itemsize
+            targets.append((int(first[0]) * one, ((m * width + apart) * one, width * one, one)))
         else:
-            targets.append(rows + (ends[list(own)] - size)[:, None, None] + np.arange(size))
+            targets.append(rows + first[:, None, None] + np.arange(size))
     return columns, targets
 
 

@@ -11,14 +11,21 @@ import pytest
 
 from factors.loss import TruncatedLoss
 from factors.model import Model, Residuals
+from pipelines.config import load_config
 from pipelines.graph.problem import Array, Estimate, Factor, Parameter, Problem, Quantity, Step
 from pipelines.judgement.observability import assess
-from pipelines.solvers.batch import solve_batch
+from pipelines.methods.los import graph as los
+from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from pipelines.solvers import batch
+from pipelines.solvers.assembly import Assembly
+from pipelines.solvers.batch import CHUNK, solve_batch
 from pipelines.solvers.incremental import solve_incremental
-from pipelines.solvers.marginals import IndeterminateError, reported_covariance
+from pipelines.solvers.marginals import IndeterminateError, joint_information, reported_covariance
+from pipelines.solvers.system import System
 from pipelines.solvers.window import Keyframes
 from tests import chain
 from tests.chain import INTERVAL, PARAMETER, PRIOR, Walk
+from tests.short_problems import los_problem
 
 
 def assert_same(estimate: Estimate, value: Array, covariance: Array, tolerance: float = 1e-8) -> None:
@@ -193,3 +200,38 @@ def test_fixed_quantities_cost_the_others_no_digits() -> None:
     np.testing.assert_allclose(covariance[np.ix_(free, free)], expected, rtol=1e-6)
     assert not covariance[2].any()
     assert not covariance[:, 2].any()
+
+
+def test_the_states_alone_go_to_the_floor() -> None:
+    """Shared variables stay where they are, and a step from there on has only to do with these."""
+    problem = los_problem()
+    whole = Assembly.of(problem.steps(CHUNK))
+    system = System.of(whole.factors, whole.shared(problem), None)
+    values, falls = whole.initial, []
+    for _ in range(3):
+        move = system.linearized(values).states_alone()
+        assert all(not move.at(key).any() for key in system.shared)
+        before, values = system.error(values), values.retract(move)
+        falls.append(before - system.error(values))
+    assert falls[0] > 0.1 * system.error(values)
+    assert abs(falls[2]) < 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_roll_that_pictures_do_not_tell_does_not_swing(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten minutes of los with all assumptions: fewer steps than without settling states, and the answer as good."""
+    scenario = LosScenario(duration_s=600.0, gyro_rate_hz=200.0, image_rate_hz=50.0)
+    problem = los.problem(simulate_los(scenario, seed)[0], load_config(los_config(scenario).encode()))
+    whole = Assembly.of(problem.steps(CHUNK))
+    shared = whole.shared(problem)
+    found = batch.optimize(whole.factors, whole.initial, shared, problem.loss)
+    # Seven and nine; ten without.
+    assert found.iterations < 10
+    system = found.system.without_rejected(found.values)
+    monkeypatch.setattr(batch, "_ERROR_TOLERANCE", 1e-12)
+    last = batch.optimize(system.factors, found.values, shared, None)
+    linear = system.linearized(last.values)
+    sigmas = np.sqrt(np.diag(np.linalg.inv(joint_information(linear.graph, system.ordering, shared))))
+    off = last.values.localCoordinates(found.values)
+    assert np.abs(np.concatenate([off.at(key) for key in shared]) / sigmas).max() < 0.01

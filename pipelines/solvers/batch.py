@@ -48,6 +48,8 @@ _ERROR_TOLERANCE = 1e-5
 # A step that was to lower the error by less than this, half a sigma, and does by less than a third of it has only
 # to do with what is of second order: noise, which is all that a sensor at rest tells of a mount or a delay.
 _LITTLE = 0.15
+# Where a step is off by more than this from what it foresaw, the states go alone before the next one.
+_OFF = 0.1
 # Parts of a step along it that are tried, and how many steps the states have to return to the floor.
 _SHARES, _MOST_RETURNS = (1.0, 0.3, 0.1, 0.03), 2
 # So much a measurement is near enough to tell which ones lie outside the gate: on average they move by 0.05 sigma yet.
@@ -69,13 +71,14 @@ _STRONGEST = 20
 
 @dataclass(frozen=True)
 class Solution:
-    """Values at a minimum of a system, and how it was reached."""
+    """Values at a minimum of a system, and how it was reached; `unsettled`: the states may be off the floor yet."""
 
     system: System
     values: gtsam.Values
     converged: bool
     message: str
     iterations: int
+    unsettled: bool = False
 
 
 def solve_batch(
@@ -252,7 +255,7 @@ def optimize(
             values, iterations = plain_but_held.values, iterations + plain_but_held.iterations
         values, more = _relaxed(unweighed, loss, values, float(norms.max()))
         iterations += more
-    final, sound = _truncated(unweighed, loss, values, plain.values, most)
+    final, sound = _truncated(unweighed, loss, values, plain.values, most, plain.unsettled and not outlying)
     iterations += final.iterations
     if outlying and not (sound and final.converged):
         # Among few measurements outliers lead plain least squares far beyond what the priors allow, and what is found
@@ -358,14 +361,19 @@ def _again(problem: Problem, system: System, values: gtsam.Values, far: bool, mo
 
 
 def _truncated(
-    unweighed: System, loss: TruncatedLoss, values: gtsam.Values, plain: gtsam.Values, most: int
+    unweighed: System,
+    loss: TruncatedLoss,
+    values: gtsam.Values,
+    plain: gtsam.Values,
+    most: int,
+    unsettled: bool = False,
 ) -> tuple[Solution, bool]:
-    """Least squares on what lies inside the gate, from some values, and whether most do.
+    """Least squares on what lies inside the gate, from some values, perhaps unsettled, and whether most do.
 
     Where few do it is least squares on all, from plain values.
     """
     truncated = unweighed.under(loss)
-    final = _minimize(truncated, values, most=most)
+    final = _minimize(truncated, values, most=most, unsettled=unsettled)
     used = np.concatenate([r.used for r in truncated.residuals(final.values).values()])
     if used.mean() < _FEWEST_USED:
         return _minimize(unweighed, plain, most=most), False
@@ -383,12 +391,17 @@ def _minimize(
     tolerance: float = _ERROR_TOLERANCE,
     most: int = _MOST_ITERATIONS,
     most_damping: float = _MOST_DAMPING,
+    unsettled: bool = False,
 ) -> Solution:
     """Gauss-Newton steps, damped (Levenberg-Marquardt) only where full ones fail.
 
     A full step along a curved valley, such as that of two mounts whose product alone is known, leaves the floor and
     raises the error by what is of second order. Damping would only make it crawl; there the states are brought back to
     the floor instead, see `_along_valley`.
+
+    A large step too leaves states off the floor, and by so much the next one would be misled about shared variables
+    that little tells, such as a camera's roll: these swing, and the states after them, for steps on end. So states go
+    to the floor alone first, also at the start if they are `unsettled`.
     """
     error = system.error(values)
     if not np.isfinite(error):
@@ -396,6 +409,12 @@ def _minimize(
     damping = 0.0
     for iteration in range(1, most + 1):
         linear = _linearized(system, values)
+        if unsettled:
+            unsettled = False
+            candidate, new_error = _states_alone(system, values, linear)
+            if new_error < error:
+                values, error = candidate, new_error
+                continue
         while True:
             delta, foreseen = _step(system, values, linear, damping)
             candidate = values if delta is None else values.retract(delta)
@@ -411,11 +430,22 @@ def _minimize(
                 return Solution(system, values, False, f"no step lowers the error of {error:.6g}", iteration)
         fall, rounding = error - new_error, 1e-13 * error + 1e-10 * new_error
         values, error = candidate, new_error
+        off = abs(fall - foreseen)
         small = foreseen < _LITTLE and fall < 0.3 * foreseen
-        if damping == 0.0 and (small or min(fall, abs(fall - foreseen)) < tolerance + rounding):
-            return Solution(system, values, True, f"converged after {iteration} iterations", iteration)
+        if damping == 0.0 and (small or min(fall, off) < tolerance + rounding):
+            return Solution(system, values, True, f"converged after {iteration} iterations", iteration, off > _OFF)
+        unsettled = damping == 0.0 and off > _OFF
         damping = damping / 10.0 if damping > 1e-6 else 0.0
     return Solution(system, values, False, f"not converged after {most} iterations", most)
+
+
+def _states_alone(system: System, values: gtsam.Values, linear: Linear | None) -> tuple[gtsam.Values, float]:
+    """Values and error where the states go with the shared variables held; infinite if they are not determined."""
+    try:
+        candidate = None if linear is None else values.retract(linear.states_alone())
+    except IndeterminateError:
+        candidate = None
+    return (values, np.inf) if candidate is None else (candidate, system.error(candidate))
 
 
 def _along_valley(
@@ -429,12 +459,7 @@ def _along_valley(
     for share in _SHARES:
         candidate = values.retract(delta.scale(share))
         for _ in range(_MOST_RETURNS):
-            about = _linearized(system, candidate)
-            back, _ = _step(system, candidate, about and about.holding_shared(), 0.0)
-            if back is None:
-                break
-            candidate = candidate.retract(back)
-            new_error = system.error(candidate)
+            candidate, new_error = _states_alone(system, candidate, _linearized(system, candidate))
             if new_error < error:
                 return candidate, new_error
     return values, np.inf

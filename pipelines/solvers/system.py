@@ -222,15 +222,22 @@ class Linear:
         """With some of the variables that all share held at moves (d,)."""
         return replace(self, graph=held(self.graph, HELD, at))
 
-    def holding_shared(self) -> Linear:
-        """With the variables that all measurements share held where they are."""
-        return self.holding({key: np.zeros(self.values.dims()[key]) for key in self.system.shared})
-
     def solution(self) -> gtsam.VectorValues:
         """The move to the minimum. Raises IndeterminateError, naming a variable that is not determined."""
-        solution = self.triangular.back(self.triangular.right)[:, 0]
+        return self._solved_by(self.triangular)
+
+    def states_alone(self) -> gtsam.VectorValues:
+        """The same with the variables that all measurements share held where they are."""
+        shared = set(self.system.shared)
+        states = [key for key in _keys(self.system.ordering) if key not in shared]
+        own = Triangular.of(self.graph, ordering_of(states)) if states else Triangular.none(self.graph)
+        return self._solved_by(own)
+
+    def _solved_by(self, triangular: Triangular) -> gtsam.VectorValues:
+        """What a triangular factor of `graph` says of all variables, those that it leaves where they are."""
+        solution = triangular.back(triangular.right)[:, 0]
         delta = gtsam.VectorValues()
-        for key, place in self.triangular.places.items():
+        for key, place in triangular.places.items():
             delta.insert(key, solution[place])
         for part in self.parts():
             _follow(part, delta)
