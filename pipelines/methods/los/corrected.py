@@ -18,6 +18,9 @@ from pipelines.methods.los.parameters import BIAS, ONCE_PER_TURN, SENSITIVITY, T
 from pipelines.methods.los.recording import LosData
 from pipelines.methods.temperature import FIRST
 
+# Samples of the gyro worked on together.
+_BLOCK = 100_000
+
 
 def rates(data: LosData, values: Mapping[str, float]) -> Array:
     """True rates (N, 3) at the gyro's samples, rad/s; what nobody measured the cause of stays in."""
@@ -26,8 +29,14 @@ def rates(data: LosData, values: Mapping[str, float]) -> Array:
     unknown = {name for each, cause in causes.items() if cause is None for name in each.names}
     known = {name: value for name, value in values.items() if name not in unknown}
     bias = np.array([values.get(name, 0.0) for name in BIAS])
-    measured = SimpleNamespace(**known, gyro=data.gyro, gyro_bias=bias, accel=data.force, temperature=warm)
-    return gyro_rate(known, S, *DRIVERS)[2](measured)
+    compute, out = gyro_rate(known, S, *DRIVERS)[2], np.empty_like(data.gyro)
+    for begin in range(0, len(out), _BLOCK):
+        some = slice(begin, begin + _BLOCK)
+        accel, temperature = (None if each is None else each[some] for each in (data.force, warm))
+        out[some] = compute(
+            SimpleNamespace(**known, gyro=data.gyro[some], gyro_bias=bias, accel=accel, temperature=temperature)
+        )
+    return out
 
 
 def taken(data: LosData, stamps: Array, values: Mapping[str, float]) -> Array:
