@@ -28,7 +28,7 @@ _UNEVEN = 0.05
 # A pause between samples longer than this many intervals is a gap.
 _GAP = 1.5
 # Sample intervals integrated together, and how many such blocks are kept.
-_BLOCK, _KEPT = 1 << 16, 32
+_BLOCK, _KEPT = 1 << 16, 16
 # Windows looked up together.
 _TOGETHER = 20_000
 
@@ -70,7 +70,7 @@ class Increments:
 class GyroPath:
     """A gyro stream integrated once; the rotation over any window then costs the same as a look-up.
 
-    It is integrated block by block. The last blocks looked at are kept, half an hour at 1 kHz, and those of a longer
+    It is integrated block by block. The last blocks looked at are kept, a million samples, and those of a longer
     stream are integrated anew when they are needed.
 
     Args:
@@ -181,10 +181,14 @@ class GyroPath:
         start, stop = np.asarray(start, dtype=float), np.asarray(stop, dtype=float)
         if len(start) <= _TOGETHER:
             return self._increments(start, stop, scale)
-        begins = range(0, len(start), _TOGETHER)
-        pieces = [self._increments(start[k : k + _TOGETHER], stop[k : k + _TOGETHER], scale) for k in begins]
-        there = [name for name in Increments.stacked if getattr(pieces[0], name) is not None]
-        return replace(pieces[0], **{name: np.concatenate([getattr(p, name) for p in pieces]) for name in there})
+        parts: dict[str, Array] = {}
+        for begin in range(0, len(start), _TOGETHER):
+            some = slice(begin, begin + _TOGETHER)
+            piece = self._increments(start[some], stop[some], scale)
+            for name in Increments.stacked:
+                if (part := getattr(piece, name)) is not None:
+                    parts.setdefault(name, np.empty((len(start), *part.shape[1:])))[some] = part
+        return Increments(**parts)
 
     def _increments(self, start: Array, stop: Array, scale: bool) -> Increments:
         # Both ends in one call: what a few windows cost is calls.

@@ -79,6 +79,7 @@ class VectorizedFactor:
 
     def __post_init__(self) -> None:
         self.columns = [int(c) if isinstance(c, int | np.integer) else [int(key) for key in c] for c in self.tied]
+        self.tied = self.columns
         self.blocks = self.model.blocks
         self._require_fit()
         if self.noise is not None:

@@ -204,7 +204,8 @@ class Session:
     @cached_property
     def _problem(self) -> Problem:
         _check_sheets(self.method, self.config)
-        return self.method.graph(self.data, self.config)
+        with progress.doing("preparing the graph"):
+            return self.method.graph(self.data, self.config)
 
     @cached_property
     def facts(self) -> SessionFacts:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 
 import gtsam
@@ -18,8 +19,9 @@ from pipelines.graph.problem import Array, Factor, Parameter, Step
 from pipelines.graph.walking_bias import WalkingBias
 
 
+@lru_cache(maxsize=1000)
 def state(keyframe: int) -> int:
-    """Variable of the attitude at a keyframe, Rot3."""
+    """Variable of the attitude at a keyframe, Rot3; the same number for all factors that hold it, for memory's sake."""
     return int(gtsam.symbol("x", keyframe))
 
 

@@ -27,7 +27,8 @@ def cut(hypotheses: Hypotheses, data: Any, start: float, stop: float) -> Any:
         time = getattr(data, stamps)
         if time is None:
             continue
-        inside = (time >= start) & (time < stop)
+        # Times increase: the samples are a view of those that there are.
+        inside = slice(*np.searchsorted(time, [start, stop]).tolist())
         for name in (stamps, *fields):
             values = getattr(data, name)
             if values is not None:
@@ -70,7 +71,7 @@ def split_at(method: Method, data: Any, config: Config, middle: float) -> dict[s
         return {}
     a, b = first.estimate, second.estimate
     found = {}
-    for i, q in enumerate(method.graph(data, config).quantities):
+    for i, q in enumerate(first.quantities):
         sigmas = float(a.sigmas[i]), float(b.sigmas[i])
         if 0.0 < max(sigmas) < _DETERMINED * q.scale:
             found[q.name] = Halves(float(a.values[i]), sigmas[0], float(b.values[i]), sigmas[1])

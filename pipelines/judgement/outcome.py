@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.graph.problem import ChiSquare, Estimate, Problem
+from pipelines.graph.problem import ChiSquare, Estimate, Problem, Quantity
 from pipelines.judgement.observability import Fit
 from pipelines.settings import Config
 
@@ -29,12 +29,14 @@ class Outcome:
     """How well a recording fits after a change: the solution, and the loss of what it rejected.
 
     Attributes:
+        quantities: that were solved for.
         estimate: the solution.
         chi_square: of what was used.
         lost: what the rejected measurements cost, at the gate each.
         rows: degrees of freedom, the rejected rows among them.
     """
 
+    quantities: tuple[Quantity, ...]
     estimate: Estimate
     chi_square: ChiSquare
     lost: float
@@ -49,7 +51,7 @@ class Outcome:
         rows = sum(n * estimate.residuals[f].whitened.shape[1] for f, n in rejected.items())
         gate = problem.loss.gate if problem.loss else 0.0
         lost = gate**2 * sum(rejected.values())
-        return cls(estimate, estimate.chi_square, lost, estimate.chi_square.dof + rows)
+        return cls(problem.quantities, estimate, estimate.chi_square, lost, estimate.chi_square.dof + rows)
 
     @property
     def cost(self) -> float:

@@ -336,7 +336,7 @@ class System:
 
     def error(self, values: gtsam.Values) -> float:
         """Half the sum of squares."""
-        return sum(stretch.error(values, self.loss) for stretch in self.stretches)
+        return sum(stretch.error(values, self.loss) for stretch in shown(self.stretches))
 
     def part(self, stretch: Stretch, values: gtsam.Values, damping: float = 0.0) -> Part:
         """One of several stretches about the values, damped as `Linear.damping` says."""
