@@ -284,3 +284,15 @@ def test_gyro_axis_of_opposite_sign_is_inconsistent() -> None:
     known = _config(SHORT).model_copy(update={"noise_known": 0.0})
     _, assessment = _assess(replace(data, gyro=data.gyro * np.array([1.0, -1.0, 1.0])), known)
     assert assessment.status == "inconsistent"
+
+
+def test_a_walk_stated_too_loose_does_not_drive_the_time_offset_away() -> None:
+    """A thousand times: a bias for every other picture. Were it to turn its own picture, the offset would be 0.2 s."""
+    scenario = LosScenario(duration_s=10.0, image_rate_hz=50.0, gyro_rate_hz=200.0, gimbal_rate_hz=100.0)
+    data, truth = simulate_los(scenario, 0)
+    config = load_config(los_config(scenario).encode())
+    loose = config.model_copy(update={"noise": config.noise.model_copy(update={"gyro_bias_walk": 1e-3})})
+    estimate = solve_batch(problem(data, loose))
+    assert estimate.converged
+    at = estimate.names.index("time_offset")
+    assert abs(estimate.values[at] - truth["time_offset"]) < 3.0 * estimate.sigmas[at]

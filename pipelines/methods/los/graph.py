@@ -27,6 +27,7 @@ from pipelines.graph.motion import Motion
 from pipelines.graph.noise import Level
 from pipelines.graph.priors import vector_prior
 from pipelines.graph.problem import Array, Factor, Problem, Step
+from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
 from pipelines.judgement.pictures import swaying
 from pipelines.methods import temperature
 from pipelines.methods.los.guess import camera, foreseen, guess, initial_attitudes, seen
@@ -229,6 +230,9 @@ def _step(model: _Model, keyframes: range) -> Step:
     step.factors.extend(_start_factor(model, k) for k in keyframes if chain.starts[k])
     chain.add(step, keyframes)
     step.factors.extend(_picture_factors(model, keyframes))
+    if chain.bias.nodes > 1 and model.parameters.sight is not None:
+        # All pictures take it.
+        step.timestamps[FIRST_BIAS] = step.time
     return step
 
 
@@ -271,7 +275,9 @@ def _picture_factor(model: _Model, k: NDArray[np.intp], count: int, family: str)
     )
     columns: list[int | list[int]] = [[model.chain.state(i) for i in k], p.angles.key]
     if p.sight is not None:
-        columns += [model.chain.bias_keys(k), p.sight.key, *model.chain.error_keys]
+        # From stamp to picture the bias has no time to matter but as a whole. Each keyframe's own, where it may walk
+        # far, would follow the picture's noise, the better the larger the time offset, which would grow without bounds.
+        columns += [FIRST_BIAS, p.sight.key, *model.chain.error_keys]
     return Factor.of(family, rows_model.on(*columns, loss=model.loss))
 
 
