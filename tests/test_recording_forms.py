@@ -884,7 +884,7 @@ def test_stamps_that_were_not_measured_are_told(stamps: Any, logged: Any, says: 
             "/los/error",
             "time_offset",
         ),
-        ("indexer", None, {"gyro_rate_hz": 20.0}, "/indexer/joint_states", "encoder_delay"),
+        ("indexer", None, {"gyro_rate_hz": 20.0, "encoder_rate_hz": 20.0}, "/indexer/joint_states", "encoder_delay"),
     ],
 )
 def test_log_times_in_place_of_stamps_stand_in_the_sigma_of_the_delay(
