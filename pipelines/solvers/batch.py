@@ -48,8 +48,9 @@ _ERROR_TOLERANCE = 1e-5
 # A step that was to lower the error by less than this, half a sigma, and does by less than a third of it has only
 # to do with what is of second order: noise, which is all that a sensor at rest tells of a mount or a delay.
 _LITTLE = 0.15
-# Where a step is off by more than this from what it foresaw, the states go alone before the next one.
-_OFF = 0.1
+# A step off by more than this from what it foresaw leaves states unsettled; the next one is misled by them if it is off
+# by more than a share of what it foresaw, and in all.
+_OFF, _MISLED = 0.1, 0.01
 # Parts of a step along it that are tried, and how many steps the states have to return to the floor.
 _SHARES, _MOST_RETURNS = (1.0, 0.3, 0.1, 0.03), 2
 # So much a measurement is near enough to tell which ones lie outside the gate: on average they move by 0.05 sigma yet.
@@ -400,25 +401,25 @@ def _minimize(
     the floor instead, see `_along_valley`.
 
     A large step too leaves states off the floor, and by so much the next one would be misled about shared variables
-    that little tells, such as a camera's roll: these swing, and the states after them, for steps on end. So states go
-    to the floor alone first, also at the start if they are `unsettled`.
+    that little tells, such as a camera's roll: these swing, and the states after them, for steps on end. Where it is
+    misled, states go to the floor alone in its place, also at the start if they are `unsettled`.
     """
     error = system.error(values)
     if not np.isfinite(error):
         return Solution(system, values, False, "the residuals at the start are not finite", 0)
     damping = 0.0
     for iteration in range(1, most + 1):
-        linear = _linearized(system, values)
-        if unsettled:
-            unsettled = False
-            candidate, new_error = _states_alone(system, values, linear)
-            if new_error < error:
-                values, error = candidate, new_error
-                continue
+        linear, settled = _linearized(system, values), None
         while True:
             delta, foreseen = _step(system, values, linear, damping)
             candidate = values if delta is None else values.retract(delta)
             new_error = np.inf if delta is None else system.error(candidate)
+            misled = abs(error - new_error - foreseen) > max(_MISLED, _MISLED * foreseen)
+            if unsettled and misled and damping == 0.0:
+                settled, its_error = _states_alone(system, values, linear)
+                if its_error < error:
+                    candidate, new_error, foreseen = settled, its_error, error - its_error
+                    break
             if delta is not None and damping == 0.0 and error < new_error:
                 candidate, new_error = _along_valley(system, values, error, delta)
             if new_error <= error + _ERROR_TOLERANCE:
@@ -432,7 +433,7 @@ def _minimize(
         values, error = candidate, new_error
         off = abs(fall - foreseen)
         small = foreseen < _LITTLE and fall < 0.3 * foreseen
-        if damping == 0.0 and (small or min(fall, off) < tolerance + rounding):
+        if damping == 0.0 and candidate is not settled and (small or min(fall, off) < tolerance + rounding):
             return Solution(system, values, True, f"converged after {iteration} iterations", iteration, off > _OFF)
         unsettled = damping == 0.0 and off > _OFF
         damping = damping / 10.0 if damping > 1e-6 else 0.0
