@@ -103,6 +103,25 @@ def test_numbers_whose_sum_is_known_far_better_are_inflated_alike() -> None:
     assert not found.changed
 
 
+def test_what_is_hardly_better_known_than_before_cannot_be_seen_to_change() -> None:
+    estimate, quantities = walk(np.random.default_rng(1), change=3.0)
+    narrow = replace(quantities[0], prior_sigma=1.5 * float(estimate.sigmas[0]))
+    found = stability(estimate, (narrow, quantities[1]))
+    assert found is not None
+    assert not found.changed
+    assert set(found.departures) == {"b"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_minutes_at_which_nothing_changes_raise_no_alarm(seed: int) -> None:
+    """What a camera's scale of 0.999 of its prior's sigma is moved by, noise of the states, passed for 9 sigmas."""
+    rates = {"duration_s": 240.0, "gyro_rate_hz": 100.0, "gimbal_rate_hz": 100.0}
+    found = alidade.open(alidade.simulate("los", rates, seed)).calibrate().stability
+    assert found is not None
+    assert not found.changed
+
+
 def test_what_walks_or_is_fixed_may_change() -> None:
     estimate, quantities = walk(np.random.default_rng(1), change=3.0)
     course = estimate.course

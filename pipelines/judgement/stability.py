@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.graph.assumptions import pull
 from pipelines.graph.problem import Array, Estimate, Quantity
@@ -26,6 +27,9 @@ LEVEL = 1e-3
 _PATHS, _BATCH = 4000, 500
 # Directions in which the rest of the recording added less than this share of the variance say nothing of a change.
 _LEAST = 1e-3
+# ... and of numbers whose sigma is beyond this part of the prior the recording does not tell enough to see one: what it
+# tells is as much the noise of its states, which moves the estimate without being chance as the covariances have it.
+_DETERMINED = 0.5
 # A step between the sides of a change is more than chance beyond so many sigmas.
 _STEP = 3.0
 # Priors are widened to what was found from so many sigmas on.
@@ -100,7 +104,7 @@ class Moved:
 def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability | None:
     """Of an estimate; None where its course is not known, or holds nothing that could change.
 
-    Quantities that walk are left out: they may change.
+    Quantities that walk are left out, since they may change, and those that are hardly better known than before.
 
     Args:
         estimate: with its course.
@@ -109,7 +113,7 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
     course = estimate.course
     if course is None:
         return None
-    kept = np.flatnonzero(course.steady & np.array([q.prior_sigma != 0.0 for q in quantities], dtype=bool))
+    kept = np.flatnonzero(course.steady & _determined(estimate, quantities))
     late = course.time >= _long_enough(estimate, len(kept))
     if late.sum() < _FEWEST_MOMENTS or not len(kept):
         return None
@@ -127,6 +131,12 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
     by_size = np.argsort(-np.abs(difference[worst] / sigmas))
     departures = {quantities[kept[j]].name: float(difference[worst, j] / sigmas[j]) for j in by_size}
     return Stability(float(sizes[worst]), beyond, float(time[worst]), departures)
+
+
+def _determined(estimate: Estimate, quantities: Sequence[Quantity]) -> NDArray[np.bool_]:
+    """Which of the numbers the recording tells more of than their priors do."""
+    priors = np.array([np.inf if q.prior_sigma is None else q.prior_sigma for q in quantities])
+    return np.asarray(estimate.sigmas < _DETERMINED * priors)
 
 
 def _long_enough(estimate: Estimate, numbers: int) -> float:
