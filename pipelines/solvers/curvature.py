@@ -25,8 +25,8 @@ from pipelines.solvers.marginals import IndeterminateError, prior_units, reduced
 if TYPE_CHECKING:
     from pipelines.solvers.system import System
 
-# Directions of which sigma is beyond this share of the prior are drawn, the others follow.
-_WEAK = 0.1
+# Directions of which sigma is within this share of the prior, and of the widest, follow the others.
+_WEAK, _LESS = 0.1, 0.5
 # Where no sigma of what is calibrated is beyond this share nothing is drawn.
 _SURE = 0.01
 _DRAWS = 16
@@ -70,7 +70,7 @@ def second_order(
         if eigenvalues[0] < _ANYWHERE:
             return None
         moved = linear.drawn(keys, _DRAWS)
-        told = eigenvalues >= _WEAK**-2.0
+        told = eigenvalues >= max(_WEAK**-2.0, _LESS**-2.0 * eigenvalues[0])
         steps: list[Array] = []
         known = unit @ vectors[:, told]
         for each in moved:

@@ -139,7 +139,9 @@ def test_one_axis_leaves_the_rotation_about_it() -> None:
     estimate = solve_batch(graph)
     assessment = assess(graph.quantities, estimate.covariance, estimate.chi_square, graph.advice)
     assert assessment.status == "weak"
-    (direction,) = assessment.directions
+    # The others are known along an arc about it alone, which the numbers leave by more than is required.
+    direction, *along = assessment.directions
+    assert all(each.sigma_ratio < 0.05 * direction.sigma_ratio for each in along)
     # About the axis of the motion, which is z of a: in b, where the rotation is perturbed, it is bRa z.
     tangent = np.linalg.solve(
         so3.right_jacobian_inverse(estimate.values[:3]),
