@@ -43,7 +43,7 @@ SHORT: dict[str, dict[str, Any]] = {
         "temperature": {"rise_k": 20.0, "time_constant_s": 10.0},
     },
     "los": {
-        "duration_s": 20,
+        "duration_s": 30,
         "image_rate_hz": 10,
         "gyro_rate_hz": 100,
         "gimbal_rate_hz": 100,

@@ -14,6 +14,7 @@ numbers' own tangent.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import gtsam
@@ -69,11 +70,13 @@ def second_order(
         eigenvalues, vectors = np.linalg.eigh(unit.T @ information @ unit)
         if eigenvalues[0] < _ANYWHERE:
             return None
-        moved = linear.drawn(keys, _DRAWS)
         told = eigenvalues >= max(_WEAK**-2.0, _LESS**-2.0 * eigenvalues[0])
         steps: list[Array] = []
         known = unit @ vectors[:, told]
-        for each in moved:
+        generator = np.random.default_rng(0)
+        # Values of hours are large: no more of them at once than are looked at.
+        draws = (linear.drawn(keys, count, generator) for count in (_TRIED, _DRAWS - _TRIED))
+        for each in chain.from_iterable(draws):
             move = values.localCoordinates(each)
             # As far as the linear system goes back itself, its covariance has it already.
             tangent = slope - information @ np.concatenate([move.at(key) for key in keys])

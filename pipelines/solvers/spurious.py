@@ -52,7 +52,7 @@ def information_of_noise(
         return None
     try:
         linear = system.linearized(values)
-        moved = linear.drawn(set(values.keys()) - set(doubtful), _DRAWS)
+        moved = linear.drawn(set(values.keys()) - set(doubtful), _DRAWS, np.random.default_rng(0))
         graphs = (linear.graph, *map(system.linearize, moved))
         own, *elsewhere = (joint_information(graph, system.ordering, keys) for graph in graphs)
     except (RuntimeError, IndeterminateError):

@@ -186,13 +186,12 @@ class Linear:
             right[its] = joint[ours]
             yield part, part.triangular.back(right)
 
-    def drawn(self, keys: Collection[int], count: int) -> list[gtsam.Values]:
+    def drawn(self, keys: Collection[int], count: int, generator: np.random.Generator) -> list[gtsam.Values]:
         """Values drawn from their covariance about these, by what some variables add to it.
 
         Raises:
             IndeterminateError: a variable is not determined.
         """
-        generator = np.random.default_rng(0)
         dims = self.values.dims()
         units = {key: np.zeros((dims[key], count)) for key in self.values.keys()}
         for k, (key, unit) in product(range(count), units.items()):
