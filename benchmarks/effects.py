@@ -145,7 +145,7 @@ def report(found: Sequence[Found]) -> Iterator[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the sweep of one method."""
+    """Run the sweep of one method; what FILE already has is not run again."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.effects", description=__doc__.split("\n\n")[1])
     parser.add_argument("method")
     parser.add_argument("--scenario", help="default: the nominal one")
@@ -163,15 +163,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for effect in options.only or swept
         for size, seed in product((0.0,) if effect == NOTHING else SIZES, range(options.seeds))
     ]
+    done = {} if options.out is None else {f.case: f for f in _read(options.out)}
+    left = [case for case in cases if case not in done]
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as processes:
-        found = []
-        for each in processes.map(run, cases, [swept[case.effect] for case in cases]):
-            found.append(each)
+        for each in processes.map(run, left, [swept[case.effect] for case in left]):
+            done[each.case] = each
             if options.out is not None:
-                with options.out.open("w" if len(found) == 1 else "a") as lines:
+                with options.out.open("a") as lines:
                     lines.write(json.dumps(asdict(each)) + "\n")
-    print("\n".join(report(found)))
+    print("\n".join(report([done[case] for case in cases])))
     return 0
+
+
+def _read(path: Path) -> list[Found]:
+    """What was found before, if anything."""
+    if not path.exists():
+        return []
+    rows = (json.loads(line) for line in path.read_text().splitlines())
+    return [Found(**row | {"case": Case(**row["case"])}) for row in rows]
 
 
 if __name__ == "__main__":

@@ -54,6 +54,20 @@ def excess(raw: Array, sigma: Array, numbers: Array) -> Array:
     return np.asarray(sigma**2 * (0.5 * trace / slope - bent / slope**3))
 
 
+def sagitta(raw: Array, scatter: Array, numbers: Array) -> Array:
+    """(n,) how far the means raw (n, 3) of points of the ellipsoid with covariances (n, 3, 3) lie inside it.
+
+    With what `excess` has for letters it is tr (H scatter) / (2 |g|).
+    """
+    K, vectors = numbers[:9].reshape(3, 3), nominal_of(raw, numbers)
+    length = np.linalg.norm(vectors, axis=1)
+    direction = vectors / length[:, None]
+    turned = K @ scatter @ K.T
+    along = np.einsum("ni,nij,nj->n", direction, turned, direction)
+    bent = (np.trace(turned, axis1=1, axis2=2) - along) / length
+    return np.asarray(0.5 * bent / np.linalg.norm(direction @ K, axis=1))
+
+
 @dataclass(frozen=True)
 class StrengthFactor(Model):
     """The length of a vector measured in any attitude: |K raw + b - c warmth| = s.

@@ -284,7 +284,7 @@ def test_coloured_innovations_leave_what_goes_together_together() -> None:
     # The scale of K and the field's strength are known together far better than either.
     simulated = simulate("tumble", {}, seed=1)
     data = simulated.data
-    keep = np.exp(-float(np.median(np.diff(data.mag_t))) / 0.1)
+    keep = np.exp(-float(np.median(np.diff(data.mag_t))) / 0.3)
     fresh = 3.5e-7 * np.sqrt(1.0 - keep**2) * np.random.default_rng(1).standard_normal(data.mag.shape)
     data = replace(data, mag=data.mag + lfilter([1.0], [1.0, -keep], fresh, axis=0))
     problem = methods.method("tumble").problem(data, load_config(simulated.config.encode()))

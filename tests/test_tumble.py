@@ -14,7 +14,7 @@ import pytest
 
 from factors import so3
 from factors.chi_square import quantile
-from factors.ellipsoid import DipFactor, StrengthFactor
+from factors.ellipsoid import DipFactor, StrengthFactor, sagitta
 from factors.preintegration import GyroPath
 from factors.testing import assert_jacobians
 from factors.turned import FieldFactor, UpFactor
@@ -23,8 +23,10 @@ from pipelines.errors import InputError
 from pipelines.graph.problem import Estimate
 from pipelines.methods import method
 from pipelines.methods.triads import triad_names, triad_of
+from pipelines.methods.tumble.model import prepare
 from pipelines.methods.tumble.recording import TumbleData, read_tumble, write_tumble
 from pipelines.methods.tumble.scenario import TumbledAccelerometer, TumbledGyro, TumbledMagnetometer, TumbleScenario
+from pipelines.methods.tumble.unturned import unturned
 from pipelines.planning import make_plan
 from pipelines.recording import series
 from pipelines.recording.checks import nanoseconds
@@ -395,6 +397,39 @@ def test_too_little_is_an_input_error(tmp_path: Path) -> None:
     write_session(tmp_path / "n.mcap", {"/other": series.MagneticSeries(np.arange(9), np.ones((9, 3)))}, {})
     with pytest.raises(InputError, match="neither /mag"):
         Session.read(open_recording(tmp_path / "n.mcap"), "tumble", None)
+
+
+def test_the_mean_of_points_of_an_ellipsoid_lies_inside_it() -> None:
+    rng = np.random.default_rng(5)
+    K, b = np.eye(3) + 0.2 * rng.normal(size=(3, 3)), 0.1 * rng.normal(size=3)
+    numbers = np.concatenate([K.ravel(), b])
+    about = rng.normal(size=(20, 1, 3)) + 0.05 * rng.normal(size=(20, 400, 3))
+    points = np.linalg.solve(K, (about / np.linalg.norm(about, axis=-1, keepdims=True) - b)[..., None])[..., 0]
+    means = points.mean(axis=1)
+    apart = points - means[:, None]
+    scatter = np.einsum("nki,nkj->nij", apart, apart) / 400
+    distance = StrengthFactor(np.arange(20.0), means, np.ones(20), np.zeros(20), symmetric=False)
+    inside = -distance(np.tile(numbers, (20, 1)), np.ones((20, 1)))[0][:, 0]
+    np.testing.assert_allclose(sagitta(means, scatter, numbers), inside, rtol=0.03)
+
+
+def test_a_rest_counts_as_one_attitude() -> None:
+    data = _simulated(TumbleScenario(attitudes=4, rest_s=3.0), 1).data
+    (sensor,) = prepare(data, Config.model_validate({"noise": {"mag_density": 5e-8}})).sensors
+    means = unturned(sensor)
+    assert len(means.raw) < 0.1 * len(sensor.raw)
+    # ... and no sample counts for more or less than before.
+    assert (means.sigma**-2.0).sum() == pytest.approx((sensor.sigma**-2.0).sum())
+    # An outlier stays alone, and does not pull the others with it.
+    rest = int(np.argmax(means.sigma**-2.0))
+    row = int(np.searchsorted(sensor.time, means.time[rest]))
+    raw = sensor.raw.copy()
+    raw[row] += 0.2 * sensor.radius
+    spoiled = unturned(replace(sensor, raw=raw))
+    assert spoiled.sigma[np.flatnonzero(spoiled.time == sensor.time[row])] == pytest.approx(sensor.sigma[row])
+    # Where nobody states the noise, what scatters may be motion.
+    (sensor,) = prepare(replace(data, mag_density=None), Config()).sensors
+    assert unturned(sensor) is sensor
 
 
 def test_the_figures_of_a_published_example(tmp_path: Path) -> None:

@@ -111,3 +111,10 @@ def test_the_study_follows_a_recording_to_its_end() -> None:
     assert found.numbers == 17
     assert found.worst < 4.0
     assert len(list(report([found]))) == 3
+
+
+def test_the_first_attitudes_of_a_tumbled_magnetometer() -> None:
+    # One by one, the samples of a rest would tell how the ellipsoid lies there, and it is found far away.
+    found = [run("tumble", "rest", seed) for seed in range(2, 6)]
+    assert not any(f.message for f in found)
+    assert np.mean([f.nees for f in found], axis=0).max() < 30.0

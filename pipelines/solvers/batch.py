@@ -460,10 +460,19 @@ def _along_valley(
     for share in _SHARES:
         candidate = values.retract(delta.scale(share))
         for _ in range(_MOST_RETURNS):
-            candidate, new_error = _states_alone(system, candidate, _linearized(system, candidate))
+            candidate, new_error = _returned(system, candidate)
             if new_error < error:
                 return candidate, new_error
     return values, np.inf
+
+
+def _returned(system: System, values: gtsam.Values) -> tuple[gtsam.Values, float]:
+    """Values nearer to the floor, and their error: the states alone moved, or of a graph without any what is known."""
+    linear = _linearized(system, values)
+    if linear is None or linear.has_states:
+        return _states_alone(system, values, linear)
+    candidate = values.retract(linear.of_the_known())
+    return candidate, system.error(candidate)
 
 
 def _linearized(system: System, values: gtsam.Values) -> Linear | None:

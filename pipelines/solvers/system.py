@@ -221,6 +221,26 @@ class Linear:
         """With some of the variables that all share held at moves (d,)."""
         return replace(self, graph=held(self.graph, HELD, at))
 
+    @property
+    def has_states(self) -> bool:
+        """Whether there are variables that not all measurements share."""
+        return len(self.system.shared) < self.system.ordering.size()
+
+    def of_the_known(self) -> gtsam.VectorValues:
+        """The move to the minimum of a graph without states, but along what little is known about.
+
+        That is held by the geometric mean of the most and the least that is known of a direction.
+        """
+        information, slope = self.graph.hessian(ordering_of(self.system.shared))
+        known, axes = np.linalg.eigh(information)
+        known = np.maximum(known, np.finfo(float).eps * known[-1])
+        move = axes @ (axes.T @ slope / (known + np.sqrt(known[0] * known[-1])))
+        delta, dims, end = gtsam.VectorValues(), self.values.dims(), 0
+        for key in self.system.shared:
+            start, end = end, end + dims[key]
+            delta.insert(key, move[start:end])
+        return delta
+
     def solution(self) -> gtsam.VectorValues:
         """The move to the minimum. Raises IndeterminateError, naming a variable that is not determined."""
         return self._solved_by(self.triangular)

@@ -10,6 +10,7 @@ chains the attitudes (`chained`): each sample of the field then tells three numb
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise, product
 
@@ -26,6 +27,7 @@ from pipelines.methods.tumble.chained import FAMILIES, advice, chained
 from pipelines.methods.tumble.model import Model, Moments, Sensor, prepare
 from pipelines.methods.tumble.parameters import DIP_KEY, SLOPE_KEY, STRENGTH_KEYS, TRIAD_KEYS, Variable, variables
 from pipelines.methods.tumble.recording import TumbleData
+from pipelines.methods.tumble.unturned import unturned
 from pipelines.settings import Config
 
 # What is measured within this time, s, makes one step.
@@ -42,6 +44,7 @@ def problem(data: TumbleData, config: Config) -> Problem:
     found = variables(model, config)
     if model.mounted is not None:
         return chained(data, config, model, found)
+    model = replace(model, sensors=tuple(map(unturned, model.sensors)))
     noises = [Level(sensor.noise) for sensor in model.sensors]
     if model.moments is not None:
         noises.append(Level(model.moments.noise))
@@ -64,7 +67,8 @@ def _steps(model: Model, found: tuple[Variable, ...], chunk: int) -> Iterator[St
     loss = TruncatedLoss(gate(1))
     times = [each.time for each in (*model.sensors, model.moments) if each is not None]
     start, stop = min(t[0] for t in times), max(t[-1] for t in times)
-    edges = np.append(np.arange(start, stop, chunk * _STRETCH), np.inf)
+    # The same numbers whatever the chunk: a sample may be at an edge.
+    edges = np.append(start + _STRETCH * np.arange(0, np.ceil((stop - start) / _STRETCH), chunk), np.inf)
     first = True
     for low, high in pairwise(edges.tolist()):
         step = Step(time=float(min(high, stop)))

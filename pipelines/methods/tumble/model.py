@@ -59,6 +59,7 @@ class Sensor:
         name: accel or mag.
         time, raw: (n,) s and (n, 3), as recorded, of the samples or means that are used.
         sigma, excess: (n,) of these over the radius; see StrengthFactor.
+        believed: what a sample scatters by over the radius, as stated or else as the first guess has it.
         symmetric: whether K is so by definition: the sensor defines the body's axes.
         is_si: whether it is recorded in SI; else in counts.
         radius: of the ellipsoid, in the unit recorded.
@@ -76,6 +77,7 @@ class Sensor:
     raw: Array
     sigma: Array
     excess: Array
+    believed: float
     symmetric: bool
     is_si: bool
     radius: float
@@ -346,13 +348,14 @@ def _sensor(
     interval = float(np.median(np.diff(stream[0])))
     noise = _noise(name, config, stream[1], is_si, seen * interval**0.5)
     stated_sigma = noise.stated * interval**-0.5
-    believed = stated_sigma if noise.source != "default" or noise.known == 0.0 else seen
+    believed = (stated_sigma if noise.source != "default" or noise.known == 0.0 else seen) / radius
     return Sensor(
         name=name,
         time=time,
         raw=raw,
         sigma=stated_sigma / radius / root_number,
-        excess=excess(raw / radius, believed / radius / root_number, numbers),
+        excess=excess(raw / radius, believed / root_number, numbers),
+        believed=believed,
         symmetric=True,
         is_si=is_si,
         radius=radius,
