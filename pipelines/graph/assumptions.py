@@ -19,7 +19,7 @@ from pipelines.settings import Config
 # What is left free has a prior so many times the one in force.
 _FREE = 10.0
 # A sigma of more than this part of its prior's says nothing, one of less than that determines it.
-_UNTOLD, _DETERMINED = 0.98, 0.5
+_UNTOLD = 0.98
 
 # What the names of numbers of one kind differ by.
 _NUMBERS = re.compile(r"(_[xyzenu]{1,2})?(_sin|_cos)?$")
@@ -156,11 +156,6 @@ def pull(quantity: Quantity, value: float, sigma: float, inflation: float = 1.0)
         return None
     elsewhere = sigma**2 - (white**2 / prior) ** 2
     return (value - quantity.prior_mean) / math.sqrt((prior - white**2 / prior) ** 2 + elsewhere)
-
-
-def determined(quantity: Quantity, sigma: float) -> bool:
-    """Whether the recording, and not the prior, says what an assumption is: then it is worth applying."""
-    return sigma < _DETERMINED * (quantity.prior_sigma or 0.0)
 
 
 def stated(config: Config, assumption: Assumption) -> float:

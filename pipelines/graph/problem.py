@@ -45,6 +45,10 @@ def rotation_vector_coordinates(values: gtsam.Values, key: int) -> tuple[Array, 
     return phi, so3.right_jacobian_inverse(phi)
 
 
+# A recording says what a number is when its sigma is below this share of the prior's.
+_DETERMINED = 0.5
+
+
 @dataclass(frozen=True)
 class Quantity:
     """One calibrated number as the contract lists it.
@@ -88,6 +92,10 @@ class Quantity:
     def scale(self) -> float:
         """Sigma against which this quantity's own is measured."""
         return self.prior_sigma or self.prior_scale
+
+    def determined(self, sigma: float) -> bool:
+        """Whether a recording that leaves this sigma says what it is, and not the prior."""
+        return self.prior_sigma != 0.0 and sigma < _DETERMINED * self.scale
 
 
 @dataclass(frozen=True)

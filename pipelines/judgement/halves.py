@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from pipelines.judgement.hypotheses import Hypotheses
     from pipelines.methods import Method
 
-# A half determines a parameter when its sigma is below this share of the prior's; one chunk in so many is held out.
-_DETERMINED, _HELD_OUT = 0.5, 5
+# One chunk in so many is held out.
+_HELD_OUT = 5
 
 
 def cut(hypotheses: Hypotheses, data: Any, start: float, stop: float) -> Any:
@@ -73,7 +73,7 @@ def split_at(method: Method, data: Any, config: Config, middle: float) -> dict[s
     found = {}
     for i, q in enumerate(first.quantities):
         sigmas = float(a.sigmas[i]), float(b.sigmas[i])
-        if 0.0 < max(sigmas) < _DETERMINED * q.scale:
+        if q.determined(max(sigmas)):
             found[q.name] = Halves(float(a.values[i]), sigmas[0], float(b.values[i]), sigmas[1])
     return found
 

@@ -15,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.graph.assumptions import pull
 from pipelines.graph.problem import Array, Estimate, Quantity
@@ -27,9 +26,6 @@ LEVEL = 1e-3
 _PATHS, _BATCH = 4000, 500
 # Directions in which the rest of the recording added less than this share of the variance say nothing of a change.
 _LEAST = 1e-3
-# ... and of numbers whose sigma is beyond this part of the prior the recording does not tell enough to see one: what it
-# tells is as much the noise of its states, which moves the estimate without being chance as the covariances have it.
-_DETERMINED = 0.5
 # A step between the sides of a change is more than chance beyond so many sigmas.
 _STEP = 3.0
 # Priors are widened to what was found from so many sigmas on.
@@ -113,7 +109,10 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
     course = estimate.course
     if course is None:
         return None
-    kept = np.flatnonzero(course.steady & _determined(estimate, quantities))
+    # What a recording tells of other numbers is as much the noise of its states, which moves the estimate without being
+    # chance as the covariances have it.
+    told = [q.determined(sigma) for q, sigma in zip(quantities, estimate.sigmas.tolist(), strict=True)]
+    kept = np.flatnonzero(course.steady & told)
     late = course.time >= _long_enough(estimate, len(kept))
     if late.sum() < _FEWEST_MOMENTS or not len(kept):
         return None
@@ -131,12 +130,6 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
     by_size = np.argsort(-np.abs(difference[worst] / sigmas))
     departures = {quantities[kept[j]].name: float(difference[worst, j] / sigmas[j]) for j in by_size}
     return Stability(float(sizes[worst]), beyond, float(time[worst]), departures)
-
-
-def _determined(estimate: Estimate, quantities: Sequence[Quantity]) -> NDArray[np.bool_]:
-    """Which of the numbers the recording tells more of than their priors do."""
-    priors = np.array([np.inf if q.prior_sigma is None else q.prior_sigma for q in quantities])
-    return np.asarray(estimate.sigmas < _DETERMINED * priors)
 
 
 def _long_enough(estimate: Estimate, numbers: int) -> float:

@@ -133,12 +133,11 @@ def _unmoved(run: NDArray[np.intp], streams: Sequence[tuple[Array, float]]) -> t
 def _colour(values: Array) -> float:
     """By what sums of some samples (n, d) scatter more than those of white noise: a filtered sensor's are alike."""
     blocks = len(values) // _TOGETHER
-    means = values[: blocks * _TOGETHER].reshape(blocks, _TOGETHER, -1).mean(axis=1)
     if blocks < _FEWEST_BLOCKS:
         return 1.0
-    return float(
-        np.sqrt(np.maximum(_TOGETHER * (means.var(axis=0) / np.maximum(values.var(axis=0), _TINY)).mean(), 1.0))
-    )
+    means = values[: blocks * _TOGETHER].reshape(blocks, _TOGETHER, -1).mean(axis=1)
+    more = _TOGETHER * means.var(axis=0) / np.maximum(values.var(axis=0), _TINY)
+    return float(np.sqrt(max(more.mean(), 1.0)))
 
 
 def _still_for(off: Array, count: int) -> int:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
-from pipelines.graph.assumptions import determined, pull
+from pipelines.graph.assumptions import pull
 from pipelines.graph.noise import Level, Source
 from pipelines.graph.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
 from pipelines.judgement.changes import Changes
@@ -299,7 +299,7 @@ class Calibration:
         return [
             q.name
             for q in self.problem.quantities
-            if q.group is None or (q.name in sigmas and determined(q, sigmas[q.name]))
+            if q.group is None or (q.name in sigmas and q.determined(sigmas[q.name]))
         ]
 
     @property

@@ -81,7 +81,7 @@ def second_order(
             # As far as the linear system goes back itself, its covariance has it already.
             tangent = slope - information @ np.concatenate([move.at(key) for key in keys])
             back = _back(*reduced(system.linearize(each), ordering, keys), known)
-            bent = _numbers_bent(problem, values, each, keys)[free] / scale
+            bent = _numbers_bent(problem, values, each, move, keys)[free] / scale
             steps.append(back - _back(information, tangent, known) + vectors[:, told].T @ bent)
             if len(steps) == _TRIED and (eigenvalues[told] * np.square(steps)).sum(axis=1).max() < _SLIGHT:
                 return None
@@ -98,9 +98,11 @@ def _back(information: Array, slope: Array, known: Array) -> Array:
     return np.asarray(np.linalg.solve(known.T @ information @ known, known.T @ slope))
 
 
-def _numbers_bent(problem: Problem, values: gtsam.Values, moved: gtsam.Values, keys: Sequence[int]) -> Array:
-    """How far the reported numbers (n,) of moved values are from what their Jacobian foresees."""
-    found, move = [], values.localCoordinates(moved)
+def _numbers_bent(
+    problem: Problem, values: gtsam.Values, moved: gtsam.Values, move: gtsam.VectorValues, keys: Sequence[int]
+) -> Array:
+    """How far the reported numbers (n,) of values moved are from what their Jacobian foresees."""
+    found = []
     for p, key in zip(problem.parameters, keys, strict=True):
         numbers, J = p.coordinates(values, key)
         found.append(p.coordinates(moved, key)[0] - numbers - J @ move.at(key))
