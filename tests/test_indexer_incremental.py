@@ -50,8 +50,19 @@ def _assert_same(estimate: Estimate, batch: Estimate) -> None:
     assert np.abs(ratio - 1.0).max() < 0.2
 
 
-@pytest.mark.parametrize("window", [1.0, None], ids=["window", "all"])
-@pytest.mark.parametrize("name", ["ideal", "rough", "large_angles", "two_positions"])
+@pytest.mark.parametrize(
+    ("name", "window"),
+    [
+        ("ideal", 1.0),
+        ("rough", None),
+        ("large_angles", 1.0),
+        ("two_positions", None),
+        pytest.param("ideal", None, marks=pytest.mark.slow),
+        pytest.param("rough", 1.0, marks=pytest.mark.slow),
+        pytest.param("large_angles", None, marks=pytest.mark.slow),
+        pytest.param("two_positions", 1.0, marks=pytest.mark.slow),
+    ],
+)
 def test_ends_where_batch_does(name: str, window: float | None) -> None:
     graph, truth, batch = _in_batch(name)
     incremental = solve_incremental(graph, window)

@@ -86,7 +86,7 @@ def _mean_nees(scenario: LosScenario, solve: Solve, runs: int) -> tuple[float, i
 @pytest.mark.parametrize(
     ("scenario", "solve", "runs"),
     [
-        (REAL, solve_batch, 3),
+        (REAL, solve_batch, 2),
         (SHORT, solve_batch, 5),
         (REAL.model_copy(update={"duration_s": 10.0}), solve_incremental, 1),
     ],

@@ -79,8 +79,8 @@ def test_the_incremental_solver_finds_them_too() -> None:
     simulated = simulate("head", {"duration_s": 10.0, "vision_rate_hz": 12.0, "sensors": {}}, seed=1)
     right_config = load_config(simulated.config.encode())
     wrong_config = stated(right_config, {"vision_attitude": 3.0, "gyro_density": 1.0 / 3.0})
-    configs = (right_config, wrong_config)
-    assert_as_right(*(solve_incremental(methods.method("head").problem(simulated.data, each)) for each in configs))
+    as_it_is, wrong = (methods.method("head").problem(simulated.data, each) for each in (right_config, wrong_config))
+    assert_as_right(solve_batch(as_it_is), solve_incremental(wrong))
 
 
 @pytest.mark.slow
@@ -259,7 +259,9 @@ def test_nothing_stated_and_honest(method: str, grade: str) -> None:
     assert 0.8 < unstated(method, grade, range(25 if method in ("los", "cube") else 50)) < 1.25
 
 
-@pytest.mark.parametrize(("method", "grade"), [("head", "consumer"), ("indexer", "navigation")])
+@pytest.mark.parametrize(
+    ("method", "grade"), [pytest.param("head", "consumer", marks=pytest.mark.slow), ("indexer", "navigation")]
+)
 def test_nothing_stated_and_honest_on_a_few(method: str, grade: str) -> None:
     assert 0.6 < unstated(method, grade, range(3)) < 1.6
 
