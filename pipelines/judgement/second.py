@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipelines.graph.problem import Estimate, Quantity
+from pipelines.reports.units import human_unit
 
 # So many of the numbers that differ most are named.
 _NAMED = 3
@@ -18,12 +19,13 @@ def other_solution(estimate: Estimate, quantities: Sequence[Quantity]) -> str:
         return ""
     there, scales = estimate.second.values, np.array([q.scale for q in quantities])
     most = np.argsort(-np.abs(there - estimate.values) / scales)[:_NAMED]
-    named = ", ".join(
-        f"{quantities[i].name} {there[i]:.3g} for {estimate.values[i]:.3g}"
-        + ("" if quantities[i].unit == "1" else f" {quantities[i].unit}")
-        for i in most
-    )
+    named = []
+    for i in most:
+        unit, factor = human_unit(quantities[i])
+        named.append(
+            f"{quantities[i].name} {factor * there[i]:.3g} for {factor * estimate.values[i]:.3g} {unit}".rstrip()
+        )
     return (
         f"Another solution is nearly as likely, its chi-square {estimate.second.chi_square:.1f} higher by the priors: "
-        f"{named}. second_best in result.json has it whole."
+        f"{', '.join(named)}. second_best in result.json has it whole."
     )
