@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -147,8 +148,11 @@ def test_workers_killed_at_random_cost_nothing(start: Start, recordings: Path, t
     while len(finished(out)) < COUNT - 8:
         until(partial(has_finished, len(finished(out)) + 2, out))
         time.sleep(rng.uniform(0.0, 0.3))
-        os.kill(rng.choice(workers_of(command.pid)), signal.SIGKILL)
-        killed += 1
+        # All may be on their way up again, and the one chosen may just have ended.
+        until(lambda: bool(workers_of(command.pid)))
+        with suppress(ProcessLookupError, IndexError):
+            os.kill(rng.choice(workers_of(command.pid)), signal.SIGKILL)
+            killed += 1
     output, error = command.communicate(timeout=100)
     assert (command.returncode, error) == (0, "")
     assert f"{COUNT} of {COUNT} " in output
@@ -172,8 +176,11 @@ def has_finished(count: int, out: Path) -> bool:
 
 def workers_of(command: int) -> list[int]:
     """Process ids of the workers that a command started on this machine."""
-    children = psutil.Process(command).children(recursive=True)
-    return [child.pid for child in children if "multiprocessing.spawn" in " ".join(child.cmdline())]
+    found = []
+    for child in psutil.Process(command).children(recursive=True):
+        with suppress(psutil.NoSuchProcess):
+            found += [child.pid] if "multiprocessing.spawn" in " ".join(child.cmdline()) else []
+    return found
 
 
 def untimed(result: Any) -> Any:
