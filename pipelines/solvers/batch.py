@@ -128,7 +128,7 @@ def solve_batch(
         if course is None
         else course.covariance[-1]
     )
-    noise = information_of_noise(problem, system, values, marginal, whole.current_keys)
+    noise = information_of_noise(problem, about, marginal, whole.current_keys)
     if noise is not None:
         marginal = joint_covariance(problem, linear, ordering, values, whole.current_keys, noise)
     bent = second_order(problem, system, values, marginal, whole.current_keys)

@@ -20,7 +20,7 @@ import numpy as np
 
 from pipelines.graph.problem import Array, Attitudes, ChiSquare, Course, Estimate, Factor, History, Problem, Step
 from pipelines.solvers.assembly import Assembly
-from pipelines.solvers.batch import CHUNK, Solution, optimize, with_levels
+from pipelines.solvers.batch import CHUNK, optimize, with_levels
 from pipelines.solvers.coloured import growth, inflated_by_innovations
 from pipelines.solvers.course import Way
 from pipelines.solvers.curvature import second_order
@@ -33,6 +33,7 @@ from pipelines.solvers.rows import Rows
 from pipelines.solvers.smoother import FixedLag, Smoother, Unlimited, linearized, unweighed, used_part
 from pipelines.solvers.spurious import information_of_noise
 from pipelines.solvers.state import State, explained, require_known, require_sound
+from pipelines.solvers.system import Linear
 from pipelines.solvers.window import Keyframes, Window
 
 DEFAULT_WINDOW = 1.0
@@ -345,10 +346,13 @@ class Run:
             whole.timestamps = {**self.base.stamps, **whole.timestamps}
         weighed = weigh(whole.factors, self.levels)
         solution = optimize(weighed, whole.initial, self.keys, self.problem.loss, held=self.problem.assumed)
+        about = None
         if solution.converged:
-            solution, self.levels, *_ = with_levels(self.problem, whole.factors, solution, self.levels)
+            solution, self.levels, about, _ = with_levels(self.problem, whole.factors, solution, self.levels)
         if not solution.converged:
             require_sound(whole.factors, whole.initial, self.time)
+        if about is None:
+            about = solution.system.linearized(solution.values)
         self._trouble = "" if solution.converged else f"the first {self.time:.1f} s: {solution.message}"
         values = solution.values
         if from_start:
@@ -359,15 +363,15 @@ class Run:
         grown = self._young and since >= max(_YOUNG, self._looked) and len(self.past) >= _FEW_STEPS
         if grown and (self.window is None or since >= _OLDEST):
             self._young = False
-        self._restart(solution, whole.timestamps)
-        self._correct(solution)
+        self._restart(about, whole.timestamps)
+        self._correct(about)
         if grown and self._young:
             self._looked = _GROWTH * since
             # Neither correction is carried on once the past is folded.
             corrected = self._noise is not None or self._bent is not None
             if not corrected and is_linear(self.problem, solution, self.keys):
                 self._young = False
-                self._restart(solution, whole.timestamps)
+                self._restart(about, whole.timestamps)
         system = solution.system
         if from_start:
             self.moments += 1
@@ -383,17 +387,17 @@ class Run:
         self._solved = _Solved(since, len(self.past), self.values(), np.sqrt(np.diag(self.covariance())))
         self.innovations.begin_count()
 
-    def _correct(self, solution: Solution) -> None:
+    def _correct(self, about: Linear) -> None:
         """Find what of a young run's covariance its linear system has wrong; of another nothing is known."""
         self._noise = self._bent = None
         if not self._young:
             return
-        system, values, current = solution.system, solution.values, self.current_keys
+        current = self.current_keys
         covariance = self.covariance()
-        self._noise = information_of_noise(self.problem, system, values, covariance, current)
+        self._noise = information_of_noise(self.problem, about, covariance, current)
         if self._noise is not None:
             covariance = self.covariance()
-        self._bent = second_order(self.problem, system, values, covariance, current)
+        self._bent = second_order(self.problem, about.system, about.values, covariance, current)
 
     def _due(self, since: float) -> bool:
         """Whether a young run is to be solved in batch again, `since` s after its first step."""
@@ -424,15 +428,15 @@ class Run:
             yield step
         yield from (step for step in self.past if step.time > now)
 
-    def _restart(self, solution: Solution, stamps: Mapping[int, float]) -> None:
+    def _restart(self, about: Linear, stamps: Mapping[int, float]) -> None:
         """Start the smoother from a solution: from what it says of the variables it goes on with, or from all of it."""
-        values, loss = solution.values, solution.system.loss
+        values, loss = about.values, about.system.loss
         if self.window is None:
             past = (f for step in self.past for f in weigh(step.factors, self.levels))
             factors = [used_part(f, values, loss) for f in past]
             self._start([unweighed(f) for f in factors if f is not None], values, stamps)
             return
-        state = State.of(self.time, solution.system.linearize(values), values, _in_use(values, stamps), stamps)
+        state = State.of(self.time, about.graph, values, _in_use(values, stamps), stamps)
         if self._young:
             self._start([state.factor], state.values, state.stamps)
         else:

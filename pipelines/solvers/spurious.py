@@ -14,12 +14,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import gtsam
 import numpy as np
 
 from pipelines.graph.problem import Array, Problem
 from pipelines.solvers.marginals import IndeterminateError, joint_information, prior_units
-from pipelines.solvers.system import System
+from pipelines.solvers.system import Linear
 
 # Directions in which sigma is beyond this share of the prior are looked at; in others noise adds next to nothing.
 _WEAK = 0.3
@@ -30,8 +29,7 @@ _DRAWS = 3
 
 def information_of_noise(
     problem: Problem,
-    system: System,
-    values: gtsam.Values,
+    about: Linear,
     covariance: Array,
     current_keys: Mapping[int, int],
 ) -> Array | None:
@@ -41,8 +39,7 @@ def information_of_noise(
 
     Args:
         problem: the graph's.
-        system: of the same.
-        values: the solution.
+        about: it linearised at its solution.
         covariance: (n, n) of the reported numbers as the linearised graph has it.
         current_keys: parameter key -> variable that holds its value.
     """
@@ -50,10 +47,10 @@ def information_of_noise(
     doubtful = _doubtful(problem, keys, covariance)
     if not doubtful:
         return None
+    system, values = about.system, about.values
     try:
-        linear = system.linearized(values)
-        moved = linear.drawn(set(values.keys()) - set(doubtful), _DRAWS, np.random.default_rng(0))
-        graphs = (linear.graph, *map(system.linearize, moved))
+        moved = about.drawn(set(values.keys()) - set(doubtful), _DRAWS, np.random.default_rng(0))
+        graphs = (about.graph, *map(system.linearize, moved))
         own, *elsewhere = (joint_information(graph, system.ordering, keys) for graph in graphs)
     except (RuntimeError, IndeterminateError):
         return None
