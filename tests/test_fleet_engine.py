@@ -156,7 +156,7 @@ def test_workers_killed_at_random_cost_nothing(start: Start, recordings: Path, t
     output, error = command.communicate(timeout=100)
     assert (command.returncode, error) == (0, "")
     assert f"{COUNT} of {COUNT} " in output
-    assert killed >= 4
+    assert killed >= 2
     entries = [json.loads(line) for line in finished(out)]
     assert len(entries) == COUNT
     kept = {entry["name"]: untimed(entry["result"]) for entry in entries}

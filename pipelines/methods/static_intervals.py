@@ -22,7 +22,7 @@ _QUIET, _STILL = 3.0, 6.0
 _MARGIN = 0.25
 # ... and more where the sum of what the readings differ by from the quietest half of the interval, from there on, comes
 # out beyond the first many of its sigmas: back to where it was last within the second.
-_MOVED, _UNMOVED = 4.0, 1.0
+_MOVED, _UNMOVED = 5.0, 1.0
 # Samples whose means tell whether noise is white, and how many such means it takes.
 _TOGETHER, _FEWEST_BLOCKS, _TINY = 8, 4, np.finfo(float).tiny
 # The noise is what the quietest twentieth of the recording shows, between these multiples of the stated one.

@@ -115,6 +115,8 @@ def solve_batch(
     solution = optimize(
         weighed, whole.initial, shared, problem.loss, most, held=problem.assumed, boundaries=whole.boundaries
     )
+    # As large as the solution, and of no more use.
+    whole.initial, whole.timestamps = gtsam.Values(), {}
     solution, levels, about, expected = with_levels(problem, whole.factors, solution, problem.noises, most)
     best, second = likeliest(problem, solution, _minimize, whole.current_keys)
     if best is not solution:
