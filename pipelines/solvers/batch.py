@@ -1,15 +1,10 @@
-"""Batch: all steps in one graph, solved once.
-
-The outer loop is our own, since gtsam's optimizers copy all values into Python at every call of a Python factor, which
-makes them quadratic in the number of variables. Linearising, ordering and elimination stay gtsam's. Elimination
-is by QR: tight processes beside loose priors cost Cholesky its digits, and QR costs only half as much again.
-"""
+"""Batch: all steps in one graph, solved once."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -20,10 +15,10 @@ from pipelines.graph.problem import Array, Estimate, Factor, Problem, Told
 from pipelines.solvers.assembly import Assembly, StepBoundary
 from pipelines.solvers.coloured import added_variance, coloured, inflations
 from pipelines.solvers.curvature import second_order
+from pipelines.solvers.gauss_newton import MOST_DAMPING, MOST_ITERATIONS, Solution, minimize
 from pipelines.solvers.history import sequential_history
 from pipelines.solvers.influence import Influence, influence, strongest, uncertainty_budget
 from pipelines.solvers.marginals import (
-    IndeterminateError,
     chi_square,
     joint_covariance,
     reported,
@@ -39,20 +34,6 @@ from pipelines.solvers.told import told
 
 # Frames in one vectorised factor: past this the Jacobians' zeros cost more than the Python calls they save.
 CHUNK = 20
-_MOST_ITERATIONS = 60
-# Damping in units of an unknown's own information, beyond which no step is left to be made.
-_MOST_DAMPING = 1e8
-# An error (unit: half a squared sigma) less than this above the minimum has nothing more than 0.005 sigma off. What a
-# linearisation foresaw wrongly of its step is about what is left for the next one.
-_ERROR_TOLERANCE = 1e-5
-# A step that was to lower the error by less than this, half a sigma, and does by less than a third of it has only
-# to do with what is of second order: noise, which is all that a sensor at rest tells of a mount or a delay.
-_LITTLE = 0.15
-# A step off by more than this from what it foresaw leaves states unsettled; the next one is misled by them if it is off
-# by more than a share of what it foresaw, and in all.
-_OFF, _MISLED = 0.1, 0.01
-# Parts of a step along it that are tried, and how many steps the states have to return to the floor.
-_SHARES, _MOST_RETURNS = (1.0, 0.3, 0.1, 0.03), 2
 # So much a measurement is near enough to tell which ones lie outside the gate: on average they move by 0.05 sigma yet.
 _ROUGH_TOLERANCE = 1e-3
 # Below this mean pull of outliers on plain least squares, in sigmas a measurement, good measurements stay inside the
@@ -70,21 +51,9 @@ _MOST_LEVELS = 8
 _STRONGEST = 20
 
 
-@dataclass(frozen=True)
-class Solution:
-    """Values at a minimum of a system, and how it was reached; `unsettled`: the states may be off the floor yet."""
-
-    system: System
-    values: gtsam.Values
-    converged: bool
-    message: str
-    iterations: int
-    unsettled: bool = False
-
-
 def solve_batch(
     problem: Problem,
-    most: int = _MOST_ITERATIONS,
+    most: int = MOST_ITERATIONS,
     budget: bool = False,
     changed: Iterable[tuple[str, Problem]] = (),
     device: Collection[str] = (),
@@ -118,7 +87,7 @@ def solve_batch(
     # As large as the solution, and of no more use.
     whole.initial, whole.timestamps = gtsam.Values(), {}
     solution, levels, about, expected = with_levels(problem, whole.factors, solution, problem.noises, most)
-    best, second = likeliest(problem, solution, _minimize, whole.current_keys)
+    best, second = likeliest(problem, solution, minimize, whole.current_keys)
     if best is not solution:
         solution, (about, expected) = best, _expected(best)
     solved = time.perf_counter()
@@ -232,8 +201,8 @@ def optimize(
     values: gtsam.Values,
     shared: Sequence[int],
     loss: TruncatedLoss | None,
-    most: int = _MOST_ITERATIONS,
-    most_damping: float = _MOST_DAMPING,
+    most: int = MOST_ITERATIONS,
+    most_damping: float = MOST_DAMPING,
     held: Sequence[int] = (),
     boundaries: Sequence[StepBoundary] = (),
 ) -> Solution:
@@ -244,17 +213,17 @@ def optimize(
     """
     unweighed = System.of(factors, shared, None, boundaries)
     if loss is None:
-        return _minimize(unweighed, values, most=most, most_damping=most_damping)
+        return minimize(unweighed, values, most=most, most_damping=most_damping)
     measurements = sum(len(f.measurement.model.time) for f in factors if f.measurement is not None)
     start = values
-    plain = _minimize(unweighed, start, _ROUGH_TOLERANCE * measurements, min(most, _MOST_PLAIN) if held else most)
+    plain = minimize(unweighed, start, _ROUGH_TOLERANCE * measurements, min(most, _MOST_PLAIN) if held else most)
     values, iterations = plain.values, plain.iterations
     norms = _norms(unweighed, values)
     outlying = norms[norms > loss.gate].sum() > _MILD_PULL * len(norms)
     if outlying:
         if held:
             tied = System.of([*factors, *(_tie(key, start.atVector(key)) for key in held)], shared, None, boundaries)
-            plain_but_held = _minimize(tied, start, _ROUGH_TOLERANCE * measurements, most)
+            plain_but_held = minimize(tied, start, _ROUGH_TOLERANCE * measurements, most)
             values, iterations = plain_but_held.values, iterations + plain_but_held.iterations
         values, more = _relaxed(unweighed, loss, values, float(norms.max()))
         iterations += more
@@ -264,7 +233,7 @@ def optimize(
         # Among few measurements outliers lead plain least squares far beyond what the priors allow, and what is found
         # from there is none of the likely minima. With noise as large as they are the priors keep their say.
         softened = unweighed.made_of(_softened(factors, float(norms.max()) / loss.gate))
-        soft = _minimize(softened, start, most=most)
+        soft = minimize(softened, start, most=most)
         values, more = _relaxed(unweighed, loss, soft.values, float(_norms(unweighed, soft.values).max()))
         again, _ = _truncated(unweighed, loss, values, soft.values, most)
         iterations += soft.iterations + more + again.iterations
@@ -296,7 +265,7 @@ def _relaxed(unweighed: System, loss: TruncatedLoss, values: gtsam.Values, large
     """
     iterations, mu = 0, loss.gate**2 / max(2.0 * largest**2 - loss.gate**2, 1e-300)
     while mu < 1e3:
-        relaxed = _minimize(unweighed.under(replace(loss, mu=mu)), values, most=2)
+        relaxed = minimize(unweighed.under(replace(loss, mu=mu)), values, most=2)
         values, iterations = relaxed.values, iterations + relaxed.iterations
         mu *= 4.0
     return values, iterations
@@ -307,7 +276,7 @@ def with_levels(
     factors: Sequence[Factor],
     solution: Solution,
     levels: tuple[Level, ...],
-    most: int = _MOST_ITERATIONS,
+    most: int = MOST_ITERATIONS,
 ) -> tuple[Solution, tuple[Level, ...], Linear, dict[tuple[str, int], float]]:
     """The solution with the noise levels that the recording tells, and these; it linearised, and its expected squares.
 
@@ -349,7 +318,7 @@ def _expected(solution: Solution) -> tuple[Linear, dict[tuple[str, int], float]]
 def _again(problem: Problem, system: System, values: gtsam.Values, far: bool, most: int) -> Solution:
     """The solution of a system, not yet under a loss, near values; outliers looked for anew where noise is far off."""
     if problem.loss is None:
-        return _minimize(system, values, most=most)
+        return minimize(system, values, most=most)
     if far:
         return optimize(
             system.factors,
@@ -376,122 +345,13 @@ def _truncated(
     Where few do it is least squares on all, from plain values.
     """
     truncated = unweighed.under(loss)
-    final = _minimize(truncated, values, most=most, unsettled=unsettled)
+    final = minimize(truncated, values, most=most, unsettled=unsettled)
     used = np.concatenate([r.used for r in truncated.residuals(final.values).values()])
     if used.mean() < _FEWEST_USED:
-        return _minimize(unweighed, plain, most=most), False
+        return minimize(unweighed, plain, most=most), False
     return final, True
 
 
 def _tie(key: int, at: Array) -> Factor:
     """Holds a vector where it is."""
     return Factor("prior", gtsam.PriorFactorVector(key, at, gtsam.noiseModel.Isotropic.Sigma(len(at), _TIED)))
-
-
-def _minimize(
-    system: System,
-    values: gtsam.Values,
-    tolerance: float = _ERROR_TOLERANCE,
-    most: int = _MOST_ITERATIONS,
-    most_damping: float = _MOST_DAMPING,
-    unsettled: bool = False,
-) -> Solution:
-    """Gauss-Newton steps, damped (Levenberg-Marquardt) only where full ones fail.
-
-    A full step along a curved valley, such as that of two mounts whose product alone is known, leaves the floor and
-    raises the error by what is of second order. Damping would only make it crawl; there the states are brought back to
-    the floor instead, see `_along_valley`.
-
-    A large step too leaves states off the floor, and by so much the next one would be misled about shared variables
-    that little tells, such as a camera's roll: these swing, and the states after them, for steps on end. Where it is
-    misled, states go to the floor alone in its place, also at the start if they are `unsettled`.
-    """
-    error = system.error(values)
-    if not np.isfinite(error):
-        return Solution(system, values, False, "the residuals at the start are not finite", 0)
-    damping = 0.0
-    for iteration in range(1, most + 1):
-        linear, settled = _linearized(system, values), None
-        while True:
-            delta, foreseen = _step(system, values, linear, damping)
-            candidate = values if delta is None else values.retract(delta)
-            new_error = np.inf if delta is None else system.error(candidate)
-            misled = abs(error - new_error - foreseen) > max(_MISLED, _MISLED * foreseen)
-            if unsettled and misled and damping == 0.0:
-                settled, its_error = _states_alone(system, values, linear)
-                if its_error < error:
-                    candidate, new_error, foreseen = settled, its_error, error - its_error
-                    break
-            if delta is not None and damping == 0.0 and error < new_error:
-                candidate, new_error = _along_valley(system, values, error, delta)
-            if new_error <= error + _ERROR_TOLERANCE:
-                break
-            if damping == 0.0 and delta is not None and foreseen < _LITTLE:
-                return Solution(system, values, True, f"converged after {iteration} iterations", iteration)
-            damping = max(10.0 * damping, 1e-6)
-            if damping > most_damping:
-                return Solution(system, values, False, f"no step lowers the error of {error:.6g}", iteration)
-        fall, rounding = error - new_error, 1e-13 * error + 1e-10 * new_error
-        values, error = candidate, new_error
-        off = abs(fall - foreseen)
-        small = foreseen < _LITTLE and fall < 0.3 * foreseen
-        if damping == 0.0 and candidate is not settled and (small or min(fall, off) < tolerance + rounding):
-            return Solution(system, values, True, f"converged after {iteration} iterations", iteration, off > _OFF)
-        unsettled = damping == 0.0 and off > _OFF
-        damping = damping / 10.0 if damping > 1e-6 else 0.0
-    return Solution(system, values, False, f"not converged after {most} iterations", most)
-
-
-def _states_alone(system: System, values: gtsam.Values, linear: Linear | None) -> tuple[gtsam.Values, float]:
-    """Values and error where the states go with the shared variables held; infinite if they are not determined."""
-    try:
-        candidate = None if linear is None else values.retract(linear.states_alone())
-    except IndeterminateError:
-        candidate = None
-    return (values, np.inf) if candidate is None else (candidate, system.error(candidate))
-
-
-def _along_valley(
-    system: System, values: gtsam.Values, error: float, delta: gtsam.VectorValues
-) -> tuple[gtsam.Values, float]:
-    """Values on a step's way with a lower error, and that error; infinite if there is none.
-
-    The states are solved for anew with the shared variables held where the step takes them, and these go less far until
-    that lowers the error.
-    """
-    for share in _SHARES:
-        candidate = values.retract(delta.scale(share))
-        for _ in range(_MOST_RETURNS):
-            candidate, new_error = _returned(system, candidate)
-            if new_error < error:
-                return candidate, new_error
-    return values, np.inf
-
-
-def _returned(system: System, values: gtsam.Values) -> tuple[gtsam.Values, float]:
-    """Values nearer to the floor, and their error: the states alone moved, or of a graph without any what is known."""
-    linear = _linearized(system, values)
-    if linear is None or linear.has_states:
-        return _states_alone(system, values, linear)
-    candidate = values.retract(linear.of_the_known())
-    return candidate, system.error(candidate)
-
-
-def _linearized(system: System, values: gtsam.Values) -> Linear | None:
-    """A system about some values; None: a stretch does not determine what it alone holds."""
-    try:
-        return system.linearized(values)
-    except IndeterminateError:
-        return None
-
-
-def _step(
-    system: System, values: gtsam.Values, linear: Linear | None, damping: float
-) -> tuple[gtsam.VectorValues | None, float]:
-    """One (damped) step, None if the system is singular, and by how much it should lower the error."""
-    try:
-        if damping > 0.0:
-            linear = system.linearized(values, damping) if linear is None else linear.damped(damping)
-        return (None, 0.0) if linear is None else linear.step()
-    except (RuntimeError, IndeterminateError):
-        return None, 0.0

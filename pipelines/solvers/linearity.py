@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipelines.graph.problem import Problem
-from pipelines.solvers.batch import Solution
+from pipelines.solvers.gauss_newton import Solution
 from pipelines.solvers.marginals import IndeterminateError, coordinate_inverse, joint_information
 
 # So many points about the estimate are tried, in pairs.

@@ -18,7 +18,7 @@ from pipelines.solvers.marginals import reported
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from pipelines.solvers.batch import Solution
+    from pipelines.solvers.gauss_newton import Solution
     from pipelines.solvers.system import System
 
 # By so much less than this, in chi-square, another minimum is told: the 99 % quantile for one degree of freedom.

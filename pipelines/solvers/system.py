@@ -35,6 +35,8 @@ Shown = TypeVar("Shown")
 
 # Shared variables are held by so many times their information.
 HELD = 1e6
+# ... and by so much, in the units of each, where only the others move.
+_STILL = 1e-12
 # A graph of more variables is divided, and into stretches of about so many, or fewer where that gives the history too
 # few moments.
 _UNDIVIDED, _STRETCH = 100_000, 3_000
@@ -243,21 +245,27 @@ class Linear:
 
     def solution(self) -> gtsam.VectorValues:
         """The move to the minimum. Raises IndeterminateError, naming a variable that is not determined."""
-        return self._solved_by(self.triangular)
+        solution = self.triangular.back(self.triangular.right)[:, 0]
+        delta = gtsam.VectorValues()
+        for key, place in self.triangular.places.items():
+            delta.insert(key, solution[place])
+        return self._followed(delta)
 
     def states_alone(self) -> gtsam.VectorValues:
-        """The same with the variables that all measurements share held where they are."""
-        shared = set(self.system.shared)
-        states = [key for key in _keys(self.system.ordering) if key not in shared]
-        own = Triangular.of(self.graph, ordering_of(states)) if states else Triangular.none(self.graph)
-        return self._solved_by(own)
+        """The same with the variables that all measurements share held; raises RuntimeError if that is singular."""
+        graph, dims = gtsam.GaussianFactorGraph(), self.values.dims()
+        graph.push_back(self.graph)
+        for key in self.system.shared:
+            noise = gtsam.noiseModel.Isotropic.Sigma(dims[key], _STILL)
+            graph.add(gtsam.JacobianFactor(key, np.eye(dims[key]), np.zeros(dims[key]), noise))
+        delta, still = graph.optimize(self.system.ordering, gtsam.EliminateQR), gtsam.VectorValues()
+        for key in self.system.shared:
+            still.insert(key, np.zeros(dims[key]))
+        delta.update(still)
+        return self._followed(delta)
 
-    def _solved_by(self, triangular: Triangular) -> gtsam.VectorValues:
-        """What a triangular factor of `graph` says of all variables, those that it leaves where they are."""
-        solution = triangular.back(triangular.right)[:, 0]
-        delta = gtsam.VectorValues()
-        for key, place in triangular.places.items():
-            delta.insert(key, solution[place])
+    def _followed(self, delta: gtsam.VectorValues) -> gtsam.VectorValues:
+        """A move of the variables that stretches share, with those of their own."""
         for part in self.parts():
             _follow(part, delta)
         return delta
@@ -330,6 +338,12 @@ class System:
         if len(self.stretches) == 1:
             return self.stretches[0].factors
         return [f for stretch in self.stretches for f in stretch.factors]
+
+    @cached_property
+    def measured(self) -> int:
+        """Rows of all measurements."""
+        models = [f.measurement.model for f in self.factors if f.measurement is not None]
+        return sum(len(model.time) * model.rows for model in models)
 
     def made_of(self, factors: Sequence[Factor]) -> System:
         """The same system with other noise: of factors on the same variables, one for one."""

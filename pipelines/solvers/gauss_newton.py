@@ -1,0 +1,218 @@
+"""Least squares by Gauss-Newton steps, for graphs with curved valleys and for models that do not fit.
+
+The outer loop is our own, since gtsam's optimizers copy all values into Python at every call of a Python factor, which
+makes them quadratic in the number of variables. Linearising, ordering and elimination stay gtsam's. Elimination
+is by QR: tight processes beside loose priors cost Cholesky its digits, and QR costs only half as much again.
+
+A full step may be wrong in three ways. Along a curved valley, such as that of two mounts whose product alone is known,
+it leaves the floor and raises the error by what is of second order; damping would only make it crawl, and there the
+states are brought back to the floor instead. A large step too leaves states off the floor, and by so much the next one
+would be misled about shared variables that little tells, such as a camera's roll: these swing, and the states after
+them, for steps on end; there states go to the floor alone in its place. And where measurements do not fit, residuals
+bend the error as much as Jacobians do: steps are too short or too long by the same share again and again. What one
+gained instead of what it foresaw tells how far the parabola through both has its floor (Nocedal, Wright, "Numerical
+Optimization", 2006, sections 3.5 and 10.3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from pipelines.solvers.marginals import IndeterminateError
+from pipelines.solvers.system import Linear, System
+
+MOST_ITERATIONS = 60
+# Damping in units of an unknown's own information, beyond which no step is left to be made.
+MOST_DAMPING = 1e8
+# An error (unit: half a squared sigma) less than this above the minimum has nothing more than 0.005 sigma off, sigmas
+# being as large as the residuals say. What a linearisation foresaw wrongly of its step is about what is left for the
+# next one.
+_ERROR_TOLERANCE = 1e-5
+# A step that was to lower the error by less than this, half a sigma, and does by less than a third of it has only
+# to do with what is of second order: noise, which is all that a sensor at rest tells of a mount or a delay.
+_LITTLE = 0.15
+# A step off by more than this from what it foresaw leaves states unsettled; the next one is misled by them if it gains
+# less than it foresaw by more than a share of that, and in all.
+_OFF, _MISLED = 0.1, 0.01
+# Parts of a step along it that are tried, and how many steps the states have to return to the floor.
+_SHARES, _MOST_RETURNS = (1.0, 0.3, 0.1, 0.03), 2
+# A step that gains more or less than it foresaw by such a share of it is too short or too long, at most so many times.
+_WRONG_LENGTH, _LONGEST = 0.2, 10.0
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Values at a minimum of a system, and how it was reached; `unsettled`: the states may be off the floor yet."""
+
+    system: System
+    values: gtsam.Values
+    converged: bool
+    message: str
+    iterations: int
+    unsettled: bool = False
+
+
+@dataclass(frozen=True)
+class _Move:
+    """Values to go to, and their error.
+
+    Attributes:
+        foreseen: by how much the linear system foresaw that they lower the error.
+        on_floor: whether the states are there.
+        halfway: whether the shared variables are yet to follow.
+    """
+
+    values: gtsam.Values
+    error: float
+    foreseen: float
+    on_floor: bool = False
+    halfway: bool = False
+
+
+def minimize(
+    system: System,
+    values: gtsam.Values,
+    tolerance: float = _ERROR_TOLERANCE,
+    most: int = MOST_ITERATIONS,
+    most_damping: float = MOST_DAMPING,
+    unsettled: bool = False,
+) -> Solution:
+    """Values with the least error, by steps that are damped (Levenberg-Marquardt) only where full ones fail.
+
+    Args:
+        system: with the loss in force.
+        values: where to begin.
+        tolerance: of the error above its minimum, where the residuals are as large as their noise.
+        most: iterations, after which it counts as not converged.
+        most_damping: in units of an unknown's own information, beyond which no step is left.
+        unsettled: the states may be off the floor at the start.
+    """
+    error, damping = system.error(values), 0.0
+    if not np.isfinite(error):
+        return Solution(system, values, False, "the residuals at the start are not finite", 0)
+    for iteration in range(1, most + 1):
+        said = f"converged after {iteration} iterations"
+        near = tolerance * max(1.0, 2.0 * error / max(system.measured, 1))
+        linear, move = _linearized(system, values), None
+        while move is None:
+            delta, foreseen = _step(system, values, linear, damping)
+            if delta is not None and damping == 0.0 and foreseen < near:
+                last = _there(system, values, delta, foreseen)
+                return Solution(system, last.values if last.error < error else values, True, said, iteration)
+            if delta is not None and damping == 0.0:
+                move = _full(system, values, error, linear, delta, foreseen, unsettled)
+                if move is None and foreseen < _LITTLE:
+                    return Solution(system, values, True, said, iteration)
+            elif delta is not None:
+                move = _lower(error, _there(system, values, delta, foreseen))
+            if move is None:
+                damping = max(10.0 * damping, 1e-6)
+                if damping > most_damping:
+                    return Solution(system, values, False, f"no step lowers the error of {error:.6g}", iteration)
+        fall, rounding = error - move.error, 1e-13 * error + 1e-10 * move.error
+        off = abs(fall - move.foreseen)
+        values, error = move.values, move.error
+        small = move.foreseen < _LITTLE and fall < 0.3 * move.foreseen
+        if damping == 0.0 and not move.halfway and (small or min(fall, off) < near + rounding):
+            return Solution(system, values, True, said, iteration, off > _OFF and not move.on_floor)
+        unsettled = damping == 0.0 and off > _OFF and not move.on_floor
+        damping = damping / 10.0 if damping > 1e-6 else 0.0
+    return Solution(system, values, False, f"not converged after {most} iterations", most)
+
+
+def _full(
+    system: System,
+    values: gtsam.Values,
+    error: float,
+    linear: Linear | None,
+    delta: gtsam.VectorValues,
+    foreseen: float,
+    unsettled: bool,
+) -> _Move | None:
+    """Where an undamped step leads, or what is better there; None: nowhere that is lower."""
+    move = _there(system, values, delta, foreseen)
+    fall = error - move.error
+    if unsettled and foreseen - fall > max(_MISLED, _MISLED * foreseen):
+        alone = _states_alone(system, values, linear)
+        if alone.error < min(error, move.error):
+            return alone
+    if fall < 0.0:
+        return _lower(error, _along_valley(system, values, error, delta, foreseen))
+    if abs(fall - foreseen) > _WRONG_LENGTH * foreseen:
+        bend = 2.0 * foreseen - fall
+        share = foreseen / bend if foreseen < _LONGEST * bend else _LONGEST
+        other = _there(system, values, delta.scale(share), foreseen)
+        if other.error < move.error:
+            return other
+    return move
+
+
+def _there(system: System, values: gtsam.Values, delta: gtsam.VectorValues, foreseen: float) -> _Move:
+    """Where a step leads."""
+    candidate = values.retract(delta)
+    return _Move(candidate, system.error(candidate), foreseen)
+
+
+def _lower(error: float, move: _Move) -> _Move | None:
+    """A move that does not raise the error, but for rounding."""
+    return move if move.error <= error + _ERROR_TOLERANCE else None
+
+
+def _states_alone(system: System, values: gtsam.Values, linear: Linear | None) -> _Move:
+    """The states moved with the shared variables held; its error infinite if they are not determined."""
+    try:
+        candidate = None if linear is None else values.retract(linear.states_alone())
+    except (RuntimeError, IndeterminateError):
+        candidate = None
+    error = np.inf if candidate is None else system.error(candidate)
+    return _Move(values if candidate is None else candidate, error, 0.0, on_floor=True, halfway=True)
+
+
+def _along_valley(
+    system: System, values: gtsam.Values, error: float, delta: gtsam.VectorValues, foreseen: float
+) -> _Move:
+    """A place with a lower error on a step's way; its error infinite if there is none.
+
+    The states are solved for anew with the shared variables held where the step takes them, and these go less far until
+    that lowers the error. In a graph without states it is what is known that returns to the floor.
+    """
+    for share in _SHARES:
+        candidate = values.retract(delta.scale(share))
+        for _ in range(_MOST_RETURNS):
+            candidate, new_error = _returned(system, candidate)
+            if new_error < error:
+                return _Move(candidate, new_error, foreseen, on_floor=True)
+    return _Move(values, np.inf, foreseen)
+
+
+def _returned(system: System, values: gtsam.Values) -> tuple[gtsam.Values, float]:
+    """Values nearer to the floor, and their error: the states alone moved, or of a graph without any what is known."""
+    linear = _linearized(system, values)
+    if linear is None or linear.has_states:
+        move = _states_alone(system, values, linear)
+        return move.values, move.error
+    candidate = values.retract(linear.of_the_known())
+    return candidate, system.error(candidate)
+
+
+def _linearized(system: System, values: gtsam.Values) -> Linear | None:
+    """A system about some values; None: a stretch does not determine what it alone holds."""
+    try:
+        return system.linearized(values)
+    except IndeterminateError:
+        return None
+
+
+def _step(
+    system: System, values: gtsam.Values, linear: Linear | None, damping: float
+) -> tuple[gtsam.VectorValues | None, float]:
+    """One (damped) step, None if the system is singular, and by how much it should lower the error."""
+    try:
+        if damping > 0.0:
+            linear = system.linearized(values, damping) if linear is None else linear.damped(damping)
+        return (None, 0.0) if linear is None else linear.step()
+    except (RuntimeError, IndeterminateError):
+        return None, 0.0
