@@ -16,7 +16,7 @@ from pipelines.graph.problem import Array, Estimate, Factor, Parameter, Problem,
 from pipelines.judgement.observability import assess
 from pipelines.methods.los import graph as los
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.solvers import batch
+from pipelines.solvers import batch, gauss_newton
 from pipelines.solvers.assembly import Assembly
 from pipelines.solvers.batch import CHUNK, solve_batch
 from pipelines.solvers.gauss_newton import minimize
@@ -27,6 +27,9 @@ from pipelines.solvers.window import Keyframes
 from tests import chain
 from tests.chain import INTERVAL, PARAMETER, PRIOR, Walk
 from tests.short_problems import los_problem
+
+# Slopes of a gyro's bias, rad/s/K.
+WARMING = (1.5e-4, -2e-4, 2.5e-4)
 
 
 def assert_same(estimate: Estimate, value: Array, covariance: Array, tolerance: float = 1e-8) -> None:
@@ -216,6 +219,34 @@ def test_the_states_alone_go_to_the_floor() -> None:
         falls.append(before - system.error(values))
     assert falls[0] > 0.1 * system.error(values)
     assert abs(falls[2]) < 1e-3
+
+
+@pytest.mark.parametrize("pictures_hz", [5.0, 10.0])
+def test_where_measurements_do_not_fit_steps_get_the_right_length(
+    pictures_hz: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A gyro warms up and nobody says so: residuals are tens of sigmas, and bend the error as much as Jacobians do.
+
+    With full steps alone 57 iterations and more, most of them for the same share of what is left.
+    """
+    scenario = LosScenario.model_validate(
+        {"duration_s": 30.0, "image_rate_hz": pictures_hz, "gyro_rate_hz": 100.0, "gimbal_rate_hz": 100.0}
+        | {"temperature": {"rise_k": 20.0, "time_constant_s": 10.0}}
+        | {"effects": {f"gyro_temperature_{axis}": slope for axis, slope in zip("xyz", WARMING, strict=True)}}
+    )
+    data = replace(simulate_los(scenario, 1)[0], temperature=None)
+    problem = los.problem(data, load_config(los_config(scenario).encode()))
+    whole = Assembly.of(problem.steps(CHUNK))
+    system = System.of(whole.factors, whole.shared(problem), None)
+    found = minimize(system, whole.initial)
+    assert found.converged
+    assert found.iterations < 30
+    error = system.error(found.values)
+    assert error > 10.0 * system.measured
+    monkeypatch.setattr(gauss_newton, "_ERROR_TOLERANCE", 1e-9)
+    least = system.error(minimize(system, found.values, 1e-9).values)
+    # Of a sigma as large as the residuals say, 0.01.
+    assert error - least < 0.5 * 0.01**2 * 2.0 * error / system.measured
 
 
 @pytest.mark.slow

@@ -85,7 +85,7 @@ def minimize(
     Args:
         system: with the loss in force.
         values: where to begin.
-        tolerance: of the error above its minimum, where the residuals are as large as their noise.
+        tolerance: of the error above its minimum; where residuals are larger than their noise it may be more.
         most: iterations, after which it counts as not converged.
         most_damping: in units of an unknown's own information, beyond which no step is left.
         unsettled: the states may be off the floor at the start.
@@ -95,7 +95,7 @@ def minimize(
         return Solution(system, values, False, "the residuals at the start are not finite", 0)
     for iteration in range(1, most + 1):
         said = f"converged after {iteration} iterations"
-        near = tolerance * max(1.0, 2.0 * error / max(system.measured, 1))
+        near = max(tolerance, _ERROR_TOLERANCE * 2.0 * error / max(system.measured, 1))
         linear, move = _linearized(system, values), None
         while move is None:
             delta, foreseen = _step(system, values, linear, damping)
