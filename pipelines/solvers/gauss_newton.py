@@ -95,7 +95,7 @@ def minimize(
         return Solution(system, values, False, "the residuals at the start are not finite", 0)
     for iteration in range(1, most + 1):
         said = f"converged after {iteration} iterations"
-        near = max(tolerance, _ERROR_TOLERANCE * 2.0 * error / max(system.measured, 1))
+        near = _near(system, error, tolerance)
         linear, move = _linearized(system, values), None
         while move is None:
             delta, foreseen = _step(system, values, linear, damping)
@@ -112,15 +112,20 @@ def minimize(
                 damping = max(10.0 * damping, 1e-6)
                 if damping > most_damping:
                     return Solution(system, values, False, f"no step lowers the error of {error:.6g}", iteration)
-        fall, rounding = error - move.error, 1e-13 * error + 1e-10 * move.error
-        off = abs(fall - move.foreseen)
-        values, error = move.values, move.error
+        before, values, error = error, move.values, move.error
+        fall, off = before - error, abs(before - error - move.foreseen)
         small = move.foreseen < _LITTLE and fall < 0.3 * move.foreseen
-        if damping == 0.0 and not move.halfway and (small or min(fall, off) < near + rounding):
+        enough = _near(system, error, tolerance) + 1e-13 * before + 1e-10 * error
+        if damping == 0.0 and not move.halfway and (small or min(fall, off) < enough):
             return Solution(system, values, True, said, iteration, off > _OFF and not move.on_floor)
         unsettled = damping == 0.0 and off > _OFF and not move.on_floor
         damping = damping / 10.0 if damping > 1e-6 else 0.0
     return Solution(system, values, False, f"not converged after {most} iterations", most)
+
+
+def _near(system: System, error: float, tolerance: float) -> float:
+    """So much above the minimum is near enough, if the error there is about what it is."""
+    return max(tolerance, _ERROR_TOLERANCE * 2.0 * error / max(system.measured, 1))
 
 
 def _full(
@@ -145,6 +150,8 @@ def _full(
         bend = 2.0 * foreseen - fall
         share = foreseen / bend if foreseen < _LONGEST * bend else _LONGEST
         other = _there(system, values, delta.scale(share), foreseen)
+        if share > 1.0 and other.error >= move.error:
+            other = _Move(*_returned(system, other.values), foreseen, on_floor=True)
         if other.error < move.error:
             return other
     return move
