@@ -22,7 +22,8 @@ from pipelines.methods.los.simulation import LosScenario, los_config, simulate_l
 from pipelines.settings import Config, Sensors
 from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.solvers.assembly import Assembly
-from pipelines.solvers.batch import CHUNK, Solution, optimize, solve_batch
+from pipelines.solvers.batch import CHUNK, optimize, solve_batch
+from pipelines.solvers.gauss_newton import Solution
 
 IDEAL = Config.model_validate({"sensors": "ideal"}).sensors
 MOUNT = int(gtsam.symbol("M", 0))

@@ -146,7 +146,9 @@ def _full(
             return alone
     if fall < 0.0:
         return _lower(error, _along_valley(system, values, error, delta, foreseen))
-    if abs(fall - foreseen) > _WRONG_LENGTH * foreseen:
+    # A surrogate of the loss weighs anew with every step: of a few on the way nothing is to be learned.
+    relaxed = system.loss is not None and np.isfinite(system.loss.mu)
+    if not relaxed and abs(fall - foreseen) > _WRONG_LENGTH * foreseen:
         bend = 2.0 * foreseen - fall
         share = foreseen / bend if foreseen < _LONGEST * bend else _LONGEST
         other = _there(system, values, delta.scale(share), foreseen)
