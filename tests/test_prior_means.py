@@ -125,15 +125,18 @@ def test_yesterdays_result_with_todays_recording_is_both_together(case: str, tmp
 @pytest.fixture(scope="module")
 def earlier(tmp_path_factory: pytest.TempPathFactory) -> tuple[Calibration, Path]:
     folder = tmp_path_factory.mktemp("earlier")
-    found = alidade.calibrate(alidade.simulate("indexer", None, seed=1))
+    found = alidade.calibrate(alidade.simulate("indexer", COARSE, seed=1))
     found.write(folder)
     return found, folder
 
 
 @pytest.fixture(scope="module")
 def today(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    recording = tmp_path_factory.mktemp("today") / "today.mcap"
-    CliRunner().invoke(app, ["simulate", "indexer", "--seed", "2", "--out", str(recording)])
+    folder = tmp_path_factory.mktemp("today")
+    recording, scenario = folder / "today.mcap", folder / "coarse.yaml"
+    scenario.write_text(json.dumps(COARSE))
+    arguments = ["--scenario", str(scenario), "--seed", "2", "--out", str(recording)]
+    CliRunner().invoke(app, ["simulate", "indexer", *arguments])
     return recording
 
 
@@ -169,12 +172,12 @@ def test_what_walks_is_known_less_well_after_a_while(earlier: tuple[Calibration,
 def test_how_far_it_walks_is_not_told_by_one_recording(earlier: tuple[Calibration, Path]) -> None:
     config = load_config(b"share: {theta_*: walks}")
     with pytest.raises(InputError, match="how far theta_x walks, only several recordings together tell"):
-        alidade.open(alidade.simulate("indexer", None, seed=2), config=config, prior=earlier[1] / "result.json")
+        alidade.open(alidade.simulate("indexer", COARSE, seed=2), config=config, prior=earlier[1] / "result.json")
 
 
 def test_what_the_config_says_of_a_prior_goes_before_an_earlier_calibration(earlier: tuple[Calibration, Path]) -> None:
     config = load_config(b"priors: {theta_y: 0.1, theta_z: {mean: 0.001, sigma: 0.01}}")
-    session = alidade.open(alidade.simulate("indexer", None, seed=2), config=config, prior=earlier[1] / "result.json")
+    session = alidade.open(alidade.simulate("indexer", COARSE, seed=2), config=config, prior=earlier[1] / "result.json")
     priors = {q.name: (q.prior_mean, q.prior_sigma) for q in session.problem().quantities}
     assert priors["theta_y"] == (0.0, 0.1)
     assert priors["theta_z"] == (0.001, 0.01)
@@ -182,7 +185,7 @@ def test_what_the_config_says_of_a_prior_goes_before_an_earlier_calibration(earl
 
 
 def test_unusable_priors_are_told_in_one_line(earlier: tuple[Calibration, Path], tmp_path: Path) -> None:
-    again = alidade.simulate("indexer", None, seed=1)
+    again = alidade.simulate("indexer", COARSE, seed=1)
     with pytest.raises(InputError, match="was made of this very recording"):
         alidade.open(again, prior=earlier[1] / "result.json")
     with pytest.raises(InputError, match="is a calibration of indexer, not of head"):
@@ -219,7 +222,7 @@ def test_priors_and_shares_that_mean_nothing(text: str, message: str) -> None:
 def test_a_mean_for_what_the_graph_leaves_out_is_refused() -> None:
     config = load_config(b"priors: {axis_nonperpendicularity: {mean: 1.0e-4, sigma: 0}}")
     with pytest.raises(InputError, match=r"priors\.axis_nonperpendicularity: where it is fixed"):
-        alidade.open(alidade.simulate("indexer", None, seed=1), config=config).problem()
+        alidade.open(alidade.simulate("indexer", COARSE, seed=1), config=config).problem()
 
 
 def test_methods_say_what_belongs_to_a_recording() -> None:

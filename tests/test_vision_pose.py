@@ -63,7 +63,7 @@ def test_covariance_is_calibrated_and_flips_are_told(
     camera: Camera, body: TagBody, distance: float, sigma: float
 ) -> None:
     rng = np.random.default_rng(7)
-    nees, squares, trials, ambiguous = [], [], 400, 0
+    nees, squares, trials, ambiguous = [], [], 200, 0
     for _ in range(trials):
         cRb, position = _random_pose(rng, body, distance)
         pose = estimate_pose(camera, body, _seen(camera, body, cRb, position, sigma, rng), sigma)
