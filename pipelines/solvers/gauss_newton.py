@@ -16,7 +16,7 @@ Optimization", 2006, sections 3.5 and 10.3).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -63,6 +63,7 @@ class _Move:
         foreseen: by how much the linear system foresaw that they lower the error.
         on_floor: whether the states are there.
         halfway: whether the shared variables are yet to follow.
+        last: whether the minimum is there.
     """
 
     values: gtsam.Values
@@ -70,6 +71,7 @@ class _Move:
     foreseen: float
     on_floor: bool = False
     halfway: bool = False
+    last: bool = False
 
 
 def minimize(
@@ -93,34 +95,55 @@ def minimize(
     error, damping = system.error(values), 0.0
     if not np.isfinite(error):
         return Solution(system, values, False, "the residuals at the start are not finite", 0)
+    near = _near(system, error, tolerance)
     for iteration in range(1, most + 1):
-        said = f"converged after {iteration} iterations"
-        near = _near(system, error, tolerance)
-        linear, move = _linearized(system, values), None
-        while move is None:
-            delta, foreseen = _step(system, values, linear, damping)
-            if delta is not None and damping == 0.0 and foreseen < near:
-                last = _there(system, values, delta, foreseen)
-                return Solution(system, last.values if last.error < error else values, True, said, iteration)
-            if delta is not None and damping == 0.0:
-                move = _full(system, values, error, linear, delta, foreseen, unsettled)
-                if move is None and foreseen < _LITTLE:
-                    return Solution(system, values, True, said, iteration)
-            elif delta is not None:
-                move = _lower(error, _there(system, values, delta, foreseen))
-            if move is None:
-                damping = max(10.0 * damping, 1e-6)
-                if damping > most_damping:
-                    return Solution(system, values, False, f"no step lowers the error of {error:.6g}", iteration)
+        move, damping = _move(system, values, error, near, damping, most_damping, unsettled)
+        if move is None:
+            return Solution(system, values, False, f"no step lowers the error of {error:.6g}", iteration)
         before, values, error = error, move.values, move.error
         fall, off = before - error, abs(before - error - move.foreseen)
         small = move.foreseen < _LITTLE and fall < 0.3 * move.foreseen
-        enough = _near(system, error, tolerance) + 1e-13 * before + 1e-10 * error
-        if damping == 0.0 and not move.halfway and (small or min(fall, off) < enough):
-            return Solution(system, values, True, said, iteration, off > _OFF and not move.on_floor)
+        near = _near(system, error, tolerance)
+        enough = small or min(fall, off) < near + 1e-13 * before + 1e-10 * error
         unsettled = damping == 0.0 and off > _OFF and not move.on_floor
+        if move.last or (damping == 0.0 and not move.halfway and enough):
+            return Solution(system, values, True, f"converged after {iteration} iterations", iteration, unsettled)
         damping = damping / 10.0 if damping > 1e-6 else 0.0
     return Solution(system, values, False, f"not converged after {most} iterations", most)
+
+
+def _move(
+    system: System,
+    values: gtsam.Values,
+    error: float,
+    near: float,
+    damping: float,
+    most_damping: float,
+    unsettled: bool,
+) -> tuple[_Move | None, float]:
+    """The next move, None if there is none, and the damping that it took."""
+    linear = _linearized(system, values)
+    while damping <= most_damping:
+        delta, foreseen = _step(system, values, linear, damping)
+        move = None
+        if delta is not None and damping > 0.0:
+            move = _lower(error, _there(system, values, delta, foreseen))
+        elif delta is not None and foreseen < near:
+            move = _there(system, values, delta, foreseen)
+            return (replace(move, last=True) if move.error < error else _stay(values, error)), damping
+        elif delta is not None:
+            move = _full(system, values, error, linear, delta, foreseen, unsettled)
+            if move is None and foreseen < _LITTLE:
+                return _stay(values, error), damping
+        if move is not None:
+            return move, damping
+        damping = max(10.0 * damping, 1e-6)
+    return None, damping
+
+
+def _stay(values: gtsam.Values, error: float) -> _Move:
+    """No further move, since the minimum is as near as need be."""
+    return _Move(values, error, 0.0, on_floor=True, last=True)
 
 
 def _near(system: System, error: float, tolerance: float) -> float:
