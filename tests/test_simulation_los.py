@@ -10,6 +10,7 @@ import pytest
 from pydantic import ValidationError
 
 from factors import so3
+from pipelines.methods.los import simulation
 from pipelines.methods.los.parameters import ASSUMPTIONS
 from pipelines.methods.los.simulation import (
     LosAngles,
@@ -147,3 +148,17 @@ def test_same_seed_same_session() -> None:
 def test_gaps_that_end_before_they_start_are_refused() -> None:
     with pytest.raises(ValidationError, match="starts before it ends"):
         LosScenario(dropouts_s=[(5.0, 4.0)])
+
+
+@pytest.mark.parametrize("latitude_deg", [None, 50.0])
+def test_long_recordings_are_simulated_block_by_block(
+    latitude_deg: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    loss = Loss(start_s=0.4, end_s=0.7, azimuth_step_deg=5.0)
+    scenario = LosScenario(duration_s=1.0, latitude_deg=latitude_deg, losses=[loss])
+    whole, truth = simulate_los(scenario, 0)
+    monkeypatch.setattr(simulation, "_BLOCK", 123)
+    blocks, its_truth = simulate_los(scenario, 0)
+    for name in ("gyro", "force", "gimbal", "error"):
+        np.testing.assert_array_equal(getattr(blocks, name), getattr(whole, name))
+    assert its_truth == pytest.approx(truth, rel=1e-12)

@@ -40,6 +40,9 @@ Array = NDArray[np.float64]
 # 2026-11-20 12:00 UTC: simulated sessions start here.
 EPOCH_NS = 1_795_176_000_000_000_000
 
+# Gyro samples that are simulated at once.
+_BLOCK = 100_000
+
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -192,7 +195,7 @@ def simulate_los(scenario: LosScenario, seed: int) -> tuple[LosData, dict[str, f
     error[outlying, :2] += scenario.outlier_size * rng.standard_normal((int(outlying.sum()), 2))
     if not scenario.measures_roll:
         error[:, 2] = np.nan
-    shaken = noise.accel_density * np.sqrt(scenario.gyro_rate_hz) * rng_of_sensors.standard_normal(motion.force.shape)
+    _shake(motion.force, noise.accel_density * np.sqrt(scenario.gyro_rate_hz), rng_of_sensors)
     data = LosData(
         epoch_ns=EPOCH_NS,
         gyro_t=motion.gyro_t,
@@ -202,7 +205,7 @@ def simulate_los(scenario: LosScenario, seed: int) -> tuple[LosData, dict[str, f
         image_t=image_t,
         error=error,
         gyro_density=noise.gyro_density or None,
-        force=motion.force + shaken,
+        force=motion.force,
         temperature=measured(scenario.temperature, scenario.duration_s),
     )
     return data, _truth(scenario, motion)
@@ -216,20 +219,39 @@ def simulate_motion(scenario: LosScenario, effects: Mapping[str, float], rng: np
     rate_hz = scenario.gyro_rate_hz
     gyro_t = sample_times(scenario.duration_s, rate_hz)
     edges = np.asarray((np.arange(len(gyro_t) + 1) - 0.5) / rate_hz)
-    iRm = so3.multiply(carrier_attitude(scenario, edges), _gyro_mount(scenario))
-    exact = so3.log(so3.multiply(so3.inverse(iRm[:-1]), iRm[1:])) * rate_hz
-    # The carrier turns about a point at rest.
-    nRm = so3.multiply(scenario.carrier.attitude(gyro_t), _gyro_mount(scenario))
-    up = np.array([0.0, 0.0, float(gravity(np.deg2rad(scenario.latitude_deg or 0.0)))])
-    force = so3.rotate(so3.inverse(nRm), up)
     start = scenario.gyro_turn_on_bias * rng.standard_normal(3)
-    steps = scenario.noise.gyro_bias_walk / np.sqrt(rate_hz) * rng.standard_normal(exact.shape)
-    bias = np.asarray(start + np.cumsum(steps, axis=0))
-    gyro = read_by(exact, "gyro", effects, force) + bias + drift(scenario.temperature, "gyro", effects, gyro_t)
-    gyro = gyro + scenario.noise.gyro_density * np.sqrt(rate_hz) * rng.standard_normal(exact.shape)
-    first = np.deg2rad(scenario.azimuth_deg), np.deg2rad(scenario.elevation_deg)
-    gimbal = _stabilise(gyro, _slew(scenario, gyro_t), 1.0 / rate_hz, *first)
+    bias = rng.standard_normal((len(gyro_t), 3))
+    bias *= scenario.noise.gyro_bias_walk / np.sqrt(rate_hz)
+    np.cumsum(bias, axis=0, out=bias)
+    bias += start
+    gyro, force = np.empty_like(bias), np.empty_like(bias)
+    for some in _blocks(len(gyro_t)):
+        iRm = so3.multiply(carrier_attitude(scenario, edges[some.start : some.stop + 1]), _gyro_mount(scenario))
+        exact = so3.log(so3.multiply(so3.inverse(iRm[:-1]), iRm[1:])) * rate_hz
+        force[some] = _force(scenario, gyro_t[some])
+        read = read_by(exact, "gyro", effects, force[some])
+        gyro[some] = read + bias[some] + drift(scenario.temperature, "gyro", effects, gyro_t[some])
+    _shake(gyro, scenario.noise.gyro_density * np.sqrt(rate_hz), rng)
+    gimbal = _stabilise(scenario, gyro_t, gyro)
     return LosMotion(edges, gimbal, gyro_t, gyro, bias, force, effects)
+
+
+def _blocks(count: int) -> Iterator[slice]:
+    """Samples, so many at once that hours of them take little more memory than what is kept of them."""
+    return (slice(begin, min(begin + _BLOCK, count)) for begin in range(0, count, _BLOCK))
+
+
+def _force(scenario: LosScenario, t: Array) -> Array:
+    """Specific force (N, 3) in m, m/s^2; the carrier turns about a point at rest."""
+    nRm = so3.multiply(scenario.carrier.attitude(t), _gyro_mount(scenario))
+    up = np.array([0.0, 0.0, float(gravity(np.deg2rad(scenario.latitude_deg or 0.0)))])
+    return so3.rotate(so3.inverse(nRm), up)
+
+
+def _shake(readings: Array, sigma: float, rng: np.random.Generator) -> None:
+    """Add white noise to readings (N, 3)."""
+    for some in _blocks(len(readings)):
+        readings[some] += sigma * rng.standard_normal(readings[some].shape)
 
 
 def _encoders(scenario: LosScenario, motion: LosMotion, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -365,18 +387,24 @@ def _slew(scenario: LosScenario, t: Array) -> Array:
     return out
 
 
-def _stabilise(gyro: Array, slew: Array, dt: float, azimuth: float, elevation: float) -> Array:
+def _stabilise(scenario: LosScenario, t: Array, gyro: Array) -> Array:
     """Gimbal angles (N + 1, 2) under the commanded rates, the command taken for the angles at mid-interval."""
-    out = [(azimuth, elevation)]
-    for (wx, wy, wz), (slew_z, slew_x) in zip(gyro.tolist(), slew.tolist(), strict=True):
-        middle, lift = azimuth, elevation
-        for _ in range(2):
+    dt = 1.0 / scenario.gyro_rate_hz
+    angles = np.empty((len(t) + 1, 2))
+    angles[0] = np.deg2rad([scenario.azimuth_deg, scenario.elevation_deg])
+    azimuth, elevation = angles[0].tolist()
+    for some in _blocks(len(t)):
+        out = []
+        for (wx, wy, wz), (slew_z, slew_x) in zip(gyro[some].tolist(), _slew(scenario, t[some]).tolist(), strict=True):
+            middle, lift = azimuth, elevation
+            for _ in range(2):
+                rate_z, rate_x = _command(wx, wy, wz, middle, lift)
+                middle, lift = azimuth + 0.5 * dt * rate_z, elevation + 0.5 * dt * rate_x
             rate_z, rate_x = _command(wx, wy, wz, middle, lift)
-            middle, lift = azimuth + 0.5 * dt * rate_z, elevation + 0.5 * dt * rate_x
-        rate_z, rate_x = _command(wx, wy, wz, middle, lift)
-        azimuth, elevation = azimuth + dt * (rate_z + slew_z), elevation + dt * (rate_x + slew_x)
-        out.append((azimuth, elevation))
-    return np.array(out)
+            azimuth, elevation = azimuth + dt * (rate_z + slew_z), elevation + dt * (rate_x + slew_x)
+            out.append((azimuth, elevation))
+        angles[some.start + 1 : some.stop + 1] = out
+    return angles
 
 
 def _command(wx: float, wy: float, wz: float, azimuth: float, elevation: float) -> tuple[float, float]:
@@ -438,13 +466,21 @@ def _about(axis: int, angle: Array | float) -> Array:
     return so3.exp(np.asarray(angle, dtype=float)[..., None] * np.eye(3)[axis])
 
 
+def _earth(scenario: LosScenario, t: Array) -> Array:
+    """Mean of the earth's rate (3,) in m, rad/s."""
+    rate, total = earth_rate(np.deg2rad(scenario.latitude_deg or 0.0)), np.zeros(3)
+    for some in _blocks(len(t)):
+        nRm = so3.multiply(scenario.carrier.attitude(t[some]), _gyro_mount(scenario))
+        total += so3.rotate(so3.inverse(nRm), rate).sum(axis=0)
+    return total / len(t)
+
+
 def _truth(scenario: LosScenario, motion: LosMotion) -> dict[str, float]:
     truth = {name: float(np.deg2rad(value)) for name, value in scenario.angles_deg.model_dump().items()}
     truth["delta_z"] = truth["delta_pz"] - truth["delta_gz"]
     bias = motion.bias.mean(axis=0)
     if scenario.latitude_deg is not None:
         # To a target on the earth the earth rate looks like a bias.
-        nRm = so3.multiply(scenario.carrier.attitude(motion.gyro_t), _gyro_mount(scenario))
-        bias = bias + so3.rotate(so3.inverse(nRm), earth_rate(np.deg2rad(scenario.latitude_deg))).mean(axis=0)
+        bias = bias + _earth(scenario, motion.gyro_t)
     truth |= {f"gyro_bias_{axis}": float(b) for axis, b in zip("xyz", bias, strict=True)}
     return {**truth, **motion.effects}
