@@ -449,16 +449,19 @@ def _pieces(factors: Sequence[Factor], ends: Sequence[StepBoundary]) -> list[Seq
 def _joint(
     pieces: Sequence[Sequence[Factor]], boundaries: Sequence[StepBoundary], shared: Sequence[int]
 ) -> dict[int, None]:
-    """Variables of several stretches and those that ever hold a parameter, in order of time, the shared ones last."""
+    """Variables of several stretches and those that ever hold a parameter, in order of last use, the shared ones last.
+
+    Eliminated in that order they leave a band: what is held until the end would join all stretches if it went first.
+    """
     own = [np.unique([key for f in piece for key in f.factor.keys()]).tolist() for piece in pieces]
     joint = {key for boundary in boundaries for key in boundary.current_keys.values()}
     seen: set[int] = set()
     for keys in own:
         joint.update(seen.intersection(keys))
         seen.update(keys)
-    last = set(shared)
-    found = dict.fromkeys(key for keys in own for key in keys if key in joint and key not in last)
-    return {**found, **dict.fromkeys(shared)}
+    # From the last one back, and that turned round.
+    used = dict.fromkeys(key for keys in (shared, *own[::-1]) for key in keys[::-1] if key in joint.union(shared))
+    return dict.fromkeys([*used][::-1])
 
 
 def _keys(ordering: gtsam.Ordering) -> list[int]:
