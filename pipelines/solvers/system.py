@@ -33,10 +33,8 @@ from pipelines.solvers.triangular import Triangular, rows_of
 
 Shown = TypeVar("Shown")
 
-# Shared variables are held by so many times their information.
-HELD = 1e6
-# ... and by so much, in the units of each, where only the others move.
-_STILL = 1e-12
+# What is held is held this tightly, in the units of each variable.
+_HELD = 1e-12
 # A graph of more variables is divided, and into stretches of about so many, or fewer where that gives the history too
 # few moments.
 _UNDIVIDED, _STRETCH = 100_000, 3_000
@@ -217,11 +215,16 @@ class Linear:
         """With each unknown held where it is by so many times its own information."""
         if len(self.system.stretches) > 1:
             return self.system.linearized(self.values, damping)
-        return replace(self, graph=held(self.graph, damping))
+        return replace(self, graph=damped(self.graph, damping))
 
     def holding(self, at: Mapping[int, Array]) -> Linear:
-        """With some of the variables that all share held at moves (d,)."""
-        return replace(self, graph=held(self.graph, HELD, at))
+        """With some of the variables that stretches share held at moves (d,)."""
+        graph = gtsam.GaussianFactorGraph()
+        graph.push_back(self.graph)
+        for key, move in at.items():
+            noise = gtsam.noiseModel.Isotropic.Sigma(len(move), _HELD)
+            graph.add(gtsam.JacobianFactor(key, np.eye(len(move)), move, noise))
+        return replace(self, graph=graph)
 
     @property
     def has_states(self) -> bool:
@@ -249,26 +252,14 @@ class Linear:
         delta = gtsam.VectorValues()
         for key, place in self.triangular.places.items():
             delta.insert(key, solution[place])
-        return self._followed(delta)
-
-    def states_alone(self) -> gtsam.VectorValues:
-        """The same with the variables that all measurements share held; raises RuntimeError if that is singular."""
-        graph, dims = gtsam.GaussianFactorGraph(), self.values.dims()
-        graph.push_back(self.graph)
-        for key in self.system.shared:
-            noise = gtsam.noiseModel.Isotropic.Sigma(dims[key], _STILL)
-            graph.add(gtsam.JacobianFactor(key, np.eye(dims[key]), np.zeros(dims[key]), noise))
-        delta, still = graph.optimize(self.system.ordering, gtsam.EliminateQR), gtsam.VectorValues()
-        for key in self.system.shared:
-            still.insert(key, np.zeros(dims[key]))
-        delta.update(still)
-        return self._followed(delta)
-
-    def _followed(self, delta: gtsam.VectorValues) -> gtsam.VectorValues:
-        """A move of the variables that stretches share, with those of their own."""
         for part in self.parts():
             _follow(part, delta)
         return delta
+
+    def states_alone(self) -> gtsam.VectorValues:
+        """The same with the variables that all measurements share held; raises RuntimeError if that is singular."""
+        dims = self.values.dims()
+        return self.holding({key: np.zeros(dims[key]) for key in self.system.shared}).step()[0]
 
     def step(self) -> tuple[gtsam.VectorValues, float]:
         """The same, by gtsam's own solution, and by how much it lowers the error. Raises RuntimeError if singular."""
@@ -375,8 +366,7 @@ class System:
         """One of several stretches about the values, damped as `Linear.damping` says."""
         graph = stretch.linearize(values, self.loss)
         if damping > 0.0:
-            gradient = graph.gradientAtZero()
-            graph = held(graph, damping, {key: np.zeros(len(gradient.at(key))) for key in _keys(stretch.inner)})
+            graph = damped(graph, damping, _keys(stretch.inner))
         return Part(stretch.factors, graph, stretch.inner)
 
     def linearized(self, values: gtsam.Values, damping: float = 0.0) -> Linear:
@@ -389,7 +379,7 @@ class System:
             (alone,) = self.stretches
             graph, families = alone.linearize(values, self.loss), [f.family for f in alone.factors]
             if damping > 0.0:
-                graph = held(graph, damping)
+                graph = damped(graph, damping)
             return Linear(self, values, damping, graph, families, self.boundaries)
         graph, families, boundaries = gtsam.GaussianFactorGraph(), [], []
         for stretch, end in zip(shown(self.stretches), self.boundaries, strict=True):
@@ -407,7 +397,7 @@ class System:
                 families.append("")
             boundaries.append(end._replace(factors=graph.size()))
         if damping > 0.0:
-            graph = held(graph, damping)
+            graph = damped(graph, damping)
         return Linear(self, values, damping, graph, families, boundaries)
 
     def linearize(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
@@ -513,10 +503,10 @@ def elimination_ordering(graph: gtsam.NonlinearFactorGraph, shared: Sequence[int
     return ordering_of([*(alone.keys() - last - set(chain)), *chain, *shared])
 
 
-def held(
-    linear: gtsam.GaussianFactorGraph, weight: float, at: Mapping[int, Array] | None = None
+def damped(
+    linear: gtsam.GaussianFactorGraph, weight: float, keys: Collection[int] | None = None
 ) -> gtsam.GaussianFactorGraph:
-    """The system with each unknown held where it is by `weight` times its own information, or some at moves (d,)."""
+    """The system with each unknown, or some, held where it is by `weight` times its own information."""
     gradient = linear.gradientAtZero()
     diagonal = {key: np.zeros(len(gradient.at(key))) for key in linear.keyVector()}
     for i in range(linear.size()):
@@ -526,12 +516,12 @@ def held(
             size = len(diagonal[key])
             diagonal[key] += squares[:size]
             squares = squares[size:]
-    out = linear.clone()
-    for key in diagonal if at is None else at:
+    out = gtsam.GaussianFactorGraph()
+    out.push_back(linear)
+    for key in diagonal if keys is None else keys:
         scale = np.sqrt(weight * np.maximum(diagonal[key], 1e-6))
         noise = gtsam.noiseModel.Unit.Create(len(scale))
-        aim = np.zeros(len(scale)) if at is None else scale * at[key]
-        out.add(gtsam.JacobianFactor(key, np.diag(scale), aim, noise))
+        out.add(gtsam.JacobianFactor(key, np.diag(scale), np.zeros(len(scale)), noise))
     return out
 
 
