@@ -193,6 +193,17 @@ def test_a_rest_ends_where_a_slow_motion_begins() -> None:
     assert (np.abs(still.mean(axis=0)) < 4.0 * noise / np.sqrt(len(still))).all()
 
 
+@pytest.mark.parametrize(("length", "cut"), [(2.0, 0.5), (3.7, 0.57), (8.0, 0.65)])
+def test_more_is_cut_off_a_long_rest(length: float, cut: float) -> None:
+    """A quarter of a second that the test looks at, another, and more where a rest is long enough to spare it."""
+    t, rng = np.arange(0.0, length + 6.0, 0.005), np.random.default_rng(4)
+    gyro, accel = (noise * rng.standard_normal((len(t), 3)) for noise in (1e-3, 0.01))
+    moves = np.abs(t - 3.0 - 0.5 * length) > 0.5 * length
+    gyro[moves] += np.sin(9.0 * t[moves])[:, None] * (0.5, 0.6, 0.8)
+    ((start, stop),) = find_static_intervals(t, gyro, accel + (0.0, 0.0, 9.81), 1e-3, 0.01)
+    assert (start - 3.0, 3.0 + length - stop) == pytest.approx((cut, cut), abs=0.03)
+
+
 def test_poses_near_iron_are_named() -> None:
     data, _, config = _simulated(11, poses=14, static_s=2.0, camera=None, reference=None)
     assert data.mag is not None

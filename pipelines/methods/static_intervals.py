@@ -23,6 +23,8 @@ _MARGIN = 0.25
 # ... and more where the sum of what the readings differ by from the quietest half of the interval, from there on, comes
 # out beyond the first many of its sigmas: back to where it was last within the second.
 _MOVED, _UNMOVED = 5.0, 1.0
+# What stays below that is slow all the same: this share of a long interval, up to s, is cut off at least.
+_SLOW_SHARE, _SLOW = 0.1, 0.4
 # Samples whose means tell whether noise is white, and how many such means it takes.
 _TOGETHER, _FEWEST_BLOCKS, _TINY = 8, 4, np.finfo(float).tiny
 # The noise is what the quietest twentieth of the recording shows, between these multiples of the stated one.
@@ -53,7 +55,8 @@ def find_static_intervals(t: Array, gyro: Array, accel: Array, gyro_sigma: float
         InputError: there is none.
     """
     runs, scatter, floor = _quiet_runs(t, [(gyro, gyro_sigma), (accel, accel_sigma)])
-    ends = [_unmoved(run, [(gyro, float(floor[0])), (accel, float(floor[1]))]) for run in runs]
+    interval = float(np.median(np.diff(t)))
+    ends = [_unmoved(run, [(gyro, float(floor[0])), (accel, float(floor[1]))], interval) for run in runs]
     runs = np.array([run for run in ends if t[run[1]] - t[run[0]] >= _SHORTEST], dtype=np.intp).reshape(-1, 2)
     means, forces = (
         np.array([values[a : b + 1].mean(axis=0) for a, b in runs]).reshape(-1, 3) for values in (gyro, accel)
@@ -108,7 +111,7 @@ def _quiet_runs(t: Array, streams: Sequence[tuple[Array, float]]) -> tuple[NDArr
     return runs[t[runs[:, 1]] - t[runs[:, 0]] >= _SHORTEST], scatter, floor
 
 
-def _unmoved(run: NDArray[np.intp], streams: Sequence[tuple[Array, float]]) -> tuple[int, int]:
+def _unmoved(run: NDArray[np.intp], streams: Sequence[tuple[Array, float]], interval: float) -> tuple[int, int]:
     """First and last sample of a quiet run of vectors, each with its noise, but for ends in which motion is slow."""
     first, last = run.tolist()
     quarter = (last - first) // 4
@@ -124,9 +127,11 @@ def _unmoved(run: NDArray[np.intp], streams: Sequence[tuple[Array, float]]) -> t
         before.append((values[first : middle.start] - mean)[::-1] / sigma)
         after.append((values[middle.stop : last + 1] - mean) / sigma)
     count = middle.stop - middle.start
+    rest = (last - first) * interval + 2.0 * _MARGIN
+    slow = round((max(min(_SLOW_SHARE * rest, _SLOW), _MARGIN) - _MARGIN) / interval)
     return (
-        middle.start - _still_for(np.hstack(before), count),
-        middle.stop - 1 + _still_for(np.hstack(after), count),
+        max(middle.start - _still_for(np.hstack(before), count), first + slow),
+        min(middle.stop - 1 + _still_for(np.hstack(after), count), last - slow),
     )
 
 
