@@ -258,8 +258,13 @@ class Linear:
 
     def states_alone(self) -> gtsam.VectorValues:
         """The same with the variables that all measurements share held; raises RuntimeError if that is singular."""
-        dims = self.values.dims()
-        return self.holding({key: np.zeros(dims[key]) for key in self.system.shared}).step()[0]
+        dims, still = self.values.dims(), gtsam.VectorValues()
+        for key in self.system.shared:
+            still.insert(key, np.zeros(dims[key]))
+        delta, _ = self.holding({key: still.at(key) for key in self.system.shared}).step()
+        # To the last digit, too.
+        delta.update(still)
+        return delta
 
     def step(self) -> tuple[gtsam.VectorValues, float]:
         """The same, by gtsam's own solution, and by how much it lowers the error. Raises RuntimeError if singular."""
@@ -449,8 +454,9 @@ def _joint(
     for keys in own:
         joint.update(seen.intersection(keys))
         seen.update(keys)
+    joint.update(shared)
     # From the last one back, and that turned round.
-    used = dict.fromkeys(key for keys in (shared, *own[::-1]) for key in keys[::-1] if key in joint.union(shared))
+    used = dict.fromkeys(key for keys in (shared, *own[::-1]) for key in keys[::-1] if key in joint)
     return dict.fromkeys([*used][::-1])
 
 

@@ -225,10 +225,12 @@ def simulate_motion(scenario: LosScenario, effects: Mapping[str, float], rng: np
     np.cumsum(bias, axis=0, out=bias)
     bias += start
     gyro, force = np.empty_like(bias), np.empty_like(bias)
+    # The carrier turns about a point at rest.
+    up = np.array([0.0, 0.0, float(gravity(np.deg2rad(scenario.latitude_deg or 0.0)))])
     for some in _blocks(len(gyro_t)):
         iRm = so3.multiply(carrier_attitude(scenario, edges[some.start : some.stop + 1]), _gyro_mount(scenario))
         exact = so3.log(so3.multiply(so3.inverse(iRm[:-1]), iRm[1:])) * rate_hz
-        force[some] = _force(scenario, gyro_t[some])
+        force[some] = _in_gyro(scenario, gyro_t[some], up)
         read = read_by(exact, "gyro", effects, force[some])
         gyro[some] = read + bias[some] + drift(scenario.temperature, "gyro", effects, gyro_t[some])
     _shake(gyro, scenario.noise.gyro_density * np.sqrt(rate_hz), rng)
@@ -241,11 +243,10 @@ def _blocks(count: int) -> Iterator[slice]:
     return (slice(begin, min(begin + _BLOCK, count)) for begin in range(0, count, _BLOCK))
 
 
-def _force(scenario: LosScenario, t: Array) -> Array:
-    """Specific force (N, 3) in m, m/s^2; the carrier turns about a point at rest."""
+def _in_gyro(scenario: LosScenario, t: Array, vector: Array) -> Array:
+    """A vector of n (3,) in m at times t (N,), (N, 3)."""
     nRm = so3.multiply(scenario.carrier.attitude(t), _gyro_mount(scenario))
-    up = np.array([0.0, 0.0, float(gravity(np.deg2rad(scenario.latitude_deg or 0.0)))])
-    return so3.rotate(so3.inverse(nRm), up)
+    return so3.rotate(so3.inverse(nRm), vector)
 
 
 def _shake(readings: Array, sigma: float, rng: np.random.Generator) -> None:
@@ -470,8 +471,7 @@ def _earth(scenario: LosScenario, t: Array) -> Array:
     """Mean of the earth's rate (3,) in m, rad/s."""
     rate, total = earth_rate(np.deg2rad(scenario.latitude_deg or 0.0)), np.zeros(3)
     for some in _blocks(len(t)):
-        nRm = so3.multiply(scenario.carrier.attitude(t[some]), _gyro_mount(scenario))
-        total += so3.rotate(so3.inverse(nRm), rate).sum(axis=0)
+        total += _in_gyro(scenario, t[some], rate).sum(axis=0)
     return total / len(t)
 
 
