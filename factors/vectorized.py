@@ -367,6 +367,9 @@ class _Group:
 
     def _column(self, i: int, places: dict[int, int]) -> NDArray[np.intp]:
         """The place of the variable that each measurement takes in a column; only one if they share it."""
+        first = self._factors[0].columns[i]
+        if isinstance(first, int) and all(factor.columns[i] == first for factor in self._factors):
+            return np.array([places.setdefault(first, len(places))])
         rows: list[Any] = []
         for factor in self._factors:
             column = factor.columns[i]

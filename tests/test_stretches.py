@@ -52,8 +52,10 @@ def test_progress_is_shown(monkeypatch: pytest.MonkeyPatch, capfd: pytest.Captur
     assert "stretch by stretch" in capfd.readouterr().err
 
 
-@pytest.mark.parametrize("make", [los_problem, head_problem])
-def test_it_is_the_same_solution(make: Callable[[], Problem], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("make", "kept"), [(los_problem, system._KEPT), (head_problem, 0)])
+def test_it_is_the_same_solution(make: Callable[[], Problem], kept: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether a stretch's elimination is kept or not."""
+    monkeypatch.setattr(system, "_KEPT", kept)
     whole = solve_batch(make(), budget=True, device=[make().quantities[0].name])
     parts = divided(monkeypatch, make())
     sigmas = np.maximum(whole.sigmas, 1e-12)
@@ -109,7 +111,7 @@ from benchmarks.measure import peak_mib, resident_mib
 from pipelines.solvers import system
 from pipelines.solvers.batch import solve_batch
 
-system._UNDIVIDED, system._STRETCH = 10_000, 600
+system._UNDIVIDED, system._STRETCH, system._KEPT = 10_000, 600, 0
 scenario = {"duration_s": float(sys.argv[1]), "gyro_rate_hz": 100.0, "gimbal_rate_hz": 100.0}
 problem = alidade.open(alidade.simulate("los", scenario)).problem()
 before = resident_mib()

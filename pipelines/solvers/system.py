@@ -4,7 +4,8 @@ A long recording is divided into stretches of time. The variables that only one 
 which leaves, as square root of information, what the stretch says of the others; these rows of all stretches are the
 system that is solved. Where the others are known, a stretch's own variables follow by back substitution. That is the
 whole system's elimination in another order, hence exact, and only one stretch is linearised at a time: what memory
-holds of a state is its value and residuals. A stretch is linearised and eliminated anew whenever it is needed.
+holds of a state of many hours is its value and residuals. A stretch is linearised anew whenever it is needed, and of
+many hours eliminated, too.
 
 A short recording is one stretch of which nothing is eliminated in advance.
 """
@@ -28,8 +29,8 @@ from pipelines import progress
 from pipelines.graph.problem import Array, Factor, Residuals
 from pipelines.solvers.assembly import StepBoundary
 from pipelines.solvers.history import MOMENTS
-from pipelines.solvers.marginals import IndeterminateError, explain, ordering_of
-from pipelines.solvers.triangular import Triangular, rows_of
+from pipelines.solvers.marginals import ordering_of
+from pipelines.solvers.triangular import Triangular, conditionals_of, eliminated, rows_of
 
 Shown = TypeVar("Shown")
 
@@ -37,7 +38,9 @@ Shown = TypeVar("Shown")
 _HELD = 1e-12
 # A graph of more variables is divided, and into stretches of about so many, or fewer where that gives the history too
 # few moments.
-_UNDIVIDED, _STRETCH = 100_000, 3_000
+_UNDIVIDED, _STRETCH = 150_000, 3_000
+# Up to so many variables what back substitution needs of stretches is kept, 6 kB each; of more it is found anew.
+_KEPT = 400_000
 
 
 def shown(stretches: Sequence[Shown]) -> Iterable[Shown]:
@@ -106,16 +109,18 @@ class Part:
         factors: of it.
         graph: the same, linearised.
         inner: as the stretch has it.
+        tree: of its own variables, if they are eliminated already.
     """
 
     factors: Sequence[Factor]
     graph: gtsam.GaussianFactorGraph
     inner: gtsam.Ordering
+    tree: gtsam.GaussianBayesTree | None = None
 
     @cached_property
     def triangular(self) -> Triangular:
         """The triangular factor of its own variables. Raises IndeterminateError, naming one that is not determined."""
-        return Triangular.of(self.graph, self.inner) if self.inner.size() else Triangular.none(self.graph)
+        return Triangular.of(self.graph, self.inner, self.tree)
 
     @cached_property
     def _rows(self) -> list[NDArray[np.intp]]:
@@ -138,6 +143,7 @@ class Linear:
         graph: what the stretches say of the variables that they share, all of it for a graph in one piece.
         families: of its factors, empty for those left of an elimination.
         boundaries: ends of stretches, counted in its factors; of a graph in one piece the ends of the steps.
+        trees: of the variables that each stretch alone holds, where they are kept.
     """
 
     system: System
@@ -146,6 +152,7 @@ class Linear:
     graph: gtsam.GaussianFactorGraph
     families: Sequence[str]
     boundaries: Sequence[StepBoundary]
+    trees: Sequence[gtsam.GaussianBayesTree | None] = (None,)
 
     @cached_property
     def triangular(self) -> Triangular:
@@ -156,7 +163,7 @@ class Linear:
         """A stretch; the only one of a graph in one piece is this system itself."""
         if len(self.system.stretches) == 1:
             return self._alone
-        return self.system.part(self.system.stretches[i], self.values, self.damping)
+        return replace(self.system.part(self.system.stretches[i], self.values, self.damping), tree=self.trees[i])
 
     @cached_property
     def _alone(self) -> Part:
@@ -252,8 +259,7 @@ class Linear:
         delta = gtsam.VectorValues()
         for key, place in self.triangular.places.items():
             delta.insert(key, solution[place])
-        for part in self.parts():
-            _follow(part, delta)
+        self._follow(delta)
         return delta
 
     def states_alone(self) -> gtsam.VectorValues:
@@ -269,27 +275,24 @@ class Linear:
     def step(self) -> tuple[gtsam.VectorValues, float]:
         """The same, by gtsam's own solution, and by how much it lowers the error. Raises RuntimeError if singular."""
         delta = self.graph.optimize(self.system.ordering, gtsam.EliminateQR)
-        foreseen = 0.0
-        for part in self.parts():
-            _follow(part, delta)
-            gradient, keys = part.graph.gradientAtZero(), list(part.graph.keyVector())
-            foreseen -= 0.5 * float(gradient.vector(keys) @ delta.vector(keys))
-        return delta, foreseen
+        gradient, keys = self.graph.gradientAtZero(), list(self.graph.keyVector())
+        return delta, self._follow(delta) - 0.5 * float(gradient.vector(keys) @ delta.vector(keys))
 
-
-def _follow(part: Part, delta: gtsam.VectorValues) -> None:
-    """Add a part's own variables to a solution that has all others."""
-    own = set(_keys(part.inner))
-    if not own:
-        return
-    triangular = part.triangular
-    known = triangular.right
-    for key, place in triangular.places.items():
-        if key not in own:
-            known[place, 0] = delta.at(key)
-    solution = triangular.back(known)[:, 0]
-    for key in own:
-        delta.insert(key, solution[triangular.places[key]])
+    def _follow(self, delta: gtsam.VectorValues) -> float:
+        """Add stretches' own variables to a solution that has all others; by how much they alone lower the error."""
+        lowers = 0.0
+        for i, stretch in enumerate(shown(self.system.stretches)):
+            if not stretch.inner.size():
+                continue
+            tree = self.trees[i] or eliminated(self.part(i).graph, stretch.inner)[0]
+            # Those above come first.
+            for conditional in reversed(conditionals_of(tree, stretch.inner)):
+                solved, d = conditional.solve(delta), conditional.d()
+                lowers += 0.5 * float(d @ d)
+                for key in conditional.keys():
+                    if not delta.exists(key):
+                        delta.insert(key, solved.at(key))
+        return lowers
 
 
 @dataclass(frozen=True, eq=False)
@@ -386,7 +389,8 @@ class System:
             if damping > 0.0:
                 graph = damped(graph, damping)
             return Linear(self, values, damping, graph, families, self.boundaries)
-        graph, families, boundaries = gtsam.GaussianFactorGraph(), [], []
+        graph, families, boundaries, trees = gtsam.GaussianFactorGraph(), [], [], []
+        kept = sum(stretch.inner.size() for stretch in self.stretches) <= _KEPT
         for stretch, end in zip(shown(self.stretches), self.boundaries, strict=True):
             part, outer = self.part(stretch, values, damping), set(stretch.outer)
             own = gtsam.GaussianFactorGraph()
@@ -396,14 +400,15 @@ class System:
                     families.append(stretch.factors[i].family)
                 else:
                     own.push_back(part.graph.at(i))
-            left = _without(own, stretch.inner)
+            tree, left = eliminated(own, stretch.inner)
+            trees.append(tree if kept else None)
             for i in range(left.size()):
                 graph.push_back(left.at(i))
                 families.append("")
             boundaries.append(end._replace(factors=graph.size()))
         if damping > 0.0:
             graph = damped(graph, damping)
-        return Linear(self, values, damping, graph, families, boundaries)
+        return Linear(self, values, damping, graph, families, boundaries, trees)
 
     def linearize(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
         """What `linearized` says of the variables that stretches share, all of it for a graph in one piece."""
@@ -466,14 +471,6 @@ def _keys(ordering: gtsam.Ordering) -> list[int]:
 
 def _vectorized(factors: Sequence[Factor]) -> list[VectorizedFactor]:
     return [v for f in factors if (v := f.vectorized) is not None]
-
-
-def _without(linear: gtsam.GaussianFactorGraph, inner: gtsam.Ordering) -> gtsam.GaussianFactorGraph:
-    """What a stretch says of variables that are not its own. Raises IndeterminateError, naming one that is."""
-    try:
-        return linear.eliminatePartialMultifrontal(inner, gtsam.EliminateQR)[1]
-    except RuntimeError as error:
-        raise IndeterminateError(explain(str(error))) from None
 
 
 def without_rejected(factor: Factor, like: Factor, values: gtsam.Values) -> Factor:

@@ -43,32 +43,18 @@ class Triangular:
     tree: gtsam.GaussianBayesTree
 
     @classmethod
-    def of(cls, linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> Triangular:
-        """Eliminate all or some variables of a system, in order.
-
-        By QR: tight processes beside loose priors cost Cholesky its digits, and with them the whole system.
+    def of(
+        cls, linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, tree: gtsam.GaussianBayesTree | None = None
+    ) -> Triangular:
+        """Eliminate all or some variables of a system, in order, unless a tree has them already.
 
         Raises:
             IndeterminateError: a variable is not determined; names it.
         """
+        if tree is None:
+            tree = eliminated(linear, ordering)[0] if ordering.size() else gtsam.GaussianBayesTree()
         places = places_of(linear)
-        try:
-            tree, _ = linear.eliminatePartialMultifrontal(ordering, gtsam.EliminateQR)
-        except RuntimeError as error:
-            raise IndeterminateError(explain(str(error))) from None
-        # What is eliminated last in a clique is eliminated before anything above it.
-        conditionals: dict[int, gtsam.GaussianConditional] = {}
-        for i in range(ordering.size()):
-            conditional = tree[ordering.at(i)].conditional()
-            first = conditional.firstFrontalKey()
-            conditionals.pop(first, None)
-            conditionals[first] = conditional
-        return cls(places, [_clique(each, places) for each in conditionals.values()], tree)
-
-    @classmethod
-    def none(cls, linear: gtsam.GaussianFactorGraph) -> Triangular:
-        """Of a system of which nothing is eliminated."""
-        return cls(places_of(linear), [], gtsam.GaussianBayesTree())
+        return cls(places, [_clique(each, places) for each in conditionals_of(tree, ordering)], tree)
 
     @cached_property
     def size(self) -> int:
@@ -99,6 +85,35 @@ class Triangular:
             right = x[clique.own] - clique.S @ x[clique.above]
             x[clique.own] = np.linalg.solve(clique.R, right)
         return x
+
+
+def eliminated(
+    linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
+) -> tuple[gtsam.GaussianBayesTree, gtsam.GaussianFactorGraph]:
+    """All or some variables of a system eliminated in order, and what that leaves of it.
+
+    By QR: tight processes beside loose priors cost Cholesky its digits, and with them the whole system.
+
+    Raises:
+        IndeterminateError: a variable is not determined; names it.
+    """
+    try:
+        tree, left = linear.eliminatePartialMultifrontal(ordering, gtsam.EliminateQR)
+    except RuntimeError as error:
+        raise IndeterminateError(explain(str(error))) from None
+    return tree, left
+
+
+def conditionals_of(tree: gtsam.GaussianBayesTree, ordering: gtsam.Ordering) -> list[gtsam.GaussianConditional]:
+    """Those of all variables of an ordering, each once, what is eliminated first before anything above it."""
+    # What is eliminated last in a clique is eliminated before anything above it.
+    conditionals: dict[int, gtsam.GaussianConditional] = {}
+    for i in range(ordering.size()):
+        conditional = tree[ordering.at(i)].conditional()
+        first = conditional.firstFrontalKey()
+        conditionals.pop(first, None)
+        conditionals[first] = conditional
+    return list(conditionals.values())
 
 
 def places_of(linear: gtsam.GaussianFactorGraph) -> dict[int, slice]:
