@@ -3,17 +3,18 @@
 A sensor at rest tells a sum of bias and mounting angle times rate to the last digit, and neither of both. The linear
 system knows the sum along the tangent at the estimate alone: at the true values, a tenth of a radian off, it differs by
 what is of second order, which is thousands of its sigmas. So the directions that are known have, beside the variance
-that the linear system gives them, that of how far they follow the ones that are not: of the way from the tangent back
-to the floor of the error, at values drawn from their covariance.
+that the linear system gives them, that of how far they follow the ones that are less known.
 
-Variables that measurements are linear in may be reported as numbers that are not: an offset c of raw readings is known
-to the last digit where b = -K c, with a K that is not, is reported. Of that the same draws tell, by the way from the
-numbers' own tangent.
+How they follow is the slope T of the error's floor, none at the estimate, and elsewhere linear in the way w there. Of a
+known direction that follows by w'Hw/2 it is T = Hw, with w in sigmas: its variance tr(HH)/2 is half the mean of TT' over
+draws of w, and its mean tr(H)/2 half that of Tw. Slopes tell that from far fewer draws than the ways themselves, which
+are products of the sigmas. They are those of the reported numbers, so that what bends because numbers are no linear
+functions of the variables is among it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import chain
 from typing import TYPE_CHECKING
 
@@ -21,12 +22,19 @@ import gtsam
 import numpy as np
 
 from pipelines.graph.problem import Array, Problem
-from pipelines.solvers.marginals import IndeterminateError, prior_units, reduced
+from pipelines.solvers.marginals import (
+    IndeterminateError,
+    joint_information,
+    marginal,
+    ordering_of,
+    prior_units,
+    reported,
+)
 
 if TYPE_CHECKING:
     from pipelines.solvers.system import System
 
-# Directions of which sigma is within this share of the prior, and of the widest, follow the others.
+# A direction with a sigma within this share of the prior follows those of which its sigma is within this share.
 _WEAK, _LESS = 0.1, 0.5
 # Where no sigma of what is calibrated is beyond this share nothing is drawn.
 _SURE = 0.01
@@ -66,44 +74,35 @@ def second_order(
     system, ordering = system.without_rejected(values), system.ordering
     try:
         linear = system.linearized(values)
-        information, slope = reduced(linear.graph, ordering, keys)
-        eigenvalues, vectors = np.linalg.eigh(unit.T @ information @ unit)
+        eigenvalues, vectors = np.linalg.eigh(unit.T @ joint_information(linear.graph, ordering, keys) @ unit)
         if eigenvalues[0] < _ANYWHERE:
             return None
-        told = eigenvalues >= max(_WEAK**-2.0, _LESS**-2.0 * eigenvalues[0])
-        steps: list[Array] = []
-        known = unit @ vectors[:, told]
+        # The best known one first.
+        eigenvalues, vectors = eigenvalues[::-1], vectors[:, ::-1]
+        numbers, sigmas = reported(problem, values, current_keys), eigenvalues**-0.5
+        follows = (sigmas[:, None] < _LESS * sigmas) & (sigmas < _WEAK)[:, None]
+        slopes: list[Array] = []
+        ways: list[Array] = []
         generator = np.random.default_rng(0)
         # Values of hours are large: no more of them at once than are looked at.
         draws = (linear.drawn(keys, count, generator) for count in (_TRIED, _DRAWS - _TRIED))
         for each in chain.from_iterable(draws):
-            move = values.localCoordinates(each)
-            # As far as the linear system goes back itself, its covariance has it already.
-            tangent = slope - information @ np.concatenate([move.at(key) for key in keys])
-            back = _back(*reduced(system.linearize(each), ordering, keys), known)
-            bent = _numbers_bent(problem, values, each, move, keys)[free] / scale
-            steps.append(back - _back(information, tangent, known) + vectors[:, told].T @ bent)
-            if len(steps) == _TRIED and (eigenvalues[told] * np.square(steps)).sum(axis=1).max() < _SLIGHT:
-                return None
+            unit = prior_units(problem.parameters, each, keys)[2]
+            A, _ = marginal(system.linearize(each), ordering, keys).jacobian(ordering_of(keys))
+            # One row a direction: it and those less known, the better known ones marginalised out.
+            R = np.asarray(np.linalg.qr(A @ unit @ vectors, mode="r"))
+            slopes.append(np.where(follows, -R / np.diag(R)[:, None], 0.0) * sigmas)
+            moved = (reported(problem, each, current_keys) - numbers)[free] / scale
+            ways.append(slopes[-1] @ (vectors.T @ moved / sigmas))
+            if len(slopes) == _TRIED:
+                square = 0.5 * np.square(slopes).sum(axis=2) + 0.25 * np.square(ways)
+                if (eigenvalues * square).sum(axis=1).max() < _SLIGHT:
+                    return None
     except (RuntimeError, IndeterminateError, np.linalg.LinAlgError):
         return None
-    moves = np.array(steps) @ vectors[:, told].T * scale
+    bent = 0.5 * np.mean([slope @ slope.T for slope in slopes], axis=0)
+    mean = 0.5 * np.mean(ways, axis=0)
+    axes = scale[:, None] * vectors
     found = np.zeros_like(covariance)
-    found[np.ix_(free, free)] = moves.T @ moves / _DRAWS
+    found[np.ix_(free, free)] = axes @ (bent + np.outer(mean, mean)) @ axes.T
     return found
-
-
-def _back(information: Array, slope: Array, known: Array) -> Array:
-    """The step (k,) to the floor along some directions, by columns, of parameters with these normal equations."""
-    return np.asarray(np.linalg.solve(known.T @ information @ known, known.T @ slope))
-
-
-def _numbers_bent(
-    problem: Problem, values: gtsam.Values, moved: gtsam.Values, move: gtsam.VectorValues, keys: Sequence[int]
-) -> Array:
-    """How far the reported numbers (n,) of values moved are from what their Jacobian foresees."""
-    found = []
-    for p, key in zip(problem.parameters, keys, strict=True):
-        numbers, J = p.coordinates(values, key)
-        found.append(p.coordinates(moved, key)[0] - numbers - J @ move.at(key))
-    return np.concatenate(found)

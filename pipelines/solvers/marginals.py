@@ -60,24 +60,25 @@ def joint_information(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Orderin
     Raises:
         IndeterminateError: another variable is undetermined.
     """
-    return reduced(linear, ordering, keys)[0]
+    information, _ = marginal(linear, ordering, keys).hessian(ordering_of(keys))
+    return np.asarray(information)
 
 
-def reduced(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, keys: Sequence[int]) -> tuple[Array, Array]:
-    """The normal equations (d, d), (d,) of some variables, in their order, everything else marginalised out.
+def marginal(
+    linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, keys: Sequence[int]
+) -> gtsam.GaussianFactorGraph:
+    """What a system says of some variables, everything else marginalised out.
 
     Raises:
         IndeterminateError: another variable is undetermined.
     """
     rest = [ordering.at(i) for i in range(ordering.size()) if ordering.at(i) not in set(keys)]
-    remaining = linear
-    if rest:
-        try:
-            remaining = linear.eliminatePartialMultifrontal(ordering_of(rest), gtsam.EliminateQR)[1]
-        except RuntimeError as error:
-            raise IndeterminateError(explain(str(error))) from None
-    information, slope = remaining.hessian(ordering_of(keys))
-    return np.asarray(information), np.asarray(slope)
+    if not rest:
+        return linear
+    try:
+        return linear.eliminatePartialMultifrontal(ordering_of(rest), gtsam.EliminateQR)[1]
+    except RuntimeError as error:
+        raise IndeterminateError(explain(str(error))) from None
 
 
 def smoothed(
