@@ -5,10 +5,10 @@ system knows the sum along the tangent at the estimate alone: at the true values
 what is of second order, which is thousands of its sigmas. So the directions that are known have, beside the variance
 that the linear system gives them, that of how far they follow the ones that are less known.
 
-How they follow is the slope T of the error's floor, none at the estimate, and elsewhere linear in the way w there. Of a
-known direction that follows by w'Hw/2 it is T = Hw, with w in sigmas: its variance tr(HH)/2 is half the mean of TT' over
-draws of w, and its mean tr(H)/2 half that of Tw. Slopes tell that from far fewer draws than the ways themselves, which
-are products of the sigmas. They are those of the reported numbers, so that what bends because numbers are no linear
+How they follow is the slope T of the error's floor, none at the estimate, and elsewhere linear in the way w there. Of
+a known direction that follows by w'Hw/2 it is T = Hw, with w in sigmas: its variance tr(HH)/2 is half the mean of TT'
+over draws of w, and its mean tr(H)/2 half that of Tw. Slopes tell that from far fewer draws than the ways themselves,
+which are products of sigmas. They are those of the reported numbers, so that what bends because numbers are no linear
 functions of the variables is among it.
 """
 
