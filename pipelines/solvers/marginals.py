@@ -73,12 +73,24 @@ def marginal(
         IndeterminateError: another variable is undetermined.
     """
     rest = [ordering.at(i) for i in range(ordering.size()) if ordering.at(i) not in set(keys)]
-    if not rest:
-        return linear
+    return eliminated(linear, ordering_of(rest))[1] if rest else linear
+
+
+def eliminated(
+    linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
+) -> tuple[gtsam.GaussianBayesTree, gtsam.GaussianFactorGraph]:
+    """All or some variables of a system eliminated in order, and what that leaves of it.
+
+    By QR: tight processes beside loose priors cost Cholesky its digits, and with them the whole system.
+
+    Raises:
+        IndeterminateError: a variable is not determined; names it.
+    """
     try:
-        return linear.eliminatePartialMultifrontal(ordering_of(rest), gtsam.EliminateQR)[1]
+        tree, left = linear.eliminatePartialMultifrontal(ordering, gtsam.EliminateQR)
     except RuntimeError as error:
         raise IndeterminateError(explain(str(error))) from None
+    return tree, left
 
 
 def smoothed(

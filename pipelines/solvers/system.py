@@ -29,8 +29,8 @@ from pipelines import progress
 from pipelines.graph.problem import Array, Factor, Residuals
 from pipelines.solvers.assembly import StepBoundary
 from pipelines.solvers.history import MOMENTS
-from pipelines.solvers.marginals import ordering_of
-from pipelines.solvers.triangular import Triangular, conditionals_of, eliminated, rows_of
+from pipelines.solvers.marginals import eliminated, ordering_of
+from pipelines.solvers.triangular import Triangular, conditionals_of, rows_of
 
 Shown = TypeVar("Shown")
 

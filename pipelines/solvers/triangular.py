@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.graph.problem import Array
-from pipelines.solvers.marginals import IndeterminateError, explain
+from pipelines.solvers.marginals import IndeterminateError, eliminated, explain
 
 
 @dataclass(frozen=True)
@@ -85,23 +85,6 @@ class Triangular:
             right = x[clique.own] - clique.S @ x[clique.above]
             x[clique.own] = np.linalg.solve(clique.R, right)
         return x
-
-
-def eliminated(
-    linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering
-) -> tuple[gtsam.GaussianBayesTree, gtsam.GaussianFactorGraph]:
-    """All or some variables of a system eliminated in order, and what that leaves of it.
-
-    By QR: tight processes beside loose priors cost Cholesky its digits, and with them the whole system.
-
-    Raises:
-        IndeterminateError: a variable is not determined; names it.
-    """
-    try:
-        tree, left = linear.eliminatePartialMultifrontal(ordering, gtsam.EliminateQR)
-    except RuntimeError as error:
-        raise IndeterminateError(explain(str(error))) from None
-    return tree, left
 
 
 def conditionals_of(tree: gtsam.GaussianBayesTree, ordering: gtsam.Ordering) -> list[gtsam.GaussianConditional]:
