@@ -65,17 +65,21 @@ class Surroundings:
         elapsed: (n,) since the recording's first stamp, s.
         watched: (n,) since their target was found, s.
         foreseen: (n, 2) phx, phz as first guessed, rad, with none of the picture's own noise.
+        moved: (n,) s, by how much the stamps were moved already to where the pictures may have been taken.
     """
 
     motion: LocalMotion
     elapsed: Array
     watched: Array
     foreseen: Array
-    stacked: ClassVar = ("motion", "elapsed", "watched", "foreseen")
+    moved: Array
+    stacked: ClassVar = ("motion", "elapsed", "watched", "foreseen", "moved")
 
     def __getitem__(self, rows: Any) -> Surroundings:
         """Those of some of the pictures."""
-        return Surroundings(self.motion[rows], self.elapsed[rows], self.watched[rows], self.foreseen[rows])
+        return Surroundings(
+            self.motion[rows], self.elapsed[rows], self.watched[rows], self.foreseen[rows], self.moved[rows]
+        )
 
 
 @dataclass(frozen=True)
@@ -89,7 +93,7 @@ class LosDirectionFactor(Model):
     factors.gyro. With those errors
 
     - a picture was taken at stamp + time_offset - clock_skew * elapsed, and an encoder read its axis encoder_delay
-      later than it is stamped; gyro and gimbal carry attitude and angles there;
+      later than it is stamped; gyro and gimbal carry attitude and angles there from where the stamp was moved to;
     - an encoder reads angle + s sin(angle) + c cos(angle);
     - phx and phz are measured larger by los_scale times what was foreseen. Scaling what the attitudes predict instead
       would reward small attitude changes, which cost the gyro less, with a large scale: the mode of all variables
@@ -97,7 +101,7 @@ class LosDirectionFactor(Model):
     - the target's frame turns at (target_rate_x, 0, target_rate_z), about its own axes, from where it was found.
 
     Attributes:
-        time: (n,) stamps of the pictures, s.
+        time: (n,) stamps of the pictures, moved as `around` says, s.
         measured: (n, 2) phx, phz, or (n, 3) with the roll, rad.
         sqrt_information: (n, 2, 2) or (n, 3, 3), 1/rad.
         gimbal: (n, 2) azimuth and elevation as read at the stamps, rad.
@@ -140,7 +144,7 @@ class LosDirectionFactor(Model):
             residual, derivatives = self._residuals(tRm, angles, self.gimbal, 0.0)
             return residual, lambda: derivatives()[:2]
         motion, elapsed, watched = self.around.motion, self.around.elapsed, self.around.watched
-        late = sight[:, 0] - sight[:, 1] * elapsed
+        late = sight[:, 0] - sight[:, 1] * elapsed - self.around.moved
         turn, by_late, by_gyro = _carried(motion, late, bias, errors)
         gimbal, gimbal_rate, by_encoder = self._gimbal(motion, sight[:, 5:9], late - sight[:, 9])
         moved = np.stack([sight[:, 3], np.zeros_like(late), sight[:, 4]], axis=1) * watched[:, None]

@@ -90,13 +90,13 @@ class GyroPath:
     ) -> None:
         self.t = np.asarray(t, dtype=float)
         self.bias_hat = np.asarray(bias_hat, dtype=float)
-        self._mean = np.asarray(rate, dtype=float)
-        if len(self.t) < 2 or self._mean.shape != (len(self.t), 3):
-            raise ValueError(f"needs stamps (N,) and rates (N, 3), N >= 2; got {self.t.shape} and {self._mean.shape}")
+        self.read = np.asarray(rate, dtype=float)
+        if len(self.t) < 2 or self.read.shape != (len(self.t), 3):
+            raise ValueError(f"needs stamps (N,) and rates (N, 3), N >= 2; got {self.t.shape} and {self.read.shape}")
         self._driving = np.empty((len(self.t), 0)) if drivers is None else np.asarray(drivers, dtype=float)
-        if self._driving.ndim != 2 or len(self._driving) != len(self._mean):
-            raise ValueError(f"needs drivers for each rate; got {self._driving.shape} and {self._mean.shape}")
-        self._unseen = _gap_variance(self.t, self._mean)
+        if self._driving.ndim != 2 or len(self._driving) != len(self.read):
+            raise ValueError(f"needs drivers for each rate; got {self._driving.shape} and {self.read.shape}")
+        self._unseen = _gap_variance(self.t, self.read)
         self._last = (len(self.t) - 2) // _BLOCK
         self._kept: dict[int, _Block] = {}
         # Attitudes at the blocks' starts.
@@ -112,7 +112,7 @@ class GyroPath:
             # One sample more on either side tells what trapezoids count too much.
             some = slice(max(begin - 1, 0), end + 2)
             inner = slice(begin - some.start, end + 1 - some.start)
-            t, mean = self.t[some], self._mean[some]
+            t, mean = self.t[some], self.read[some]
             driving = self._driving[some]
             rate = (mean - self.bias_hat - trapezoid_excess(t, mean))[inner]
             drivers = (driving - trapezoid_excess(t, driving))[inner]

@@ -107,6 +107,50 @@ def test_errors_fit_their_covariance_over_many_runs(sensors: Sensors, solve: Sol
     assert quantile(5e-3, runs * size) < runs * mean < quantile(1 - 5e-3, runs * size)
 
 
+def _drifting(duration_s: float, skew: float) -> LosScenario:
+    """A recording whose pictures' clock drifts by what is usual, or more."""
+    return LosScenario(
+        duration_s=duration_s,
+        gyro_rate_hz=100.0,
+        gimbal_rate_hz=100.0,
+        image_rate_hz=5.0,
+        sensors=Sensors(),
+        effects={"clock_skew": skew},
+    )
+
+
+def test_pictures_whose_clock_drifts_are_looked_for_where_they_were_taken() -> None:
+    scenario = _drifting(400.0, 4e-4)
+    data, truth = simulate_los(scenario, 2)
+    estimate = solve_batch(problem(data, _config(scenario)))
+    assert _nees(estimate, truth) < quantile(1 - 1e-3, len(estimate.values))
+    assert _errors(estimate, truth)[estimate.names.index("clock_skew")] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_a_clock_that_cannot_be_told_is_that_of_the_stamps() -> None:
+    data, _ = simulate_los(REAL, 100)
+    made = problem(data, _config(REAL))
+    assert {step.time for step in made.steps(1)} <= set(data.image_t.tolist())
+
+
+@pytest.mark.slow
+def test_clocks_that_drift_for_a_quarter_of_an_hour() -> None:
+    mean, size = _mean_nees(_drifting(900.0, 1e-4), solve_batch, runs := 6)
+    assert runs * mean < quantile(1 - 5e-3, runs * size)
+
+
+def test_a_clock_is_guessed_over_an_hour() -> None:
+    """One that has gone wrong by as much as half a swing takes."""
+    scenario = _drifting(3600.0, 5e-4).model_copy(update={"image_rate_hz": 2.0, "gyro_rate_hz": 50.0})
+    data, truth = simulate_los(scenario, 1)
+    made = problem(data, _config(scenario))
+    taken = np.array([step.time for step in made.steps(20)])
+    late = truth["time_offset"] - truth["clock_skew"] * (data.image_t - data.image_t[0])
+    where = data.image_t + late
+    nearest = where[np.abs(where[:, None] - taken).argmin(axis=0)]
+    np.testing.assert_allclose(taken, nearest, rtol=0.0, atol=0.02)
+
+
 def test_nominal_noise_leaves_a_hundredth_of_a_degree_where_the_published_solver_leaves_a_tenth() -> None:
     scenario = load_scenario(LosScenario, "los_nominal").model_copy(update={"sensors": IDEAL})
     data, truth = simulate_los(scenario, 2)

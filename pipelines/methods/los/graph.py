@@ -8,7 +8,7 @@ Where a target stands is part of its first attitude, so a target found anew star
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import gtsam
@@ -30,7 +30,7 @@ from pipelines.graph.problem import Array, Factor, Problem, Step
 from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
 from pipelines.judgement.pictures import swaying
 from pipelines.methods import temperature
-from pipelines.methods.los.guess import camera, foreseen, guess, initial_attitudes, seen
+from pipelines.methods.los.guess import Clock, camera, foreseen, guess, guess_clock, initial_attitudes, seen
 from pipelines.methods.los.parameters import BIAS, OFFSET, SENSITIVITY, SPLIT, TEMPERATURE, LosParameters
 from pipelines.methods.los.pictures import select_pictures
 from pipelines.methods.los.recording import LosData
@@ -44,6 +44,8 @@ _WIDE, _HELD = 0.3, 1e-3
 _FAMILIES = ("los", "los with roll")
 # Gimbal angles at a picture are settled this long after it, s.
 _SETTLED = 0.05
+# So far from its stamp, s, motion around it still tells what gyro and gimbal did when the picture was taken.
+_NEAR = 0.02
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,7 @@ class _Model:
     parameters: LosParameters
     reference: float | None  # degrees Celsius, the temperature at which the bias is the bias; None: nobody measures it
     noises: dict[str, Level]  # by name
+    clock: Clock  # by which stamps of the recording were moved to the keyframes' times
 
 
 def problem(data: LosData, config: Config) -> Problem:
@@ -112,9 +115,18 @@ def _onward(config: Config, model: _Model, data: LosData, time: float) -> Proble
 
 
 def _prepare(
-    data: LosData, config: Config, before: _Model | None = None, trunk: Trunk | None = None, start: float = -np.inf
+    data: LosData,
+    config: Config,
+    before: _Model | None = None,
+    trunk: Trunk | None = None,
+    start: float = -np.inf,
+    clock: Clock | None = None,
 ) -> tuple[_Model, dict[str, int]]:
-    """The model of a recording, or of one that grows from a keyframe of its model until now on."""
+    """The model of a recording, or of one that grows from a keyframe of its model until now on.
+
+    `clock` has moved the data's stamps already. Those of a recording that grows stay where they are, and so do its
+    keyframes.
+    """
     reference = temperature.reference(data.temperature) if before is None else before.reference
     drivers = {SENSITIVITY: data.force, TEMPERATURE: temperature.above(data.temperature, reference, data.gyro_t)}
     caused = [each for each, driver in drivers.items() if driver is not None]
@@ -135,6 +147,12 @@ def _prepare(
     if before is None:
         known = parameters.angles, parameters.bias
         mount, bias_hat = guess(chains, time, angles, measured, gyro, known, sigma)
+        if parameters.sight is not None and clock is None:
+            begun, by = float(data.image_t[0]), (*known, parameters.sight)
+            guessed = guess_clock(chains, time, begun, gimbal, measured, gyro, by, (mount, bias_hat), sigma)
+            moved = guessed.late(data.image_t - begun)
+            if np.abs(moved).max() > _NEAR:
+                return _prepare(replace(data, image_t=data.image_t + moved), config, clock=guessed)
     else:
         mount, bias_hat = before.mount, before.chain.gyro.bias_hat
     cRm = camera(angles, mount, parameters.names)
@@ -148,19 +166,20 @@ def _prepare(
         errors=parameters.gyro,
         trunk=trunk,
     )
-    around = None
+    around, clock = None, clock or Clock(float(data.image_t[0]))
     if parameters.sight is not None:
         motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal, driving)
-        begun, found = data.image_t[0], time[starts]
+        found = time[starts]
         if before is not None and before.around is not None and start > -np.inf:
             # The data are the recording's end, and its first target may have been found before.
             k = int(np.searchsorted(before.chain.time, start))
-            begun = start - before.around.elapsed[k]
+            clock = Clock(start - before.around.elapsed[k])
             found[0] = start - before.around.watched[k]
         watched = time - found[np.cumsum(starts) - 1]
         smooth = camera(motion.gimbal, mount, parameters.names)
         errors = foreseen(chains, time, smooth, measured, chain.gyro)
-        around = Surroundings(motion, time - begun, watched, errors)
+        elapsed = clock.elapsed(time)
+        around = Surroundings(motion, elapsed, watched, errors, clock.late(elapsed))
     model = _Model(
         chain=chain,
         mount=mount,
@@ -172,6 +191,7 @@ def _prepare(
         parameters=parameters,
         reference=reference,
         noises=noises,
+        clock=clock,
     )
     return model, {**data.dropped, **dropped}
 
@@ -223,9 +243,9 @@ def _step(model: _Model, keyframes: range) -> Step:
     if chain.first + keyframes.start == 0:
         p = model.parameters
         step.initial.insert(p.angles.key, model.mount)
-        for errors in (p.sight, p.gyro):
+        for errors, guessed in ((p.sight, (model.clock.offset, model.clock.skew)), (p.gyro, ())):
             if errors is not None:
-                step.initial.insert(errors.key, np.zeros(len(errors.quantities)))
+                step.initial.insert(errors.key, np.append(guessed, np.zeros(len(errors.quantities) - len(guessed))))
         step.factors.extend(vector_prior(each, np.zeros(len(each.quantities))) for each in p.all)
     step.factors.extend(_start_factor(model, k) for k in keyframes if chain.starts[k])
     chain.add(step, keyframes)

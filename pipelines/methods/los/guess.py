@@ -1,25 +1,33 @@
-"""First guesses for the los method's graph: mounting angles, gyro bias and attitudes.
+"""First guesses for the los method's graph: mounting angles, gyro bias, the pictures' clock and attitudes.
 
 They come from pictures a second apart. Linearising at zero angles and zero bias is good enough for a minute; over ten
-the camera's roll about its line of sight, which no picture tells, would start too far off.
+the camera's roll about its line of sight, which no picture tells, would start too far off, and a clock that runs fast
+or slow would be further off than motion around the stamps tells.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from factors import so3
+from factors.gimbal import GimbalPath
 from factors.los import LosDirectionFactor
-from factors.preintegration import GyroPath
+from factors.preintegration import GyroPath, Increments
 from pipelines.graph.priors import prior_sigmas
 from pipelines.graph.problem import Array, Parameter
 
 # Pictures so far apart, s, are compared, long against their noise, and no more than so many pairs of them.
 _SPAN, _MOST_PAIRS = 1.0, 2000
 _PASSES = 5
+# A clock is guessed from fewer pairs, first of as much of a recording as takes it to go wrong by so much, s (sigma), far
+# less than a swing takes; then of so many times as much each time.
+_CLOCK_PAIRS, _CLOCK_PASSES, _WRONG_AT_FIRST, _THEN = 500, 3, 0.06, 4.0
+# It is taken for another one than the stamps' beyond so many sigmas.
+_TOLD = 5.0
 # Between the knots of a line that follows what the gyro's noise and bias add up to, s.
 _SLOW = 30.0
 _STEP = 1e-6
@@ -125,6 +133,29 @@ def _broken_line(t: Array, values: Array) -> Array:
     return np.asarray(before[:, None] * knots[i] + after[:, None] * knots[i + 1])
 
 
+@dataclass(frozen=True)
+class Clock:
+    """When pictures were taken: at stamp + offset - skew * (stamp - begun).
+
+    Attributes:
+        begun: the recording's first stamp, s.
+        offset: s.
+        skew: s/s.
+    """
+
+    begun: float
+    offset: float = 0.0
+    skew: float = 0.0
+
+    def late(self, elapsed: Array) -> Array:
+        """How much later (n,), s, than their stamps pictures were taken, so long after the first, s."""
+        return np.asarray(self.offset - self.skew * elapsed)
+
+    def elapsed(self, taken: Array) -> Array:
+        """Stamps (n,) of pictures taken at these times, s, since the first."""
+        return np.asarray((taken - self.begun - self.offset) / (1.0 - self.skew))
+
+
 def guess(
     chains: Sequence[NDArray[np.intp]],
     time: Array,
@@ -145,36 +176,124 @@ def guess(
         parameters: mounting angles and bias, with their priors.
         sigma: of one LOS error, rad.
     """
-    angles, bias = parameters[:2]
+    angles, bias = parameters
     names = tuple(q.name for q in angles.quantities)
     prior = 1.0 / np.concatenate([prior_sigmas(angles), prior_sigmas(bias)])
     x = np.zeros(len(prior))
-    i, j = _pairs(chains, time)
+    i, j = _pairs(chains, time, _MOST_PAIRS)
     if not len(i):
         return x[: len(names)], x[len(names) :]
-    increments = gyro.increments(time[i], time[j])
-
-    def miss(x: Array) -> Array:
-        mount, b = x[: len(names)], x[len(names) :]
-        before, after = camera(gimbal[i], mount, names), camera(gimbal[j], mount, names)
-        turn = so3.multiply(increments.wxyz, so3.exp(increments.bias_jacobian @ b))
-        tRm = so3.multiply(seen(before, measured[i]), turn)
-        return los_error(so3.rotate(so3.multiply(after, so3.inverse(tRm)), [0.0, 1.0, 0.0])) - measured[j, :2]
-
+    turns, read = gyro.increments(time[i], time[j]), (gimbal[i], gimbal[j])
     for _ in range(_PASSES):
-        error = miss(x)
-        size = np.linalg.norm(error, axis=1)
-        scale = max(float(np.median(size)), sigma)
-        weight = 1.0 / (scale * np.sqrt(1.0 + (size / (3.0 * scale)) ** 2))[:, None]
-        steps = _STEP * np.eye(len(x))
-        columns = [(weight * (miss(x + d) - error)).ravel() / _STEP for d in steps]
-        A = np.vstack([np.stack(columns, axis=1), np.diag(prior)])
-        x = x - np.linalg.lstsq(A, np.concatenate([(weight * error).ravel(), prior * x]))[0]
+        x, _ = _improved(lambda x: _miss(x, names, turns, read, measured[i], measured[j]), x, prior, sigma)
     return x[: len(names)], x[len(names) :]
 
 
-def _pairs(chains: Sequence[NDArray[np.intp]], time: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Pictures of one target a second apart."""
+def guess_clock(
+    chains: Sequence[NDArray[np.intp]],
+    time: Array,
+    begun: float,
+    gimbal: GimbalPath,
+    measured: Array,
+    gyro: GyroPath,
+    parameters: tuple[Parameter, ...],
+    guessed: tuple[Array, Array],
+    sigma: float,
+) -> Clock:
+    """The clock with which LOS errors are carried on best, guessed anew together with mounting angles and bias.
+
+    It is that of the stamps unless pictures at one end of the recording were certainly taken at another time.
+
+    Args:
+        chains, time, measured, gyro, sigma: as `guess` has them.
+        begun: the recording's first stamp, s.
+        gimbal: at all times.
+        parameters: mounting angles and bias, and one whose first two numbers are offset and skew, with their priors.
+        guessed: mounting angles and bias to begin with.
+    """
+    angles, bias, clock = parameters
+    names = tuple(q.name for q in angles.quantities)
+    prior = 1.0 / np.concatenate([prior_sigmas(angles), prior_sigmas(bias), prior_sigmas(clock)[:2]])
+    x = np.concatenate([*guessed, np.zeros(2)])
+    until, last, covariance = _WRONG_AT_FIRST * prior[-1], time[-1] - begun, np.diag(prior**-2.0)
+    while True:
+        i, j = _pairs([chain[time[chain] - begun <= until] for chain in chains], time, _CLOCK_PAIRS)
+        elapsed, pictures = (time[i] - begun, time[j] - begun), (measured[i], measured[j])
+        for _ in range(_CLOCK_PASSES if len(i) else 0):
+            miss = _miss_by_clock(x, names, elapsed, pictures, begun, gimbal, gyro)
+            x, covariance = _improved(miss, x, prior, sigma)
+        if until >= last:
+            break
+        until *= _THEN
+    at_ends = np.array([[1.0, 0.0], [1.0, -last]])
+    sigmas = np.sqrt(np.diag(at_ends @ covariance[-2:, -2:] @ at_ends.T))
+    told = (np.abs(at_ends @ x[-2:]) > _TOLD * sigmas).any()
+    return Clock(begun, *x[-2:].tolist()) if told else Clock(begun)
+
+
+def _miss_by_clock(
+    x: Array,
+    names: tuple[str, ...],
+    elapsed: tuple[Array, Array],
+    measured: tuple[Array, Array],
+    begun: float,
+    gimbal: GimbalPath,
+    gyro: GyroPath,
+) -> Callable[[Array], Array]:
+    """What `_miss` says near some x whose last two numbers are the clock's, the gyro's turns looked up there alone."""
+
+    def taken(x: Array) -> list[Array]:
+        clock = Clock(begun, *x[-2:])
+        return [begun + each + clock.late(each) for each in elapsed]
+
+    at = taken(x)
+    turns = gyro.increments(at[0], at[1])
+    rates = [np.stack([np.interp(t, gyro.t, each) for each in gyro.read.T], axis=1) for t in at]
+
+    def miss(x: Array) -> Array:
+        now = taken(x)
+        back, on = (so3.exp(rate * (t - was)[:, None]) for rate, t, was in zip(rates, now, at, strict=True))
+        turned = replace(turns, wxyz=so3.compose(so3.inverse(back), turns.wxyz, on))
+        return _miss(x[:-2], names, turned, (gimbal.at(now[0]), gimbal.at(now[1])), *measured)
+
+    return miss
+
+
+def _miss(
+    x: Array, names: tuple[str, ...], turns: Increments, gimbal: tuple[Array, Array], before: Array, after: Array
+) -> Array:
+    """By how much LOS errors before a turn, carried on by it, miss those after it (n, 2), rad.
+
+    Args:
+        x: mounting angles of these names and bias.
+        turns: of the gyro, n of them.
+        gimbal: angles (n, 2) before and after, rad.
+        before, after: phx, phz, roll (n, 3), rad.
+    """
+    mount, bias = x[: len(names)], x[len(names) :]
+    turn = so3.multiply(turns.wxyz, so3.exp(turns.bias_jacobian @ bias))
+    tRm = so3.multiply(seen(camera(gimbal[0], mount, names), before), turn)
+    cRm = camera(gimbal[1], mount, names)
+    return los_error(so3.rotate(so3.multiply(cRm, so3.inverse(tRm)), [0.0, 1.0, 0.0])) - after[:, :2]
+
+
+def _improved(miss: Callable[[Array], Array], x: Array, prior: Array, sigma: float) -> tuple[Array, Array]:
+    """x after a robust least-squares step on what misses (n, 2), and its covariance.
+
+    Priors are about zero, with these inverse sigmas.
+    """
+    error = miss(x)
+    size = np.linalg.norm(error, axis=1)
+    scale = max(float(np.median(size)), sigma)
+    weight = 1.0 / (scale * np.sqrt(1.0 + (size / (3.0 * scale)) ** 2))[:, None]
+    columns = [(weight * (miss(x + d) - error)).ravel() / _STEP for d in _STEP * np.eye(len(x))]
+    A = np.vstack([np.stack(columns, axis=1), np.diag(prior)])
+    x = x - np.linalg.lstsq(A, np.concatenate([(weight * error).ravel(), prior * x]))[0]
+    return x, np.linalg.inv(A.T @ A)
+
+
+def _pairs(chains: Sequence[NDArray[np.intp]], time: Array, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Pictures of one target a second apart, at most about so many pairs."""
     first, second = [], []
     for chain in chains:
         later = np.searchsorted(time[chain], time[chain] + _SPAN)
@@ -182,7 +301,7 @@ def _pairs(chains: Sequence[NDArray[np.intp]], time: Array) -> tuple[NDArray[np.
         first.append(chain[inside])
         second.append(chain[later[inside]])
     i, j = np.concatenate(first), np.concatenate(second)
-    stride = -(-len(i) // _MOST_PAIRS) or 1
+    stride = -(-len(i) // most) or 1
     return i[::stride], j[::stride]
 
 
