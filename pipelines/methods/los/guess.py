@@ -23,8 +23,8 @@ from pipelines.graph.problem import Array, Parameter
 # Pictures so far apart, s, are compared, long against their noise, and no more than so many pairs of them.
 _SPAN, _MOST_PAIRS = 1.0, 2000
 _PASSES = 5
-# A clock is guessed from fewer pairs, first of as much of a recording as takes it to go wrong by so much, s (sigma), far
-# less than a swing takes; then of so many times as much each time.
+# A clock is guessed from fewer pairs: first of as much of a recording as takes it to go wrong by so much, s (sigma), by
+# far less than a swing takes, then of so many times as much each time.
 _CLOCK_PAIRS, _CLOCK_PASSES, _WRONG_AT_FIRST, _THEN = 500, 3, 0.06, 4.0
 # It is taken for another one than the stamps' beyond so many sigmas.
 _TOLD = 5.0
