@@ -73,6 +73,8 @@ class VisionAttitudeFactor(Model):
         errors: numbers of the helmet gyro's errors, 0 for a perfect gyro.
         platform_errors: whether the platform's gyro has errors too.
         anchor: (n,) times of the variables, s; None: the stamps.
+        expected: (n,) about when the pictures were taken, s; None: at their stamps. The gyros' errors are evaluated
+            halfway between it and the anchor.
         elapsed, first: (n,) s since the recording's first stamp, (n, 4) cRh of its first picture; with both, skew and
             angle scale are variables.
     """
@@ -85,10 +87,11 @@ class VisionAttitudeFactor(Model):
     errors: int = 0
     platform_errors: bool = False
     anchor: Array | None = None
+    expected: Array | None = None
     elapsed: Array | None = None
     first: Array | None = None
     rows: int = 3
-    stacked: ClassVar = ("time", "measured", "sqrt_information", "anchor", "elapsed", "first")
+    stacked: ClassVar = ("time", "measured", "sqrt_information", "anchor", "expected", "elapsed", "first")
 
     @property
     def blocks(self) -> tuple[Block, ...]:
@@ -104,7 +107,7 @@ class VisionAttitudeFactor(Model):
         errors, platform = parted(of_gyros, self.errors > 0)
         at, by_at = self._times(picture)
         anchor = self.time if self.anchor is None else self.anchor
-        middle = 0.5 * (anchor + self.time)
+        middle = 0.5 * (anchor + (self.time if self.expected is None else self.expected))
         dV, rate, by_gyro = carried(self.helmet, anchor, middle, at, bias, errors)
         bRv = so3.multiply(bRv, dV)
         by_dB: Derivatives = tuple

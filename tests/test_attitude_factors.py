@@ -106,6 +106,7 @@ def _vision_of_all(rows: np.ndarray, errors: int, moving: bool) -> tuple[VisionA
         errors=errors,
         platform_errors=moving,
         anchor=TIMES[rows] + np.linspace(-0.05, 0.05, N)[rows],
+        expected=TIMES[rows] + np.linspace(0.02, -0.01, N)[rows],
         elapsed=TIMES[rows],
         first=np.tile(so3.exp(np.array([0.1, 0.2, -0.3])), (N, 1))[rows],
     )

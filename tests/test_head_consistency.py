@@ -48,6 +48,12 @@ def scenario(**changes: object) -> HeadScenario:
     return HeadScenario.model_validate(load_scenario(HeadScenario, "head_mounts").model_dump() | SHORT | changes)
 
 
+def _drifting(duration_s: float, skew: float) -> HeadScenario:
+    """A long recording whose pictures' clock drifts."""
+    rates = {"vision_rate_hz": 4, "gyro_rate_hz": 50, "platform_gyro_rate_hz": 50}
+    return scenario(duration_s=duration_s, effects={"clock_skew": skew}, **rates)
+
+
 class Run:
     """A simulated session solved."""
 
@@ -236,3 +242,25 @@ def test_mounts_thirty_degrees_off_converge(solve: Solve, mount: tuple[float, fl
     run = Run(scenario(helmet_mount_deg=mount, camera_mount_deg=mount[::-1]), 1, solve)
     assert run.worst < 3.0
     assert run.assessment.status == "calibrated"
+
+
+def test_keyframes_stand_where_pictures_of_a_drifting_clock_were_taken() -> None:
+    settings = _drifting(600.0, 1e-3)
+    data, truth = simulate_head(settings, 1)
+    made = problem(data, load_config(head_config(settings).encode()))
+    taken = np.array([step.time for step in made.steps(1)])
+    late = truth["time_offset"] - truth["clock_skew"] * (data.vision_t - data.vision_t[0])
+    off = np.abs((data.vision_t + late)[:, None] - taken).min(axis=1)
+    assert late.min() < -0.5
+    assert off.max() < 0.02
+
+
+def test_errors_fit_their_covariance_over_ten_minutes_of_a_clock_that_drifts() -> None:
+    run = Run(_drifting(600.0, -1.5e-3), 2, solve_batch)
+    assert run.nees < chi2.ppf(1 - 1e-3, len(run.error))
+
+
+@pytest.mark.slow
+def test_errors_fit_their_covariance_over_an_hour() -> None:
+    runs = [Run(_drifting(3600.0, skew), seed, solve_batch) for seed, skew in enumerate((1e-4, -1e-4, 3e-4))]
+    assert sum(run.nees for run in runs) < chi2.ppf(1 - 1e-3, sum(len(run.error) for run in runs))

@@ -120,11 +120,11 @@ def _drifting(duration_s: float, skew: float) -> LosScenario:
 
 
 def test_pictures_whose_clock_drifts_are_looked_for_where_they_were_taken() -> None:
-    scenario = _drifting(400.0, 4e-4)
+    scenario = _drifting(400.0, 1e-3)
     data, truth = simulate_los(scenario, 2)
     estimate = solve_batch(problem(data, _config(scenario)))
     assert _nees(estimate, truth) < quantile(1 - 1e-3, len(estimate.values))
-    assert _errors(estimate, truth)[estimate.names.index("clock_skew")] == pytest.approx(0.0, abs=1e-6)
+    assert abs(_errors(estimate, truth)[estimate.names.index("clock_skew")]) < 1e-5
 
 
 def test_a_clock_that_cannot_be_told_is_that_of_the_stamps() -> None:

@@ -21,6 +21,7 @@ from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
 from pipelines.errors import InputError
 from pipelines.graph.assumptions import acting
+from pipelines.graph.clock import Clock
 from pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk, shared_keyframes
 from pipelines.graph.motion import Motion
 from pipelines.graph.noise import Level
@@ -28,6 +29,7 @@ from pipelines.graph.priors import rotation_prior, vector_prior
 from pipelines.graph.problem import Array, Attitudes, Factor, Problem, Step
 from pipelines.judgement.pictures import swaying
 from pipelines.methods import temperature
+from pipelines.methods.head.guess import guess, guess_picture_clock
 from pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, SENSITIVITY, TEMPERATURE, HeadParameters
 from pipelines.methods.head.recording import HeadData
 from pipelines.methods.noise import sampled, stated, typical, walking
@@ -38,8 +40,8 @@ from pipelines.settings import DEFAULT_NOISE, Config, first_given
 _SHARED, _LONGEST_INCREMENT = 0.1, 0.25
 # Pictures share a keyframe as far as what gyro noise adds on the way is at most this part of vision's.
 _NEGLIGIBLE = 0.1
-# Rates for the first guess are taken over this time, s: long against vision noise, short against turns.
-_GUESS_SPAN = 0.3
+# So far from its stamp, s, the gyros carry an attitude to where its picture was taken.
+_NEAR = 0.1
 _FEWEST_FRAMES = 10
 _FAMILY = "vision"
 
@@ -54,6 +56,8 @@ class _Model:
     chain: GyroChain  # bRv at the keyframes
     pictures: NDArray[np.intp]  # (K + 1,) those of keyframe k are from pictures[k] to pictures[k + 1]
     stamps: Array  # (frames,)
+    taken: Array  # (frames,) s, about when
+    clock: Clock  # that tells so
     origins: tuple[float, float, float]  # s: of `elapsed`, of the groups that share a keyframe, and how long these are
     elapsed: Array  # (frames,) since the recording's first stamp
     measured: Array  # (frames, 4) cRh
@@ -119,18 +123,28 @@ def _onward(config: Config, model: _Model, data: HeadData, time: float) -> Probl
 
 
 def _prepare(
-    data: HeadData, config: Config, before: _Model | None = None, trunk: Trunk | None = None, start: float = -np.inf
+    data: HeadData,
+    config: Config,
+    before: _Model | None = None,
+    trunk: Trunk | None = None,
+    start: float = -np.inf,
+    clock: Clock | None = None,
 ) -> _Model:
-    """The model of a recording, or of one that grows from a keyframe of its model until now on."""
-    inside = (data.vision_t >= data.head_t[0]) & (data.vision_t <= data.head_t[-1])
+    """The model of a recording, or of one that grows from a keyframe of its model until now on.
+
+    `clock` tells when pictures were taken. Those of a recording that grows count as taken at their stamps.
+    """
+    begun = float(data.vision_t[0])
+    taken = data.vision_t + (Clock(begun) if clock is None else clock).late(data.vision_t - begun)
+    inside = (taken >= data.head_t[0]) & (taken <= data.head_t[-1])
     if data.platform_t is not None:
-        inside &= (data.vision_t >= data.platform_t[0]) & (data.vision_t <= data.platform_t[-1])
+        inside &= (taken >= data.platform_t[0]) & (taken <= data.platform_t[-1])
     if inside.sum() < _FEWEST_FRAMES:
         raise InputError(
             f"vision: only {int(inside.sum())} of {len(inside)} frames lie within the gyros' record; "
             f"at least {_FEWEST_FRAMES} are needed: check the topics and their clocks"
         )
-    vision_t, measured = data.vision_t[inside], data.vision_wxyz[inside]
+    stamps, taken, measured = data.vision_t[inside], taken[inside], data.vision_wxyz[inside]
     noises = _noises(data, config) if before is None else before.noises
     density = noises["gyro_density"].used
     platform_density = 0.0
@@ -147,21 +161,29 @@ def _prepare(
 
     sigma = float(1.0 / np.median(np.linalg.norm(sqrt_information, axis=(1, 2)) / np.sqrt(3.0)))
     if before is None:
-        iRb = so3.identity(len(vision_t)) if platform is None else platform.attitude(vision_t)
-        bias_hat, vRh = _guess(data, vision_t, so3.multiply(iRb, measured), sigma)
+        gyro = GyroPath(data.head_t, data.head_gyro)
+        if parameters.clock and clock is None:
+            by = parameters.helmet, parameters.bias, parameters.picture
+            guessed = guess_picture_clock(gyro, platform, stamps - begun, begun, measured, by, sigma)
+            if np.abs(guessed.late(stamps - begun)).max() > _NEAR:
+                return _prepare(data, config, clock=guessed)
+        iRb = so3.identity(len(taken)) if platform is None else platform.attitude(taken)
+        bias_hat, vRh = guess(gyro, taken, so3.multiply(iRb, measured), sigma)
         negligible = (_NEGLIGIBLE * sigma) ** 2 / max(density**2 + platform_density**2, 1e-300)
-        first, origins = data.vision_wxyz[0], (data.vision_t[0], vision_t[0], min(_SHARED, negligible))
+        first, origins = data.vision_wxyz[0], (begun, taken[0], min(_SHARED, negligible))
     else:
         bias_hat, vRh, first, origins = before.chain.gyro.bias_hat, before.helmet_guess, before.first, before.origins
-    time, pictures = shared_keyframes(vision_t, *origins[1:], _LONGEST_INCREMENT)
+        if trunk is ROOT:
+            origins = origins[0], taken[0], origins[2]
+    time, pictures = shared_keyframes(taken, *origins[1:], _LONGEST_INCREMENT)
     late = int(np.searchsorted(time, start))
     time, pictures = time[late:], pictures[late:] - pictures[late]
-    frames = slice(len(vision_t) - pictures[-1], None)
-    vision_t, measured, sqrt_information = vision_t[frames], measured[frames], sqrt_information[frames]
+    frames = slice(len(taken) - pictures[-1], None)
+    stamps, taken, measured = stamps[frames], taken[frames], measured[frames]
     chain = GyroChain.over(
         time,
         np.arange(len(time)) == 0,
-        so3.interpolate(vision_t, so3.multiply(measured, so3.inverse(vRh)), time),
+        so3.interpolate(taken, so3.multiply(measured, so3.inverse(vRh)), time),
         GyroPath(data.head_t, data.head_gyro, bias_hat, acting(parameters.gyro, drivers)),
         density=density,
         other_density=platform_density,
@@ -174,12 +196,14 @@ def _prepare(
     return _Model(
         chain=chain,
         pictures=pictures,
-        stamps=vision_t,
+        stamps=stamps,
+        taken=taken,
+        clock=Clock(begun) if clock is None else clock,
         origins=origins,
-        elapsed=vision_t - origins[0],
+        elapsed=stamps - origins[0],
         measured=measured,
         first=first,
-        sqrt_information=sqrt_information,
+        sqrt_information=sqrt_information[frames],
         loss=TruncatedLoss(gate(3)),
         parameters=parameters,
         helmet_guess=vRh,
@@ -195,32 +219,6 @@ def _sqrt_information(covariance: Array | None, inside: NDArray[np.bool_], confi
         return np.broadcast_to(np.eye(3) / sigma, (int(inside.sum()), 3, 3))
     root: Array = np.linalg.cholesky(np.linalg.inv(covariance[inside]))
     return np.swapaxes(root, 1, 2)
-
-
-def _guess(data: HeadData, vision_t: Array, iRh: Array, sigma: float) -> tuple[Array, Array]:
-    """First guess of the gyro bias (3,) and vRh (4,) from rates: w_v = vRh w_h + bias over short windows.
-
-    Rates seen by vision beyond what the gyro's length allows are outliers. The mount is the rotation between the
-    rates when the motion is about more than one axis, else the identity.
-    """
-    stride = max(1, round(_GUESS_SPAN / max(float(np.median(np.diff(vision_t))), 1e-3)))
-    if len(vision_t) <= stride:
-        return np.zeros(3), so3.identity()
-    start, stop = vision_t[:-stride], vision_t[stride:]
-    span = (stop - start)[:, None]
-    gyro = so3.log(GyroPath(data.head_t, data.head_gyro).increments(start, stop).wxyz) / span
-    seen = so3.log(so3.multiply(so3.inverse(iRh[:-stride]), iRh[stride:])) / span
-    mismatch = np.abs(np.linalg.norm(gyro, axis=1) - np.linalg.norm(seen, axis=1))
-    good = (span[:, 0] < 2.0 * _GUESS_SPAN) & (mismatch < 0.05 + 5.0 * sigma / span[:, 0])
-    if good.sum() < _FEWEST_FRAMES:
-        return np.zeros(3), so3.identity()
-    gyro, seen = gyro[good], seen[good]
-    a, b = gyro - gyro.mean(axis=0), seen - seen.mean(axis=0)
-    s = np.linalg.svd(a.T @ b, compute_uv=False)
-    noise = 2.0 * (sigma / _GUESS_SPAN) ** 2 * len(gyro)
-    two_axes = s[1] > 3.0 * noise / np.sqrt(len(gyro)) and s[1] > 0.01 * s[0]
-    vRh = so3.align(a, b) if two_axes else so3.identity()
-    return np.median(gyro - so3.rotate(vRh, seen), axis=0), vRh
 
 
 def _steps(model: _Model, chunk: int, after: float = -np.inf) -> Iterator[Step]:
@@ -258,7 +256,10 @@ def _begin(model: _Model, step: Step) -> None:
     for vector in (p.picture, p.gyro, p.platform):
         if vector is not None:
             zeros = np.zeros(len(vector.quantities))
-            step.initial.insert(vector.key, zeros)
+            initial = zeros.copy()
+            if vector is p.picture and p.clock:
+                initial[:2] = model.clock.offset, model.clock.skew
+            step.initial.insert(vector.key, initial)
             step.factors.append(vector_prior(vector, zeros))
 
 
@@ -282,6 +283,7 @@ def _vision_factor(model: _Model, keyframes: range) -> list[Factor]:
         errors=0 if p.gyro is None else len(p.gyro.quantities),
         platform_errors=p.platform is not None,
         anchor=chain.time[of],
+        expected=model.taken[rows],
         elapsed=model.elapsed[rows] if p.clock else None,
         first=np.broadcast_to(model.first, (len(rows), 4)) if p.clock else None,
     )
@@ -297,7 +299,7 @@ def _attitudes(model: _Model, keyframes: Sequence[int], values: gtsam.Values) ->
         return Attitudes(np.empty(0), np.empty((0, 4)))
     offset, *skew = values.atVector(model.parameters.picture.key)[:2]
     at = model.stamps[rows] + offset - (skew[0] * model.elapsed[rows] if skew else 0.0)
-    return Attitudes(at, model.chain.attitudes(of, model.stamps[rows], at, values))
+    return Attitudes(at, model.chain.attitudes(of, model.taken[rows], at, values))
 
 
 def _advice(weights: Mapping[str, float]) -> Motion:

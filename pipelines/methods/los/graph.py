@@ -22,6 +22,7 @@ from factors.los import LosDirectionFactor, Surroundings
 from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
 from pipelines.graph.assumptions import acting
+from pipelines.graph.clock import Clock
 from pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk, as_slice
 from pipelines.graph.motion import Motion
 from pipelines.graph.noise import Level
@@ -30,7 +31,7 @@ from pipelines.graph.problem import Array, Factor, Problem, Step
 from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
 from pipelines.judgement.pictures import swaying
 from pipelines.methods import temperature
-from pipelines.methods.los.guess import Clock, camera, foreseen, guess, guess_clock, initial_attitudes, seen
+from pipelines.methods.los.guess import camera, foreseen, guess, guess_picture_clock, initial_attitudes, seen
 from pipelines.methods.los.parameters import BIAS, OFFSET, SENSITIVITY, SPLIT, TEMPERATURE, LosParameters
 from pipelines.methods.los.pictures import select_pictures
 from pipelines.methods.los.recording import LosData
@@ -149,7 +150,8 @@ def _prepare(
         mount, bias_hat = guess(chains, time, angles, measured, gyro, known, sigma)
         if parameters.sight is not None and clock is None:
             begun, by = float(data.image_t[0]), (*known, parameters.sight)
-            guessed = guess_clock(chains, time, begun, gimbal, measured, gyro, by, (mount, bias_hat), sigma)
+            at = mount, bias_hat
+            guessed = guess_picture_clock(chains, time, begun, gimbal, measured, gyro, by, at, sigma)
             moved = guessed.late(data.image_t - begun)
             if np.abs(moved).max() > _NEAR:
                 return _prepare(replace(data, image_t=data.image_t + moved), config, clock=guessed)

@@ -7,8 +7,8 @@ or slow would be further off than motion around the stamps tells.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,20 +17,18 @@ from factors import so3
 from factors.gimbal import GimbalPath
 from factors.los import LosDirectionFactor
 from factors.preintegration import GyroPath, Increments
+from pipelines.graph.clock import Clock, Miss, guess_clock
 from pipelines.graph.priors import prior_sigmas
 from pipelines.graph.problem import Array, Parameter
+from pipelines.graph.robust import improved
 
 # Pictures so far apart, s, are compared, long against their noise, and no more than so many pairs of them.
 _SPAN, _MOST_PAIRS = 1.0, 2000
 _PASSES = 5
-# A clock is guessed from fewer pairs: first of as much of a recording as takes it to go wrong by so much, s (sigma), by
-# far less than a swing takes, then of so many times as much each time.
-_CLOCK_PAIRS, _CLOCK_PASSES, _WRONG_AT_FIRST, _THEN = 500, 3, 0.06, 4.0
-# It is taken for another one than the stamps' beyond so many sigmas.
-_TOLD = 5.0
+# A clock is guessed from fewer pairs.
+_CLOCK_PAIRS = 500
 # Between the knots of a line that follows what the gyro's noise and bias add up to, s.
 _SLOW = 30.0
-_STEP = 1e-6
 
 
 def los_direction(measured: Array) -> Array:
@@ -133,29 +131,6 @@ def _broken_line(t: Array, values: Array) -> Array:
     return np.asarray(before[:, None] * knots[i] + after[:, None] * knots[i + 1])
 
 
-@dataclass(frozen=True)
-class Clock:
-    """When pictures were taken: at stamp + offset - skew * (stamp - begun).
-
-    Attributes:
-        begun: the recording's first stamp, s.
-        offset: s.
-        skew: s/s.
-    """
-
-    begun: float
-    offset: float = 0.0
-    skew: float = 0.0
-
-    def late(self, elapsed: Array) -> Array:
-        """How much later (n,), s, than their stamps pictures were taken, so long after the first, s."""
-        return np.asarray(self.offset - self.skew * elapsed)
-
-    def elapsed(self, taken: Array) -> Array:
-        """Stamps (n,) of pictures taken at these times, s, since the first."""
-        return np.asarray((taken - self.begun - self.offset) / (1.0 - self.skew))
-
-
 def guess(
     chains: Sequence[NDArray[np.intp]],
     time: Array,
@@ -185,11 +160,11 @@ def guess(
         return x[: len(names)], x[len(names) :]
     turns, read = gyro.increments(time[i], time[j]), (gimbal[i], gimbal[j])
     for _ in range(_PASSES):
-        x, _ = _improved(lambda x: _miss(x, names, turns, read, measured[i], measured[j]), x, prior, sigma)
+        x, _ = improved(lambda x: _miss(x, names, turns, read, measured[i], measured[j]), x, prior, sigma)
     return x[: len(names)], x[len(names) :]
 
 
-def guess_clock(
+def guess_picture_clock(
     chains: Sequence[NDArray[np.intp]],
     time: Array,
     begun: float,
@@ -202,8 +177,6 @@ def guess_clock(
 ) -> Clock:
     """The clock with which LOS errors are carried on best, guessed anew together with mounting angles and bias.
 
-    It is that of the stamps unless pictures at one end of the recording were certainly taken at another time.
-
     Args:
         chains, time, measured, gyro, sigma: as `guess` has them.
         begun: the recording's first stamp, s.
@@ -214,21 +187,15 @@ def guess_clock(
     angles, bias, clock = parameters
     names = tuple(q.name for q in angles.quantities)
     prior = 1.0 / np.concatenate([prior_sigmas(angles), prior_sigmas(bias), prior_sigmas(clock)[:2]])
-    x = np.concatenate([*guessed, np.zeros(2)])
-    until, last, covariance = _WRONG_AT_FIRST * prior[-1], time[-1] - begun, np.diag(prior**-2.0)
-    while True:
+
+    def missing(until: float, x: Array) -> Miss | None:
         i, j = _pairs([chain[time[chain] - begun <= until] for chain in chains], time, _CLOCK_PAIRS)
+        if not len(i):
+            return None
         elapsed, pictures = (time[i] - begun, time[j] - begun), (measured[i], measured[j])
-        for _ in range(_CLOCK_PASSES if len(i) else 0):
-            miss = _miss_by_clock(x, names, elapsed, pictures, begun, gimbal, gyro)
-            x, covariance = _improved(miss, x, prior, sigma)
-        if until >= last:
-            break
-        until *= _THEN
-    at_ends = np.array([[1.0, 0.0], [1.0, -last]])
-    sigmas = np.sqrt(np.diag(at_ends @ covariance[-2:, -2:] @ at_ends.T))
-    told = (np.abs(at_ends @ x[-2:]) > _TOLD * sigmas).any()
-    return Clock(begun, *x[-2:].tolist()) if told else Clock(begun)
+        return _miss_by_clock(x, names, elapsed, pictures, begun, gimbal, gyro)
+
+    return guess_clock(begun, time[-1] - begun, np.concatenate([*guessed, np.zeros(2)]), prior, sigma, missing)
 
 
 def _miss_by_clock(
@@ -239,7 +206,7 @@ def _miss_by_clock(
     begun: float,
     gimbal: GimbalPath,
     gyro: GyroPath,
-) -> Callable[[Array], Array]:
+) -> Miss:
     """What `_miss` says near some x whose last two numbers are the clock's, the gyro's turns looked up there alone."""
 
     def taken(x: Array) -> list[Array]:
@@ -275,21 +242,6 @@ def _miss(
     tRm = so3.multiply(seen(camera(gimbal[0], mount, names), before), turn)
     cRm = camera(gimbal[1], mount, names)
     return los_error(so3.rotate(so3.multiply(cRm, so3.inverse(tRm)), [0.0, 1.0, 0.0])) - after[:, :2]
-
-
-def _improved(miss: Callable[[Array], Array], x: Array, prior: Array, sigma: float) -> tuple[Array, Array]:
-    """x after a robust least-squares step on what misses (n, 2), and its covariance.
-
-    Priors are about zero, with these inverse sigmas.
-    """
-    error = miss(x)
-    size = np.linalg.norm(error, axis=1)
-    scale = max(float(np.median(size)), sigma)
-    weight = 1.0 / (scale * np.sqrt(1.0 + (size / (3.0 * scale)) ** 2))[:, None]
-    columns = [(weight * (miss(x + d) - error)).ravel() / _STEP for d in _STEP * np.eye(len(x))]
-    A = np.vstack([np.stack(columns, axis=1), np.diag(prior)])
-    x = x - np.linalg.lstsq(A, np.concatenate([(weight * error).ravel(), prior * x]))[0]
-    return x, np.linalg.inv(A.T @ A)
 
 
 def _pairs(chains: Sequence[NDArray[np.intp]], time: Array, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

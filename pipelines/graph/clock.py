@@ -1,0 +1,82 @@
+"""When pictures were taken, by their stamps, and a first guess of it.
+
+Two ordinary clocks drift apart by 1e-4: 60 ms in ten minutes, 0.36 s in an hour, further than motion around a stamp can
+be carried. So a clock is guessed before the graph is made, and keyframes stand where pictures were taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipelines.graph.problem import Array
+from pipelines.graph.robust import improved
+
+# A clock is guessed first from as much of a recording as takes it to go wrong by so much, s (sigma), far less than a
+# swing takes, then from so many times as much each time.
+_WRONG_AT_FIRST, _THEN, _PASSES = 0.06, 4.0, 3
+# It is taken for another one than the stamps' beyond so many sigmas.
+_TOLD = 5.0
+
+# What misses (n, d) at numbers near some, the last two of which are a clock's offset and skew.
+Miss = Callable[[Array], Array]
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Pictures were taken at stamp + offset - skew * (stamp - begun).
+
+    Attributes:
+        begun: the recording's first stamp, s.
+        offset: s.
+        skew: s/s.
+    """
+
+    begun: float
+    offset: float = 0.0
+    skew: float = 0.0
+
+    def late(self, elapsed: Array) -> Array:
+        """How much later (n,), s, than their stamps pictures were taken, so long after the first, s."""
+        return np.asarray(self.offset - self.skew * elapsed)
+
+    def elapsed(self, taken: Array) -> Array:
+        """Stamps (n,) of pictures taken at these times, s, since the first."""
+        return np.asarray((taken - self.begun - self.offset) / (1.0 - self.skew))
+
+
+def first_span(skew_sigma: float) -> float:
+    """So long, s, no clock goes wrong by much."""
+    return _WRONG_AT_FIRST / skew_sigma
+
+
+def guess_clock(
+    begun: float, last: float, x: Array, prior: Array, sigma: float, missing: Callable[[float, Array], Miss | None]
+) -> Clock:
+    """The clock with which a recording's pictures are explained best.
+
+    It is that of the stamps unless pictures at one end of the recording were certainly taken at another time.
+
+    Args:
+        begun: the recording's first stamp, s.
+        last: stamp of the last picture since then, s.
+        x: (d,) numbers to begin with, offset and skew the last two.
+        prior: (d,) their inverse sigmas about zero.
+        sigma: of what misses, where nothing is wrong.
+        missing: of the recording's first so many seconds, what misses near some numbers; None: too little is there.
+    """
+    until, covariance = first_span(1.0 / prior[-1]), np.diag(prior**-2.0)
+    while True:
+        for _ in range(_PASSES):
+            miss = missing(until, x)
+            if miss is not None:
+                x, covariance = improved(miss, x, prior, sigma)
+        if until >= last:
+            break
+        until *= _THEN
+    at_ends = np.array([[1.0, 0.0], [1.0, -last]])
+    sigmas = np.sqrt(np.diag(at_ends @ covariance[-2:, -2:] @ at_ends.T))
+    told = (np.abs(at_ends @ x[-2:]) > _TOLD * sigmas).any()
+    return Clock(begun, *x[-2:].tolist()) if told else Clock(begun)

@@ -1,0 +1,111 @@
+"""First guesses for the head method's graph: gyro bias, the helmet's mount and the pictures' clock."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import so3
+from factors.preintegration import GyroPath
+from pipelines.graph.clock import Clock, Miss, first_span, guess_clock
+from pipelines.graph.priors import prior_sigmas
+from pipelines.graph.problem import Array, Parameter
+
+# Rates for the first guess are taken over this time, s: long against vision noise, short against turns.
+_GUESS_SPAN = 0.3
+_FEWEST_FRAMES = 10
+# Pairs of pictures that tell the clock.
+_CLOCK_PAIRS = 1000
+
+
+def guess(gyro: GyroPath, vision_t: Array, iRh: Array, sigma: float) -> tuple[Array, Array]:
+    """First guess of the gyro bias (3,) and vRh (4,) from rates: w_v = vRh w_h + bias over short windows.
+
+    Rates seen by vision beyond what the gyro's length allows are outliers. The mount is the rotation between the
+    rates when the motion is about more than one axis, else the identity.
+
+    Args:
+        gyro: the helmet's, integrated without any bias taken off.
+        vision_t: (n,) when the pictures were taken, s.
+        iRh: (n, 4) what they show, the platform's own attitude before it.
+        sigma: of one, rad.
+    """
+    i, j = _pairs(vision_t, len(vision_t))
+    if not len(i):
+        return np.zeros(3), so3.identity()
+    start, stop = vision_t[i], vision_t[j]
+    span = (stop - start)[:, None]
+    rate = so3.log(gyro.increments(start, stop).wxyz) / span
+    seen = so3.log(so3.multiply(so3.inverse(iRh[i]), iRh[j])) / span
+    mismatch = np.abs(np.linalg.norm(rate, axis=1) - np.linalg.norm(seen, axis=1))
+    good = mismatch < 0.05 + 5.0 * sigma / span[:, 0]
+    if good.sum() < _FEWEST_FRAMES:
+        return np.zeros(3), so3.identity()
+    rate, seen = rate[good], seen[good]
+    a, b = rate - rate.mean(axis=0), seen - seen.mean(axis=0)
+    s = np.linalg.svd(a.T @ b, compute_uv=False)
+    noise = 2.0 * (sigma / _GUESS_SPAN) ** 2 * len(rate)
+    two_axes = s[1] > 3.0 * noise / np.sqrt(len(rate)) and s[1] > 0.01 * s[0]
+    vRh = so3.align(a, b) if two_axes else so3.identity()
+    return np.median(rate - so3.rotate(vRh, seen), axis=0), vRh
+
+
+def guess_picture_clock(
+    gyro: GyroPath,
+    platform: GyroPath | None,
+    elapsed: Array,
+    begun: float,
+    measured: Array,
+    parameters: tuple[Parameter, Parameter, Parameter],
+    sigma: float,
+) -> Clock:
+    """The clock with which the helmet's gyro tells best what pictures show, guessed with its bias and mount.
+
+    Args:
+        gyro, platform: of helmet and platform, integrated without any bias taken off; None: the platform is at rest.
+        elapsed: (n,) stamps of the pictures since the recording's first, s.
+        begun: that one, s.
+        measured: (n, 4) cRh.
+        parameters: the helmet's mount, bias, and one whose first two numbers are offset and skew, with their priors.
+        sigma: of one picture, rad.
+    """
+    # The mount is a correction of the guess.
+    prior = 1.0 / np.concatenate([prior_sigmas(p)[:size] for p, size in zip(parameters, (3, 3, 2), strict=True)])
+
+    def stamped(of: Array, x: Array) -> Array:
+        return np.asarray(begun + of + Clock(begun, *x[-2:]).late(of))
+
+    def carried(at: Array, seen: Array) -> Array:
+        return seen if platform is None else so3.multiply(platform.attitude(at), seen)
+
+    def missing(until: float, x: Array) -> Miss | None:
+        count = int(np.searchsorted(elapsed, until, side="right"))
+        i, j = _pairs(elapsed[:count], _CLOCK_PAIRS)
+        if len(i) < _FEWEST_FRAMES:
+            return None
+        before, after = stamped(elapsed[i], x), stamped(elapsed[j], x)
+        turn = so3.multiply(so3.inverse(carried(before, measured[i])), carried(after, measured[j]))
+        turns = gyro.increments(before, after)
+        rates = [np.stack([np.interp(t, gyro.t, each) for each in gyro.read.T], axis=1) for t in (before, after)]
+
+        def miss(near: Array) -> Array:
+            by = [(stamped(elapsed[of], near) - t)[:, None] for of, t in ((i, before), (j, after))]
+            back, on = (so3.exp(rate * each) for rate, each in zip(rates, by, strict=True))
+            told = so3.compose(so3.inverse(back), turns.wxyz, on, so3.exp(turns.bias_jacobian @ near[3:6]))
+            vRh = so3.multiply(mount, so3.exp(near[None, :3]))
+            return so3.log(so3.multiply(so3.inverse(so3.compose(vRh, turn, so3.inverse(vRh))), told))
+
+        return miss
+
+    first = elapsed <= first_span(1.0 / prior[-1])
+    bias, mount = guess(gyro, begun + elapsed[first], carried(begun + elapsed[first], measured[first]), sigma)
+    x = np.concatenate([np.zeros(3), bias, np.zeros(2)])
+    return guess_clock(begun, float(elapsed[-1]), x, prior, sigma, missing)
+
+
+def _pairs(time: Array, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Pictures about _GUESS_SPAN apart, at most about so many pairs."""
+    stride = max(1, round(_GUESS_SPAN / max(float(np.median(np.diff(time))), 1e-3))) if len(time) > 1 else 1
+    i = np.flatnonzero(time[stride:] - time[:-stride] < 2.0 * _GUESS_SPAN)
+    i = i[:: -(-len(i) // most) or 1]
+    return i, i + stride
