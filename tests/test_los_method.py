@@ -88,7 +88,7 @@ def _mean_nees(scenario: LosScenario, solve: Solve, runs: int) -> tuple[float, i
     [
         (REAL, solve_batch, 2),
         (SHORT, solve_batch, 5),
-        (REAL.model_copy(update={"duration_s": 10.0}), solve_incremental, 1),
+        (REAL.model_copy(update={"duration_s": 10.0}), solve_incremental, 2),
     ],
     ids=["real", "ideal", "real, incremental"],
 )

@@ -1,8 +1,8 @@
 """First guesses for the los method's graph: mounting angles, gyro bias, the pictures' clock and attitudes.
 
 They come from pictures a second apart. Linearising at zero angles and zero bias is good enough for a minute; over ten
-the camera's roll about its line of sight, which no picture tells, would start too far off, and a clock that runs fast
-or slow would be further off than motion around the stamps tells.
+what they do together would start too far off, and a clock that runs fast or slow would be further off than motion
+around the stamps tells.
 """
 
 from __future__ import annotations
@@ -25,6 +25,9 @@ from pipelines.graph.robust import improved
 # Pictures so far apart, s, are compared, long against their noise, and no more than so many pairs of them.
 _SPAN, _MOST_PAIRS = 1.0, 2000
 _PASSES = 5
+# What is assumed is held at zero by this part of its prior: a gyro's skew, which is not looked for, would pass for ten
+# times the roll that a camera may have, and turn the axes of the target's frame with it.
+_HELD = 1e-3
 # A clock is guessed from fewer pairs.
 _CLOCK_PAIRS = 500
 # Between the knots of a line that follows what the gyro's noise and bias add up to, s.
@@ -153,7 +156,7 @@ def guess(
     """
     angles, bias = parameters
     names = tuple(q.name for q in angles.quantities)
-    prior = 1.0 / np.concatenate([prior_sigmas(angles), prior_sigmas(bias)])
+    prior = 1.0 / np.concatenate([_sigmas(angles), prior_sigmas(bias)])
     x = np.zeros(len(prior))
     i, j = _pairs(chains, time, _MOST_PAIRS)
     if not len(i):
@@ -186,7 +189,7 @@ def guess_picture_clock(
     """
     angles, bias, clock = parameters
     names = tuple(q.name for q in angles.quantities)
-    prior = 1.0 / np.concatenate([prior_sigmas(angles), prior_sigmas(bias), prior_sigmas(clock)[:2]])
+    prior = 1.0 / np.concatenate([_sigmas(angles), prior_sigmas(bias), prior_sigmas(clock)[:2]])
 
     def missing(until: float, x: Array) -> Miss | None:
         i, j = _pairs([chain[time[chain] - begun <= until] for chain in chains], time, _CLOCK_PAIRS)
@@ -196,6 +199,11 @@ def guess_picture_clock(
         return _miss_by_clock(x, names, elapsed, pictures, begun, gimbal, gyro)
 
     return guess_clock(begun, time[-1] - begun, np.concatenate([*guessed, np.zeros(2)]), prior, sigma, missing)
+
+
+def _sigmas(angles: Parameter) -> Array:
+    """(d,) rad, of the mounting angles and what is assumed with them."""
+    return np.where([q.assumed for q in angles.quantities], _HELD, 1.0) * prior_sigmas(angles)
 
 
 def _miss_by_clock(
