@@ -62,14 +62,13 @@ def played(
         return source_of(bridge.url, None, lambda _: None), lambda: bridge.is_over, lambda: bridge.came[first]
     if kind == "standard input":
         out, into = os.pipe()
-        thread = threading.Thread(target=lambda: write(paced(whole, 1.0), _Pipe(into, "w"), 2_000), daemon=True)
-        source: Source = StandardInput(None, os.fdopen(out, "rb"))
-    else:
-        path = folder / "s.mcap" if kind == "file" else folder / "bag"
-        thread = threading.Thread(target=_record, args=(whole, path), daemon=True)
-        source = Source(path)
+        threading.Thread(target=_send, args=(whole, into), daemon=True).start()
+        # What is written may not have been read: the end of the pipe is the end.
+        return StandardInput(None, os.fdopen(out, "rb")), lambda: False, lambda: began
+    path = folder / "s.mcap" if kind == "file" else folder / "bag"
+    thread = threading.Thread(target=_record, args=(whole, path), daemon=True)
     thread.start()
-    return source, lambda: not thread.is_alive(), lambda: began
+    return Source(path), lambda: not thread.is_alive(), lambda: began
 
 
 class _Pipe(io.FileIO):
@@ -84,6 +83,11 @@ class _Pipe(io.FileIO):
 
     def tell(self) -> int:
         return self._at
+
+
+def _send(whole: list[Message], into: int) -> None:
+    with _Pipe(into, "w") as pipe:
+        write(paced(whole, 1.0), pipe, 2_000)
 
 
 def _record(whole: list[Message], path: Path) -> None:
