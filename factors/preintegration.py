@@ -71,7 +71,7 @@ class GyroPath:
     """A gyro stream integrated once; the rotation over any window then costs the same as a look-up.
 
     It is integrated block by block. The last blocks looked at are kept, a million samples, and those of a longer
-    stream are integrated anew when they are needed.
+    stream are integrated anew when they are needed. Stamps and rates as given stay at hand as `t` and `read`.
 
     Args:
         t: (N,) stamps, s, increasing, N >= 2.

@@ -7,10 +7,12 @@ be carried. So a clock is guessed before the graph is made, and keyframes stand 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from factors import so3
+from factors.preintegration import GyroPath, Increments
 from pipelines.graph.problem import Array
 from pipelines.graph.robust import improved
 
@@ -42,6 +44,10 @@ class Clock:
         """How much later (n,), s, than their stamps pictures were taken, so long after the first, s."""
         return np.asarray(self.offset - self.skew * elapsed)
 
+    def taken(self, elapsed: Array) -> Array:
+        """When (n,), s, pictures were taken whose stamps are so long after the first, s."""
+        return np.asarray(self.begun + elapsed + self.late(elapsed))
+
     def elapsed(self, taken: Array) -> Array:
         """Stamps (n,) of pictures taken at these times, s, since the first."""
         return np.asarray((taken - self.begun - self.offset) / (1.0 - self.skew))
@@ -52,8 +58,29 @@ def first_span(skew_sigma: float) -> float:
     return _WRONG_AT_FIRST / skew_sigma
 
 
+def turns_near(gyro: GyroPath, start: Array, stop: Array) -> Callable[[Array, Array], Increments]:
+    """What a gyro turned over windows whose ends (n,), s, are near these: looked up once, then carried on by its rates.
+
+    A stream longer than what is kept of it is integrated anew for every look.
+    """
+    turns = gyro.increments(start, stop)
+    rates = [np.stack([np.interp(t, gyro.t, each) for each in gyro.read.T], axis=1) for t in (start, stop)]
+
+    def near(*ends: Array) -> Increments:
+        moves = zip(rates, ends, (start, stop), strict=True)
+        back, on = (so3.exp(rate * (end - was)[:, None]) for rate, end, was in moves)
+        return replace(turns, wxyz=so3.compose(so3.inverse(back), turns.wxyz, on))
+
+    return near
+
+
 def guess_clock(
-    begun: float, last: float, x: Array, prior: Array, sigma: float, missing: Callable[[float, Array], Miss | None]
+    begun: float,
+    last: float,
+    x: Array,
+    prior: Array,
+    sigma: float,
+    missing: Callable[[float], Callable[[Array], Miss] | None],
 ) -> Clock:
     """The clock with which a recording's pictures are explained best.
 
@@ -69,10 +96,10 @@ def guess_clock(
     """
     until, covariance = first_span(1.0 / prior[-1]), np.diag(prior**-2.0)
     while True:
-        for _ in range(_PASSES):
-            miss = missing(until, x)
-            if miss is not None:
-                x, covariance = improved(miss, x, prior, sigma)
+        near = missing(until)
+        if near is not None:
+            for _ in range(_PASSES):
+                x, covariance = improved(near(x), x, prior, sigma)
         if until >= last:
             break
         until *= _THEN

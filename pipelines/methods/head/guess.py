@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
 from factors import so3
 from factors.preintegration import GyroPath
-from pipelines.graph.clock import Clock, Miss, first_span, guess_clock
+from pipelines.graph.clock import Clock, Miss, first_span, guess_clock, turns_near
 from pipelines.graph.priors import prior_sigmas
 from pipelines.graph.problem import Array, Parameter
 
@@ -72,27 +75,27 @@ def guess_picture_clock(
     # The mount is a correction of the guess.
     prior = 1.0 / np.concatenate([prior_sigmas(p)[:size] for p, size in zip(parameters, (3, 3, 2), strict=True)])
 
-    def stamped(of: Array, x: Array) -> Array:
-        return np.asarray(begun + of + Clock(begun, *x[-2:]).late(of))
-
     def carried(at: Array, seen: Array) -> Array:
         return seen if platform is None else so3.multiply(platform.attitude(at), seen)
 
-    def missing(until: float, x: Array) -> Miss | None:
+    def missing(until: float) -> Callable[[Array], Miss] | None:
         count = int(np.searchsorted(elapsed, until, side="right"))
-        i, j = _pairs(elapsed[:count], _CLOCK_PAIRS)
-        if len(i) < _FEWEST_FRAMES:
-            return None
-        before, after = stamped(elapsed[i], x), stamped(elapsed[j], x)
-        turn = so3.multiply(so3.inverse(carried(before, measured[i])), carried(after, measured[j]))
-        turns = gyro.increments(before, after)
-        rates = [np.stack([np.interp(t, gyro.t, each) for each in gyro.read.T], axis=1) for t in (before, after)]
+        pairs = _pairs(elapsed[:count], _CLOCK_PAIRS)
+        return None if len(pairs[0]) < _FEWEST_FRAMES else partial(near, *pairs)
 
-        def miss(near: Array) -> Array:
-            by = [(stamped(elapsed[of], near) - t)[:, None] for of, t in ((i, before), (j, after))]
-            back, on = (so3.exp(rate * each) for rate, each in zip(rates, by, strict=True))
-            told = so3.compose(so3.inverse(back), turns.wxyz, on, so3.exp(turns.bias_jacobian @ near[3:6]))
-            vRh = so3.multiply(mount, so3.exp(near[None, :3]))
+    def near(i: NDArray[np.intp], j: NDArray[np.intp], x: Array) -> Miss:
+        def taken(x: Array) -> tuple[Array, Array]:
+            clock = Clock(begun, *x[-2:])
+            return clock.taken(elapsed[i]), clock.taken(elapsed[j])
+
+        before, after = taken(x)
+        turn = so3.multiply(so3.inverse(carried(before, measured[i])), carried(after, measured[j]))
+        turns_at = turns_near(gyro, before, after)
+
+        def miss(x: Array) -> Array:
+            turns = turns_at(*taken(x))
+            told = so3.multiply(turns.wxyz, so3.exp(turns.bias_jacobian @ x[3:6]))
+            vRh = so3.multiply(mount, so3.exp(x[None, :3]))
             return so3.log(so3.multiply(so3.inverse(so3.compose(vRh, turn, so3.inverse(vRh))), told))
 
         return miss

@@ -7,8 +7,7 @@ around the stamps tells.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from factors import so3
 from factors.gimbal import GimbalPath
 from factors.los import LosDirectionFactor
 from factors.preintegration import GyroPath, Increments
-from pipelines.graph.clock import Clock, Miss, guess_clock
+from pipelines.graph.clock import Clock, Miss, guess_clock, turns_near
 from pipelines.graph.priors import prior_sigmas
 from pipelines.graph.problem import Array, Parameter
 from pipelines.graph.robust import improved
@@ -191,12 +190,12 @@ def guess_picture_clock(
     names = tuple(q.name for q in angles.quantities)
     prior = 1.0 / np.concatenate([_sigmas(angles), prior_sigmas(bias), prior_sigmas(clock)[:2]])
 
-    def missing(until: float, x: Array) -> Miss | None:
+    def missing(until: float) -> Callable[[Array], Miss] | None:
         i, j = _pairs([chain[time[chain] - begun <= until] for chain in chains], time, _CLOCK_PAIRS)
         if not len(i):
             return None
         elapsed, pictures = (time[i] - begun, time[j] - begun), (measured[i], measured[j])
-        return _miss_by_clock(x, names, elapsed, pictures, begun, gimbal, gyro)
+        return lambda x: _miss_by_clock(x, names, elapsed, pictures, begun, gimbal, gyro)
 
     return guess_clock(begun, time[-1] - begun, np.concatenate([*guessed, np.zeros(2)]), prior, sigma, missing)
 
@@ -217,19 +216,15 @@ def _miss_by_clock(
 ) -> Miss:
     """What `_miss` says near some x whose last two numbers are the clock's, the gyro's turns looked up there alone."""
 
-    def taken(x: Array) -> list[Array]:
+    def taken(x: Array) -> tuple[Array, Array]:
         clock = Clock(begun, *x[-2:])
-        return [begun + each + clock.late(each) for each in elapsed]
+        return clock.taken(elapsed[0]), clock.taken(elapsed[1])
 
-    at = taken(x)
-    turns = gyro.increments(at[0], at[1])
-    rates = [np.stack([np.interp(t, gyro.t, each) for each in gyro.read.T], axis=1) for t in at]
+    turns_at = turns_near(gyro, *taken(x))
 
     def miss(x: Array) -> Array:
-        now = taken(x)
-        back, on = (so3.exp(rate * (t - was)[:, None]) for rate, t, was in zip(rates, now, at, strict=True))
-        turned = replace(turns, wxyz=so3.compose(so3.inverse(back), turns.wxyz, on))
-        return _miss(x[:-2], names, turned, (gimbal.at(now[0]), gimbal.at(now[1])), *measured)
+        before, after = taken(x)
+        return _miss(x[:-2], names, turns_at(before, after), (gimbal.at(before), gimbal.at(after)), *measured)
 
     return miss
 
