@@ -133,6 +133,21 @@ def test_a_clock_that_cannot_be_told_is_that_of_the_stamps() -> None:
     assert {step.time for step in made.steps(1)} <= set(data.image_t.tolist())
 
 
+def test_pictures_close_in_time_share_a_step() -> None:
+    scenario = REAL.model_copy(update={"image_rate_hz": 50.0, "dropouts_s": [(4.03, 4.5)]})
+    data, _ = simulate_los(scenario, 100)
+    made = problem(data, _config(scenario))
+    few, many = list(made.steps(1)), list(made.steps(20))
+    sizes = np.array([len(step.keyframes) for step in few])
+    assert sizes.max() == np.median(sizes) == 5
+    assert all(len(step.keyframes) >= 20 for step in many[:-1])
+    ends = [step.keyframes.stop for step in few]
+    assert {step.keyframes.stop for step in many} < set(ends)
+    assert made.steps_after is not None
+    later = made.steps_after(few[7].time)
+    assert [step.keyframes.stop for step in later] == ends[8:], "a run that goes on takes the same steps"
+
+
 @pytest.mark.slow
 def test_clocks_that_drift_for_a_quarter_of_an_hour() -> None:
     mean, size = _mean_nees(_drifting(900.0, 1e-4), solve_batch, runs := 6)

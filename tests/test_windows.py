@@ -49,8 +49,12 @@ def test_every_window_ends_where_batch_does(method: str, window: float | None) -
     np.testing.assert_allclose(incremental.sigmas[free], batch.sigmas[free], rtol=0.05)
 
 
-def test_so_many_keyframes_are_kept() -> None:
-    problem = made("head", duration_s=6.0)
+@pytest.mark.parametrize(
+    ("method", "changes"),
+    [("head", {}), pytest.param("los", {"image_rate_hz": 50.0}, id="los, five pictures a step")],
+)
+def test_so_many_keyframes_are_kept(method: str, changes: dict[str, float]) -> None:
+    problem = made(method, duration_s=6.0, **changes)
     run = Run(problem, Keyframes(7))
     held = []
     for step in problem.steps(1):

@@ -238,12 +238,11 @@ class GyroChain:
         for key in [*map(self.bias.key, nodes), *map(self.bias.mean_key, means)]:
             out.insert(key, bias)
         carried_by, turned = self._turned(keyframes, bias, current)
-        for k, carrier, turn in zip(keyframes, carried_by, turned, strict=True):
-            if self.starts[k]:
-                attitude = seen(k, current)
-            else:
-                before = (out if out.exists(self.state(k - 1)) else current).atRot3(self.state(k - 1))
-                attitude = so3.compose(so3.inverse(carrier), so3.from_gtsam([before])[0], turn)
+        attitude = so3.identity()
+        if not self.starts[keyframes.start]:
+            attitude = so3.from_gtsam([current.atRot3(self.state(keyframes.start - 1))])[0]
+        for k, carrier, turn in zip(keyframes, so3.inverse(carried_by), turned, strict=True):
+            attitude = seen(k, current) if self.starts[k] else so3.compose(carrier, attitude, turn)
             out.insert(self.state(k), so3.to_gtsam(attitude))
         return out
 

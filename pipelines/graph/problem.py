@@ -188,15 +188,15 @@ class Problem:
     Attributes:
         method: its name.
         parameters: what is calibrated, in reporting order.
-        steps: yields the graph; its argument is how many measurements a step takes together (one when fed to a
-            smoother, many in batch, where fewer and larger factors are faster).
+        steps: yields the graph; its argument is how many measurements a step takes together at least (one when fed to a
+            smoother, many in batch, where fewer and larger factors are faster). Steps of many end where some of one do.
         loss: shared by all measurements that may be outliers; the batch solver anneals it. None: no outliers expected.
         attitudes: the trajectory at some keyframes, given values that hold them; None when the method has none.
         attitude_name: what the trajectory is, e.g. "bRv".
         advice: what to do about a weak direction, given its weights by parameter name.
         dropped: measurements left out before solving, reason -> count.
         premises: what is taken for granted and a reader has to know, sentences.
-        steps_after: the steps of one measurement each that are later than a time, s, for graphs whose steps stay
+        steps_after: the steps of one measurement or more that are later than a time, s, for graphs whose steps stay
             as they are while the recording grows, but for those of its last second. None: all may change.
         onward: the graph of a recording that grows, from the data of its end and the time, s, of a keyframe of this
             graph that is in them and from which on there are steps; -inf: from all data, with all steps. It agrees with

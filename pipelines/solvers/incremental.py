@@ -138,8 +138,8 @@ class Run:
         self._outdated: list[Step] = []  # steps no longer needed, yet to be freed
         self._smoother: Smoother | None = None  # None before the first batch solution
         self._stamps: dict[int, float] = {}  # of the variables held that age, in the window's unit
-        self._times: list[float] = []  # of the steps, where the window's unit is keyframes
-        self._before = 0.0  # so many steps were taken before these
+        self._times: list[float] = []  # of the keyframes, where they are the window's unit
+        self._before = 0.0  # so many were taken before these
         self._young = True
         self._solved: _Solved | None = None  # the last batch solution while young
         self._looked = 0.0  # from so many s on it is to be seen again whether the past may be folded
@@ -193,7 +193,7 @@ class Run:
         self.past.append(step)
         del self._outdated[-_FREED:]
         if isinstance(self.window, Keyframes):
-            self._times.append(step.time)
+            self._times.extend(sorted({*step.timestamps.values(), step.time}))
         if self._smoother is not None:
             self._advance(self._smoother, step)
         else:
@@ -316,7 +316,7 @@ class Run:
         return processes + measurements
 
     def _aged(self, timestamps: Mapping[int, float]) -> dict[int, float]:
-        """Times of last use, s, in the window's unit: the number of the step, one a keyframe, or as they are."""
+        """Times of last use, s, in the window's unit: the number of the keyframe, or as they are."""
         if not isinstance(self.window, Keyframes):
             return dict(timestamps)
         number = self._before + np.searchsorted(self._times, list(timestamps.values()))

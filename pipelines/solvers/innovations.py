@@ -104,16 +104,17 @@ class Innovations:
         error, S = error + A @ moves, A @ P @ A.T + np.eye(len(error))
         parts = n if measurement.divisible else 1
         size = len(error) // parts
-        spans = [slice(i, i + size) for i in range(0, len(error), size)]
-        squares = np.array([error[i] @ np.linalg.solve(S[i, i], error[i]) for i in spans])
+        single, part = error.reshape(parts, size), np.arange(parts)
+        blocks = S.reshape(parts, size, parts, size)[part, :, part]
+        squares = (single * np.linalg.solve(blocks, single[:, :, None])[:, :, 0]).sum(axis=1)
         used = squares < gate(size) ** 2 if gated else np.ones(parts, dtype=bool)
         self.rejected_in_a_row = 0 if used.any() else self.rejected_in_a_row + 1
         if self.rejected_in_a_row > _MOST_REJECTED:
             used[:], self.rejected_in_a_row = True, 0
         self.tried, self.refused = self.tried + parts, self.refused + int((~used).sum())
         whitened = np.zeros(len(error))
-        together = np.flatnonzero(np.repeat(used, size))
-        for rows in (together, *(np.arange(len(error))[spans[i]] for i in np.flatnonzero(~used))):
+        standing = np.arange(len(error)).reshape(parts, size)
+        for rows in (standing[used].ravel(), *standing[~used]):
             whitened[rows] = np.linalg.solve(np.linalg.cholesky(S[np.ix_(rows, rows)]), error[rows])
         self.note(factor, whitened.reshape(n, -1), np.repeat(used, n // parts))
         if used.all() or not used.any():

@@ -45,6 +45,9 @@ _WIDE, _HELD = 0.3, 1e-3
 _FAMILIES = ("los", "los with roll")
 # Gimbal angles at a picture are settled this long after it, s.
 _SETTLED = 0.05
+# Pictures within so long, s, share a step, but no more than so many: nobody waits for the estimate between them, and
+# five at once take a smoother little more time than one.
+_TOGETHER, _MOST_TOGETHER = 0.1 - 1e-3, 10
 # So far from its stamp, s, motion around it still tells what gyro and gimbal did when the picture was taken.
 _NEAR = 0.02
 
@@ -229,10 +232,15 @@ def _sqrt_information(covariance: Array) -> Array:
 
 
 def _steps(model: _Model, chunk: int, after: float = -np.inf) -> Iterator[Step]:
-    """`chunk` keyframes at a time; the first step brings the calibration variables and their priors too."""
+    """Pictures close in time, and more until there are `chunk`; the first step brings variables and priors too."""
     time = model.chain.time
-    for begin in range(int(np.searchsorted(time, after, side="right")), len(time), chunk):
-        yield _step(model, range(begin, min(begin + chunk, len(time))))
+    begin = int(np.searchsorted(time, after, side="right"))
+    while begin < len(time):
+        end = begin
+        while end < len(time) and end - begin < chunk:
+            end = min(int(np.searchsorted(time, time[end] + _TOGETHER)), end + _MOST_TOGETHER)
+        yield _step(model, range(begin, end))
+        begin = end
 
 
 def _step(model: _Model, keyframes: range) -> Step:
