@@ -102,7 +102,7 @@ def solve_batch(
     noise = information_of_noise(problem, about, marginal, whole.current_keys)
     if noise is not None:
         marginal = joint_covariance(problem, linear, ordering, values, whole.current_keys, noise)
-    bent = second_order(problem, system, values, marginal, whole.current_keys)
+    bent = second_order(problem, about, marginal, whole.current_keys)
     if bent is not None:
         marginal = marginal + bent
     residuals = system.residuals(values)

@@ -18,7 +18,6 @@ from collections.abc import Mapping
 from itertools import chain
 from typing import TYPE_CHECKING
 
-import gtsam
 import numpy as np
 
 from pipelines.graph.problem import Array, Problem
@@ -32,23 +31,23 @@ from pipelines.solvers.marginals import (
 )
 
 if TYPE_CHECKING:
-    from pipelines.solvers.system import System
+    from pipelines.solvers.system import Linear
 
 # A direction with a sigma within this share of the prior follows those of which its sigma is within this share.
 _WEAK, _LESS = 0.1, 0.5
 # Where no sigma of what is calibrated is beyond this share nothing is drawn.
 _SURE = 0.01
 _DRAWS = 16
-# The first few suffice to see that none makes up this much of a squared sigma in all.
-_TRIED, _SLIGHT = 3, 0.1
+# Looked at after so many draws: where no direction gained this share of its squared sigma, none is said to bend. One
+# that gains all of it shows so little in so few draws with a chance of 3 %.
+_SLIGHT = {1: 1e-3, 3: 0.1}
 # Information in units of the priors' with which there is no prior.
 _ANYWHERE = 0.5
 
 
 def second_order(
     problem: Problem,
-    system: System,
-    values: gtsam.Values,
+    about: Linear,
     covariance: Array,
     current_keys: Mapping[int, int],
 ) -> Array | None:
@@ -58,8 +57,7 @@ def second_order(
 
     Args:
         problem: the graph's.
-        system: of the same.
-        values: its solution.
+        about: the same, linearised at its solution.
         covariance: (n, n) of the reported numbers as the linearised graph has it.
         current_keys: parameter key -> variable that holds its value.
     """
@@ -68,13 +66,12 @@ def second_order(
     scaled = (covariance / np.outer(scales, scales))[np.ix_(calibrated, calibrated)]
     if not len(scaled) or np.linalg.eigvalsh(scaled)[-1] < _SURE**2:
         return None
-    keys = [current_keys.get(p.key, p.key) for p in problem.parameters]
+    values, keys = about.values, [current_keys.get(p.key, p.key) for p in problem.parameters]
     free, scale, unit = prior_units(problem.parameters, values, keys)
     # Far from the solution the loss would reject what is good.
-    system, ordering = system.without_rejected(values), system.ordering
+    system, ordering = about.system.without_rejected(values), about.system.ordering
     try:
-        linear = system.linearized(values)
-        eigenvalues, vectors = np.linalg.eigh(unit.T @ joint_information(linear.graph, ordering, keys) @ unit)
+        eigenvalues, vectors = np.linalg.eigh(unit.T @ joint_information(about.graph, ordering, keys) @ unit)
         if eigenvalues[0] < _ANYWHERE:
             return None
         # The best known one first.
@@ -85,7 +82,8 @@ def second_order(
         ways: list[Array] = []
         generator = np.random.default_rng(0)
         # Values of hours are large: no more of them at once than are looked at.
-        draws = (linear.drawn(keys, count, generator) for count in (_TRIED, _DRAWS - _TRIED))
+        counts = np.diff([0, *_SLIGHT, _DRAWS]).tolist()
+        draws = (about.drawn(keys, count, generator) for count in counts)
         for each in chain.from_iterable(draws):
             unit = prior_units(problem.parameters, each, keys)[2]
             A, _ = marginal(system.linearize(each), ordering, keys).jacobian(ordering_of(keys))
@@ -94,9 +92,9 @@ def second_order(
             slopes.append(np.where(follows, -R / np.diag(R)[:, None], 0.0) * sigmas)
             moved = (reported(problem, each, current_keys) - numbers)[free] / scale
             ways.append(slopes[-1] @ (vectors.T @ moved / sigmas))
-            if len(slopes) == _TRIED:
+            if len(slopes) in _SLIGHT:
                 square = 0.5 * np.square(slopes).sum(axis=2) + 0.25 * np.square(ways)
-                if (eigenvalues * square).sum(axis=1).max() < _SLIGHT:
+                if (eigenvalues * square).sum(axis=1).max() < _SLIGHT[len(slopes)]:
                     return None
     except (RuntimeError, IndeterminateError, np.linalg.LinAlgError):
         return None

@@ -397,7 +397,7 @@ class Run:
         self._noise = information_of_noise(self.problem, about, covariance, current)
         if self._noise is not None:
             covariance = self.covariance()
-        self._bent = second_order(self.problem, about.system, about.values, covariance, current)
+        self._bent = second_order(self.problem, about, covariance, current)
 
     def _due(self, since: float) -> bool:
         """Whether a young run is to be solved in batch again, `since` s after its first step."""
