@@ -56,6 +56,7 @@ class Drawn:
         return len(self.figures) > 1 or self.figures[0].height > _TALL
 
 
+@cache
 def environment(package: str) -> Environment:
     """Templates of a package on top of the base of all: every string escaped, a name that is not given is an error."""
     from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined

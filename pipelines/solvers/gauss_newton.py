@@ -6,12 +6,12 @@ is by QR: tight processes beside loose priors cost Cholesky its digits, and QR c
 
 A full step may be wrong in three ways. Along a curved valley, such as that of two mounts whose product alone is known,
 it leaves the floor and raises the error by what is of second order; damping would only make it crawl, and there the
-states are brought back to the floor instead. A large step too leaves states off the floor, and by so much the next one
-would be misled about shared variables that little tells, such as a camera's roll: these swing, and the states after
-them, for steps on end; there states go to the floor alone in its place. And where measurements do not fit, residuals
-bend the error as much as Jacobians do: steps are too short or too long by the same share again and again. What one
-gained instead of what it foresaw tells how far the parabola through both has its floor (Nocedal, Wright, "Numerical
-Optimization", 2006, sections 3.5 and 10.3).
+states, and shared variables as far as they are known, are brought back to the floor instead. A large step too leaves
+states off the floor, and by so much the next one would be misled about shared variables that little tells, such as a
+camera's roll: these swing, and the states after them, for steps on end; there states go to the floor alone in its
+place. And where measurements do not fit, residuals bend the error as much as Jacobians do: steps are too short or too
+long by the same share again and again. What one gained instead of what it foresaw tells how far the parabola through
+both has its floor (Nocedal, Wright, "Numerical Optimization", 2006, sections 3.5 and 10.3).
 """
 
 from __future__ import annotations
@@ -37,8 +37,9 @@ _LITTLE = 0.15
 # A step off by more than this from what it foresaw leaves states unsettled; the next one is misled by them if it gains
 # less than it foresaw by more than a share of that, and in all.
 _OFF, _MISLED = 0.1, 0.01
-# Parts of a step along it that are tried, and how many steps the states have to return to the floor.
-_SHARES, _MOST_RETURNS = (1.0, 0.3, 0.1, 0.03), 2
+# Parts of a step along a valley that are tried, and whether what is known of shared variables returns to the floor in
+# each of the steps that the states then have for it.
+_SHARES, _RETURNS = (1.0, 0.3, 0.1, 0.03), (False, False, True, True)
 # A step that gains more or less than it foresaw by such a share of it is too short or too long, at most so many times.
 _WRONG_LENGTH, _LONGEST = 0.2, 10.0
 
@@ -176,7 +177,7 @@ def _full(
         share = foreseen / bend if foreseen < _LONGEST * bend else _LONGEST
         other = _there(system, values, delta.scale(share), foreseen)
         if share > 1.0 and other.error >= move.error:
-            other = _Move(*_returned(system, other.values), foreseen, on_floor=True)
+            other = _Move(*_returned(system, other.values, known=False), foreseen, on_floor=True)
         if other.error < move.error:
             return other
     return move
@@ -208,26 +209,30 @@ def _along_valley(
 ) -> _Move:
     """A place with a lower error on a step's way; its error infinite if there is none.
 
-    The states are solved for anew with the shared variables held where the step takes them, and these go less far until
-    that lowers the error. In a graph without states it is what is known that returns to the floor.
+    The states are solved for anew with the shared variables held where the step takes them. Where these alone are off
+    the floor, as a bias is once the mount has turned by which it is known, only what little is known about them stays
+    where it is, as from the first in a graph without states. They go less far until that lowers the error.
     """
     for share in _SHARES:
         candidate = values.retract(delta.scale(share))
-        for _ in range(_MOST_RETURNS):
-            candidate, new_error = _returned(system, candidate)
+        for known in _RETURNS:
+            candidate, new_error = _returned(system, candidate, known)
             if new_error < error:
                 return _Move(candidate, new_error, foreseen, on_floor=True)
     return _Move(values, np.inf, foreseen)
 
 
-def _returned(system: System, values: gtsam.Values) -> tuple[gtsam.Values, float]:
-    """Values nearer to the floor, and their error: the states alone moved, or of a graph without any what is known."""
+def _returned(system: System, values: gtsam.Values, known: bool) -> tuple[gtsam.Values, float]:
+    """Values nearer to the floor, and their error: the states alone moved, or all that is known."""
     linear = _linearized(system, values)
-    if linear is None or linear.has_states:
-        move = _states_alone(system, values, linear)
-        return move.values, move.error
-    candidate = values.retract(linear.of_the_known())
-    return candidate, system.error(candidate)
+    if linear is not None and (known or not linear.has_states):
+        try:
+            candidate = values.retract(linear.of_the_known())
+        except (RuntimeError, IndeterminateError):
+            return values, np.inf
+        return candidate, system.error(candidate)
+    move = _states_alone(system, values, linear)
+    return move.values, move.error
 
 
 def _linearized(system: System, values: gtsam.Values) -> Linear | None:

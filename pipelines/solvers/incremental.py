@@ -47,9 +47,10 @@ _FIRST, _GROWTH = 1.0, 1.25
 _YOUNG, _OLDEST = 40.0, 600.0
 # ... and for so many steps: few large ones cost little to solve again.
 _FEW_STEPS = 100
-# It is solved at once, if there is _MORE to go by than before, while what is known of the parameters bends, when they
-# have moved by _MOVED of the sigmas they had then and by _FAR of their priors', or when ...
-_MORE, _MOVED, _FAR = 1.05, 0.2, 0.02
+# It is solved at once when a parameter has moved by _LOST of its prior's sigma, as where motion begins after a rest. If
+# there is _MORE to go by than before, it is while what is known of the parameters bends, when they have moved by _MOVED
+# of the sigmas they had then and by _FAR of their priors', or when ...
+_LOST, _MORE, _MOVED, _FAR = 0.5, 1.05, 0.2, 0.02
 # ... so many steps in a row were rejected, or more than this share of measurements: the run may have lost its way.
 _DOUBTED, _TOO_MANY = 5, 0.25
 # Later the past is marginalised out this often, s.
@@ -406,12 +407,14 @@ class Run:
             return since >= _FIRST
         if since >= _GROWTH * solved.since:
             return True
+        moved, scales = np.abs(self.values() - solved.values), self._scales
+        if (moved > _LOST * scales).any():
+            return True
         if len(self.past) < _MORE * solved.steps:
             return False
         if self._bent is not None or self.innovations.doubtful(_DOUBTED, _TOO_MANY):
             return True
-        moved = np.abs(self.values() - solved.values)
-        return bool((moved > np.maximum(_MOVED * solved.sigmas, _FAR * self._scales)).any())
+        return bool((moved > np.maximum(_MOVED * solved.sigmas, _FAR * scales)).any())
 
     @property
     def _scales(self) -> Array:

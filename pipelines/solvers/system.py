@@ -239,11 +239,15 @@ class Linear:
         return len(self.system.shared) < self.system.ordering.size()
 
     def of_the_known(self) -> gtsam.VectorValues:
-        """The move to the minimum of a graph without states, but along what little is known about.
+        """The move to the minimum, but for directions of the shared variables that little is known about.
 
-        That is held by the geometric mean of the most and the least that is known of a direction.
+        These are held by the geometric mean of the most and the least that is known of a direction; states follow.
+        Raises RuntimeError if these are not determined.
         """
-        information, slope = self.graph.hessian(ordering_of(self.system.shared))
+        order, shared = self.system.ordering, set(self.system.shared)
+        states = [key for key in (order.at(i) for i in range(order.size())) if key not in shared]
+        left = eliminated(self.graph, ordering_of(states))[1] if states else self.graph
+        information, slope = left.hessian(ordering_of(self.system.shared))
         known, axes = np.linalg.eigh(information)
         known = np.maximum(known, np.finfo(float).eps * known[-1])
         move = axes @ (axes.T @ slope / (known + np.sqrt(known[0] * known[-1])))
@@ -251,7 +255,7 @@ class Linear:
         for key in self.system.shared:
             start, end = end, end + dims[key]
             delta.insert(key, move[start:end])
-        return delta
+        return self.holding({key: delta.at(key) for key in self.system.shared}).step()[0] if states else delta
 
     def solution(self) -> gtsam.VectorValues:
         """The move to the minimum. Raises IndeterminateError, naming a variable that is not determined."""

@@ -10,7 +10,7 @@ import numpy as np
 from pipelines.belief import Belief, root_of_information
 from pipelines.graph.believing import about_alone
 from pipelines.graph.problem import Array, Problem, Told
-from pipelines.solvers.marginals import IndeterminateError, coordinate_inverse, explain, reported
+from pipelines.solvers.marginals import coordinate_inverse, eliminated, ordering_of, reported
 from pipelines.solvers.system import Linear
 
 # Combinations whose sigma would be so many times their prior's are not told at all.
@@ -38,12 +38,11 @@ def told(problem: Problem, linear: Linear, current_keys: Mapping[int, int], devi
             alone.append(about_alone(factor, problem.parameters, values, device))
         else:
             rest.push_back(factor)
-    states = [key for key in rest.keyVector() if key not in set(keys)]
+    states, order = set(rest.keyVector()) - set(keys), linear.system.ordering
     if states:
-        try:
-            rest = rest.eliminatePartialMultifrontal(states, gtsam.EliminateQR)[1]
-        except RuntimeError as error:
-            raise IndeterminateError(explain(str(error))) from None
+        # gtsam would look for an ordering of its own, which takes longer than the elimination.
+        own = ordering_of(key for key in (order.at(i) for i in range(order.size())) if key in states)
+        rest = eliminated(rest, own)[1]
 
     quantities = problem.quantities
     free = np.flatnonzero([q.prior_sigma != 0.0 for q in quantities])
