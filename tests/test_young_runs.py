@@ -13,8 +13,10 @@ from pipelines.graph.problem import Array, Estimate, Problem
 from pipelines.methods.head.simulation import HeadScenario
 from pipelines.settings import Sensors
 from pipelines.simulation.motion import EulerMotion
-from pipelines.solvers.batch import solve_batch
+from pipelines.solvers.assembly import Assembly
+from pipelines.solvers.batch import CHUNK, optimize, solve_batch
 from pipelines.solvers.incremental import solve_incremental
+from pipelines.solvers.noise_levels import weigh
 
 MOUNT = slice(3, 6)
 PRIOR = 0.35
@@ -90,6 +92,27 @@ def test_a_second_axis_after_the_run_was_folded() -> None:
     batch, incremental = solve_batch(problem), solve_incremental(problem)
     assert _apart(incremental, batch) < 0.3
     assert np.abs((incremental.values - truth) / np.maximum(incremental.sigmas, 1e-12))[MOUNT].max() < 4.0
+
+
+def test_a_valley_that_bends_between_bias_and_mount_is_followed_to_its_end() -> None:
+    """At rest a gimbal's bias is known by its mount alone: from the mount of the motion to come to that of the rest."""
+    settings, _ = CASES["los"]["rest"](27)
+    problem, _ = made("los", settings, 27)
+    whole = Assembly.of(step for step in problem.steps(CHUNK) if step.time <= 47.0)
+    factors, shared = weigh(whole.factors, problem.noises), whole.shared(problem)
+    found = optimize(factors, whole.initial, shared, problem.loss, most=20, held=problem.assumed)
+    assert found.converged, found.message
+
+
+@pytest.mark.slow
+def test_errors_fit_their_covariance_where_motion_begins_after_a_rest() -> None:
+    """Linear about what rest told of the mounts, their joint error is hundreds as soon as anything moves."""
+    for seed in (6, 46):
+        settings, _ = CASES["los"]["rest"](seed)
+        problem, truth = made("los", settings.model_copy(update={"duration_s": 33.0}), seed)
+        found = followed(problem, truth, 30.0 + np.array([0.5, 1.4, 2.0, 2.8]))
+        assert not found.message
+        assert np.mean(found.nees) < chi2.ppf(0.999, found.numbers)
 
 
 def test_outliers_among_few_pictures_lead_to_no_far_minimum() -> None:
