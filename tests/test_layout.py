@@ -150,6 +150,7 @@ def test_sigmas_of_a_small_layout_hold() -> None:
     assert 0.75 < nees(8, 40, range(3)) < 1.3
 
 
+@pytest.mark.slow
 def test_sigmas_of_bent_tags_hold() -> None:
     assert 0.75 < nees(8, 40, range(3), bend=2e-3) < 1.3
 

@@ -123,6 +123,7 @@ def test_what_no_motion_can_tell_gets_no_change(tmp_path: Path) -> None:
         assert plan.best.missing[name] == pytest.approx(plan.now.missing[name], rel=0.01)
 
 
+@pytest.mark.slow
 def test_the_next_best_poses_of_a_cube_are_named_and_mend_the_plan(tmp_path: Path) -> None:
     """Three poses tell little; the scenario written holds the poses named, and simulates to what was foreseen."""
     few = scenario_file(

@@ -71,7 +71,9 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=[pytest.mark.slow] if case == "indexer" else []) for case in CASES]
+)
 def test_it_is_one_big_graph(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """To 1e-6 sigmas at fixed noise levels, the device's numbers and those of the last recording, and their sigmas."""
     monkeypatch.setattr(together, "_STAYS", 1e-7)
