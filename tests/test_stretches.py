@@ -45,6 +45,18 @@ def test_stretches_leave_a_band(make: Callable[[], Problem], monkeypatch: pytest
     assert max(len(clique.own) + len(clique.above) for clique in cliques) < 60 < sum(len(c.own) for c in cliques)
 
 
+def test_what_is_known_moves_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The states follow in either, those of stretches too."""
+    whole = Assembly.of(los_problem().steps(CHUNK))
+    shared = whole.shared(los_problem())
+    alone = system.System.of(whole.factors, shared, None, whole.boundaries)
+    parts, values = stretches(monkeypatch, los_problem())
+    moved, expected = (each.linearized(values).of_the_known() for each in (parts.under(None), alone))
+    for key in values.keys():
+        np.testing.assert_allclose(moved.at(key), expected.at(key), atol=1e-9)
+    assert max(np.abs(moved.at(key)).max() for key in values.keys()) > 1e-4
+
+
 def test_progress_is_shown(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(Console, "is_terminal", True)
     with progress.shown():
