@@ -72,7 +72,8 @@ def marginal(
     Raises:
         IndeterminateError: another variable is undetermined.
     """
-    rest = [ordering.at(i) for i in range(ordering.size()) if ordering.at(i) not in set(keys)]
+    kept = set(keys)
+    rest = [key for key in (ordering.at(i) for i in range(ordering.size())) if key not in kept]
     return eliminated(linear, ordering_of(rest))[1] if rest else linear
 
 

@@ -29,7 +29,7 @@ from pipelines import progress
 from pipelines.graph.problem import Array, Factor, Residuals
 from pipelines.solvers.assembly import StepBoundary
 from pipelines.solvers.history import MOMENTS
-from pipelines.solvers.marginals import eliminated, ordering_of
+from pipelines.solvers.marginals import eliminated, marginal, ordering_of
 from pipelines.solvers.triangular import Triangular, conditionals_of, rows_of
 
 Shown = TypeVar("Shown")
@@ -244,18 +244,16 @@ class Linear:
         These are held by the geometric mean of the most and the least that is known of a direction; states follow.
         Raises RuntimeError if these are not determined.
         """
-        order, shared = self.system.ordering, set(self.system.shared)
-        states = [key for key in (order.at(i) for i in range(order.size())) if key not in shared]
-        left = eliminated(self.graph, ordering_of(states))[1] if states else self.graph
-        information, slope = left.hessian(ordering_of(self.system.shared))
+        shared = self.system.shared
+        information, slope = marginal(self.graph, self.system.ordering, shared).hessian(ordering_of(shared))
         known, axes = np.linalg.eigh(information)
         known = np.maximum(known, np.finfo(float).eps * known[-1])
         move = axes @ (axes.T @ slope / (known + np.sqrt(known[0] * known[-1])))
         delta, dims, end = gtsam.VectorValues(), self.values.dims(), 0
-        for key in self.system.shared:
+        for key in shared:
             start, end = end, end + dims[key]
             delta.insert(key, move[start:end])
-        return self.holding({key: delta.at(key) for key in self.system.shared}).step()[0] if states else delta
+        return self.holding({key: delta.at(key) for key in shared}).step()[0] if self.has_states else delta
 
     def solution(self) -> gtsam.VectorValues:
         """The move to the minimum. Raises IndeterminateError, naming a variable that is not determined."""

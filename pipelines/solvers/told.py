@@ -10,7 +10,7 @@ import numpy as np
 from pipelines.belief import Belief, root_of_information
 from pipelines.graph.believing import about_alone
 from pipelines.graph.problem import Array, Problem, Told
-from pipelines.solvers.marginals import coordinate_inverse, eliminated, ordering_of, reported
+from pipelines.solvers.marginals import coordinate_inverse, marginal, reported
 from pipelines.solvers.system import Linear
 
 # Combinations whose sigma would be so many times their prior's are not told at all.
@@ -38,11 +38,7 @@ def told(problem: Problem, linear: Linear, current_keys: Mapping[int, int], devi
             alone.append(about_alone(factor, problem.parameters, values, device))
         else:
             rest.push_back(factor)
-    states, order = set(rest.keyVector()) - set(keys), linear.system.ordering
-    if states:
-        # gtsam would look for an ordering of its own, which takes longer than the elimination.
-        own = ordering_of(key for key in (order.at(i) for i in range(order.size())) if key in states)
-        rest = eliminated(rest, own)[1]
+    rest = marginal(rest, linear.system.ordering, keys)
 
     quantities = problem.quantities
     free = np.flatnonzero([q.prior_sigma != 0.0 for q in quantities])
