@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from enum import Enum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,8 +56,11 @@ class Model:
     has d = 3, 6 (rotation first, as in gtsam) or d numbers; rotations and poses are perturbed on the right.
 
     A dataclass whose `stacked` names the fields that hold something for each measurement may be evaluated together with
-    others that agree in all other fields.
+    others that agree in all other fields. Where `divisible` is false measurements of one factor are used or left out
+    together.
     """
+
+    divisible: ClassVar[bool] = True
 
     if TYPE_CHECKING:
 

@@ -270,7 +270,7 @@ class _Block:
     @cached_property
     def attitude(self) -> Array:
         """At the samples, (n, 4), in the sensor's frame at the stream's first."""
-        turned = so3.multiply(self.start, _running_product(so3.exp(self.arc)))
+        turned = so3.multiply(self.start, running_product(so3.exp(self.arc)))
         return np.concatenate([self.start, so3.normalize(turned)])
 
     @cached_property
@@ -343,7 +343,7 @@ def _rate(w0: Array, a: Array, s: Array, arc: Array) -> Array:
     return np.einsum("nij,nj->ni", so3.right_jacobian(arc), speed)
 
 
-def _running_product(q: Array) -> Array:
+def running_product(q: Array) -> Array:
     """q0, q0 q1, q0 q1 q2, ...: in blocks, vectorised over the blocks, so that the loop is as long as one block.
 
     Few are multiplied over twice the distance each time, which are far fewer calls.
@@ -361,5 +361,5 @@ def _running_product(q: Array) -> Array:
     grid.reshape(-1, 4)[:n] = q
     for i in range(1, length):
         grid[:, i] = so3.multiply(grid[:, i - 1], grid[:, i])
-    before = np.concatenate([so3.identity(1), _running_product(grid[:-1, -1])])
+    before = np.concatenate([so3.identity(1), running_product(grid[:-1, -1])])
     return so3.normalize(so3.multiply(before[:, None], grid).reshape(-1, 4)[:n])

@@ -7,6 +7,7 @@ tag on the body (x right, y up, z out of the face). Source: methods page, sectio
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -48,6 +49,9 @@ class TagAttitudeFactor(Model):
     placed: bool = False
     by_lens: Array | None = None
     rows: int = 8
+    stacked: ClassVar = ("time", "measured", "sqrt_information", "corners", "bRt", "position", "by_lens")
+    # Tags of one pose settle its place among themselves: alone each would fit.
+    divisible: ClassVar = False
 
     @property
     def blocks(self) -> tuple[Block, ...]:

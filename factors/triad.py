@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -94,6 +95,7 @@ class AccelFactor(Model):
     curved: bool = False
     warmth: Array | None = None
     rows: int = 3
+    stacked: ClassVar = ("time", "raw", "sigma", "warmth")
 
     @property
     def blocks(self) -> tuple[Block, ...]:
@@ -144,6 +146,7 @@ class GyroStaticFactor(Model):
     gravity: float | None = None
     warmth: Array | None = None
     rows: int = 3
+    stacked: ClassVar = ("time", "raw", "sigma", "warmth")
 
     @property
     def blocks(self) -> tuple[Block, ...]:
@@ -184,6 +187,7 @@ class MagFactor(Model):
     sigma: Array
     rows: int = 3
     blocks = (ROT3, 12, 3)
+    stacked: ClassVar = ("time", "raw", "sigma")
 
     def __call__(self, nRb: Array, triads: Array, field: Array) -> Residuals:
         """Residual (predicted - raw) / sigma, (n, 3)."""

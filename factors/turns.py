@@ -8,13 +8,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import starmap
+from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from factors import so3
 from factors.model import ROT3, Array, Block, Model, Residuals
-from factors.preintegration import GyroPath, trapezoid_excess
+from factors.preintegration import running_product, trapezoid_excess
 from factors.triad import parts
 
 
@@ -41,14 +42,15 @@ class GyroRotationFactor(Model):
     """
 
     time: Array
-    stamps: Sequence[Array]
-    raw: Sequence[Array]
+    stamps: list[Array]
+    raw: list[Array]
     earth_rate: Array
     sigma: Array
-    accel: Sequence[Array] | None = None
-    warmth: Sequence[Array] | None = None
+    accel: list[Array] | None = None
+    warmth: list[Array] | None = None
     drifts: bool = False
     rows: int = 3
+    stacked: ClassVar = ("time", "stamps", "raw", "sigma", "accel", "warmth")
 
     @property
     def blocks(self) -> tuple[Block, ...]:
@@ -63,12 +65,15 @@ class GyroRotationFactor(Model):
         """Residual Log(predicted^T nRb_j) / sigma, (n, 3)."""
         offsets = np.concatenate([triads[:, :9], triads[:, 9:] + 0.5 * (wandered_i + wandered_j)], axis=1)
         felt, slopes = ((), terms) if self.accel is None else (terms[:2], terms[2:])
-        raw = self._undrifted(self.raw, slopes[:1])
-        of_force = () if self.accel is None else (*felt, self._undrifted(self.accel, slopes[1:]))
-        of_each = zip(self.stamps, raw, offsets, *of_force, strict=True)
-        turned = list(starmap(Turn.of, of_each))
-        dR = np.array([each.rotation for each in turned])
-        earth = np.array([t[-1] - t[0] for t in self.stamps])[:, None] * self.earth_rate
+        raw, accel, warmth = self._joined
+        samples = self._samples
+        if warmth is not None:
+            drift = [warmth[:, None] * slope[samples.turn] for slope in slopes]
+            raw = raw - drift[0]
+            accel = accel if accel is None or not self.drifts else accel - drift[1]
+        turns = Turns.of(samples, raw, offsets, *felt, *(() if accel is None else (accel,)))
+        dR = turns.rotation
+        earth = (samples.t[samples.last] - samples.t[samples.first])[:, None] * self.earth_rate
         predicted = so3.compose(so3.exp(-earth), nRb_i, dR)
         error = so3.log(so3.multiply(so3.inverse(predicted), nRb_j))
         weight = 1.0 / self.sigma
@@ -76,42 +81,82 @@ class GyroRotationFactor(Model):
         def jacobians() -> tuple[Array, ...]:
             left = -so3.right_jacobian_inverse(-error) * weight[:, None, None]
             right = so3.right_jacobian_inverse(error) * weight[:, None, None]
-            by = [left @ np.array(each) for each in zip(*self._derivatives(turned), strict=True)]
+            by = [*turns.derivatives(), *(() if warmth is None else turns.by_slopes(warmth)[: len(slopes)])]
+            by = [left @ each for each in by]
             by_offset = by[0][..., 9:]
             ends = left @ so3.matrix(so3.inverse(dR)), right
             return *ends, by[0], 0.5 * by_offset, 0.5 * by_offset, *by[1:]
 
         return error * weight[:, None], jacobians
 
-    def _undrifted(self, readings: Sequence[Array], slope: Sequence[Array]) -> Sequence[Array]:
-        """Readings less what they drift by a slope (n, 3) over temperature; as they are without one."""
-        if self.warmth is None or not slope:
-            return readings
-        return [each - np.outer(*by) for each, *by in zip(readings, self.warmth, slope[0], strict=True)]
+    @cached_property
+    def _samples(self) -> Samples:
+        return Samples.of(self.stamps)
 
-    def _derivatives(self, turned: Sequence[Turn]) -> list[tuple[Array, ...]]:
-        """Of each turn's rotation by what is shared, in the order of the blocks."""
-        if self.warmth is None:
-            return [turn.derivatives() for turn in turned]
-        count = 2 if self.drifts else 1
-        pairs = zip(turned, self.warmth, strict=True)
-        return [(*turn.derivatives(), *turn.by_slopes(warmth)[:count]) for turn, warmth in pairs]
+    @cached_property
+    def _joined(self) -> tuple[Array, Array | None, Array | None]:
+        """Readings of gyro and accelerometer and the warmth, all turns' one after the other."""
+        accel, warmth = (None if each is None else np.concatenate(each) for each in (self.accel, self.warmth))
+        return np.concatenate(self.raw), accel, warmth
 
 
 @dataclass(frozen=True)
-class Turn:
-    """One turn as a gyro with its triad sees it.
+class Samples:
+    """When the N samples of n turns were taken, one turn after the other.
 
     Attributes:
-        path: of the calibrated rates.
-        rate: (N, 3) calibrated, rad/s.
-        K: (3, 3), the inverse of the gyro's A.
-        force: (N, 3) m/s^2; None where the gyro does not feel it.
-        G: (3, 3), likewise.
-        accel_K: (3, 3), the inverse of the accelerometer's A, likewise.
+        t: (N,) s.
+        first, last: (n,) of each turn.
+        turn: (N,) of each sample.
+        step: (N - 1, 1) s to the next sample; none from one turn to another.
     """
 
-    path: GyroPath
+    t: Array
+    first: NDArray[np.intp]
+    last: NDArray[np.intp]
+    turn: NDArray[np.intp]
+    step: Array
+
+    @classmethod
+    def of(cls, stamps: Sequence[Array]) -> Samples:
+        """From the stamps of each turn, two at least."""
+        counts = np.array([len(each) for each in stamps])
+        t, ends = np.concatenate(stamps), np.cumsum(counts)
+        step = np.diff(t)[:, None]
+        step[ends[:-1] - 1] = 0.0
+        return cls(t, ends - counts, ends - 1, np.repeat(np.arange(len(counts)), counts), step)
+
+    def points(self, means: Array) -> Array:
+        """Vectors (N, d) between which lines integrate to the means (N, d) that were read."""
+        excess = trapezoid_excess(self.t, means)
+        excess[self.first] = excess[self.last] = 0.0
+        return np.asarray(means - excess)
+
+    def turned(self, matrices: Array, vectors: Array) -> Array:
+        """Each turn's matrix (n, 3, 3) times its samples' vectors (N, 3)."""
+        return np.einsum("kij,kj->ki", matrices[self.turn], vectors)
+
+    def products(self, matrices: Array, vectors: Array) -> Array:
+        """Sum (n, 3, 3, d) over each turn of the samples' matrices (N, 3, 3) times each component of vectors (N, d)."""
+        rows = matrices.reshape(-1, 9)
+        slices = map(slice, self.first.tolist(), (self.last + 1).tolist())
+        return np.array([rows[some].T @ vectors[some] for some in slices]).reshape(len(self.first), 3, 3, -1)
+
+
+@dataclass(frozen=True)
+class Turns:
+    """Turns as a gyro with its triad sees them.
+
+    Attributes:
+        samples: of all turns.
+        rate: (N, 3) calibrated, between which rates are linear, rad/s.
+        K: (n, 3, 3), the inverse of the gyro's A.
+        force: (N, 3) likewise, m/s^2; None where the gyro does not feel it.
+        G: (n, 3, 3), likewise.
+        accel_K: (n, 3, 3), the inverse of the accelerometer's A, likewise.
+    """
+
+    samples: Samples
     rate: Array
     K: Array
     force: Array | None = None
@@ -121,86 +166,86 @@ class Turn:
     @classmethod
     def of(
         cls,
-        t: Array,
+        samples: Samples,
         raw: Array,
-        triad: Array,
+        triads: Array,
         sensitivity: Array | None = None,
-        accel_triad: Array | None = None,
+        accel_triads: Array | None = None,
         accel: Array | None = None,
-    ) -> Turn:
-        """From samples (N, 3) at t (N,) s of gyro and, if it feels force, accelerometer, and their triads (12,)."""
-        A, c = parts(triad)
-        K = np.asarray(np.linalg.inv(A), dtype=float)
-        if sensitivity is None or accel_triad is None or accel is None:
-            rate = (raw - c) @ K.T
-            return cls(GyroPath(t, rate), rate, K)
-        accel_A, accel_c = parts(accel_triad)
+    ) -> Turns:
+        """From readings (N, 3) of gyro and, if it feels force, accelerometer, with G (n, 9) and the triads (n, 12)."""
+        A, c = parts(triads)
+        K, offset = np.asarray(np.linalg.inv(A), dtype=float), c[samples.turn]
+        if sensitivity is None or accel_triads is None or accel is None:
+            return cls(samples, samples.points(samples.turned(K, raw - offset)), K)
+        accel_A, accel_c = parts(accel_triads)
         accel_K = np.asarray(np.linalg.inv(accel_A), dtype=float)
-        force, G = (accel - accel_c) @ accel_K.T, sensitivity.reshape(3, 3)
-        rate = (raw - c - force @ G.T) @ K.T
-        return cls(GyroPath(t, rate, drivers=force), rate, K, force, G, accel_K)
+        force, G = samples.turned(accel_K, accel - accel_c[samples.turn]), sensitivity.reshape(-1, 3, 3)
+        rate = samples.turned(K, raw - offset - samples.turned(G, force))
+        return cls(samples, samples.points(rate), K, samples.points(force), G, accel_K)
 
     @property
     def rotation(self) -> Array:
-        """From its first stamp to its last, (4,)."""
-        return self.path.attitude(self.path.t[-1:])[0]
+        """From the first stamp of each to its last, (n, 4)."""
+        first, last = self._attitude[self.samples.first], self._attitude[self.samples.last]
+        return so3.multiply(so3.inverse(first), last)
 
     def derivatives(self) -> tuple[Array, ...]:
-        """Of the rotation, perturbed on the right, by the gyro's triad (3, 12) and, where there is force, by G (3, 9)
-        and the accelerometer's triad (3, 12).
+        """Of the rotations, perturbed on the right, by the gyro's triad (n, 3, 12) and, where there is force, by G
+        (n, 3, 9) and the accelerometer's triad (n, 3, 12).
 
         dw = -K (dA w + dc + dG f + G df), df = -K_a (dA_a f + dc_a).
         """
-        points = self._points
-        by_offset = self._by_offset
+        by_triad = _by_numbers(self._sums(self.rate), -self.K)
         if self.force is None or self.G is None or self.accel_K is None:
-            return (_by_numbers(by_offset, points),)
-        forces = self.path.drivers(self.path.t)
-        assert forces is not None
-        by_accel_offset = -by_offset @ self.G @ self.accel_K
-        return (
-            _by_numbers(by_offset, points),
-            _by_numbers(by_offset, forces)[:, :9],
-            _by_numbers(by_accel_offset, forces),
-        )
+            return (by_triad,)
+        by_force = self._sums(self.force)
+        by_accel = _by_numbers(by_force, self.K @ self.G @ self.accel_K)
+        return by_triad, _by_numbers(by_force, -self.K)[..., :9], by_accel
 
     def by_slopes(self, warmth: Array) -> tuple[Array, ...]:
-        """Likewise by the slopes over temperature of the gyro and, where there is force, of the accelerometer, (3, 3)
-        each, for a temperature (N,), K, above that at which the offsets are what they are."""
-        point_warmth = warmth - trapezoid_excess(self.path.t, warmth[:, None])[:, 0]
-        by_slope = np.einsum("kia,k->ia", self._by_offset, point_warmth)
+        """Likewise by the slopes over temperature of the gyro and, where there is force, of the accelerometer,
+        (n, 3, 3) each, for a temperature (N,), K, above that at which the offsets are what they are."""
+        by_rate = self.samples.products(self._by_rate, self.samples.points(warmth[:, None]))[..., 0]
         if self.G is None or self.accel_K is None:
-            return (by_slope,)
-        return by_slope, -by_slope @ self.G @ self.accel_K
+            return (-by_rate @ self.K,)
+        return -by_rate @ self.K, by_rate @ self.K @ self.G @ self.accel_K
 
     @cached_property
-    def _points(self) -> Array:
-        """The rates (N, 3) that the path takes as linear in between; at its last stamp that is the sample itself."""
-        points = self.path.rate(self.path.t)
-        points[-1] = self.rate[-1]
-        return points
+    def _arcs(self) -> Array:
+        """Rotation vectors (N - 1, 3) from each sample to the next."""
+        w0, w1, step = self.rate[:-1], self.rate[1:], self.samples.step
+        return np.asarray(0.5 * step * (w0 + w1) + step**2 / 12.0 * so3.cross(w0, w1))
 
     @cached_property
-    def _by_offset(self) -> Array:
-        """Derivative (N, 3, 3) of the rotation by what is added to each reading."""
-        return np.asarray(-_by_rate(self.path, self._points) @ self.K)
+    def _attitude(self) -> Array:
+        """At each sample (N, 4), one turn carried on from the other."""
+        return np.concatenate([so3.identity(1), running_product(so3.exp(self._arcs))])
+
+    @cached_property
+    def _by_rate(self) -> Array:
+        """Derivative (N, 3, 3) of a turn's rotation, perturbed on the right, by its rate at each sample."""
+        step, attitude = self.samples.step[..., None], so3.matrix(self._attitude)
+        end = np.swapaxes(attitude[self.samples.last], 1, 2)
+        # What a change of each arc does to the end.
+        carried = end[self.samples.turn[:-1]] @ attitude[1:] @ so3.right_jacobian(self._arcs)
+        by_rate = np.zeros_like(attitude)
+        by_rate[:-1] += carried @ (0.5 * step * np.eye(3) - step**2 / 12.0 * so3.hat(self.rate[1:]))
+        by_rate[1:] += carried @ (0.5 * step * np.eye(3) + step**2 / 12.0 * so3.hat(self.rate[:-1]))
+        return by_rate
+
+    def _sums(self, vectors: Array) -> Array:
+        """Sums (n, 3, 3, 4) over each turn of its derivatives by the rates times vectors (N, 3), and of these alone."""
+        return self.samples.products(self._by_rate, np.concatenate([vectors, np.ones((len(vectors), 1))], axis=1))
 
 
-def _by_rate(path: GyroPath, points: Array) -> Array:
-    """Derivative (N, 3, 3) of a path's whole rotation, perturbed on the right, by its rates at each stamp (N, 3)."""
-    dt = np.diff(path.t)[:, None, None]
-    w0, w1 = points[:-1], points[1:]
-    arcs = 0.5 * dt[..., 0] * (w0 + w1) + dt[..., 0] ** 2 / 12.0 * so3.cross(w0, w1)
-    attitude = so3.matrix(path.attitude(path.t))
-    # What a change of each arc does to the end.
-    carried = attitude[-1].T @ attitude[1:] @ so3.right_jacobian(arcs)
-    by_rate = np.zeros((len(points), 3, 3))
-    by_rate[:-1] += carried @ (0.5 * dt * np.eye(3) - dt**2 / 12.0 * so3.hat(w1))
-    by_rate[1:] += carried @ (0.5 * dt * np.eye(3) + dt**2 / 12.0 * so3.hat(w0))
-    return by_rate
+def _by_numbers(sums: Array, matrices: Array) -> Array:
+    """Derivative (n, 3, 12) by a matrix D (rows) and an offset d, where dw = M (D v + d).
 
-
-def _by_numbers(by_offset: Array, vectors: Array) -> Array:
-    """Derivative (3, 12) by a matrix (rows) that acts on vectors (N, 3) and by an offset beside it, (N, 3, 3) each."""
-    by_matrix = np.einsum("kia,kb->iab", by_offset, vectors).reshape(3, 9)
-    return np.concatenate([by_matrix, by_offset.sum(axis=0)], axis=1)
+    Args:
+        sums: (n, 3, 3, 4) of the derivatives by w times v, and of these alone.
+        matrices: (n, 3, 3) M.
+    """
+    by_numbers = np.einsum("niab,nac->nicb", sums, matrices)
+    by_matrix = by_numbers[..., :3].reshape(len(matrices), 3, 9)
+    return np.concatenate([by_matrix, by_numbers[..., 3]], axis=2)

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
+from itertools import chain
 from typing import Any
 
 import gtsam
@@ -170,7 +171,7 @@ class VectorizedFactor:
     @property
     def divisible(self) -> bool:
         """Whether `only` serves."""
-        return hasattr(self.model, "stacked") and not self.compress
+        return hasattr(self.model, "stacked") and self.model.divisible and not self.compress
 
     @property
     def _loss_in_force(self) -> TruncatedLoss | None:
@@ -443,25 +444,33 @@ def _kind(factor: VectorizedFactor) -> Hashable:
     if stacked is None:
         return id(factor)
     model: Any = factor.model
-    shared = tuple(getattr(model, f.name) for f in fields(model) if f.name not in stacked)
+    shared = tuple(_hashable(getattr(model, f.name)) for f in fields(model) if f.name not in stacked)
     absent = tuple(getattr(model, name) is None for name in stacked)
     return type(model), shared, absent, model.rows, model.blocks
 
 
+def _hashable(field: Any) -> Hashable:
+    return (field.shape, field.tobytes()) if isinstance(field, np.ndarray) else field
+
+
 def _stack(parts: Sequence[Any]) -> Any:
-    """One array or dataclass of several, their `stacked` fields one after the other."""
+    """One array, list or dataclass of several, their `stacked` fields one after the other."""
     first = parts[0]
     if first is None or len(parts) == 1:
         return first
     if isinstance(first, np.ndarray):
         return np.concatenate(parts)
+    if isinstance(first, list):
+        return list(chain.from_iterable(parts))
     return replace(first, **{name: _stack([getattr(part, name) for part in parts]) for name in first.stacked})
 
 
 def _take(whole: Any, rows: NDArray[np.intp]) -> Any:
-    """An array or dataclass of some measurements."""
+    """An array, list or dataclass of some measurements."""
     if whole is None or isinstance(whole, np.ndarray):
         return whole if whole is None else whole[rows]
+    if isinstance(whole, list):
+        return [whole[row] for row in rows]
     return replace(whole, **{name: _take(getattr(whole, name), rows) for name in whole.stacked})
 
 

@@ -19,7 +19,7 @@ import gtsam
 import numpy as np
 
 from factors import so3
-from factors.turns import Turn
+from factors.turns import Samples, Turns
 from pipelines.graph.believing import believing
 from pipelines.graph.problem import Attitudes, Factor, Problem, Step
 from pipelines.methods import temperature
@@ -140,8 +140,8 @@ def _predict(model: Model, k: int, initial: gtsam.Values, current: gtsam.Values)
         gyro, accel = gyro - drifts.get("gyro", 0.0), accel - drifts.get("accel", 0.0)
     of_force = []
     if model.parameters.sensitivity is not None:
-        of_force = [current.atVector(SENSITIVITY_KEY), current.atVector(TRIAD_KEYS["accel"]), accel]
-    turned = Turn.of(samples.t, gyro, own, *of_force).rotation
+        of_force = [current.atVector(SENSITIVITY_KEY)[None], current.atVector(TRIAD_KEYS["accel"])[None], accel]
+    (turned,) = Turns.of(Samples.of([samples.t]), gyro, own[None], *of_force).rotation
     out.update(deviation_key(k), model.deviation.correlation[k] * deviation)
     before = so3.from_gtsam([current.atRot3(pose_key(k - 1))])[0]
     earth = so3.exp(-model.earth_rate * (samples.t[-1] - samples.t[0]))
