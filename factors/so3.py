@@ -213,8 +213,9 @@ def interpolate(t: ArrayLike, q: ArrayLike, at: ArrayLike) -> Array:
 
 
 def from_gtsam(rotations: list[gtsam.Rot3]) -> Array:
-    """gtsam rotations -> quaternions, shape (n, 4)."""
-    return from_matrix(np.array([r.matrix() for r in rotations]).reshape(-1, 3, 3))
+    """gtsam rotations -> quaternions with w >= 0, shape (n, 4)."""
+    q = np.array([r.toQuaternion().coeffs() for r in rotations]).reshape(-1, 4)[:, [3, 0, 1, 2]]
+    return np.where(q[:, :1] < 0.0, -q, q)
 
 
 def to_gtsam(q: ArrayLike) -> gtsam.Rot3:
