@@ -7,7 +7,9 @@ coordinates in frame a. Tangent vectors, shape (..., 3) in radians, are ordered 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from functools import wraps
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +21,30 @@ Array = NDArray[np.float64]
 
 # Below this angle (rad) the closed forms lose more digits to cancellation than their series truncate.
 _SMALL = 1e-2
+# So many rows fit into a processor's cache with all that is made of them on the way.
+_ROWS = 8192
+
+_Function = TypeVar("_Function", bound=Callable[..., Array])
+
+
+def _in_cache(function: _Function) -> _Function:
+    """The function, evaluated some rows at a time where arrays (n, d) have many, which takes half the time."""
+
+    @wraps(function)
+    def some_at_a_time(*given: ArrayLike) -> Array:
+        n = max(map(len, given))  # type: ignore[arg-type]
+        arrays = [np.asarray(each, dtype=float) for each in given] if n > _ROWS else []
+        if not arrays or any(array.ndim > 2 for array in arrays):
+            return function(*given)
+        whole = np.empty(0)
+        for begin in range(0, n, _ROWS):
+            some = slice(begin, begin + _ROWS)
+            part = function(*(each[some] if each.shape[:-1] == (n,) else each for each in arrays))
+            whole = whole if begin else np.empty((n, *part.shape[1:]))
+            whole[some] = part
+        return whole
+
+    return cast(_Function, some_at_a_time)
 
 
 def identity(shape: int | tuple[int, ...] = ()) -> Array:
@@ -40,6 +66,7 @@ def inverse(q: ArrayLike) -> Array:
     return np.asarray(q, dtype=float) * np.array([1.0, -1.0, -1.0, -1.0])
 
 
+@_in_cache
 def multiply(p: ArrayLike, q: ArrayLike) -> Array:
     """aRb, bRc -> aRc."""
     p, q = np.asarray(p, dtype=float), np.asarray(q, dtype=float)
@@ -62,6 +89,7 @@ def compose(*rotations: ArrayLike) -> Array:
     return out
 
 
+@_in_cache
 def rotate(q: ArrayLike, v: ArrayLike) -> Array:
     """Coordinates in a of the vectors v, shape (..., 3), given in b; q is aRb."""
     q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
@@ -70,6 +98,7 @@ def rotate(q: ArrayLike, v: ArrayLike) -> Array:
     return v + q[..., :1] * t + cross(u, t)
 
 
+@_in_cache
 def cross(a: Array, b: Array) -> Array:
     """Cross product of (..., 3) arrays (numpy's own spends most of its time moving axes)."""
     ax, ay, az = a[..., 0], a[..., 1], a[..., 2]
@@ -92,6 +121,7 @@ def hat(v: ArrayLike) -> Array:
     return out
 
 
+@_in_cache
 def exp(phi: ArrayLike) -> Array:
     """Rotation vectors, shape (..., 3), rad -> quaternions."""
     phi = np.asarray(phi, dtype=float)
@@ -113,6 +143,7 @@ def log(q: ArrayLike) -> Array:
     return v * (np.where(w < 0.0, -1.0, 1.0) * factor)[..., None]
 
 
+@_in_cache
 def matrix(q: ArrayLike) -> Array:
     """Quaternions -> rotation matrices, shape (..., 3, 3)."""
     q = np.asarray(q, dtype=float)
@@ -151,6 +182,7 @@ def from_matrix(r: ArrayLike) -> Array:
     return np.where(q[..., :1] < 0.0, -q, q)
 
 
+@_in_cache
 def right_jacobian(phi: ArrayLike) -> Array:
     """J with Exp(phi + d) = Exp(phi) * Exp(J d) to first order, shape (..., 3, 3).
 
@@ -214,7 +246,7 @@ def interpolate(t: ArrayLike, q: ArrayLike, at: ArrayLike) -> Array:
 
 def from_gtsam(rotations: list[gtsam.Rot3]) -> Array:
     """gtsam rotations -> quaternions with w >= 0, shape (n, 4)."""
-    q = np.array([r.toQuaternion().coeffs() for r in rotations]).reshape(-1, 4)[:, [3, 0, 1, 2]]
+    q = np.array([cast(Any, r.toQuaternion()).coeffs() for r in rotations]).reshape(-1, 4)[:, [3, 0, 1, 2]]
     return np.where(q[:, :1] < 0.0, -q, q)
 
 

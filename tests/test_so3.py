@@ -112,3 +112,24 @@ def test_align_of_vectors_without_weight_counts_nothing() -> None:
     a = so3.rotate(aRb, b)
     a[0] = [9.0, 9.0, 9.0]
     np.testing.assert_allclose(so3.align(a, b, [0.0, 1.0, 1.0, 1.0]), aRb, atol=1e-12)
+
+
+def test_many_rows_give_what_few_do() -> None:
+    """Evaluated some at a time; also where one rotation meets many vectors, and where rows have rows of their own."""
+    v = RNG.normal(size=(20_001, 3))
+    p, q = so3.exp(v), so3.exp(v[::-1])
+    several = slice(8_000, 8_400)
+    for function, arrays in (
+        (so3.multiply, (p, q)),
+        (so3.rotate, (q, v)),
+        (so3.cross, (v, v[::-1])),
+        (so3.exp, (v,)),
+        (so3.matrix, (p,)),
+        (so3.right_jacobian, (v,)),
+    ):
+        few = function(*(array[several] for array in arrays))
+        np.testing.assert_array_equal(function(*arrays)[several], few)
+    for one in (p[0], p[:1]):
+        np.testing.assert_array_equal(so3.rotate(one, v)[several], so3.rotate(one, v[several]))
+        np.testing.assert_array_equal(so3.multiply(p, one)[several], so3.multiply(p[several], one))
+    np.testing.assert_array_equal(so3.rotate(p[:, None], v[:3])[several], so3.rotate(p[several, None], v[:3]))
