@@ -150,7 +150,7 @@ def test_cut_anywhere(small: Small) -> None:
 
 
 def test_flipped_bytes(small: Small) -> None:
-    found = small.outcomes(flips(small.data, 30, 1), is_sound=small.form in CHECKED)
+    found = small.outcomes(flips(small.data, 15, 1), is_sound=small.form in CHECKED)
     assert found["read"] > 0 or small.form in TABLES
 
 

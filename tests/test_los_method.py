@@ -86,11 +86,16 @@ def _mean_nees(scenario: LosScenario, solve: Solve, runs: int) -> tuple[float, i
 @pytest.mark.parametrize(
     ("scenario", "solve", "runs"),
     [
-        (REAL, solve_batch, 2),
-        (SHORT, solve_batch, 5),
-        (REAL.model_copy(update={"duration_s": 10.0}), solve_incremental, 2),
+        pytest.param(REAL, solve_batch, 2, id="real"),
+        pytest.param(SHORT, solve_batch, 5, id="ideal"),
+        pytest.param(
+            REAL.model_copy(update={"duration_s": 10.0}),
+            solve_incremental,
+            2,
+            id="real, incremental",
+            marks=pytest.mark.slow,
+        ),
     ],
-    ids=["real", "ideal", "real, incremental"],
 )
 def test_errors_fit_their_covariance_in_a_few_short_runs(scenario: LosScenario, solve: Solve, runs: int) -> None:
     mean, size = _mean_nees(scenario, solve, runs)

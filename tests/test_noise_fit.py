@@ -96,9 +96,7 @@ MIXES: dict[str, tuple[int, dict[str, float]]] = {
 }
 
 
-@pytest.mark.parametrize(
-    "mix", [pytest.param(m, marks=[pytest.mark.slow] * (m not in ("white", "walk"))) for m in MIXES]
-)
+@pytest.mark.parametrize("mix", [pytest.param(m, marks=[pytest.mark.slow] * (m != "white")) for m in MIXES])
 def test_intervals_hold_the_coefficients(mix: str) -> None:
     """95 % intervals cover in 88 to 99 of 100 runs, and noises that are not there are hardly ever found."""
     n, truth = MIXES[mix]

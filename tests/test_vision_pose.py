@@ -56,8 +56,12 @@ def _error(pose: BodyPose, cRb: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("camera", "body", "distance", "sigma"),
-    [(PINHOLE, SINGLE, 0.5, 0.1), (PINHOLE, CUBE, 0.7, 0.2), (FISHEYE, CUBE, 0.7, 0.1), (PINHOLE, BOARD, 0.5, 0.1)],
-    ids=["single tag", "cube", "cube, fisheye", "board"],
+    [
+        pytest.param(PINHOLE, SINGLE, 0.5, 0.1, id="single tag"),
+        pytest.param(PINHOLE, CUBE, 0.7, 0.2, id="cube", marks=pytest.mark.slow),
+        pytest.param(FISHEYE, CUBE, 0.7, 0.1, id="cube, fisheye"),
+        pytest.param(PINHOLE, BOARD, 0.5, 0.1, id="board", marks=pytest.mark.slow),
+    ],
 )
 def test_covariance_is_calibrated_and_flips_are_told(
     camera: Camera, body: TagBody, distance: float, sigma: float
