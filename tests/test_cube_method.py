@@ -13,6 +13,8 @@ import pytest
 
 from datasets import imu_tk_xsens
 from factors import so3
+from factors.turns import GyroRotationFactor
+from factors.vectorized import Ensemble
 from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.graph.problem import Estimate, Problem
@@ -41,7 +43,9 @@ from pipelines.methods.cube.validation import validate
 from pipelines.methods.static_intervals import find_static_intervals
 from pipelines.recording.reading import open_recording
 from pipelines.settings import Config
-from pipelines.solvers.batch import solve_batch
+from pipelines.simulation.temperature import Warming
+from pipelines.solvers.assembly import Assembly
+from pipelines.solvers.batch import CHUNK, solve_batch
 from pipelines.solvers.incremental import solve_incremental
 
 # The default field prior leaves the magnetometer's scale at one per cent; here the field is known better, and is so.
@@ -419,3 +423,25 @@ def test_from_pictures_as_good_as_from_perfect_corners(tmp_path: Path) -> None:
     """24 poses, 5 pictures a second."""
     scenario = "poses: 24, static_s: 2.0, turn_rad_s: 2.0, camera: {rate_hz: 5.0, pictures: {rate_hz: 5.0}}"
     _assert_as_good_from_pictures(tmp_path, scenario, 1e-3)
+
+
+def test_poses_and_turns_are_evaluated_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One call for all turns, however many samples each has; all factors answer as they do alone."""
+    data, _, config = _simulated(1, temperature=Warming())
+    whole = Assembly.of(problem(data, config).steps(CHUNK))
+    factors = [factor.vectorized for factor in whole.factors if factor.vectorized is not None]
+    alone = [factor.rows(whole.initial) for factor in factors]
+    calls = []
+    evaluated = GyroRotationFactor.__call__
+
+    def counted(self: GyroRotationFactor, *blocks: Any) -> Any:
+        calls.append(len(self.time))
+        return evaluated(self, *blocks)
+
+    monkeypatch.setattr(GyroRotationFactor, "__call__", counted)
+    with Ensemble(factors).at(whole.initial):
+        together = [factor.rows(whole.initial) for factor in factors]
+    assert calls == [SHORT["poses"] - 1]
+    for own, shared in zip(alone, together, strict=True):
+        for a, b in zip(own, shared, strict=True):
+            np.testing.assert_allclose(b, a, rtol=1e-9, atol=1e-9 * np.abs(a).max())

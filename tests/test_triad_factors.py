@@ -232,6 +232,13 @@ def test_tags_are_met_at_the_truth_and_missed_beside_it() -> None:
         assert np.abs(model(*moved)[0]).max() > 1e-4
 
 
+def test_tags_of_one_pose_are_used_or_left_out_together() -> None:
+    """Alone each would fit, at some place of the cube; readings at rest stand for themselves."""
+    rows = np.arange(N)
+    assert not _tags(rows, None).on(rows, N + rows, 20, 21, 22, 23).divisible
+    assert _static("mag", rows).on(rows, 20, 21).divisible
+
+
 def test_a_corner_behind_the_camera_is_a_finite_large_residual() -> None:
     blocks = _tag_blocks(0.5)
     model = _tags(np.arange(N), blocks)
