@@ -32,11 +32,12 @@ def _in_cache(function: _Function) -> _Function:
 
     @wraps(function)
     def some_at_a_time(*given: ArrayLike) -> Array:
-        n = max(map(len, given))  # type: ignore[arg-type]
-        arrays = [np.asarray(each, dtype=float) for each in given] if n > _ROWS else []
-        if not arrays or any(array.ndim > 2 for array in arrays):
+        if max(map(np.size, given)) <= 4 * _ROWS:
             return function(*given)
-        whole = np.empty(0)
+        arrays = [np.asarray(each, dtype=float) for each in given]
+        if any(array.ndim > 2 for array in arrays):
+            return function(*given)
+        n, whole = max(map(len, arrays)), np.empty(0)
         for begin in range(0, n, _ROWS):
             some = slice(begin, begin + _ROWS)
             part = function(*(each[some] if each.shape[:-1] == (n,) else each for each in arrays))
