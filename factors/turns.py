@@ -68,9 +68,9 @@ class GyroRotationFactor(Model):
         raw, accel, warmth = self._joined
         samples = self._samples
         if warmth is not None:
-            drift = [warmth[:, None] * slope[samples.turn] for slope in slopes]
-            raw = raw - drift[0]
-            accel = accel if accel is None or not self.drifts else accel - drift[1]
+            raw = raw - warmth[:, None] * slopes[0][samples.turn]
+        if warmth is not None and accel is not None and self.drifts:
+            accel = accel - warmth[:, None] * slopes[1][samples.turn]
         turns = Turns.of(samples, raw, offsets, *felt, *(() if accel is None else (accel,)))
         dR = turns.rotation
         earth = (samples.t[samples.last] - samples.t[samples.first])[:, None] * self.earth_rate

@@ -18,6 +18,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from factors import so3
 from factors.loss import TruncatedLoss
 from factors.model import POSE3, ROT3, Array, Block, Keys, Model, Residuals, check, dimension, width
 
@@ -449,8 +450,8 @@ def _kind(factor: VectorizedFactor) -> Hashable:
     return type(model), shared, absent, model.rows, model.blocks
 
 
-def _hashable(field: Any) -> Hashable:
-    return (field.shape, field.tobytes()) if isinstance(field, np.ndarray) else field
+def _hashable(value: Any) -> Hashable:
+    return (value.shape, value.tobytes()) if isinstance(value, np.ndarray) else value
 
 
 def _stack(parts: Sequence[Any]) -> Any:
@@ -502,8 +503,8 @@ def _array(variables: Sequence[Any], block: Block) -> Array:
     """Values of variables, (n, width)."""
     if not isinstance(block, int):
         out = np.empty((len(variables), width(block)))
-        rotations = variables if block is ROT3 else [pose.rotation() for pose in variables]
-        out[:, :4] = np.array([r.toQuaternion().coeffs() for r in rotations])[:, [3, 0, 1, 2]]
+        rotations = list(variables) if block is ROT3 else [pose.rotation() for pose in variables]
+        out[:, :4] = so3.from_gtsam(rotations)
         if block is POSE3:
             out[:, 4:] = [pose.translation() for pose in variables]
         return out
