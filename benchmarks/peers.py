@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 
 from benchmarks import static
-from benchmarks.batch import build, solve
+from benchmarks.batch import IDEAL, build, solve
 from benchmarks.measure import Ratio, costs
 from factors import so3
 from factors.gyro import GyroIncrementFactor
@@ -153,8 +153,7 @@ def by_ceres(model: Model, start: Array) -> Array:
 def run() -> Iterator[Ratio]:
     """Both peers. Raises AssertionError when the answers differ."""
     data, _ = simulate_los(_SCENARIO, 0)
-    config = load_config(los_config(_SCENARIO).encode())
-    config = config.model_copy(update={"noise": config.noise.model_copy(update={"gyro_scale": 0.0})})
+    config = load_config(los_config(_SCENARIO).encode()).model_copy(update={"sensors": IDEAL})
     problem = los.problem(data, config)
     graph, rows = build(problem, CHUNK), LosRows(problem, data)
     angles = solve(problem, graph).values.atVector(problem.parameters[0].key)
