@@ -27,6 +27,7 @@ from pipelines.solvers.marginals import (
 )
 from pipelines.solvers.minima import likeliest
 from pipelines.solvers.noise_levels import far, refined, weigh
+from pipelines.solvers.pull import without_pull
 from pipelines.solvers.redundancy import expected_squares
 from pipelines.solvers.spurious import information_of_noise
 from pipelines.solvers.system import Linear, System, without_rejected
@@ -90,6 +91,9 @@ def solve_batch(
     best, second = likeliest(problem, solution, minimize, whole.current_keys)
     if best is not solution:
         solution, (about, expected) = best, _expected(best)
+    unpulled = without_pull(problem, solution, about, whole.current_keys, most)
+    if unpulled is not solution:
+        solution, (about, expected) = unpulled, _expected(unpulled)
     solved = time.perf_counter()
     values, system, ordering = solution.values, solution.system, solution.system.ordering
     linear, factors = about.graph, system.factors
@@ -101,7 +105,7 @@ def solve_batch(
     )
     noise = information_of_noise(problem, about, marginal, whole.current_keys)
     if noise is not None:
-        marginal = joint_covariance(problem, linear, ordering, values, whole.current_keys, noise)
+        marginal = joint_covariance(problem, linear, ordering, values, whole.current_keys, noise.information)
     bent = second_order(problem, about, marginal, whole.current_keys)
     if bent is not None:
         marginal = marginal + bent
@@ -182,6 +186,7 @@ def _moves(changed: Problem, solution: Solution, levels: tuple[Level, ...], foun
     """
     system, values = solution.system, solution.values
     factors = weigh(Assembly.of(changed.steps(CHUNK)).factors, levels)
+    factors += system.factors[len(factors) :]  # what balances the pull of noise
     if [_shape(f) for f in factors] != [_shape(f) for f in system.factors]:
         return {}
     with system.at(values):

@@ -29,6 +29,7 @@ from pipelines.solvers.innovations import Innovations, Prediction
 from pipelines.solvers.linearity import is_linear
 from pipelines.solvers.marginals import IndeterminateError, reported, reported_covariance
 from pipelines.solvers.noise_levels import weigh
+from pipelines.solvers.pull import without_pull
 from pipelines.solvers.rows import Rows
 from pipelines.solvers.smoother import FixedLag, Smoother, Unlimited, linearized, unweighed, used_part
 from pipelines.solvers.spurious import information_of_noise
@@ -354,6 +355,10 @@ class Run:
             require_sound(whole.factors, whole.initial, self.time)
         if about is None:
             about = solution.system.linearized(solution.values)
+        elif self._young and self.window is not None:
+            unpulled = without_pull(self.problem, solution, about, self.current_keys)
+            if unpulled is not solution:
+                solution, about = unpulled, unpulled.system.linearized(unpulled.values)
         self._trouble = "" if solution.converged else f"the first {self.time:.1f} s: {solution.message}"
         values = solution.values
         if from_start:
@@ -395,8 +400,9 @@ class Run:
             return
         current = self.current_keys
         covariance = self.covariance()
-        self._noise = information_of_noise(self.problem, about, covariance, current)
-        if self._noise is not None:
+        noise = information_of_noise(self.problem, about, covariance, current)
+        if noise is not None:
+            self._noise = noise.information
             covariance = self.covariance()
         self._bent = second_order(self.problem, about, covariance, current)
 

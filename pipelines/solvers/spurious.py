@@ -8,11 +8,16 @@ How much of the information is of this kind other linearisations tell, at states
 are from the true ones, drawn from their covariance: it is quadratic in what the states are off by, so that the noise of
 a draw adds what the noise of the estimate has added already (a bootstrap of the bias, Efron, Tibshirani, "An
 Introduction to the Bootstrap", 1993, chapter 10).
+
+What noise seems to tell has a sigma and a value: the noise of a gimbal at rest moves its mounting angles by as much as
+their priors let it. So combinations of which most of the information is noise are held where the priors have them, and
+all that is told of them counts as noise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,6 +30,21 @@ _WEAK = 0.3
 # ... and so are only those of which the recording says at least this much, in units of the prior's information.
 _TOLD = 0.01
 _DRAWS = 3
+# Of more than this share of noise it is all that is told.
+_MOSTLY = 0.5
+
+
+@dataclass(frozen=True)
+class Spurious:
+    """Information about the reported numbers that is the states' noise; of those that are free, in prior scales.
+
+    Attributes:
+        information: (m, m).
+        directions: (k, m) unit rows, combinations of the numbers of which nothing else is told.
+    """
+
+    information: Array
+    directions: Array
 
 
 def information_of_noise(
@@ -32,10 +52,8 @@ def information_of_noise(
     about: Linear,
     covariance: Array,
     current_keys: Mapping[int, int],
-) -> Array | None:
-    """Information about the reported numbers that is the states' noise; None: there is none.
-
-    (m, m) of those that are free, in units of their prior scales.
+) -> Spurious | None:
+    """What of the information about the reported numbers is the states' noise; None: nothing.
 
     Args:
         problem: the graph's.
@@ -61,7 +79,8 @@ def information_of_noise(
     told = own - np.diag([(s / sigma) ** 2 if sigma else 0.0 for s, sigma in zip(scale, priors, strict=True)])
     eigenvalues, vectors = np.linalg.eigh(own)
     weak = vectors[:, eigenvalues < _WEAK**-2.0]
-    return np.asarray(weak @ _part(weak.T @ told @ weak, weak.T @ noise @ weak) @ weak.T)
+    information, directions = _part(weak.T @ told @ weak, weak.T @ noise @ weak)
+    return Spurious(weak @ information @ weak.T, directions @ weak.T)
 
 
 def _doubtful(problem: Problem, keys: Sequence[int], covariance: Array) -> list[int]:
@@ -77,11 +96,17 @@ def _doubtful(problem: Problem, keys: Sequence[int], covariance: Array) -> list[
     return found
 
 
-def _part(told: Array, noise: Array) -> Array:
-    """What of the information (m, m) that a recording tells is noise: none at least, all of it at most."""
+def _part(told: Array, noise: Array) -> tuple[Array, Array]:
+    """What of the information (m, m) that a recording tells is noise, and directions (k, m) of which all that is.
+
+    None of it is at least, all at most.
+    """
     eigenvalues, vectors = np.linalg.eigh(0.5 * (told + told.T))
     root = vectors * np.sqrt(np.maximum(eigenvalues, 1e-12))
     inverse = np.linalg.inv(root)
     shares, directions = np.linalg.eigh(inverse @ (0.5 * (noise + noise.T)) @ inverse.T)
+    mostly = shares > _MOSTLY
     part = root @ directions
-    return np.asarray((part * np.clip(shares, 0.0, 1.0)) @ part.T)
+    held = part.T[mostly & (np.square(part).sum(axis=0) > _TOLD)]
+    information = (part * np.where(mostly, 1.0, np.maximum(shares, 0.0))) @ part.T
+    return information, held / np.linalg.norm(held, axis=1, keepdims=True)
