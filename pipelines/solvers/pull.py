@@ -19,12 +19,14 @@ from pipelines.solvers.marginals import joint_covariance
 from pipelines.solvers.spurious import information_of_noise
 from pipelines.solvers.system import Linear, System
 
-# Combinations nearer than this to their priors' means, in sigmas of these, stay where they are.
-_NEAR = 0.05
+# Combinations nearer than this to their priors' means, in sigmas of these, stay where they are. Where some are held, it
+# may show of others that they have been pulled, or that all is told: so often it is looked. One that is less than this
+# off others is theirs.
+_NEAR, _LOOKS, _SAME = 0.05, 4, 0.1
 # They are held by so many priors' sigmas to one, and a force is a prior with this part of a sigma's weight, far away.
 _TIGHT, _FAINT = 30.0, 0.03
-# Where that raises chi-square by more than this for each of them, it was not noise that told them.
-_DEAR = 9.0
+# Where that raises chi-square by more than this a squared sigma of their priors, it was not noise that told them.
+_DEAR = 3.0
 
 
 def without_pull(
@@ -46,23 +48,40 @@ def without_pull(
     Raises:
         IndeterminateError: states other than the parameters are not determined.
     """
-    system, values = solution.system, solution.values
-    covariance = joint_covariance(problem, about.graph, system.ordering, values, current_keys)
-    noise = information_of_noise(problem, about, covariance, current_keys)
-    if not solution.converged or noise is None:
-        return solution
-    combined = _Combined(problem, current_keys, noise.directions)
-    if not (np.abs(combined.at(values)) > _NEAR).any():
-        return solution
+    found, rows = solution, np.zeros((0, np.count_nonzero([q.prior_sigma != 0.0 for q in problem.quantities])))
+    for look in range(_LOOKS if solution.converged else 0):
+        covariance = joint_covariance(problem, about.graph, found.system.ordering, found.values, current_keys)
+        noise = information_of_noise(problem, about, covariance, current_keys)
+        if noise is None:
+            return solution
+        rows = _orthonormal(np.concatenate([rows, noise.directions]))
+        combined = _Combined(problem, current_keys, rows)
+        if look + 1 == _LOOKS or not (np.abs(combined.at(found.values)) > _NEAR).any():
+            break
+        held = _held(solution.system, found.values, combined, most)
+        if held is None:
+            break
+        found = replace(held, iterations=found.iterations + held.iterations)
+        about = found.system.linearized(found.values)
+    return found
+
+
+def _held(system: System, values: gtsam.Values, combined: _Combined, most: int) -> Solution | None:
+    """The solution with combinations held, found from some values, with the force that does it; None: there is none."""
     # What is rejected stays so, lest what is held have measurements rejected that speak against it.
-    hold = combined.prior(np.zeros(len(noise.directions)), _TIGHT)
+    hold = combined.prior(np.zeros(len(combined.rows)), _TIGHT)
     held = minimize(_with(system.without_rejected(values), hold), values, most=most)
-    costs = 2.0 * (system.error(held.values) - system.error(values))
-    if not held.converged or costs > _DEAR * len(noise.directions):
-        return solution
+    costs, off = 2.0 * (system.error(held.values) - system.error(values)), combined.at(values)
+    if not held.converged or costs > _DEAR * float(off @ off):
+        return None
     mean = combined.at(held.values) * (1.0 - (_TIGHT / _FAINT) ** 2)
-    iterations = solution.iterations + held.iterations
-    return replace(held, system=_with(system, combined.prior(mean, _FAINT)), iterations=iterations)
+    return replace(held, system=_with(system, combined.prior(mean, _FAINT)))
+
+
+def _orthonormal(rows: Array) -> Array:
+    """Orthonormal rows that span the same, but for what is nearly in the others already."""
+    _, sizes, axes = np.linalg.svd(rows, full_matrices=False)
+    return np.asarray(axes[sizes > _SAME])
 
 
 def _with(system: System, factor: Factor) -> System:
@@ -74,7 +93,7 @@ def _with(system: System, factor: Factor) -> System:
 
 @dataclass(frozen=True)
 class _Combined:
-    """Combinations of the reported numbers that are free, off their priors' means, in prior scales.
+    """Combinations of the reported numbers that are free: how far they are off their priors' means, in prior scales.
 
     Attributes:
         problem: the graph's.

@@ -9,9 +9,10 @@ are from the true ones, drawn from their covariance: it is quadratic in what the
 a draw adds what the noise of the estimate has added already (a bootstrap of the bias, Efron, Tibshirani, "An
 Introduction to the Bootstrap", 1993, chapter 10).
 
-What noise seems to tell has a sigma and a value: the noise of a gimbal at rest moves its mounting angles by as much as
-their priors let it. So combinations of which most of the information is noise are held where the priors have them, and
-all that is told of them counts as noise.
+What noise seems to tell has a sigma and a value: the noise of a gyro that drives a gimbal at rest moves the mounting
+angles by as much as their priors let it, some of them always to the same side. So combinations of which most of the
+information is noise, and those that have moved farther than little information could move them, are to be held where
+the priors have them, and all that is told of them counts as noise.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.graph.problem import Array, Problem
-from pipelines.solvers.marginals import IndeterminateError, joint_information, prior_units
+from pipelines.solvers.marginals import IndeterminateError, joint_information, prior_units, reported
 from pipelines.solvers.system import Linear
 
 # Directions in which sigma is beyond this share of the prior are looked at; in others noise adds next to nothing.
@@ -32,6 +33,9 @@ _TOLD = 0.01
 _DRAWS = 3
 # Of more than this share of noise it is all that is told.
 _MOSTLY = 0.5
+# What tells less than this, in units of the prior's information, moves an estimate by so many of the sigmas that it has
+# beforehand, and by less than this part of a prior's sigma at least; of more, the true value may be a rare one.
+_LITTLE, _FAR, _LEAST = 0.2, 3.0, 0.2
 
 
 @dataclass(frozen=True)
@@ -76,11 +80,16 @@ def information_of_noise(
     free, scale, unit = prior_units(problem.parameters, values, keys)
     own, noise = unit.T @ own @ unit, unit.T @ noise @ unit
     priors = [problem.quantities[i].prior_sigma for i in free]
-    told = own - np.diag([(s / sigma) ** 2 if sigma else 0.0 for s, sigma in zip(scale, priors, strict=True)])
+    prior = np.diag([(s / sigma) ** 2 if sigma else 0.0 for s, sigma in zip(scale, priors, strict=True)])
+    means = np.array([problem.quantities[i].prior_mean for i in free])
+    off = (reported(problem, values, current_keys)[free] - means) / scale
     eigenvalues, vectors = np.linalg.eigh(own)
     weak = vectors[:, eigenvalues < _WEAK**-2.0]
-    information, directions = _part(weak.T @ told @ weak, weak.T @ noise @ weak)
-    return Spurious(weak @ information @ weak.T, directions @ weak.T)
+    told, noise, loose = (weak.T @ each @ weak for each in (own - prior, noise, prior))
+    held = _held(told, noise, loose, weak.T @ off)
+    others = np.eye(len(held.T)) - held.T @ held
+    information = told - others @ (told - _part(told, noise)) @ others
+    return Spurious(weak @ information @ weak.T, held @ weak.T)
 
 
 def _doubtful(problem: Problem, keys: Sequence[int], covariance: Array) -> list[int]:
@@ -96,17 +105,25 @@ def _doubtful(problem: Problem, keys: Sequence[int], covariance: Array) -> list[
     return found
 
 
-def _part(told: Array, noise: Array) -> tuple[Array, Array]:
-    """What of the information (m, m) that a recording tells is noise, and directions (k, m) of which all that is.
+def _held(told: Array, noise: Array, prior: Array, off: Array) -> Array:
+    """Directions (k, m) of which more than half of what is told (m, m) is noise, or that have moved too far for it.
 
-    None of it is at least, all at most.
+    `prior` is the priors' information (m, m), `off` (m,) by how much the estimate is off their means.
     """
+    information, axes = np.linalg.eigh(told)
+    information = np.maximum(information, 0.0)
+    seeming, known = ((axes * (each @ axes)).sum(axis=0) for each in (noise, prior))
+    moves = np.sqrt(information / np.maximum(known * (known + information), 1e-300))
+    mostly = (information > _TOLD) & (seeming > _MOSTLY * information)
+    pulled = (information < _LITTLE * known) & (np.abs(off @ axes) > np.maximum(_FAR * moves, _LEAST))
+    return np.asarray(axes[:, mostly | pulled].T)
+
+
+def _part(told: Array, noise: Array) -> Array:
+    """What of the information (m, m) that a recording tells is noise: none at least, all of it at most."""
     eigenvalues, vectors = np.linalg.eigh(0.5 * (told + told.T))
     root = vectors * np.sqrt(np.maximum(eigenvalues, 1e-12))
     inverse = np.linalg.inv(root)
     shares, directions = np.linalg.eigh(inverse @ (0.5 * (noise + noise.T)) @ inverse.T)
-    mostly = shares > _MOSTLY
     part = root @ directions
-    held = part.T[mostly & (np.square(part).sum(axis=0) > _TOLD)]
-    information = (part * np.where(mostly, 1.0, np.maximum(shares, 0.0))) @ part.T
-    return information, held / np.linalg.norm(held, axis=1, keepdims=True)
+    return np.asarray((part * np.clip(shares, 0.0, 1.0)) @ part.T)
