@@ -150,12 +150,18 @@ def by_ceres(model: Model, start: Array) -> Array:
     return x
 
 
-def run() -> Iterator[Ratio]:
-    """Both peers. Raises AssertionError when the answers differ."""
+def los_peers() -> tuple[Problem, LosRows]:
+    """A graph and the same as rows."""
     data, _ = simulate_los(_SCENARIO, 0)
     config = load_config(los_config(_SCENARIO).encode()).model_copy(update={"sensors": IDEAL})
     problem = los.problem(data, config)
-    graph, rows = build(problem, CHUNK), LosRows(problem, data)
+    return problem, LosRows(problem, data)
+
+
+def run() -> Iterator[Ratio]:
+    """Both peers. Raises AssertionError when the answers differ."""
+    problem, rows = los_peers()
+    graph = build(problem, CHUNK)
     angles = solve(problem, graph).values.atVector(problem.parameters[0].key)
     found: list[Array] = []
     a, b = costs([partial(solve, problem, graph), lambda: found.append(rows.solve())], 1, warm=False)

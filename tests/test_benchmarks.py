@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from benchmarks import __main__ as runner
+from benchmarks.batch import build
 from benchmarks.measure import Ratio, costs, growth, worse
+from pipelines.solvers.batch import CHUNK
 
 SLOW = """
 from benchmarks.measure import Ratio, costs
@@ -81,3 +83,12 @@ def test_committed_baseline_names_what_is_measured() -> None:
     baseline = json.loads(runner.BASELINE.read_text())
     assert {name.split(".")[0] for name in baseline} <= set(runner.SUITE)
     assert all(value > 0.0 for value in baseline.values())
+
+
+def test_scipy_gets_the_rows_of_our_graph() -> None:
+    from benchmarks.peers import los_peers
+
+    problem, rows = los_peers()
+    factors, values = build(problem, CHUNK)
+    ours = sum(f.factor.error(values) for f in factors)
+    assert 0.5 * np.square(rows.residuals(rows.x0)).sum() == pytest.approx(ours, rel=1e-2)

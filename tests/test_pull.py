@@ -1,0 +1,80 @@
+"""The noise of a gyro that drives a gimbal at rest moves nothing that it does not tell."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cache
+
+import numpy as np
+import pytest
+
+from benchmarks.young import drawn_los, made
+from pipelines.graph.problem import Array, Problem
+from pipelines.simulation.motion import EulerMotion
+from pipelines.solvers import batch
+from pipelines.solvers.assembly import Assembly
+from pipelines.solvers.batch import CHUNK, solve_batch, with_levels
+from pipelines.solvers.gauss_newton import Solution
+from pipelines.solvers.incremental import solve_incremental
+from pipelines.solvers.marginals import joint_information
+from pipelines.solvers.noise_levels import weigh
+from pipelines.solvers.pull import without_pull
+from pipelines.solvers.system import Linear
+
+MOUNTS, PRIOR = slice(0, 4), 0.1
+
+
+@cache
+def resting(seed: int, duration_s: float = 60.0) -> tuple[Problem, Array]:
+    """A gimbal on a carrier at rest, mounted as its priors let it be."""
+    still = {"carrier": EulerMotion(), "image_rate_hz": 5.0, "gyro_rate_hz": 50.0}
+    return made("los", drawn_los(seed, duration_s=duration_s, **still), seed)
+
+
+def minimum(problem: Problem) -> tuple[Solution, Linear, Mapping[int, int]]:
+    """Where the error of a graph is least, and the same linearised."""
+    whole = Assembly.of(problem.steps(CHUNK))
+    factors = weigh(whole.factors, problem.noises)
+    solution = batch.optimize(factors, whole.initial, whole.shared(problem), problem.loss)
+    solution, _, about, _ = with_levels(problem, whole.factors, solution, problem.noises)
+    return solution, about, whole.current_keys
+
+
+@pytest.mark.parametrize("seed", [3, 39])
+def test_at_rest_mounts_stay_where_their_priors_have_them(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, _ = resting(seed)
+    found = solve_batch(problem)
+    assert found.converged
+    assert np.abs(found.values[MOUNTS]).max() < 0.1 * PRIOR
+    assert np.sqrt(np.diag(found.covariance)[MOUNTS]).min() > 0.9 * PRIOR
+    monkeypatch.setattr(batch, "without_pull", lambda _, solution, *__: solution)
+    assert np.abs(solve_batch(problem).values[MOUNTS]).max() > PRIOR
+
+
+def test_nor_do_they_move_online() -> None:
+    problem, _ = resting(3, 12.0)
+    found = solve_incremental(problem)
+    assert np.abs(found.values[MOUNTS]).max() < 0.2 * PRIOR
+    assert np.sqrt(np.diag(found.covariance)[MOUNTS]).min() > 0.9 * PRIOR
+
+
+def test_it_is_a_minimum_that_says_nothing_more() -> None:
+    problem, _ = resting(3)
+    solution, about, current_keys = minimum(problem)
+    held = without_pull(problem, solution, about, current_keys)
+    assert held is not solution
+    linear = held.system.linearized(held.values)
+    step = linear.step()[0]
+    assert max(np.abs(step.at(p.key)).max() for p in problem.parameters) < 1e-3 * PRIOR
+    keys = [p.key for p in problem.parameters]
+    without = solution.system.linearized(held.values)
+    own, added = (joint_information(each.graph, each.system.ordering, keys) for each in (without, linear))
+    units = np.array([q.prior_scale for q in problem.quantities])
+    assert np.linalg.eigvalsh((added - own) * np.outer(units, units)).max() < 1e-2
+
+
+def test_what_motion_tells_is_not_held() -> None:
+    problem, truth = made("los", drawn_los(3, duration_s=10.0), 3)
+    solution, about, current_keys = minimum(problem)
+    assert without_pull(problem, solution, about, current_keys) is solution
+    assert np.abs(solve_batch(problem).values - truth)[MOUNTS].max() < 0.2 * PRIOR
