@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cache
 
 import numpy as np
@@ -16,10 +15,10 @@ from pipelines.solvers.assembly import Assembly
 from pipelines.solvers.batch import CHUNK, solve_batch, with_levels
 from pipelines.solvers.gauss_newton import Solution
 from pipelines.solvers.incremental import solve_incremental
-from pipelines.solvers.marginals import joint_information
+from pipelines.solvers.marginals import joint_covariance, joint_information
 from pipelines.solvers.noise_levels import weigh
 from pipelines.solvers.pull import without_pull
-from pipelines.solvers.system import Linear
+from pipelines.solvers.spurious import information_of_noise
 
 MOUNTS, PRIOR = slice(0, 4), 0.1
 
@@ -31,13 +30,15 @@ def resting(seed: int, duration_s: float = 60.0) -> tuple[Problem, Array]:
     return made("los", drawn_los(seed, duration_s=duration_s, **still), seed)
 
 
-def minimum(problem: Problem) -> tuple[Solution, Linear, Mapping[int, int]]:
-    """Where the error of a graph is least, and the same linearised."""
+def minimum(problem: Problem) -> tuple[Solution, Solution]:
+    """Where the error of a graph is least, and where it is without what noise alone tells."""
     whole = Assembly.of(problem.steps(CHUNK))
     factors = weigh(whole.factors, problem.noises)
     solution = batch.optimize(factors, whole.initial, whole.shared(problem), problem.loss)
     solution, _, about, _ = with_levels(problem, whole.factors, solution, problem.noises)
-    return solution, about, whole.current_keys
+    known = problem, about.graph, about.system.ordering, about.values, whole.current_keys
+    noise = information_of_noise(problem, about, joint_covariance(*known), whole.current_keys)
+    return solution, without_pull(problem, solution, noise, whole.current_keys)
 
 
 @pytest.mark.parametrize("seed", [3, 39])
@@ -60,8 +61,7 @@ def test_nor_do_they_move_online() -> None:
 
 def test_it_is_a_minimum_that_says_nothing_more() -> None:
     problem, _ = resting(3)
-    solution, about, current_keys = minimum(problem)
-    held = without_pull(problem, solution, about, current_keys)
+    solution, held = minimum(problem)
     assert held is not solution
     linear = held.system.linearized(held.values)
     step = linear.step()[0]
@@ -75,6 +75,6 @@ def test_it_is_a_minimum_that_says_nothing_more() -> None:
 
 def test_what_motion_tells_is_not_held() -> None:
     problem, truth = made("los", drawn_los(3, duration_s=10.0), 3)
-    solution, about, current_keys = minimum(problem)
-    assert without_pull(problem, solution, about, current_keys) is solution
+    solution, held = minimum(problem)
+    assert held is solution
     assert np.abs(solve_batch(problem).values - truth)[MOUNTS].max() < 0.2 * PRIOR

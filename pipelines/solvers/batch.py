@@ -11,7 +11,7 @@ import numpy as np
 
 from factors.loss import TruncatedLoss
 from pipelines.graph.noise import Level
-from pipelines.graph.problem import Array, Estimate, Factor, Problem, Told
+from pipelines.graph.problem import Array, Course, Estimate, Factor, Problem, Told
 from pipelines.solvers.assembly import Assembly, StepBoundary
 from pipelines.solvers.coloured import added_variance, coloured, inflations
 from pipelines.solvers.curvature import second_order
@@ -29,7 +29,7 @@ from pipelines.solvers.minima import likeliest
 from pipelines.solvers.noise_levels import far, refined, weigh
 from pipelines.solvers.pull import without_pull
 from pipelines.solvers.redundancy import expected_squares
-from pipelines.solvers.spurious import information_of_noise
+from pipelines.solvers.spurious import Spurious, information_of_noise
 from pipelines.solvers.system import Linear, System, without_rejected
 from pipelines.solvers.told import told
 
@@ -91,19 +91,15 @@ def solve_batch(
     best, second = likeliest(problem, solution, minimize, whole.current_keys)
     if best is not solution:
         solution, (about, expected) = best, _expected(best)
-    unpulled = without_pull(problem, solution, about, whole.current_keys, most)
-    if unpulled is not solution:
-        solution, (about, expected) = unpulled, _expected(unpulled)
+    course, marginal, noise = _known(problem, about, whole.current_keys)
+    if solution.converged:
+        unpulled = without_pull(problem, solution, noise, whole.current_keys, most)
+        if unpulled is not solution:
+            solution, (about, expected) = unpulled, _expected(unpulled)
+            course, marginal, noise = _known(problem, about, whole.current_keys)
     solved = time.perf_counter()
     values, system, ordering = solution.values, solution.system, solution.system.ordering
     linear, factors = about.graph, system.factors
-    course = sequential_history(problem, linear, ordering, values, about.boundaries)
-    marginal = (
-        joint_covariance(problem, linear, ordering, values, whole.current_keys)
-        if course is None
-        else course.covariance[-1]
-    )
-    noise = information_of_noise(problem, about, marginal, whole.current_keys)
     if noise is not None:
         marginal = joint_covariance(problem, linear, ordering, values, whole.current_keys, noise.information)
     bent = second_order(problem, about, marginal, whole.current_keys)
@@ -154,6 +150,18 @@ def solve_batch(
         second=second,
         seconds={"build": built - start, "solve": solved - built, "marginals": done - solved},
     )
+
+
+def _known(
+    problem: Problem, about: Linear, current_keys: Mapping[int, int]
+) -> tuple[Course | None, Array, Spurious | None]:
+    """What was known at some moments, covariance of the reported numbers at the end, and what of that is noise."""
+    linear, ordering, values = about.graph, about.system.ordering, about.values
+    course = sequential_history(problem, linear, ordering, values, about.boundaries)
+    marginal = (
+        joint_covariance(problem, linear, ordering, values, current_keys) if course is None else course.covariance[-1]
+    )
+    return course, marginal, information_of_noise(problem, about, marginal, current_keys)
 
 
 def _told(

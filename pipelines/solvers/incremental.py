@@ -27,12 +27,12 @@ from pipelines.solvers.curvature import second_order
 from pipelines.solvers.history import sequential_history
 from pipelines.solvers.innovations import Innovations, Prediction
 from pipelines.solvers.linearity import is_linear
-from pipelines.solvers.marginals import IndeterminateError, reported, reported_covariance
+from pipelines.solvers.marginals import IndeterminateError, joint_covariance, reported, reported_covariance
 from pipelines.solvers.noise_levels import weigh
 from pipelines.solvers.pull import without_pull
 from pipelines.solvers.rows import Rows
 from pipelines.solvers.smoother import FixedLag, Smoother, Unlimited, linearized, unweighed, used_part
-from pipelines.solvers.spurious import information_of_noise
+from pipelines.solvers.spurious import Spurious, information_of_noise
 from pipelines.solvers.state import State, explained, require_known, require_sound
 from pipelines.solvers.system import Linear
 from pipelines.solvers.window import Keyframes, Window
@@ -355,10 +355,12 @@ class Run:
             require_sound(whole.factors, whole.initial, self.time)
         if about is None:
             about = solution.system.linearized(solution.values)
-        elif self._young and self.window is not None:
-            unpulled = without_pull(self.problem, solution, about, self.current_keys)
+        noise = self._spurious(about) if self._young else None
+        if solution.converged and self.window is not None:
+            unpulled = without_pull(self.problem, solution, noise, self.current_keys)
             if unpulled is not solution:
                 solution, about = unpulled, unpulled.system.linearized(unpulled.values)
+                noise = self._spurious(about)
         self._trouble = "" if solution.converged else f"the first {self.time:.1f} s: {solution.message}"
         values = solution.values
         if from_start:
@@ -370,7 +372,7 @@ class Run:
         if grown and (self.window is None or since >= _OLDEST):
             self._young = False
         self._restart(about, whole.timestamps)
-        self._correct(about)
+        self._correct(about, noise)
         if grown and self._young:
             self._looked = _GROWTH * since
             # Neither correction is carried on once the past is folded.
@@ -393,18 +395,20 @@ class Run:
         self._solved = _Solved(since, len(self.past), self.values(), np.sqrt(np.diag(self.covariance())))
         self.innovations.begin_count()
 
-    def _correct(self, about: Linear) -> None:
+    def _correct(self, about: Linear, noise: Spurious | None) -> None:
         """Find what of a young run's covariance its linear system has wrong; of another nothing is known."""
         self._noise = self._bent = None
         if not self._young:
             return
-        current = self.current_keys
-        covariance = self.covariance()
-        noise = information_of_noise(self.problem, about, covariance, current)
         if noise is not None:
             self._noise = noise.information
-            covariance = self.covariance()
-        self._bent = second_order(self.problem, about, covariance, current)
+        self._bent = second_order(self.problem, about, self.covariance(), self.current_keys)
+
+    def _spurious(self, about: Linear) -> Spurious | None:
+        """What of the information of a linearised solution is its states' noise."""
+        linear, ordering = about.graph, about.system.ordering
+        covariance = joint_covariance(self.problem, linear, ordering, about.values, self.current_keys)
+        return information_of_noise(self.problem, about, covariance, self.current_keys)
 
     def _due(self, since: float) -> bool:
         """Whether a young run is to be solved in batch again, `since` s after its first step."""

@@ -16,13 +16,13 @@ import numpy as np
 from pipelines.graph.problem import Array, Factor, Problem
 from pipelines.solvers.gauss_newton import MOST_ITERATIONS, Solution, minimize
 from pipelines.solvers.marginals import joint_covariance
-from pipelines.solvers.spurious import information_of_noise
-from pipelines.solvers.system import Linear, System
+from pipelines.solvers.spurious import Spurious, information_of_noise
+from pipelines.solvers.system import System
 
 # Combinations nearer than this to their priors' means, in sigmas of these, stay where they are. Where some are held, it
-# may show of others that they have been pulled, or that all is told: so often it is looked. One that is less than this
-# off others is theirs.
-_NEAR, _LOOKS, _SAME = 0.05, 4, 0.1
+# may show of others that they have been pulled, or that all is told: so often there are more. One that is less than
+# this off others is theirs.
+_NEAR, _MOST, _SAME = 0.05, 3, 0.1
 # They are held by so many priors' sigmas to one, and a force is a prior with this part of a sigma's weight, far away.
 _TIGHT, _FAINT = 30.0, 0.03
 # Where that raises chi-square by more than this a squared sigma of their priors, it was not noise that told them.
@@ -32,7 +32,7 @@ _DEAR = 3.0
 def without_pull(
     problem: Problem,
     solution: Solution,
-    about: Linear,
+    noise: Spurious | None,
     current_keys: Mapping[int, int],
     most: int = MOST_ITERATIONS,
 ) -> Solution:
@@ -40,8 +40,8 @@ def without_pull(
 
     Args:
         problem: the graph's.
-        solution: of the same.
-        about: it, linearised.
+        solution: of the same, converged.
+        noise: what of its information is noise.
         current_keys: parameter key -> variable that holds its value.
         most: iterations.
 
@@ -49,21 +49,21 @@ def without_pull(
         IndeterminateError: states other than the parameters are not determined.
     """
     found, rows = solution, np.zeros((0, np.count_nonzero([q.prior_sigma != 0.0 for q in problem.quantities])))
-    for look in range(_LOOKS if solution.converged else 0):
-        covariance = joint_covariance(problem, about.graph, found.system.ordering, found.values, current_keys)
-        noise = information_of_noise(problem, about, covariance, current_keys)
+    for _ in range(_MOST):
         if noise is None:
             return solution
         rows = _orthonormal(np.concatenate([rows, noise.directions]))
         combined = _Combined(problem, current_keys, rows)
-        if look + 1 == _LOOKS or not (np.abs(combined.at(found.values)) > _NEAR).any():
-            break
-        held = _held(solution.system, found.values, combined, most)
+        held = None
+        if (np.abs(combined.at(found.values)) > _NEAR).any():
+            held = _held(solution.system, found.values, combined, most)
         if held is None:
-            break
+            return found
         found = replace(held, iterations=found.iterations + held.iterations)
         about = found.system.linearized(found.values)
-    return found
+        covariance = joint_covariance(problem, about.graph, about.system.ordering, about.values, current_keys)
+        noise = information_of_noise(problem, about, covariance, current_keys)
+    return solution if noise is None else found
 
 
 def _held(system: System, values: gtsam.Values, combined: _Combined, most: int) -> Solution | None:
