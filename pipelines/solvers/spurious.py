@@ -36,6 +36,8 @@ _MOSTLY = 0.5
 # What tells less than this, in units of the prior's information, moves an estimate by so many of the sigmas that it has
 # beforehand, and by less than this part of a prior's sigma at least; of more, the true value may be a rare one.
 _LITTLE, _FAR, _LEAST = 0.2, 3.0, 0.2
+# More than this is a prior, in units of the default one's information.
+_SOME = 0.1
 
 
 @dataclass(frozen=True)
@@ -116,7 +118,8 @@ def _held(told: Array, noise: Array, prior: Array, off: Array) -> Array:
     moves = np.sqrt(information / np.maximum(known * (known + information), 1e-300))
     mostly = (information > _TOLD) & (seeming > _MOSTLY * information)
     pulled = (information < _LITTLE * known) & (np.abs(off @ axes) > np.maximum(_FAR * moves, _LEAST))
-    return np.asarray(axes[:, mostly | pulled].T)
+    # Without a prior there is nowhere to be held.
+    return np.asarray(axes[:, (mostly | pulled) & (known > _SOME)].T)
 
 
 def _part(told: Array, noise: Array) -> Array:
