@@ -31,14 +31,20 @@ def resting(seed: int, duration_s: float = 60.0) -> tuple[Problem, Array]:
 
 
 def minimum(problem: Problem) -> tuple[Solution, Solution]:
-    """Where the error of a graph is least, and where it is without what noise alone tells."""
+    """Where the error of a graph is least, and where it is without what noise alone tells.
+
+    Afterwards other variables hold the parameters, as they do when a run goes on.
+    """
     whole = Assembly.of(problem.steps(CHUNK))
     factors = weigh(whole.factors, problem.noises)
     solution = batch.optimize(factors, whole.initial, whole.shared(problem), problem.loss)
     solution, _, about, _ = with_levels(problem, whole.factors, solution, problem.noises)
     known = problem, about.graph, about.system.ordering, about.values, whole.current_keys
     noise = information_of_noise(problem, about, joint_covariance(*known), whole.current_keys)
-    return solution, without_pull(problem, solution, noise, whole.current_keys)
+    current_keys = dict(whole.current_keys)
+    held = without_pull(problem, solution, noise, current_keys)
+    current_keys.update({p.key: p.key + 1000 for p in problem.parameters})
+    return solution, held
 
 
 @pytest.mark.parametrize("seed", [3, 39])
@@ -48,6 +54,8 @@ def test_at_rest_mounts_stay_where_their_priors_have_them(seed: int, monkeypatch
     assert found.converged
     assert np.abs(found.values[MOUNTS]).max() < 0.1 * PRIOR
     assert np.sqrt(np.diag(found.covariance)[MOUNTS]).min() > 0.9 * PRIOR
+    assert found.course is not None
+    assert np.abs(found.course.values[-1] - found.values)[MOUNTS].max() < 0.05 * PRIOR
     monkeypatch.setattr(batch, "without_pull", lambda _, solution, *__: solution)
     assert np.abs(solve_batch(problem).values[MOUNTS]).max() > PRIOR
 

@@ -347,7 +347,14 @@ class Run:
             whole.initial.insert(self.base.estimate)
             whole.timestamps = {**self.base.stamps, **whole.timestamps}
         weighed = weigh(whole.factors, self.levels)
-        solution = optimize(weighed, whole.initial, self.keys, self.problem.loss, held=self.problem.assumed)
+        solution = optimize(
+            weighed,
+            whole.initial,
+            self.keys,
+            self.problem.loss,
+            held=self.problem.assumed,
+            boundaries=whole.boundaries,
+        )
         about = None
         if solution.converged:
             solution, self.levels, about, _ = with_levels(self.problem, whole.factors, solution, self.levels)
@@ -385,7 +392,7 @@ class Run:
             self.moments += 1
             self._course = cache(
                 lambda: sequential_history(
-                    self.problem, system.linearize(values), system.ordering, values, whole.boundaries
+                    self.problem, system.linearize(values), system.ordering, values, system.boundaries
                 )
             )
             if not self._young:

@@ -53,7 +53,8 @@ def without_pull(
         if noise is None:
             return solution
         rows = _orthonormal(np.concatenate([rows, noise.directions]))
-        combined = _Combined(problem, current_keys, rows)
+        # The keys of now: later other variables hold a bias that walks.
+        combined = _Combined(problem, dict(current_keys), rows)
         held = None
         if (np.abs(combined.at(found.values)) > _NEAR).any():
             held = _held(solution.system, found.values, combined, most)
