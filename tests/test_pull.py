@@ -81,6 +81,17 @@ def test_it_is_a_minimum_that_says_nothing_more() -> None:
     assert np.linalg.eigvalsh((added - own) * np.outer(units, units)).max() < 1e-2
 
 
+def test_all_that_is_made_of_a_solution_is_made_of_it() -> None:
+    problem, _ = resting(3)
+    names = {q.name for q in problem.quantities}
+    found = solve_batch(problem, budget=True, changed=[("the same", problem)], device=names)
+    assert found.told is not None
+    assert found.budget is not None
+    assert all("held" not in sources for sources in found.budget.values())
+    assert found.moved is not None
+    assert max(map(abs, found.moved["the same"].values())) < 1e-3 * PRIOR
+
+
 def test_what_motion_tells_is_not_held() -> None:
     problem, truth = made("los", drawn_los(3, duration_s=10.0), 3)
     solution, held = minimum(problem)

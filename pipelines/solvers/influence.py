@@ -23,6 +23,7 @@ import gtsam
 import numpy as np
 
 from pipelines.graph.problem import Array, Factor, Problem, Pull
+from pipelines.solvers.marginals import HELD
 from pipelines.solvers.system import Linear
 
 # Family of the priors, which are told one by one.
@@ -114,6 +115,8 @@ def uncertainty_budget(problem: Problem, found: Influence, added: Mapping[str, A
     by_key = {p.key: p for p in problem.parameters}
     variances: dict[str, Array] = {}
     for factor, linear, rows in found.rows():
+        if factor.family == HELD:  # no source of anything
+            continue
         keys = linear.keys()
         parameter = by_key.get(keys[0]) if factor.family == _PRIOR and len(keys) == 1 else None
         squares = rows**2

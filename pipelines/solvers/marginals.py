@@ -14,8 +14,10 @@ from pipelines.graph.problem import Array, ChiSquare, Factor, History, Parameter
 # A direction the data and priors say nothing about gets this many times its prior scale as sigma, so that it can be
 # named with the others instead of making the system unsolvable.
 _UNKNOWN = 1e4
+# What balances the pull of noise, see pipelines.solvers.pull: neither measured nor believed.
+HELD = "held"
 # Families whose residuals say nothing about the noise of the recording.
-_NO_MEASUREMENTS = ("prior", "definition")
+_NO_MEASUREMENTS = ("prior", "definition", HELD)
 
 
 class IndeterminateError(Exception):
@@ -228,7 +230,7 @@ def chi_square(
     for f in factors:
         if f.family not in _NO_MEASUREMENTS:
             value[f.family] = value.get(f.family, 0.0) + sum_of_squares(f, values)
-    counted = sum(count for f, count in zip(factors, rows, strict=True) if f.family != "prior")
+    counted = sum(count for f, count in zip(factors, rows, strict=True) if f.family not in ("prior", HELD))
     dof = counted - values.dim() + _from_priors(problem, covariance)
     families = dict.fromkeys(value, 0.0)
     for (family, _), square in expected.items():

@@ -15,7 +15,7 @@ import numpy as np
 
 from pipelines.graph.problem import Array, Factor, Problem
 from pipelines.solvers.gauss_newton import MOST_ITERATIONS, Solution, minimize
-from pipelines.solvers.marginals import joint_covariance
+from pipelines.solvers.marginals import HELD, joint_covariance
 from pipelines.solvers.spurious import Spurious, information_of_noise
 from pipelines.solvers.system import System
 
@@ -129,4 +129,4 @@ class _Combined:
 
         keys = [self.current_keys.get(p.key, p.key) for p in self.problem.parameters]
         noise = gtsam.noiseModel.Isotropic.Sigma(len(self.rows), 1.0 / weight)
-        return Factor("prior", gtsam.CustomFactor(noise, keys, evaluate))
+        return Factor(HELD, gtsam.CustomFactor(noise, keys, evaluate))
