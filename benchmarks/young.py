@@ -34,8 +34,14 @@ from pipelines.simulation.motion import EulerMotion, Swing
 from pipelines.solvers.incremental import DEFAULT_WINDOW, Run
 
 HEAD = HeadScenario(
-    duration_s=30.0, vision_rate_hz=10.0, gyro_rate_hz=100.0, latitude_deg=None, sensors=Sensors()
+    duration_s=30.0,
+    vision_rate_hz=10.0,
+    gyro_rate_hz=100.0,
+    latitude_deg=None,
+    sensors=Sensors(),
+    gyro_turn_on_bias_deg_s=float(np.rad2deg(0.05)),
 )  # to be changed by the cases, as those below
+# The bias is the simulator's, 0.005 of its prior, but in a case of its own: it lets the target drift away.
 LOS = LosScenario(duration_s=30.0, image_rate_hz=10.0, gyro_rate_hz=100.0, gimbal_rate_hz=50.0, sensors=Sensors())
 INDEXER = IndexerScenario(
     positions=[
@@ -50,6 +56,8 @@ TUMBLE = TumbleScenario()
 # s at rest before anything moves, and deg that a mount may be off by where nobody knows it; by seed, in turn.
 RESTS, MOUNTS = (10.0, 20.0, 30.0, 60.0), (90.0, 120.0, 180.0)
 _AXES = ("yaw", "pitch", "roll")
+# rad/s, the prior of los's gyro bias, and s that the target then stays in the picture.
+BIAS, SEEN = 0.02, 5.0
 # Shares of a recording's motion, or of the rest before it, at which errors are looked at.
 _LATER = np.array([0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.55, 0.75, 0.97])
 _BEFORE, _AFTER = np.array([0.15, 0.5, 0.95]), np.array([0.07, 0.1, 0.15, 0.25, 0.4, 0.6, 0.97])
@@ -172,6 +180,10 @@ CASES: dict[str, dict[str, Case]] = {
             30.0 * _LATER,
         ),
         "outliers": lambda seed: (drawn_los(seed, outlier_share=0.2), 30.0 * _LATER),
+        "biases": lambda seed: (
+            drawn_los(seed, gyro_turn_on_bias=BIAS, duration_s=SEEN),
+            SEEN * np.linspace(0.2, 0.97, len(_LATER)),
+        ),
     },
     "indexer": {
         "rest": lambda seed: _indexer(seed, dwell_s=RESTS[seed % len(RESTS)]),

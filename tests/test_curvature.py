@@ -56,6 +56,22 @@ def test_joint_errors_fit_at_rest_and_when_motion_begins() -> None:
     assert (sums < chi2.ppf(0.999, 4 * found[0].numbers)).all(), sums / 4.0
 
 
+def test_other_draws_tell_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sixteen at random would differ by a half."""
+    problem, _ = recording(0, 10.0, 6.0)
+    linear, covariance = solved(problem, monkeypatch).covariance, []
+    for seed in range(4):
+        default = np.random.default_rng
+        monkeypatch.setattr(np.random, "default_rng", lambda _, default=default, seed=seed: default(seed))
+        covariance.append(solve_batch(problem).covariance)
+        monkeypatch.undo()
+    scale = np.sqrt(np.diag(linear))
+    axes = np.linalg.eigh(linear / np.outer(scale, scale))[1] / scale[:, None]
+    best = [axes[:, 0] @ each @ axes[:, 0] for each in covariance]
+    assert min(best) > 100.0 * (axes[:, 0] @ linear @ axes[:, 0])
+    assert max(best) < 1.2 * min(best)
+
+
 def test_numbers_that_measurements_are_not_linear_in_are_covered() -> None:
     """Turns about one axis: gains about the others stay unknown, and with them b = -K c, however well c is known.
 

@@ -57,6 +57,25 @@ def test_what_is_known_moves_alike(monkeypatch: pytest.MonkeyPatch) -> None:
     assert max(np.abs(moved.at(key)).max() for key in values.keys()) > 1e-4
 
 
+@pytest.mark.parametrize("whole", [True, False])
+def test_states_follow_where_what_is_shared_is_moved(whole: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a step does that holds it there, but for what the step would do anyway."""
+    assembly = Assembly.of(los_problem().steps(CHUNK))
+    shared = assembly.shared(los_problem())
+    alone = system.System.of(assembly.factors, shared, None, assembly.boundaries)
+    values, parts = assembly.initial, alone if whole else stretches(monkeypatch, los_problem())[0].under(None)
+    dims = values.dims()
+    ends = np.cumsum([dims[key] for key in shared])
+    moves = 1e-3 * np.random.default_rng(0).standard_normal((ends[-1], 2))
+    linear = alone.linearized(values)
+    still = linear.holding({key: np.zeros(dims[key]) for key in shared}).step()[0]
+    for move, followed in zip(moves.T, parts.linearized(values).followed(shared, moves), strict=True):
+        step = linear.holding(dict(zip(shared, np.split(move, ends[:-1]), strict=True))).step()[0]
+        for key in values.keys():
+            expected = step.at(key) - still.at(key)
+            np.testing.assert_allclose(values.localCoordinates(followed).at(key), expected, atol=1e-9)
+
+
 def test_progress_is_shown(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(Console, "is_terminal", True)
     with progress.shown():

@@ -10,15 +10,22 @@ a known direction that follows by w'Hw/2 it is T = Hw, with w in sigmas: its var
 over draws of w, and its mean tr(H)/2 half that of Tw. Slopes tell that from far fewer draws than the ways themselves,
 which are products of sigmas. They are those of the reported numbers, so that what bends because numbers are no linear
 functions of the variables is among it.
+
+The slopes of three draws show along which few ways anything bends, three or four of 35. Of random draws sixteen would
+leave the variance a half too small or too large, and where it is too small errors count for more than they count for
+less where it is too large. So draws are at right angles to each other along these ways, as many times as there are, of
+which the means above are exact; along all others, and in length, they are as random ones are, so that they show what is
+of higher order too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from itertools import chain
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.graph.problem import Array, Problem
 from pipelines.solvers.marginals import (
@@ -31,16 +38,18 @@ from pipelines.solvers.marginals import (
 )
 
 if TYPE_CHECKING:
-    from pipelines.solvers.system import Linear
+    from pipelines.solvers.system import Linear, System
 
 # A direction with a sigma within this share of the prior follows those of which its sigma is within this share.
 _WEAK, _LESS = 0.1, 0.5
 # Where no sigma of what is calibrated is beyond this share nothing is drawn.
 _SURE = 0.01
-_DRAWS = 16
 # Looked at after so many draws: where no direction gained this share of its squared sigma, none is said to bend. One
 # that gains all of it shows so little in so few draws with a chance of 3 %.
 _SLIGHT = {1: 1e-3, 3: 0.1}
+# Ways along which all that bends does so by less than this share of its variance are not looked for.
+_STRAIGHT = 0.01
+_DRAWS = 8
 # Information in units of the priors' with which there is no prior.
 _ANYWHERE = 0.5
 
@@ -66,41 +75,106 @@ def second_order(
     scaled = (covariance / np.outer(scales, scales))[np.ix_(calibrated, calibrated)]
     if not len(scaled) or np.linalg.eigvalsh(scaled)[-1] < _SURE**2:
         return None
-    values, keys = about.values, [current_keys.get(p.key, p.key) for p in problem.parameters]
-    free, scale, unit = prior_units(problem.parameters, values, keys)
-    # Far from the solution the loss would reject what is good.
-    system, ordering = about.system.without_rejected(values), about.system.ordering
     try:
-        eigenvalues, vectors = np.linalg.eigh(unit.T @ joint_information(about.graph, ordering, keys) @ unit)
-        if eigenvalues[0] < _ANYWHERE:
+        floor = _Floor.of(problem, about, current_keys)
+        if floor is None:
             return None
-        # The best known one first.
-        eigenvalues, vectors = eigenvalues[::-1], vectors[:, ::-1]
-        numbers, sigmas = reported(problem, values, current_keys), eigenvalues**-0.5
-        follows = (sigmas[:, None] < _LESS * sigmas) & (sigmas < _WEAK)[:, None]
-        slopes: list[Array] = []
-        ways: list[Array] = []
-        generator = np.random.default_rng(0)
-        # Values of hours are large: no more of them at once than are looked at.
-        counts = np.diff([0, *_SLIGHT, _DRAWS]).tolist()
-        draws = (about.drawn(keys, count, generator) for count in counts)
-        for each in chain.from_iterable(draws):
-            unit = prior_units(problem.parameters, each, keys)[2]
-            A, _ = marginal(system.linearize(each), ordering, keys).jacobian(ordering_of(keys))
-            # One row a direction: it and those less known, the better known ones marginalised out.
-            R = np.asarray(np.linalg.qr(A @ unit @ vectors, mode="r"))
-            slopes.append(np.where(follows, -R / np.diag(R)[:, None], 0.0) * sigmas)
-            moved = (reported(problem, each, current_keys) - numbers)[free] / scale
-            ways.append(slopes[-1] @ (vectors.T @ moved / sigmas))
-            if len(slopes) in _SLIGHT:
-                square = 0.5 * np.square(slopes).sum(axis=2) + 0.25 * np.square(ways)
-                if (eigenvalues * square).sum(axis=1).max() < _SLIGHT[len(slopes)]:
-                    return None
+        generator, n = np.random.default_rng(0), len(floor.sigmas)
+        slopes, moved = np.zeros((0, n, n)), np.zeros((0, n))
+        for count, slight in _SLIGHT.items():
+            more = floor.slopes(generator.standard_normal((n, count - len(slopes))))
+            slopes, moved = np.concatenate([slopes, more[0]]), np.concatenate([moved, more[1]])
+            bent = 0.5 * np.square(slopes).sum(axis=2) + 0.25 * np.square((slopes @ moved[:, :, None])[:, :, 0])
+            if (bent.sum(axis=0) / floor.sigmas**2).max() < slight:
+                return None
+        slopes, moved = floor.slopes(_balanced(_bending(slopes, floor.sigmas), generator))
     except (RuntimeError, IndeterminateError, np.linalg.LinAlgError):
         return None
-    bent = 0.5 * np.mean([slope @ slope.T for slope in slopes], axis=0)
-    mean = 0.5 * np.mean(ways, axis=0)
-    axes = scale[:, None] * vectors
+    mean = 0.5 * np.mean(slopes @ moved[:, :, None], axis=0)[:, 0]
+    variance = 0.5 * np.mean(slopes @ slopes.transpose(0, 2, 1), axis=0) + np.outer(mean, mean)
     found = np.zeros_like(covariance)
-    found[np.ix_(free, free)] = axes @ (bent + np.outer(mean, mean)) @ axes.T
+    found[np.ix_(floor.free, floor.free)] = floor.axes @ variance @ floor.axes.T
     return found
+
+
+@dataclass(frozen=True)
+class _Floor:
+    """The least error for each value of the reported numbers, about the solution.
+
+    Attributes:
+        problem: the graph's.
+        about: it linearised at the solution.
+        current_keys: parameter key -> variable that holds its value.
+        system: the same without what is rejected there: far from the solution the loss would reject what is good.
+        keys: variables that hold the numbers.
+        free: (n,) which numbers are free.
+        scale: (n,) their priors'.
+        vectors: (n, n) columns, independent directions in these scales, the best known one first.
+        sigmas: (n,) of the directions.
+        numbers: (m,) reported at the solution.
+    """
+
+    problem: Problem
+    about: Linear
+    current_keys: Mapping[int, int]
+    system: System
+    keys: Sequence[int]
+    free: NDArray[np.intp]
+    scale: Array
+    vectors: Array
+    sigmas: Array
+    numbers: Array
+
+    @classmethod
+    def of(cls, problem: Problem, about: Linear, current_keys: Mapping[int, int]) -> _Floor | None:
+        """None where a direction has neither prior nor measurements."""
+        values, keys = about.values, [current_keys.get(p.key, p.key) for p in problem.parameters]
+        free, scale, unit = prior_units(problem.parameters, values, keys)
+        system = about.system.without_rejected(values)
+        information = unit.T @ joint_information(about.graph, system.ordering, keys) @ unit
+        eigenvalues, vectors = np.linalg.eigh(information)
+        if eigenvalues[0] < _ANYWHERE:
+            return None
+        sigmas, numbers = eigenvalues[::-1] ** -0.5, reported(problem, values, current_keys)
+        return cls(problem, about, current_keys, system, keys, free, scale, vectors[:, ::-1], sigmas, numbers)
+
+    @property
+    def axes(self) -> Array:
+        """(n, n) columns, the directions in the numbers' own units."""
+        return self.scale[:, None] * self.vectors
+
+    def slopes(self, ways: Array) -> tuple[Array, Array]:
+        """Slopes (k, n, n) of each direction along the less known ones at ways (n, k), and how far (k, n) these went.
+
+        All is in sigmas, but for what follows. Raises IndeterminateError if states are not determined.
+        """
+        unit = prior_units(self.problem.parameters, self.about.values, self.keys)[2]
+        follows = (self.sigmas[:, None] < _LESS * self.sigmas) & (self.sigmas < _WEAK)[:, None]
+        slopes, moved = [], []
+        for there in self.about.followed(self.keys, unit @ self.vectors @ (self.sigmas[:, None] * ways)):
+            unit_there = prior_units(self.problem.parameters, there, self.keys)[2]
+            linear = marginal(self.system.linearize(there), self.system.ordering, self.keys)
+            A, _ = linear.jacobian(ordering_of(self.keys))
+            # One row a direction: it and those less known, the better known ones marginalised out.
+            R = np.asarray(np.linalg.qr(A @ unit_there @ self.vectors, mode="r"))
+            slopes.append(np.where(follows, -R / np.diag(R)[:, None], 0.0) * self.sigmas)
+            off = (reported(self.problem, there, self.current_keys) - self.numbers)[self.free] / self.scale
+            moved.append(self.vectors.T @ off / self.sigmas)
+        return np.array(slopes), np.array(moved)
+
+
+def _bending(slopes: Array, sigmas: Array) -> Array:
+    """Unit rows (r, n), at right angles, along which something bends, by slopes (k, n, n) of what is known so well."""
+    spread = np.sqrt(sigmas**2 + 0.5 * np.square(slopes).sum(axis=2).mean(axis=0))
+    rows = (slopes / spread[:, None]).reshape(-1, len(sigmas))
+    sizes, ways = np.linalg.svd(rows, full_matrices=False)[1:]
+    return np.asarray(ways[sizes**2 > _STRAIGHT * len(slopes)])
+
+
+def _balanced(along: Array, generator: np.random.Generator) -> Array:
+    """Draws (n, k), their parts along r unit rows (r, n) in sets of r at right angles, each sqrt(r) long."""
+    r = len(along)
+    sets = [np.linalg.qr(generator.standard_normal((r, r)))[0] for _ in range(-(-_DRAWS // r))]
+    inside = np.sqrt(r) * np.hstack(sets)
+    drawn = generator.standard_normal((along.shape[1], inside.shape[1]))
+    return np.asarray(drawn + along.T @ (inside - along @ drawn))

@@ -208,10 +208,32 @@ class Linear:
         def of(places: Mapping[int, slice]) -> Array:
             return np.concatenate([units[key] for key in places])
 
-        joint = self.triangular.back(of(self.triangular.places))
-        moves = [gtsam.VectorValues() for _ in range(count)]
+        return self._moved(of(self.triangular.places), lambda part: of(part.triangular.places))
+
+    def followed(self, keys: Sequence[int], moves: Array) -> list[gtsam.Values]:
+        """Values with the variables that all measurements share moved, the others where they are likeliest then.
+
+        Args:
+            keys: these variables.
+            moves: (d, k) of their tangents, one after the other, a column each.
+
+        Raises:
+            IndeterminateError: a variable is not determined.
+        """
+        # These are eliminated last: their rows hold no other.
+        own = rows_of(self.triangular.places, list(keys))
+        there = np.zeros((self.triangular.size, moves.shape[1]))
+        there[own] = moves
+        right = np.zeros_like(there)
+        right[own] = self.triangular.times(there)[own]
+        return self._moved(right)
+
+    def _moved(self, right: Array, own: Callable[[Part], Array] | None = None) -> list[gtsam.Values]:
+        """Values (k,) moved by R^-1 times (D, k) of the variables of `graph`, and of a part's own as in `solved`."""
+        joint = self.triangular.back(right)
+        moves = [gtsam.VectorValues() for _ in range(joint.shape[1])]
         inserted: set[int] = set()
-        for part, x in self.solved(joint, lambda part: of(part.triangular.places)):
+        for part, x in self.solved(joint, own):
             for key in part.triangular.places.keys() - inserted:
                 for move, column in zip(moves, x[part.triangular.places[key]].T, strict=True):
                     move.insert(key, column)

@@ -69,6 +69,13 @@ class Triangular:
             out[clique.own, 0] = clique.d
         return out
 
+    def times(self, x: Array) -> Array:
+        """(D, k) R x where variables were eliminated, elsewhere zero."""
+        out = np.zeros_like(x)
+        for clique in self.cliques:
+            out[clique.own] = clique.R @ x[clique.own] + clique.S @ x[clique.above]
+        return out
+
     def forward(self, right: Array) -> Array:
         """(D, k) y with R'y = right where variables were eliminated, elsewhere what that leaves of the right side."""
         y = right.copy()
