@@ -164,11 +164,14 @@ class _Floor:
 
 
 def _bending(slopes: Array, sigmas: Array) -> Array:
-    """Unit rows (r, n), at right angles, along which something bends, by slopes (k, n, n) of what is known so well."""
+    """Unit rows (r, n), at right angles, along which something bends, by slopes (k, n, n) of what is known so well.
+
+    One at least.
+    """
     spread = np.sqrt(sigmas**2 + 0.5 * np.square(slopes).sum(axis=2).mean(axis=0))
     rows = (slopes / spread[:, None]).reshape(-1, len(sigmas))
     sizes, ways = np.linalg.svd(rows, full_matrices=False)[1:]
-    return np.asarray(ways[sizes**2 > _STRAIGHT * len(slopes)])
+    return np.asarray(ways[: max(1, int(np.sum(sizes**2 > _STRAIGHT * len(slopes))))])
 
 
 def _balanced(along: Array, generator: np.random.Generator) -> Array:
