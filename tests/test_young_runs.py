@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from pipelines.settings import Sensors
 from pipelines.simulation.motion import EulerMotion
 from pipelines.solvers.assembly import Assembly
 from pipelines.solvers.batch import CHUNK, optimize, solve_batch
-from pipelines.solvers.incremental import solve_incremental
+from pipelines.solvers.incremental import Run, solve_incremental
 from pipelines.solvers.noise_levels import weigh
 
 MOUNT = slice(3, 6)
@@ -125,6 +126,20 @@ def test_outliers_among_few_pictures_lead_to_no_far_minimum() -> None:
     assert estimate.converged
     assert size < chi2.ppf(0.999, numbers)
     assert 0 < estimate.rejected["los"] < 0.4 * len(first)
+
+
+def test_no_sigma_is_far_beyond_its_prior() -> None:
+    """Some directions of the ellipsoid are known a million times better than others; it was 5,000 times the prior."""
+    settings, _ = CASES["tumble"]["slow"](2046)
+    problem, _ = made("tumble", settings, 2046)
+    widest = 0.0
+    following = Run(problem, 1.0)
+    for step in islice(problem.steps(1), 11):
+        following.add_step(step)
+        if following.started:
+            sigmas = np.sqrt(np.diag(following.covariance()))
+            widest = max(widest, float(np.max(sigmas / [q.scale for q in problem.quantities])))
+    assert 0.9 < widest < 1.5
 
 
 def test_the_study_follows_a_recording_to_its_end() -> None:

@@ -27,7 +27,13 @@ from pipelines.solvers.curvature import second_order
 from pipelines.solvers.history import sequential_history
 from pipelines.solvers.innovations import Innovations, Prediction
 from pipelines.solvers.linearity import is_linear
-from pipelines.solvers.marginals import IndeterminateError, joint_covariance, reported, reported_covariance
+from pipelines.solvers.marginals import (
+    IndeterminateError,
+    information_of,
+    joint_covariance,
+    reported,
+    reported_covariance,
+)
 from pipelines.solvers.noise_levels import weigh
 from pipelines.solvers.pull import without_pull
 from pipelines.solvers.rows import Rows
@@ -216,7 +222,7 @@ class Run:
         """Joint covariance of the parameters now."""
         assert self._smoother is not None
         try:
-            information = np.asarray(np.linalg.inv(self._smoother.covariance(self.keys)), dtype=float)
+            information = information_of(self._smoother.covariance(self.keys))
         except (RuntimeError, np.linalg.LinAlgError) as error:
             raise IndeterminateError(f"the parameters' covariance at {self.time:.3f} s is singular: {error}") from error
         if not np.isfinite(information).all():

@@ -66,6 +66,18 @@ def joint_information(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Orderin
     return np.asarray(information)
 
 
+def information_of(covariance: Array) -> Array:
+    """The inverse (d, d) of a covariance.
+
+    By its eigenvalues, in units of its own sigmas: where some directions are known a million times better than others,
+    the inverse by elimination has less information than none about these. Raises LinAlgError if it is not finite.
+    """
+    sigmas = np.sqrt(np.diag(covariance))
+    eigenvalues, vectors = np.linalg.eigh(covariance / np.outer(sigmas, sigmas))
+    eigenvalues = np.maximum(eigenvalues, np.finfo(float).eps * eigenvalues[-1])
+    return np.asarray((vectors / eigenvalues) @ vectors.T / np.outer(sigmas, sigmas))
+
+
 def marginal(
     linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, keys: Sequence[int]
 ) -> gtsam.GaussianFactorGraph:
