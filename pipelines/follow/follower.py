@@ -12,7 +12,7 @@ import gc
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 
@@ -21,6 +21,7 @@ import numpy as np
 from pipelines.errors import InputError
 from pipelines.follow.guidance import View, Watch, view_of
 from pipelines.follow.sources import Source
+from pipelines.graph.clock import Clock
 from pipelines.graph.problem import Problem, Step
 from pipelines.judgement.checklist import ChecklistItem
 from pipelines.recording.container import sha256_of
@@ -46,6 +47,8 @@ _LONG_AGO = 1.5
 _VIEW = 1.0
 # Times are differences of stamps, which are whole ns: they are told apart beyond this, s.
 _ROUNDING = 1e-9
+_CLOCK = "time_offset", "clock_skew"
+_MISPLACED = "by now pictures are taken farther from their stamps than motion around these can be carried"
 # A picture serves once gyro and gimbal have been read after it: so long a picture is waited for beyond its time, s.
 _SAMPLE = 0.01
 
@@ -106,6 +109,7 @@ class Follower:
         self._delay_ns, self._attachments = 0, 0
         self._guessed = 0.0  # from a recording of so many s
         self._held: Step | None = None  # the first step that is not settled
+        self._misplaced = False  # whether it was said that pictures were taken far from their stamps
         if settings.checkpoint is not None and settings.window is None:
             raise InputError("--window all has no checkpoints: it forgets nothing; give seconds")
         if settings.prior is not None:
@@ -264,6 +268,9 @@ class Follower:
 
     def _view(self) -> None:
         assert self._run is not None
+        if not self._misplaced and _is_misplaced(self._run):
+            self._misplaced = True
+            self._say(f"{_MISPLACED}; what is shown may be off by that, and is solved anew when the recording ends")
         self._watch.look(self._run)
         self._show(view_of(self._epoch_ns, self._run, tuple(self._checklist.values()), self._watch.change))
         self._shown = time.monotonic()
@@ -316,8 +323,15 @@ class Follower:
         # What was never followed is solved as any finished recording.
         followed = self._run is not None or self.settings.checkpoint is not None
         growing = _that_grows(problem, session) if followed else problem
-        self._take(growing, self._new_steps(session, growing))
+        steps = self._new_steps(session, growing)
         assert self._run is not None
+        kept, taken = growing.keyframes, problem.keyframes
+        if kept is not None and taken is not None and kept.are_far(taken.clock, session.facts.duration_s):
+            self._say(f"{_MISPLACED}: solved anew, with keyframes where they were")
+            self._run, steps = Run(problem, self.settings.window), problem.steps(1)
+            # It is no run that another process could go on with.
+            growing = replace(problem, steps_after=None)
+        self._take(growing, steps)
         estimate = self._run.finish(time.perf_counter() - started)
         (calibration,) = session.judged([(estimate, problem)], {"read": read}, self.settings.check)
         return calibration
@@ -328,6 +342,16 @@ def _first(steps: Iterable[Step]) -> Iterator[Step]:
     for step in steps:
         yield step
         return
+
+
+def _is_misplaced(run: Run) -> bool:
+    """Whether pictures of a run are certainly far from its keyframes by now."""
+    keyframes, names = run.problem.keyframes, _names(run.problem)
+    if not run.started or keyframes is None or not set(_CLOCK) <= set(names):
+        return False
+    own = [names.index(name) for name in _CLOCK]
+    clock = Clock(keyframes.clock.begun, *run.values()[own].tolist())
+    return keyframes.are_far(clock, run.time, run.covariance()[np.ix_(own, own)])
 
 
 def _names(problem: Problem) -> list[str]:

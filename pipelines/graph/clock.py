@@ -53,6 +53,28 @@ class Clock:
         return np.asarray((taken - self.begun - self.offset) / (1.0 - self.skew))
 
 
+@dataclass(frozen=True)
+class Keyframes:
+    """Where a graph's keyframes stand: where pictures were taken by some clock, the first guess of theirs.
+
+    Attributes:
+        clock: that clock.
+        near: so far off, s, motion around a keyframe still tells what sensors did when its picture was taken.
+    """
+
+    clock: Clock
+    near: float
+
+    def are_far(self, clock: Clock, time: float, covariance: Array | None = None) -> bool:
+        """Whether pictures at the beginning or by some time, s, were taken elsewhere by another clock.
+
+        With a covariance (2, 2) of that clock's offset and skew: whether they certainly were.
+        """
+        elapsed = np.array([0.0, time - self.clock.begun])
+        sigmas = np.zeros(2) if covariance is None else _sigmas_at(elapsed, covariance)
+        return bool((np.abs(clock.late(elapsed) - self.clock.late(elapsed)) > self.near + _TOLD * sigmas).any())
+
+
 def first_span(skew_sigma: float) -> float:
     """So long, s, no clock goes wrong by much."""
     return _WRONG_AT_FIRST / skew_sigma
@@ -103,7 +125,12 @@ def guess_clock(
         if until >= last:
             break
         until *= _THEN
-    at_ends = np.array([[1.0, 0.0], [1.0, -last]])
-    sigmas = np.sqrt(np.diag(at_ends @ covariance[-2:, -2:] @ at_ends.T))
-    told = (np.abs(at_ends @ x[-2:]) > _TOLD * sigmas).any()
-    return Clock(begun, *x[-2:].tolist()) if told else Clock(begun)
+    clock, ends = Clock(begun, *x[-2:].tolist()), np.array([0.0, last])
+    told = (np.abs(clock.late(ends)) > _TOLD * _sigmas_at(ends, covariance[-2:, -2:])).any()
+    return clock if told else Clock(begun)
+
+
+def _sigmas_at(elapsed: Array, covariance: Array) -> Array:
+    """Sigmas (n,), s, of how late pictures are so long after the first stamp, s, by those of offset and skew (2, 2)."""
+    rows = np.stack([np.ones_like(elapsed), -elapsed], axis=1)
+    return np.asarray(np.sqrt(np.einsum("ni,ij,nj->n", rows, covariance, rows)))

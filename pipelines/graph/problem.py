@@ -24,6 +24,8 @@ from pipelines.graph.noise import Level
 if TYPE_CHECKING:
     import gtsam
 
+    from pipelines.graph.clock import Keyframes
+
 Array = NDArray[np.float64]
 
 # What a method found beside its parameters: name of a table -> its rows, plain numbers and words in SI.
@@ -205,6 +207,7 @@ class Problem:
         unsettled: see `onward`, s.
         noises: that are in force, with what sensors' own samples say of them.
         constants: numbers of the recording that formulas need beside the parameters, by name.
+        keyframes: where they stand; None: there are no pictures with a clock that is estimated.
         elsewhere: of a solution, values that explain the measurements as well in another way, near which there may be
             other minima. None: the method has no such.
     """
@@ -223,6 +226,7 @@ class Problem:
     unsettled: float = 1.0
     noises: tuple[Level, ...] = ()
     constants: Mapping[str, float] = field(default_factory=dict)
+    keyframes: Keyframes | None = None
     elsewhere: Callable[[gtsam.Values], Iterator[gtsam.Values]] | None = None
 
     def numbers(self, estimate: Estimate) -> dict[str, float]:

@@ -21,7 +21,7 @@ from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
 from pipelines.errors import InputError
 from pipelines.graph.assumptions import acting
-from pipelines.graph.clock import Clock
+from pipelines.graph.clock import Clock, Keyframes
 from pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk, shared_keyframes
 from pipelines.graph.motion import Motion
 from pipelines.graph.noise import Level
@@ -95,6 +95,7 @@ def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
         unsettled=temperature.unsettled(data.temperature),
         noises=tuple(model.noises.values()),
         constants=temperature.constants(model.reference),
+        keyframes=Keyframes(model.clock, _NEAR),
     )
 
 

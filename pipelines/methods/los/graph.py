@@ -22,7 +22,7 @@ from factors.los import LosDirectionFactor, Surroundings
 from factors.loss import TruncatedLoss
 from factors.preintegration import GyroPath
 from pipelines.graph.assumptions import acting
-from pipelines.graph.clock import Clock
+from pipelines.graph.clock import Clock, Keyframes
 from pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk, as_slice
 from pipelines.graph.motion import Motion
 from pipelines.graph.noise import Level
@@ -93,6 +93,7 @@ def _problem(config: Config, data: LosData, model: _Model, dropped: Mapping[str,
         unsettled=max(_SETTLED if model.around is None else SMOOTHING, temperature.unsettled(data.temperature)),
         noises=tuple(model.noises.values()),
         constants=temperature.constants(model.reference),
+        keyframes=None if model.parameters.sight is None else Keyframes(model.clock, _NEAR),
     )
 
 
