@@ -255,8 +255,9 @@ def unstated(method: str, grade: str, seeds: Sequence[int]) -> float:
 @pytest.mark.parametrize("grade", GRADES["head"])
 @pytest.mark.parametrize("method", GRADES)
 def test_nothing_stated_and_honest(method: str, grade: str) -> None:
-    # 50 runs of each were within, too.
-    assert 0.8 < unstated(method, grade, range(25 if method in ("los", "cube") else 50)) < 1.25
+    # 50 runs of los were within, too. Of cube 25 are too few: gains that stay little known are drawn from a tenth of
+    # their priors, which leaves 0.84 +- 0.03.
+    assert 0.8 < unstated(method, grade, range(25 if method == "los" else 50)) < 1.25
 
 
 @pytest.mark.parametrize(

@@ -428,7 +428,8 @@ class Run:
         solved = self._solved
         if solved is None:
             return since >= _FIRST
-        if since >= _GROWTH * solved.since:
+        # The past is folded as soon as it may be, not when it happens to be solved again.
+        if since >= _GROWTH * solved.since or solved.since < _YOUNG <= since:
             return True
         moved, scales = np.abs(self.values() - solved.values), self._scales
         if (moved > _LOST * scales).any():
