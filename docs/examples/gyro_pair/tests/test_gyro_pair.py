@@ -112,7 +112,7 @@ def test_incremental_ends_where_batch_does() -> None:
 def test_the_smoother_forgets_though_all_variables_stay() -> None:
     """What it knows becomes one Gaussian: an update costs the same however long the recording is."""
     slow = {"rate_hz": 50}
-    graph = problem(simulated(duration_s=56, gyro_a=slow, gyro_b=slow).data, Config())
+    graph = problem(simulated(duration_s=64, gyro_a=slow, gyro_b=slow).data, Config())
     run = Run(graph, window=1.0)
     for step in graph.steps(1):
         run.add_step(step)
