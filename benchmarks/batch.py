@@ -21,9 +21,10 @@ from pipelines.methods.los import graph as los
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from pipelines.settings import Config, Sensors
 from pipelines.simulation.motion import EulerMotion, Swing
-from pipelines.solvers.assembly import Assembly
-from pipelines.solvers.batch import CHUNK, optimize, solve_batch
+from pipelines.solvers.assembly import CHUNK, Assembly
+from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.gauss_newton import Solution
+from pipelines.solvers.weighing import optimize
 
 IDEAL = Config.model_validate({"sensors": "ideal"}).sensors
 MOUNT = int(gtsam.symbol("M", 0))

@@ -13,7 +13,7 @@ from factors.attitude import ahrs_factors
 from factors.gyro import GyroIncrementFactor
 from factors.preintegration import GyroPath
 from factors.vectorized import Ensemble
-from pipelines.solvers.batch import CHUNK
+from pipelines.solvers.assembly import CHUNK
 
 SAMPLES, WINDOWS = 300_000, 36_000
 BIAS, ERRORS = (int(gtsam.symbol(c, 0)) for c in "be")

@@ -27,7 +27,7 @@ from pipelines.graph.problem import Problem
 from pipelines.methods.los import graph as los
 from pipelines.methods.los.recording import LosData
 from pipelines.methods.los.simulation import LosNoise, LosScenario, los_config, simulate_los
-from pipelines.solvers.batch import CHUNK
+from pipelines.solvers.assembly import CHUNK
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from factors.los import LosRateFactor, rate_matrix
 from factors.model import Array, Model, Residuals
 from factors.triad import AccelFactor
 from pipelines.graph.problem import Factor
-from pipelines.solvers.batch import optimize
+from pipelines.solvers.weighing import optimize
 
 ROWS = 2_000_000
 SAME = 1e-9  # relative

@@ -10,9 +10,9 @@ import numpy as np
 
 from factors.vectorized import VectorizedFactor
 from pipelines.graph.problem import Factor, Parameter, Problem, Step
-from pipelines.solvers.assembly import Assembly
-from pipelines.solvers.batch import CHUNK, optimize
+from pipelines.solvers.assembly import CHUNK, Assembly
 from pipelines.solvers.marginals import joint_covariance, reported
+from pipelines.solvers.weighing import optimize
 
 # Indices of one recording's variables stay below this.
 _APART = 10_000_000

@@ -12,7 +12,7 @@ import pytest
 from benchmarks import __main__ as runner
 from benchmarks.batch import build
 from benchmarks.measure import Ratio, costs, growth, worse
-from pipelines.solvers.batch import CHUNK
+from pipelines.solvers.assembly import CHUNK
 
 SLOW = """
 from benchmarks.measure import Ratio, costs

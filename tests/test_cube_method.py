@@ -44,8 +44,8 @@ from pipelines.methods.static_intervals import find_static_intervals
 from pipelines.recording.reading import open_recording
 from pipelines.settings import Config
 from pipelines.simulation.temperature import Warming
-from pipelines.solvers.assembly import Assembly
-from pipelines.solvers.batch import CHUNK, solve_batch
+from pipelines.solvers.assembly import CHUNK, Assembly
+from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.incremental import solve_incremental
 
 # The default field prior leaves the magnetometer's scale at one per cent; here the field is known better, and is so.

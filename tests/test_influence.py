@@ -11,10 +11,10 @@ import pytest
 
 from pipelines.graph.problem import Array, Factor, Parameter, Problem, Quantity
 from pipelines.solvers.assembly import Assembly
-from pipelines.solvers.batch import optimize
 from pipelines.solvers.influence import Influence, influence, uncertainty_budget
 from pipelines.solvers.marginals import IndeterminateError, joint_covariance, ordering_of
 from pipelines.solvers.system import System
+from pipelines.solvers.weighing import optimize
 from tests.short_problems import head_problem, los_problem
 
 A, B, S = gtsam.symbol("a", 0), gtsam.symbol("b", 0), gtsam.symbol("s", 0)

@@ -13,8 +13,8 @@ from pipelines import methods
 from pipelines.graph.problem import Problem, Step
 from pipelines.methods.tumble.scenario import TumbledAccelerometer, TumbledMagnetometer, TumbleScenario
 from pipelines.session import Session
-from pipelines.solvers.assembly import Assembly
-from pipelines.solvers.batch import CHUNK, solve_batch
+from pipelines.solvers.assembly import CHUNK, Assembly
+from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.minima import CLOSE
 from pipelines.solvers.system import System
 

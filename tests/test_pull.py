@@ -11,14 +11,15 @@ from benchmarks.young import drawn_los, made
 from pipelines.graph.problem import Array, Problem
 from pipelines.simulation.motion import EulerMotion
 from pipelines.solvers import batch
-from pipelines.solvers.assembly import Assembly
-from pipelines.solvers.batch import CHUNK, solve_batch, with_levels
+from pipelines.solvers.assembly import CHUNK, Assembly
+from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.gauss_newton import Solution
 from pipelines.solvers.incremental import solve_incremental
 from pipelines.solvers.marginals import joint_covariance, joint_information
 from pipelines.solvers.noise_levels import weigh
 from pipelines.solvers.pull import without_pull
 from pipelines.solvers.spurious import information_of_noise
+from pipelines.solvers.weighing import optimize, with_levels
 
 MOUNTS, PRIOR = slice(0, 4), 0.1
 
@@ -37,7 +38,7 @@ def minimum(problem: Problem) -> tuple[Solution, Solution]:
     """
     whole = Assembly.of(problem.steps(CHUNK))
     factors = weigh(whole.factors, problem.noises)
-    solution = batch.optimize(factors, whole.initial, whole.shared(problem), problem.loss)
+    solution = optimize(factors, whole.initial, whole.shared(problem), problem.loss)
     solution, _, about, _ = with_levels(problem, whole.factors, solution, problem.noises)
     known = problem, about.graph, about.system.ordering, about.values, whole.current_keys
     noise = information_of_noise(problem, about, joint_covariance(*known), whole.current_keys)

@@ -16,13 +16,14 @@ from pipelines.graph.problem import Array, Estimate, Factor, Parameter, Problem,
 from pipelines.judgement.observability import assess
 from pipelines.methods.los import graph as los
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.solvers import batch, gauss_newton
-from pipelines.solvers.assembly import Assembly
-from pipelines.solvers.batch import CHUNK, solve_batch
+from pipelines.solvers import gauss_newton
+from pipelines.solvers.assembly import CHUNK, Assembly
+from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.gauss_newton import minimize
 from pipelines.solvers.incremental import solve_incremental
 from pipelines.solvers.marginals import IndeterminateError, joint_information, reported_covariance
 from pipelines.solvers.system import System
+from pipelines.solvers.weighing import optimize
 from pipelines.solvers.window import Keyframes
 from tests import chain
 from tests.chain import INTERVAL, PARAMETER, PRIOR, Walk
@@ -257,7 +258,7 @@ def test_a_roll_that_pictures_do_not_tell_does_not_swing(seed: int) -> None:
     problem = los.problem(simulate_los(scenario, seed)[0], load_config(los_config(scenario).encode()))
     whole = Assembly.of(problem.steps(CHUNK))
     shared = whole.shared(problem)
-    found = batch.optimize(whole.factors, whole.initial, shared, problem.loss)
+    found = optimize(whole.factors, whole.initial, shared, problem.loss)
     # Seven and nine; ten without.
     assert found.iterations < 10
     system = found.system.without_rejected(found.values)

@@ -15,8 +15,8 @@ from rich.console import Console
 from pipelines import progress
 from pipelines.graph.problem import Estimate, Problem
 from pipelines.solvers import system
-from pipelines.solvers.assembly import Assembly
-from pipelines.solvers.batch import CHUNK, solve_batch
+from pipelines.solvers.assembly import CHUNK, Assembly
+from pipelines.solvers.batch import solve_batch
 from tests.short_problems import head_problem, los_problem
 
 

@@ -14,10 +14,11 @@ from pipelines.graph.problem import Array, Estimate, Problem
 from pipelines.methods.head.simulation import HeadScenario
 from pipelines.settings import Sensors
 from pipelines.simulation.motion import EulerMotion
-from pipelines.solvers.assembly import Assembly
-from pipelines.solvers.batch import CHUNK, optimize, solve_batch
+from pipelines.solvers.assembly import CHUNK, Assembly
+from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.incremental import Run, solve_incremental
 from pipelines.solvers.noise_levels import weigh
+from pipelines.solvers.weighing import optimize
 
 MOUNT = slice(3, 6)
 PRIOR = 0.35

@@ -90,9 +90,9 @@ def held_out(problem: Problem) -> dict[str, float]:
 
     One chunk in five is held out. 1 is as good as the noise; a little more is the uncertainty of the prediction.
     """
-    from pipelines.solvers.assembly import Assembly
-    from pipelines.solvers.batch import CHUNK, optimize
+    from pipelines.solvers.assembly import CHUNK, Assembly
     from pipelines.solvers.system import residuals_of
+    from pipelines.solvers.weighing import optimize
 
     steps = list(problem.steps(CHUNK))
     whole = Assembly.of(steps)

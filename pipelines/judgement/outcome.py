@@ -96,9 +96,9 @@ def quick_score(method: Method, data: Any, config: Config) -> float:
 
 
 def _score(problem: Problem) -> float:
-    from pipelines.solvers.assembly import Assembly
-    from pipelines.solvers.batch import CHUNK, optimize
+    from pipelines.solvers.assembly import CHUNK, Assembly
     from pipelines.solvers.system import residuals_of
+    from pipelines.solvers.weighing import optimize
 
     whole = Assembly.of(problem.steps(CHUNK))
     factors = whole.factors

@@ -10,6 +10,9 @@ import gtsam
 
 from pipelines.graph.problem import Factor, Problem, Step
 
+# Frames in one vectorised factor: past this the Jacobians' zeros cost more than the Python calls they save.
+CHUNK = 20
+
 
 class StepBoundary(NamedTuple):
     """The end of a step: its time, the number of factors until then, and the variables that hold the parameters."""

@@ -19,11 +19,11 @@ import gtsam
 import numpy as np
 
 from pipelines.graph.problem import Array, Attitudes, ChiSquare, Course, Estimate, Factor, History, Problem, Step
-from pipelines.solvers.assembly import Assembly
-from pipelines.solvers.batch import CHUNK, optimize, with_levels
+from pipelines.solvers.assembly import CHUNK, Assembly
 from pipelines.solvers.coloured import growth, inflated_by_innovations
 from pipelines.solvers.course import Way
 from pipelines.solvers.curvature import second_order
+from pipelines.solvers.gauss_newton import Solution
 from pipelines.solvers.history import sequential_history
 from pipelines.solvers.innovations import Innovations, Prediction
 from pipelines.solvers.linearity import is_linear
@@ -41,6 +41,7 @@ from pipelines.solvers.smoother import FixedLag, Smoother, Unlimited, linearized
 from pipelines.solvers.spurious import Spurious, information_of_noise
 from pipelines.solvers.state import State, explained, require_known, require_sound
 from pipelines.solvers.system import Linear
+from pipelines.solvers.weighing import optimize, with_levels
 from pipelines.solvers.window import Keyframes, Window
 
 DEFAULT_WINDOW = 1.0
@@ -345,16 +346,44 @@ class Run:
 
     def _reinitialize(self) -> None:
         """Solve everything since the base in batch and start the smoother from it, without the outliers."""
-        from_start = self.base is None
+        from_start, whole = self.base is None, self._whole()
+        solution, about, noise = self._solution(whole)
+        self._trouble = "" if solution.converged else f"the first {self.time:.1f} s: {solution.message}"
+        values, system = solution.values, solution.system
+        if from_start:
+            with system.at(values):
+                self.innovations.revise(system.factors, values)
+        last = self.past[-1].keyframes if self.past else range(0)
+        since = self.time - self.past[0].time if from_start and self.past else 0.0
+        self._begin(solution, about, noise, whole.timestamps, since)
+        if from_start:
+            self.moments += 1
+            self._course = cache(
+                lambda: sequential_history(
+                    self.problem, system.linearize(values), system.ordering, values, system.boundaries
+                )
+            )
+            if not self._young:
+                self.way, self._course = Way.of(self._course()), _no_course
+            self.attitudes.clear()
+        self._record(whole.keyframes if from_start else last, values)
+        self._solved = _Solved(since, len(self.past), self.values(), np.sqrt(np.diag(self.covariance())))
+        self.innovations.begin_count()
+
+    def _whole(self) -> Assembly:
+        """The steps since the base as one graph, and what was known there."""
         whole = Assembly.of(self._since_base())
         whole.timestamps = self._aged(whole.timestamps)
         if self.base is not None:
             whole.factors.append(self.base.factor)
             whole.initial.insert(self.base.estimate)
             whole.timestamps = {**self.base.stamps, **whole.timestamps}
-        weighed = weigh(whole.factors, self.levels)
+        return whole
+
+    def _solution(self, whole: Assembly) -> tuple[Solution, Linear, Spurious | None]:
+        """The likeliest values and noise levels, linearised there, and what of the information is noise."""
         solution = optimize(
-            weighed,
+            weigh(whole.factors, self.levels),
             whole.initial,
             self.keys,
             self.problem.loss,
@@ -374,17 +403,16 @@ class Run:
             if unpulled is not solution:
                 solution, about = unpulled, unpulled.system.linearized(unpulled.values)
                 noise = self._spurious(about)
-        self._trouble = "" if solution.converged else f"the first {self.time:.1f} s: {solution.message}"
-        values = solution.values
-        if from_start:
-            with solution.system.at(values):
-                self.innovations.revise(solution.system.factors, values)
-        last = self.past[-1].keyframes if self.past else range(0)
-        since = 0.0 if self.base is not None or not self.past else self.time - self.past[0].time
+        return solution, about, noise
+
+    def _begin(
+        self, solution: Solution, about: Linear, noise: Spurious | None, stamps: Mapping[int, float], since: float
+    ) -> None:
+        """Start the smoother from a solution `since` s after the first step, and fold the past if it may be."""
         grown = self._young and since >= max(_YOUNG, self._looked) and len(self.past) >= _FEW_STEPS
         if grown and (self.window is None or since >= _OLDEST):
             self._young = False
-        self._restart(about, whole.timestamps)
+        self._restart(about, stamps)
         self._correct(about, noise)
         if grown and self._young:
             self._looked = _GROWTH * since
@@ -392,21 +420,7 @@ class Run:
             corrected = self._noise is not None or self._bent is not None
             if not corrected and is_linear(self.problem, solution, self.keys):
                 self._young = False
-                self._restart(about, whole.timestamps)
-        system = solution.system
-        if from_start:
-            self.moments += 1
-            self._course = cache(
-                lambda: sequential_history(
-                    self.problem, system.linearize(values), system.ordering, values, system.boundaries
-                )
-            )
-            if not self._young:
-                self.way, self._course = Way.of(self._course()), _no_course
-            self.attitudes.clear()
-        self._record(whole.keyframes if from_start else last, values)
-        self._solved = _Solved(since, len(self.past), self.values(), np.sqrt(np.diag(self.covariance())))
-        self.innovations.begin_count()
+                self._restart(about, stamps)
 
     def _correct(self, about: Linear, noise: Spurious | None) -> None:
         """Find what of a young run's covariance its linear system has wrong; of another nothing is known."""

@@ -19,10 +19,10 @@ import numpy as np
 from pipelines.belief import Belief
 from pipelines.graph.noise import Level
 from pipelines.graph.problem import Array, Problem, Told
-from pipelines.solvers.assembly import Assembly
-from pipelines.solvers.batch import CHUNK, optimize
+from pipelines.solvers.assembly import CHUNK, Assembly
 from pipelines.solvers.noise_levels import weigh
 from pipelines.solvers.told import fewest, told
+from pipelines.solvers.weighing import optimize
 
 # Two dates are never nearer than this, days.
 _LEAST_DAYS = 1e-6
