@@ -137,19 +137,10 @@ def _prepare(
     """
     begun = float(data.vision_t[0])
     taken = data.vision_t + (Clock(begun) if clock is None else clock).late(data.vision_t - begun)
-    inside = (taken >= data.head_t[0]) & (taken <= data.head_t[-1])
-    if data.platform_t is not None:
-        inside &= (taken >= data.platform_t[0]) & (taken <= data.platform_t[-1])
-    if inside.sum() < _FEWEST_FRAMES:
-        raise InputError(
-            f"vision: only {int(inside.sum())} of {len(inside)} frames lie within the gyros' record; "
-            f"at least {_FEWEST_FRAMES} are needed: check the topics and their clocks"
-        )
+    inside = _inside(data, taken)
     stamps, taken, measured = data.vision_t[inside], taken[inside], data.vision_wxyz[inside]
     noises = _noises(data, config) if before is None else before.noises
-    density = noises["gyro_density"].used
-    platform_density = 0.0
-    platform = None
+    density, platform, platform_density = noises["gyro_density"].used, None, 0.0
     if data.platform_t is not None and data.platform_gyro is not None:
         platform = GyroPath(data.platform_t, data.platform_gyro)
         platform_density = noises["platform_gyro_density"].used
@@ -159,7 +150,6 @@ def _prepare(
     caused = [each for each, driver in drivers.items() if driver is not None]
     parameters = HeadParameters.of(config, platform is not None, caused, data.stamp_sigma)
     sqrt_information = _sqrt_information(data.vision_cov, inside, config)
-
     sigma = float(1.0 / np.median(np.linalg.norm(sqrt_information, axis=(1, 2)) / np.sqrt(3.0)))
     if before is None:
         gyro = GyroPath(data.head_t, data.head_gyro)
@@ -211,6 +201,19 @@ def _prepare(
         reference=reference,
         noises=noises,
     )
+
+
+def _inside(data: HeadData, taken: Array) -> NDArray[np.bool_]:
+    """Which frames were taken within the gyros' records. Raises InputError if these are too few."""
+    inside = (taken >= data.head_t[0]) & (taken <= data.head_t[-1])
+    if data.platform_t is not None:
+        inside &= (taken >= data.platform_t[0]) & (taken <= data.platform_t[-1])
+    if inside.sum() < _FEWEST_FRAMES:
+        raise InputError(
+            f"vision: only {int(inside.sum())} of {len(inside)} frames lie within the gyros' record; "
+            f"at least {_FEWEST_FRAMES} are needed: check the topics and their clocks"
+        )
+    return np.asarray(inside)
 
 
 def _sqrt_information(covariance: Array | None, inside: NDArray[np.bool_], config: Config) -> Array:

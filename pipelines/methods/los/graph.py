@@ -139,33 +139,24 @@ def _prepare(
     driving = acting(parameters.gyro, drivers)
     noises = _noises(data, config) if before is None else before.noises
     gimbal, gyro = GimbalPath(data.gimbal_t, data.gimbal), GyroPath(data.gyro_t, data.gyro)
-    covariance = _covariance(data, gimbal, config)
-    margin = SMOOTHING if parameters.sight else 0.0
-    rows, starts, dropped = select_pictures(data, np.sqrt(covariance[:, 0, 0]), margin)
-    late = data.image_t[rows] >= start
-    rows, starts = rows[late], starts[late]
-    starts[:1] = True
-    time, measured = data.image_t[rows], data.error[rows]
-    angles = gimbal.at(time)
-    chains = np.split(np.arange(len(time)), np.flatnonzero(starts)[1:])
-    sigma = float(np.sqrt(np.median(covariance[rows, 0, 0])))
+    used, dropped = _Used.of(data, config, gimbal, SMOOTHING if parameters.sight else 0.0, start)
+    chains, time, measured = used.chains, used.time, used.measured
     if before is None:
         known = parameters.angles, parameters.bias
-        mount, bias_hat = guess(chains, time, angles, measured, gyro, known, sigma)
+        mount, bias_hat = guess(chains, time, used.angles, measured, gyro, known, used.sigma)
         if parameters.sight is not None and clock is None:
             begun, by = float(data.image_t[0]), (*known, parameters.sight)
             at = mount, bias_hat
-            guessed = guess_picture_clock(chains, time, begun, gimbal, measured, gyro, by, at, sigma)
+            guessed = guess_picture_clock(chains, time, begun, gimbal, measured, gyro, by, at, used.sigma)
             moved = guessed.late(data.image_t - begun)
             if np.abs(moved).max() > _NEAR:
                 return _prepare(replace(data, image_t=data.image_t + moved), config, clock=guessed)
     else:
         mount, bias_hat = before.mount, before.chain.gyro.bias_hat
-    cRm = camera(angles, mount, parameters.names)
     chain = GyroChain.over(
         time,
-        starts,
-        initial_attitudes(chains, time, cRm, measured, gyro),
+        used.starts,
+        initial_attitudes(chains, time, camera(used.angles, mount, parameters.names), measured, gyro),
         GyroPath(data.gyro_t, data.gyro, bias_hat, driving),
         density=noises["gyro_density"].used,
         walk=noises["gyro_bias_walk"].used,
@@ -175,23 +166,16 @@ def _prepare(
     around, clock = None, clock or Clock(float(data.image_t[0]))
     if parameters.sight is not None:
         motion = LocalMotion.around(time, data.gyro_t, data.gyro, gimbal, driving)
-        found = time[starts]
-        if before is not None and before.around is not None and start > -np.inf:
-            # The data are the recording's end, and its first target may have been found before.
-            k = int(np.searchsorted(before.chain.time, start))
-            clock = Clock(start - before.around.elapsed[k])
-            found[0] = start - before.around.watched[k]
-        watched = time - found[np.cumsum(starts) - 1]
-        smooth = camera(motion.gimbal, mount, parameters.names)
-        errors = foreseen(chains, time, smooth, measured, chain.gyro)
+        errors = foreseen(chains, time, camera(motion.gimbal, mount, parameters.names), measured, chain.gyro)
+        clock, watched = _watched(used, clock, before, start)
         elapsed = clock.elapsed(time)
         around = Surroundings(motion, elapsed, watched, errors, clock.late(elapsed))
     model = _Model(
         chain=chain,
         mount=mount,
         measured=measured,
-        sqrt_information=_sqrt_information(covariance[rows]),
-        angles=angles,
+        sqrt_information=_sqrt_information(used.covariance),
+        angles=used.angles,
         around=around,
         loss=TruncatedLoss(gate(3 if np.isfinite(measured[:, 2]).any() else 2)),
         parameters=parameters,
@@ -200,6 +184,55 @@ def _prepare(
         clock=clock,
     )
     return model, {**data.dropped, **dropped}
+
+
+@dataclass(frozen=True, eq=False)
+class _Used:
+    """The pictures that are used.
+
+    Attributes:
+        time: (K,) stamps, s.
+        starts: (K,) which are the first of a target.
+        chains: the pictures of each target.
+        measured: (K, 3) phx, phz, roll, rad.
+        covariance: (K, 3, 3) of these; NaN where not measured.
+        angles: (K, 2) azimuth and elevation, rad.
+        sigma: of a LOS error, as is usual, rad.
+    """
+
+    time: Array
+    starts: NDArray[np.bool_]
+    chains: list[NDArray[np.intp]]
+    measured: Array
+    covariance: Array
+    angles: Array
+    sigma: float
+
+    @classmethod
+    def of(
+        cls, data: LosData, config: Config, gimbal: GimbalPath, margin: float, start: float
+    ) -> tuple[_Used, dict[str, int]]:
+        """Those from `start` on, `margin` s away from gaps, and how many are left out for which reason."""
+        covariance = _covariance(data, gimbal, config)
+        rows, starts, dropped = select_pictures(data, np.sqrt(covariance[:, 0, 0]), margin)
+        late = data.image_t[rows] >= start
+        rows, starts = rows[late], starts[late]
+        starts[:1] = True
+        time = data.image_t[rows]
+        chains = np.split(np.arange(len(time)), np.flatnonzero(starts)[1:])
+        sigma = float(np.sqrt(np.median(covariance[rows, 0, 0])))
+        return cls(time, starts, chains, data.error[rows], covariance[rows], gimbal.at(time), sigma), dropped
+
+
+def _watched(used: _Used, clock: Clock, before: _Model | None, start: float) -> tuple[Clock, Array]:
+    """The clock by which stamps count, and how long each picture's target has been watched, (K,), s."""
+    found = used.time[used.starts]
+    if before is not None and before.around is not None and start > -np.inf:
+        # The data are the recording's end, and its first target may have been found before.
+        k = int(np.searchsorted(before.chain.time, start))
+        clock = Clock(start - before.around.elapsed[k])
+        found[0] = start - before.around.watched[k]
+    return clock, used.time - found[np.cumsum(used.starts) - 1]
 
 
 def _covariance(data: LosData, gimbal: GimbalPath, config: Config) -> Array:
