@@ -21,13 +21,12 @@ from pipelines import methods, progress
 from pipelines.config import load_config, recorded_config
 from pipelines.discovery import idle, nearest_suggestion, suggestions, with_suggested
 from pipelines.errors import InputError
-from pipelines.graph.problem import Estimate, Problem, Quantity, Step, Told
+from pipelines.graph.problem import Estimate, Problem, Step, Told
 from pipelines.judgement import noise_levels
-from pipelines.judgement.assumptions import Strained, strained
 from pipelines.judgement.causes import find_causes
+from pipelines.judgement.explanation import Causes, explained, told_steps
 from pipelines.judgement.halves import Halves, held_out, span, split_at, split_halves
-from pipelines.judgement.observability import Cause, assess
-from pipelines.judgement.rejection import rejection_sentence, too_many_rejected
+from pipelines.judgement.observability import assess
 from pipelines.judgement.second import other_solution
 from pipelines.judgement.self_check import SelfCheck
 from pipelines.judgement.stability import Moved, Stability, stability
@@ -38,15 +37,11 @@ from pipelines.recording.opening import Where
 from pipelines.recording.reading import Recording, open_recording
 from pipelines.reports.known import load_known
 from pipelines.reports.result import Calibration
-from pipelines.reports.units import human_unit, to_digits_of
 from pipelines.settings import TRUTH, Config
 from pipelines.sharing import device_belief, walks
 from pipelines.simulation.simulated import Simulated
 
 SOLVERS = ("batch", "incremental", "published")
-
-# Steps between the two sides of a change that are told.
-_MOST_NAMED = 3
 
 
 class Origin(Protocol):
@@ -271,8 +266,7 @@ class Session:
         """
         # The facts before anything is solved, so that the stamps need not be kept meanwhile.
         sha256, truth, facts = self.origin.sha256(), self.origin.truth(), self.facts
-        found = []
-        causes: tuple[Cause, ...] | None = None
+        found, causes = [], Causes(partial(find_causes, self.method, self.data, self.config))
         for estimate, problem in solved:
             quantities = tuple(q for q in problem.quantities if q.name in estimate.names)
             # The published solvers stand beside as they are.
@@ -286,25 +280,10 @@ class Session:
                 problem.advice,
                 decides=not noise_levels.asked(estimate.levels),
             )
-            counts = {family: len(r.time) for family, r in estimate.residuals.items()}
-            wrong_noise = noise_levels.misfit(estimate.levels, assessment.consistency, estimate.colours, counts)
-            misfit = assessment.status == "inconsistent" or bool(wrong_noise) or too_many_rejected(estimate.residuals)
-            doubtful = misfit or noise_levels.suspicious(estimate.levels, estimate.colours, counts)
-            if ours and causes is None and (doubtful or not estimate.converged):
-                with progress.doing("looking for causes"):
-                    causes = find_causes(self.method, self.data, self.config, estimate)
-            if ours and not estimate.converged:
-                assessment = assessment.unsolved(estimate.message).explained(causes or ())
-            elif ours and (misfit or (doubtful and causes)):
-                reasons = filter(None, [wrong_noise, rejection_sentence(estimate.residuals)])
-                assessment = assessment.misfit(" ".join(reasons))
-                assumed = _not_as_assumed(strained(estimate, quantities))
-                assessment = assessment.explained(_first(causes or (), assumed))
-            elif ours:
-                assessment = assessment.remarked(rejection_sentence(estimate.residuals))
-                assessment = assessment.explained(_not_as_assumed(strained(estimate, quantities)))
+            if ours:
+                assessment = explained(assessment, estimate, quantities, causes)
             if moved is not None and change is not None:
-                sentence = f"{change.sentence}{_told(moved, quantities)}"
+                sentence = f"{change.sentence}{told_steps(moved, quantities)}"
                 small = moved.small(quantities)
                 assessment = assessment.remarked(sentence) if small else assessment.misfit(sentence)
             checked = None
@@ -491,40 +470,6 @@ def _check_sheets(method: Method, config: Config) -> None:
         used = [f"sensors.{name}.{each}" for each in figures] or [f"sensors.{each}" for each in method.sheets]
         useful = ", ".join(used) or "no data sheet"
         raise InputError(f"{where}: method {method.name} has no use for it; it uses {useful}")
-
-
-def _first(tried: Sequence[Cause], assumed: Sequence[Cause]) -> list[Cause]:
-    """A fault that explains everything goes before an assumption that it strains, noise that does so after it."""
-    faults = [cause for cause in tried if not cause.label.startswith("the noise ")]
-    return [*faults, *assumed, *(cause for cause in tried if cause not in faults)]
-
-
-def _not_as_assumed(found: Sequence[Strained]) -> list[Cause]:
-    """Assumptions that do not hold, as causes, in the units people read."""
-    causes = []
-    for each in found[:_MOST_NAMED]:
-        q, (unit, factor) = each.quantity, human_unit(each.quantity)
-        like = f" (or {', '.join(each.others)}, which it cannot be told from)" if each.others else ""
-        sigma, prior = factor * each.sigma, factor * (q.prior_sigma or 0.0)
-        value, mean = factor * each.value, factor * q.prior_mean
-        found_ = f"{to_digits_of(value, sigma) if mean else f'{value:.3g}'} ± {sigma:.1g} {unit}".strip()
-        assumed = f"{to_digits_of(mean, prior) if mean else '0'} ± {prior:.2g} {unit}".strip()
-        evidence = f"estimated as {found_} where {assumed} was assumed, a pull of {abs(each.pull):.1f}"
-        causes.append(Cause(f"{each.quantity.name} is not what was assumed{like}", evidence))
-    return causes
-
-
-def _told(moved: Moved, quantities: Sequence[Quantity]) -> str:
-    """The largest steps in the units people read, and what a small one does; empty where the sides say nothing."""
-    if not moved.steps:
-        return ""
-    units = {q.name: human_unit(q) for q in quantities}
-    steps = [
-        f"{name} by {units[name][1] * step:.2g} ± {units[name][1] * sigma:.1g} {units[name][0]}"
-        for name, (step, sigma) in list(moved.steps.items())[:_MOST_NAMED]
-    ]
-    small = " That is little beside what is required, and in the sigmas." if moved.small(quantities) else ""
-    return f" From before to after: {', '.join(steps)}.{small}"
 
 
 def _shown(problem: Problem, duration: float, chunk: int) -> Iterator[Step]:
