@@ -74,7 +74,8 @@ def test_it_is_a_minimum_that_says_nothing_more() -> None:
     assert held is not solution
     linear = held.system.linearized(held.values)
     step = linear.step()[0]
-    assert max(np.abs(step.at(p.key)).max() for p in problem.parameters) < 1e-3 * PRIOR
+    # As near as any minimum is found: at rest sigmas are the priors'.
+    assert max(np.abs(step.at(p.key)).max() for p in problem.parameters) < 0.005 * PRIOR
     keys = [p.key for p in problem.parameters]
     without = solution.system.linearized(held.values)
     own, added = (joint_information(each.graph, each.system.ordering, keys) for each in (without, linear))
