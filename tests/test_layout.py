@@ -388,6 +388,19 @@ def test_jacobians_are_those_of_differences(refined: bool) -> None:
         )
 
 
+def test_a_corner_beside_the_camera_has_no_slope() -> None:
+    """How far its distortion throws it had no digits left for what is made of it: matrices of 1e37 were singular."""
+    body = TagBody(np.array([0]), np.array([0.1]), so3.identity(1), np.zeros((1, 3)))
+    sights = Sights(np.zeros(2, dtype=np.intp), np.zeros(2, dtype=np.intp), np.zeros((2, 4, 2)), np.full(2, SIGMA))
+    sights = replace(sights, picture=np.arange(2))
+    there = np.array([[0.05, 0.02, 1e-4], [0.05, 0.02, 0.5]])
+    found = linearized(Bundle.of((CAMERA,), np.zeros(2, dtype=np.intp), body, so3.identity(2), there), sights)
+    assert not found.by_picture[0].any()
+    assert not found.by_tag[0].any()
+    assert (found.miss[0] == 1e4).all()
+    assert np.abs(found.by_picture[1]).max() > 1e2
+
+
 def apart(a: Layout, b: Layout) -> np.ndarray:
     """(n, 6) difference of the tags of two layouts, in its sigmas."""
     ids = sorted(set(a.body.ids[1:].tolist()) & set(b.body.ids[1:].tolist()))

@@ -19,8 +19,9 @@ from pipelines.vision.pose import SQUARE, TagBody
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-# A corner behind the camera, sigmas: a residual that no step may leave there.
-_BEHIND = 1e4
+# A corner behind the camera, sigmas: a residual that no step may leave there. Beside the camera, farther than so many
+# px, how it moves has no digits left.
+_BEHIND, _FARTHEST = 1e4, 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +118,7 @@ def linearized(bundle: Bundle, sights: Sights) -> Rows:
     for k, camera in enumerate(bundle.cameras):
         mine = bundle.camera[sights.picture] == k
         seen[mine], by_point[mine] = camera.project(points[mine]), camera.by_point(points[mine])
-    good = np.asarray(np.isfinite(seen).all(axis=2) & np.isfinite(by_point).all(axis=(2, 3)))
+    good = np.asarray((np.abs(seen) < _FARTHEST).all(axis=2) & np.isfinite(by_point).all(axis=(2, 3)))
     weight = 1.0 / sights.sigma[:, None, None]
     miss = np.where(good[..., None], weight * (seen - sights.corners), _BEHIND)
     by_point = np.where(good[..., None, None], weight[..., None] * by_point, 0.0)
