@@ -88,9 +88,10 @@ def test_what_is_weak_gets_advice_and_a_motion_that_mends_it(tmp_path: Path) -> 
     )
     plan = make_plan("los", weak, require={"delta_px": 5e-4}, most_steps=2)
     told = json.loads(plan_json(plan))
-    assert (told["schema"], told["status"], len(told["changes"])) == ("alidade.plan/1", "weak", len(plan.steps))
+    status = plan.now.assessment.status
+    assert (told["schema"], told["status"], len(told["changes"])) == ("alidade.plan/1", status, len(plan.steps))
     assert told["missing"].keys() == plan.now.missing.keys()
-    assert plan.now.assessment.status in ("weak", "unobservable")
+    assert status in ("weak", "unobservable")
     assert any("azimuth" in direction.advice for direction in plan.now.assessment.directions)
     assert plan.steps
     page = plan_html(plan)
