@@ -62,6 +62,8 @@ BIAS, SEEN = 0.02, 5.0
 _LATER = np.array([0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.55, 0.75, 0.97])
 _BEFORE, _AFTER = np.array([0.15, 0.5, 0.95]), np.array([0.07, 0.1, 0.15, 0.25, 0.4, 0.6, 0.97])
 LEVEL = 0.99
+# What is added to the name of a case.
+AS_DRAWN = ", priors as drawn"
 
 Case = Callable[[int], tuple[Any, Array]]
 
@@ -154,6 +156,31 @@ def _free(names: Sequence[str]) -> dict[str, None]:
     return dict.fromkeys(names)
 
 
+def _each(sensor: str, gain: float, bias: float, entries: Sequence[str]) -> dict[str, float]:
+    """Priors of a triad's K and b."""
+    return {**dict.fromkeys((f"{sensor}_k{ij}" for ij in entries), gain), **{f"{sensor}_b{i}": bias for i in "123"}}
+
+
+ENTRIES = [f"{i}{j}" for i in "123" for j in "123"]
+BIASES = [f"gyro_bias_{axis}" for axis in "xyz"]
+# Method -> the priors that the truths of a scenario are drawn from, where it draws from narrower ones than a config has
+# that does not name them.
+DRAWN: dict[str, Callable[[Any], dict[str, float]]] = {
+    "head": lambda _: {},
+    "los": lambda settings: dict.fromkeys(BIASES, settings.gyro_turn_on_bias),
+    "indexer": lambda settings: dict.fromkeys(BIASES, float(np.deg2rad(settings.gyro_bias_deg_h / 3600.0))),
+    "cube": lambda settings: {
+        **_each("accel", settings.errors.gain, settings.errors.accel_bias, ENTRIES),
+        **_each("gyro", settings.errors.gain, settings.errors.gyro_bias, ENTRIES),
+        **_each("mag", settings.errors.gain, settings.errors.mag_bias, ENTRIES),
+    },
+    "tumble": lambda settings: _each(
+        "mag",
+        settings.magnetometer.soft_iron,
+        settings.magnetometer.hard_iron,
+        [entry for entry in ENTRIES if entry[0] <= entry[1]],
+    ),
+}
 HELMET = [f"helmet_mount_{axis}" for axis in "xyz"]
 THETA = [f"theta_{axis}" for axis in "xyz"]
 ONE, ALL = {"yaw": 0.0}, dict.fromkeys(_AXES, 0.0)
@@ -268,11 +295,14 @@ def _nearest(problem: Problem, truth: Array, values: Array) -> Array:
     return found
 
 
-def run(method: str, case: str, seed: int) -> Found:
-    """Simulate and follow one recording."""
+def run(method: str, case: str, seed: int, drawn: bool = False) -> Found:
+    """Simulate and follow one recording; `drawn`: with priors that its truths are drawn from."""
     # No two cases of a method draw the same.
     number = 1000 * list(CASES[method]).index(case) + seed
     settings, moments = CASES[method][case](number)
+    if drawn:
+        settings = settings.model_copy(update={"priors": {**DRAWN[method](settings), **settings.priors}})
+        case += AS_DRAWN
     problem, truth = made(method, settings, number)
     if moments[-1] <= 1.0:
         moments = moments * [step.time for step in problem.steps(1)][-1]
@@ -314,6 +344,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("method", choices=CASES)
     parser.add_argument("--only", nargs="+", metavar="CASE", help="default: all")
     parser.add_argument("--seeds", type=int, default=50)
+    parser.add_argument("--drawn", action="store_true", help="tell the priors that the truths are drawn from")
     parser.add_argument("--out", type=Path, metavar="FILE", help="where to write what came out, a line each (JSON)")
     options = parser.parse_args(arguments)
     found: list[Found] = []
@@ -322,9 +353,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     done = {(f.method, f.case, f.seed) for f in found}
     for seed in range(options.seeds):
         for case in options.only or CASES[options.method]:
-            if (options.method, case, seed) in done:
+            if (options.method, case + AS_DRAWN * options.drawn, seed) in done:
                 continue
-            found.append(run(options.method, case, seed))
+            found.append(run(options.method, case, seed, options.drawn))
             if options.out is not None:
                 with options.out.open("a") as lines:
                     lines.write(json.dumps(asdict(found[-1])) + "\n")
