@@ -27,6 +27,7 @@ from pipelines.methods.cube.scenario import CubeScenario
 from pipelines.methods.head.simulation import HeadScenario
 from pipelines.methods.indexer.simulation import IndexerScenario, Position
 from pipelines.methods.los.simulation import LosAngles, LosScenario
+from pipelines.methods.triads import triad_names
 from pipelines.methods.tumble.scenario import TumbleScenario
 from pipelines.session import Session
 from pipelines.settings import Sensors
@@ -156,12 +157,12 @@ def _free(names: Sequence[str]) -> dict[str, None]:
     return dict.fromkeys(names)
 
 
-def _each(sensor: str, gain: float, bias: float, entries: Sequence[str]) -> dict[str, float]:
+def _triad(sensor: str, gain: float, bias: float, symmetric: bool = False) -> dict[str, float]:
     """Priors of a triad's K and b."""
-    return {**dict.fromkeys((f"{sensor}_k{ij}" for ij in entries), gain), **{f"{sensor}_b{i}": bias for i in "123"}}
+    *gains, b1, b2, b3 = triad_names(sensor, symmetric)
+    return {**dict.fromkeys(gains, gain), **dict.fromkeys((b1, b2, b3), bias)}
 
 
-ENTRIES = [f"{i}{j}" for i in "123" for j in "123"]
 BIASES = [f"gyro_bias_{axis}" for axis in "xyz"]
 # Method -> the priors that the truths of a scenario are drawn from, where it draws from narrower ones than a config has
 # that does not name them.
@@ -170,15 +171,12 @@ DRAWN: dict[str, Callable[[Any], dict[str, float]]] = {
     "los": lambda settings: dict.fromkeys(BIASES, settings.gyro_turn_on_bias),
     "indexer": lambda settings: dict.fromkeys(BIASES, float(np.deg2rad(settings.gyro_bias_deg_h / 3600.0))),
     "cube": lambda settings: {
-        **_each("accel", settings.errors.gain, settings.errors.accel_bias, ENTRIES),
-        **_each("gyro", settings.errors.gain, settings.errors.gyro_bias, ENTRIES),
-        **_each("mag", settings.errors.gain, settings.errors.mag_bias, ENTRIES),
+        **_triad("accel", settings.errors.gain, settings.errors.accel_bias),
+        **_triad("gyro", settings.errors.gain, settings.errors.gyro_bias),
+        **_triad("mag", settings.errors.gain, settings.errors.mag_bias),
     },
-    "tumble": lambda settings: _each(
-        "mag",
-        settings.magnetometer.soft_iron,
-        settings.magnetometer.hard_iron,
-        [entry for entry in ENTRIES if entry[0] <= entry[1]],
+    "tumble": lambda settings: _triad(
+        "mag", settings.magnetometer.soft_iron, settings.magnetometer.hard_iron, symmetric=True
     ),
 }
 HELMET = [f"helmet_mount_{axis}" for axis in "xyz"]

@@ -391,8 +391,7 @@ def test_jacobians_are_those_of_differences(refined: bool) -> None:
 def test_a_corner_beside_the_camera_has_no_slope() -> None:
     """How far its distortion throws it had no digits left for what is made of it: matrices of 1e37 were singular."""
     body = TagBody(np.array([0]), np.array([0.1]), so3.identity(1), np.zeros((1, 3)))
-    sights = Sights(np.zeros(2, dtype=np.intp), np.zeros(2, dtype=np.intp), np.zeros((2, 4, 2)), np.full(2, SIGMA))
-    sights = replace(sights, picture=np.arange(2))
+    sights = Sights(np.arange(2), np.zeros(2, dtype=np.intp), np.zeros((2, 4, 2)), np.full(2, SIGMA))
     there = np.array([[0.05, 0.02, 1e-4], [0.05, 0.02, 0.5]])
     found = linearized(Bundle.of((CAMERA,), np.zeros(2, dtype=np.intp), body, so3.identity(2), there), sights)
     assert not found.by_picture[0].any()

@@ -93,7 +93,7 @@ def second_order(
     mean = 0.5 * np.mean(slopes @ moved[:, :, None], axis=0)[:, 0]
     variance = 0.5 * np.mean(slopes @ slopes.transpose(0, 2, 1), axis=0) + np.outer(mean, mean)
     found = np.zeros_like(covariance)
-    found[np.ix_(floor.free, floor.free)] = floor.axes @ _bounded(variance, floor.vectors) @ floor.axes.T
+    found[np.ix_(floor.free, floor.free)] = floor.axes @ _bounded(variance) @ floor.axes.T
     return found
 
 
@@ -163,16 +163,13 @@ class _Floor:
         return np.array(slopes), np.array(moved)
 
 
-def _bounded(variance: Array, vectors: Array) -> Array:
-    """A variance (n, n) of the directions, no more any way than what the priors leave; vectors as `_Floor` has them.
+def _bounded(variance: Array) -> Array:
+    """A variance (n, n) in units of the priors', no more any way than what these leave.
 
     Beyond that slopes do not go on as they begin.
     """
-    squares, ways = np.linalg.eigh(vectors @ variance @ vectors.T)
-    if squares[-1] <= 1.0:
-        return variance
-    within = vectors.T @ ways
-    return np.asarray((within * np.minimum(squares, 1.0)) @ within.T)
+    squares, ways = np.linalg.eigh(variance)
+    return variance if squares[-1] <= 1.0 else np.asarray((ways * np.minimum(squares, 1.0)) @ ways.T)
 
 
 def _bending(slopes: Array, sigmas: Array) -> Array:
