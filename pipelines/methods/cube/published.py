@@ -24,6 +24,7 @@ from pipelines.graph.problem import Attitudes, Estimate, Problem, Residuals
 from pipelines.methods.cube.data import CubeData, local_field, recorded
 from pipelines.methods.cube.poses import StaticPoses, static_poses
 from pipelines.methods.cube.topics import CubeConfig
+from pipelines.methods.triads import triad_names
 from pipelines.settings import Config
 
 Array = NDArray[np.float64]
@@ -114,7 +115,8 @@ def published_estimate(data: CubeData, config: Config, problem: Problem) -> Esti
     k, nRb = attitudes(data, config, poses)
     nominal = nominal_vectors(data, config, nRb)
     raw = {"accel": poses.accel, "gyro": poses.gyro, "mag": poses.mag}
-    names, values, residuals = [], [], {}
+    names: list[str] = []
+    values, residuals = [], {}
     covariance = np.zeros((12 * len(nominal), 12 * len(nominal)))
     for i, (name, vectors) in enumerate(nominal.items()):
         means = raw[name]
@@ -122,7 +124,7 @@ def published_estimate(data: CubeData, config: Config, problem: Problem) -> Esti
         good = np.isfinite(means[k]).all(axis=1)
         recorded_means = recorded(means[k][good], getattr(config.section(CubeConfig).raw, name))
         found = regression(recorded_means, vectors[good])
-        names += [f"{name}_k{r}{c}" for r in "123" for c in "123"] + [f"{name}_b{r}" for r in "123"]
+        names += triad_names(name)
         values += [*found.K.ravel(), *found.b]
         covariance[12 * i : 12 * i + 12, 12 * i : 12 * i + 12] = found.covariance
         misses = vectors[good] - recorded_means @ found.K.T - found.b
