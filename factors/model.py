@@ -79,6 +79,11 @@ class Model:
         def __call__(self, *blocks: Any, **_: Any) -> Residuals:
             """Residuals and Jacobians."""
 
+    @property
+    def turning(self) -> tuple[int, int] | None:
+        """A number that turns the first two rows in their plane, from the first to the second: its block and place."""
+        return None
+
     def on(
         self,
         *keys: Keys,

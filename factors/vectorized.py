@@ -99,6 +99,7 @@ class VectorizedFactor:
         self._dim = unknowns + 1 if self.compress else len(self.model.time) * self.model.rows
         self._last: tuple[list[Any], _Evaluation] | None = None
         self._given: tuple[_Evaluation, TruncatedLoss | None] | None = None
+        self._mixed = False
 
     def _require_fit(self) -> None:
         """Raise ValueError unless model, blocks and keys belong together."""
@@ -141,8 +142,24 @@ class VectorizedFactor:
 
     def used(self, values: gtsam.Values) -> NDArray[np.bool_]:
         """Which of the n measurements the loss lets count; all of them without one."""
+        return self._weights(values) > 0.5
+
+    def _weights(self, values: gtsam.Values) -> Array:
+        """By which the loss lets the n measurements count."""
         square, loss = _squares(self.residuals(values)), self._loss_in_force
-        return np.ones(len(square), dtype=bool) if loss is None else loss.weight(square) > 0.5
+        return np.ones(len(square)) if loss is None else loss.weight(square)
+
+    def excess(self, values: gtsam.Values) -> tuple[int, int, float] | None:
+        """What `Ensemble.at` with `mixed` has too much: a variable, which of its numbers, and information about that.
+
+        None: nothing.
+        """
+        if self.model.turning is None or self.compress:
+            return None
+        block, number = self.model.turning
+        key, squares = self.columns[block], _squares(self.residuals(values)[:, :2])
+        assert isinstance(key, int), "a number that turns rows is shared"
+        return key, number, float(squares @ self._weights(values))
 
     def under(self, loss: TruncatedLoss | None) -> VectorizedFactor:
         """The same factor with another loss, if it has one at all."""
@@ -221,6 +238,8 @@ class VectorizedFactor:
             blocks = tuple(root[..., None] * b for b in blocks)
         if self.compress:
             return self._compressed(residuals, blocks, jacobians)
+        if self._mixed and self.model.turning is not None:
+            blocks = _turned(blocks, residuals, *self.model.turning)
         self._lay_out(blocks, jacobians)
         return residuals.ravel()
 
@@ -254,6 +273,14 @@ class VectorizedFactor:
             jacobians[slot] = np.vstack([R[:, start:stop], np.zeros((1, stop - start))])
             start = stop
         return np.append(d, rest)
+
+
+def _turned(blocks: Sequence[Array], residuals: Array, block: int, number: int) -> tuple[Array, ...]:
+    """Jacobians by blocks, that by a number which turns the first two rows with the residuals turned likewise."""
+    by = blocks[block].copy()
+    by[:, 0, number] += residuals[:, 1]
+    by[:, 1, number] -= residuals[:, 0]
+    return *blocks[:block], by, *blocks[block + 1 :]
 
 
 # Where a block (n, m, d) is added to the whole Jacobian: offset and strides, bytes, where its keys follow each other
@@ -309,12 +336,15 @@ class Ensemble:
         self._values: gtsam.Values | None = None
 
     @contextmanager
-    def at(self, values: gtsam.Values, loss: TruncatedLoss | None = None) -> Iterator[None]:
+    def at(self, values: gtsam.Values, loss: TruncatedLoss | None = None, mixed: bool = False) -> Iterator[None]:
         """Evaluated at the values, which nobody may change; within the block the factors answer for no others.
 
         Args:
             values: of all variables.
             loss: within the block it stands in place of the factors' own, where they have one; None weighs all in full.
+            mixed: where a number turns rows, its Jacobian's products with others have the second derivatives by both,
+                which are as large as the residuals; its product with itself then has an `excess`. The gradient is as it
+                is: what is added is at right angles to the residuals.
         """
         if values is not self._values:
             read = {block: _array(_read(values, list(keys), block), block) for block, keys in self._places.items()}
@@ -323,7 +353,7 @@ class Ensemble:
             self._values = values
         try:
             for group in self._groups:
-                group.give(loss)
+                group.give(loss, mixed)
             yield
         finally:
             for group in self._groups:
@@ -391,13 +421,14 @@ class _Group:
         whole = _Evaluation(*self._model(*blocks))
         self._parts = [whole.part(start, stop) for start, stop in self._spans]
 
-    def give(self, loss: TruncatedLoss | None) -> None:
+    def give(self, loss: TruncatedLoss | None, mixed: bool) -> None:
         for factor, part in zip(self._factors, self._parts, strict=True):
             factor._given = part.weighed(factor.weights), None if factor.loss is None else loss
+            factor._mixed = mixed
 
     def take(self) -> None:
         for factor in self._factors:
-            factor._given = None
+            factor._given, factor._mixed = None, False
 
 
 @dataclass(frozen=True)

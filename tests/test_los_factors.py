@@ -11,6 +11,7 @@ from factors.gimbal import GimbalPath, LocalMotion, command
 from factors.los import SIGHT_ERRORS, LosDirectionFactor, LosRateFactor, Surroundings, rate_matrix, roll_rate
 from factors.model import Array
 from factors.testing import assert_jacobians
+from factors.vectorized import Ensemble
 from tests.numerics import assert_rows_are_independent
 
 N = 12
@@ -264,3 +265,45 @@ def test_compressed_rate_factor_solves_least_squares() -> None:
     b = (model.measured / model.sigma[:, None]).ravel()
     np.testing.assert_allclose(solution.atVector(0), np.linalg.lstsq(A, b)[0], atol=1e-12)
     np.testing.assert_allclose(gtsam.Marginals(graph, solution).marginalCovariance(0), np.linalg.inv(A.T @ A))
+
+
+@pytest.mark.parametrize("sigmas", [(2e-5, 2e-5, 2e-4), (2e-5, 6e-5, 2e-4)])
+def test_mixed_second_derivatives_by_roll(sigmas: tuple[float, float, float]) -> None:
+    """What residuals add to the Hessian by roll and attitude: exact where noise is as large either way, else near it.
+
+    The gradient is what it is; the excess is what the Hessian by roll alone has too much, but for what noise averages.
+    """
+    tRm, angles = _blocks(ALL, 0.02, 0.01)
+    rng = np.random.default_rng(7)
+    level = LosDirectionFactor(TIMES, np.zeros((N, 3)), np.tile(np.eye(3), (N, 1, 1)), GIMBAL.at(TIMES), ALL)
+    noise = 30.0 * rng.normal(size=(N, 3)) * sigmas
+    root = np.tile(np.diag(1.0 / np.array(sigmas)), (N, 1, 1))
+    model = LosDirectionFactor(TIMES, level.predict(tRm, angles) + noise, root, GIMBAL.at(TIMES), ALL)
+    factor, shared, roll = model.on(list(range(N)), 100), 100, ALL.index("camera_roll")
+    values = gtsam.Values()
+    for k in range(N):
+        values.insert(k, so3.to_gtsam(tRm[k]))
+    values.insert(shared, angles[0])
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(factor.factor)
+    keys = [*range(N), shared]
+
+    def gradient(by: Array, mixed: bool = False) -> tuple[Array, Array]:
+        move = gtsam.VectorValues()
+        move.insert(shared, by)
+        with Ensemble([factor]).at(there := values.retract(move), mixed=mixed):
+            H, g = graph.linearize(there).hessian(gtsam.Ordering(keys))
+        return np.asarray(H), -np.asarray(g)
+
+    still, step = np.zeros(len(ALL)), 1e-6 * np.eye(len(ALL))[roll]
+    exact = (gradient(step)[1] - gradient(-step)[1]) / 2e-6
+    (H, g), (bent, same) = gradient(still), gradient(still, mixed=True)
+    np.testing.assert_allclose(same, g, atol=1e-12 * np.abs(g).max())
+    own = 3 * N + roll
+    states, left_out = slice(0, 3 * N), np.abs(exact - H[own])[: 3 * N].max()
+    near = 0.03 if sigmas[0] == sigmas[1] else 0.7
+    assert np.abs(exact - bent[own])[states].max() < near * left_out
+    excess = factor.excess(values)
+    assert excess is not None
+    assert excess[:2] == (shared, roll)
+    assert excess[2] == pytest.approx(np.square(noise[:, :2] / sigmas[:2]).sum(), rel=1e-6)

@@ -12,6 +12,11 @@ camera's roll: these swing, and the states after them, for steps on end; there s
 place. And where measurements do not fit, residuals bend the error as much as Jacobians do: steps are too short or too
 long by the same share again and again. What one gained instead of what it foresaw tells how far the parabola through
 both has its floor (Nocedal, Wright, "Numerical Optimization", 2006, sections 3.5 and 10.3).
+
+Where measurements do fit, their noise bends the error along a number that turns pictures, such as a camera's roll: by
+the mixed second derivatives states follow it, and of thousands of pictures together these are as large as all that is
+known of it. Steps have them (`Ensemble.at`), and are Newton's in that; what is said of a solution has not, since noise
+tells nothing of the number.
 """
 
 from __future__ import annotations
@@ -238,7 +243,7 @@ def _returned(system: System, values: gtsam.Values, known: bool) -> tuple[gtsam.
 def _linearized(system: System, values: gtsam.Values) -> Linear | None:
     """A system about some values; None: a stretch does not determine what it alone holds."""
     try:
-        return system.linearized(values)
+        return system.linearized(values, mixed=True)
     except IndeterminateError:
         return None
 

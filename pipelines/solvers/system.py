@@ -16,7 +16,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise, product
+from itertools import accumulate, pairwise, product
 from typing import TypeVar
 
 import gtsam
@@ -33,6 +33,11 @@ from pipelines.solvers.marginals import eliminated, marginal, ordering_of
 from pipelines.solvers.triangular import Triangular, conditionals_of, rows_of
 
 Shown = TypeVar("Shown")
+# Variable and which of its numbers -> information about it that a linear system has too much.
+Excess = dict[tuple[int, int], float]
+Elimination = Callable[
+    [gtsam.GaussianFactorGraph, gtsam.Ordering], tuple[gtsam.GaussianConditional, gtsam.GaussianFactor]
+]
 
 # What is held is held this tightly, in the units of each variable.
 _HELD = 1e-12
@@ -41,6 +46,8 @@ _HELD = 1e-12
 _UNDIVIDED, _STRETCH = 150_000, 3_000
 # Up to so many variables what back substitution needs of stretches is kept, 6 kB each; of more it is found anew.
 _KEPT = 400_000
+# Of the information that a system with mixed second derivatives has about a number no more than this share is too much.
+_EXCESS = 0.98
 
 
 def shown(stretches: Sequence[Shown]) -> Iterable[Shown]:
@@ -86,18 +93,24 @@ class Stretch:
         ensemble = None if self.ensemble is None else Ensemble(_vectorized(factors))
         return replace(self, factors=factors, graph=graph_of(factors), ensemble=ensemble)
 
-    def at(self, values: gtsam.Values, loss: TruncatedLoss | None) -> AbstractContextManager[None]:
-        """Within the block the factors answer for these values, under the loss."""
-        return (self.ensemble or Ensemble(_vectorized(self.factors))).at(values, loss)
+    def at(self, values: gtsam.Values, loss: TruncatedLoss | None, mixed: bool = False) -> AbstractContextManager[None]:
+        """Within the block the factors answer for these values, under the loss; `mixed` as Ensemble.at has it."""
+        return (self.ensemble or Ensemble(_vectorized(self.factors))).at(values, loss, mixed)
 
     def error(self, values: gtsam.Values, loss: TruncatedLoss | None) -> float:
         """Half the sum of squares."""
         with self.at(values, loss):
             return float(self.graph.error(values))
 
-    def linearize(self, values: gtsam.Values, loss: TruncatedLoss | None) -> gtsam.GaussianFactorGraph:
-        """The linear system about the values."""
-        with self.at(values, loss):
+    def linearize(
+        self, values: gtsam.Values, loss: TruncatedLoss | None, excess: Excess | None = None
+    ) -> gtsam.GaussianFactorGraph:
+        """The linear system about the values; with the mixed second derivatives where their `excess` is asked for."""
+        with self.at(values, loss, excess is not None):
+            if excess is not None:
+                found = (v.excess(values) for v in _vectorized(self.factors))
+                for key, number, information in filter(None, found):
+                    excess[key, number] = excess.get((key, number), 0.0) + information
             return self.graph.linearize(values)
 
 
@@ -144,6 +157,7 @@ class Linear:
         families: of its factors, empty for those left of an elimination.
         boundaries: ends of stretches, counted in its factors; of a graph in one piece the ends of the steps.
         trees: of the variables that each stretch alone holds, where they are kept.
+        excess: of a system with mixed second derivatives, see Ensemble.at; a step goes without it. None: it has none.
     """
 
     system: System
@@ -153,6 +167,7 @@ class Linear:
     families: Sequence[str]
     boundaries: Sequence[StepBoundary]
     trees: Sequence[gtsam.GaussianBayesTree | None] = (None,)
+    excess: Excess | None = None
 
     @cached_property
     def triangular(self) -> Triangular:
@@ -163,7 +178,9 @@ class Linear:
         """A stretch; the only one of a graph in one piece is this system itself."""
         if len(self.system.stretches) == 1:
             return self._alone
-        return replace(self.system.part(self.system.stretches[i], self.values, self.damping), tree=self.trees[i])
+        mixed: Excess | None = None if self.excess is None else {}
+        found = self.system.part(self.system.stretches[i], self.values, self.damping, mixed)
+        return replace(found, tree=self.trees[i])
 
     @cached_property
     def _alone(self) -> Part:
@@ -253,7 +270,7 @@ class Linear:
         for key, move in at.items():
             noise = gtsam.noiseModel.Isotropic.Sigma(len(move), _HELD)
             graph.add(gtsam.JacobianFactor(key, np.eye(len(move)), move, noise))
-        return replace(self, graph=graph)
+        return replace(self, graph=graph, excess=None)
 
     @property
     def has_states(self) -> bool:
@@ -298,7 +315,8 @@ class Linear:
 
     def step(self) -> tuple[gtsam.VectorValues, float]:
         """The same, by gtsam's own solution, and by how much it lowers the error. Raises RuntimeError if singular."""
-        delta = self.graph.optimize(self.system.ordering, gtsam.EliminateQR)
+        function = without_excess(self.excess, self.values.dims()) if self.excess else gtsam.EliminateQR
+        delta = self.graph.optimize(self.system.ordering, function)
         gradient, keys = self.graph.gradientAtZero(), list(self.graph.keyVector())
         return delta, self._follow(delta) - 0.5 * float(gradient.vector(keys) @ delta.vector(keys))
 
@@ -394,29 +412,30 @@ class System:
         """Half the sum of squares."""
         return sum(stretch.error(values, self.loss) for stretch in shown(self.stretches))
 
-    def part(self, stretch: Stretch, values: gtsam.Values, damping: float = 0.0) -> Part:
+    def part(self, stretch: Stretch, values: gtsam.Values, damping: float = 0.0, excess: Excess | None = None) -> Part:
         """One of several stretches about the values, damped as `Linear.damping` says."""
-        graph = stretch.linearize(values, self.loss)
+        graph = stretch.linearize(values, self.loss, excess)
         if damping > 0.0:
             graph = damped(graph, damping, _keys(stretch.inner))
         return Part(stretch.factors, graph, stretch.inner)
 
-    def linearized(self, values: gtsam.Values, damping: float = 0.0) -> Linear:
-        """About the values, each unknown held there by so many times its information.
+    def linearized(self, values: gtsam.Values, damping: float = 0.0, mixed: bool = False) -> Linear:
+        """About the values, each unknown held there by so many times its information; `mixed` as Ensemble.at has it.
 
         Raises:
             IndeterminateError: one of several stretches does not determine a variable of its own; names it.
         """
+        excess: Excess | None = {} if mixed else None
         if len(self.stretches) == 1:
             (alone,) = self.stretches
-            graph, families = alone.linearize(values, self.loss), [f.family for f in alone.factors]
+            graph, families = alone.linearize(values, self.loss, excess), [f.family for f in alone.factors]
             if damping > 0.0:
                 graph = damped(graph, damping)
-            return Linear(self, values, damping, graph, families, self.boundaries)
+            return Linear(self, values, damping, graph, families, self.boundaries, excess=excess)
         graph, families, boundaries, trees = gtsam.GaussianFactorGraph(), [], [], []
         kept = sum(stretch.inner.size() for stretch in self.stretches) <= _KEPT
         for stretch, end in zip(shown(self.stretches), self.boundaries, strict=True):
-            part, outer = self.part(stretch, values, damping), set(stretch.outer)
+            part, outer = self.part(stretch, values, damping, excess), set(stretch.outer)
             own = gtsam.GaussianFactorGraph()
             for i in range(part.graph.size()):
                 if i in outer:
@@ -432,7 +451,7 @@ class System:
             boundaries.append(end._replace(factors=graph.size()))
         if damping > 0.0:
             graph = damped(graph, damping)
-        return Linear(self, values, damping, graph, families, boundaries, trees)
+        return Linear(self, values, damping, graph, families, boundaries, trees, excess)
 
     def linearize(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
         """What `linearized` says of the variables that stretches share, all of it for a graph in one piece."""
@@ -447,6 +466,36 @@ class System:
         """Residuals of all measurements, by family."""
         with self.at(values):
             return residuals_of(self.factors, values)
+
+
+def without_excess(excess: Excess, dims: Mapping[int, int]) -> Elimination:
+    """Elimination by QR of a system whose last clique then moves as if it knew so much less.
+
+    With R x = d of that clique, U the roots of what is too much and V = R'^-1 U, (R'R - UU') x = R'd has the same R and
+    (1 - VV')^-1 d for d. Where hardly any information would be left the excess stays, and the step is shorter than it
+    might be.
+    """
+
+    def eliminate(
+        factors: gtsam.GaussianFactorGraph, keys: gtsam.Ordering
+    ) -> tuple[gtsam.GaussianConditional, gtsam.GaussianFactor]:
+        conditional, left = gtsam.EliminateQR(factors, keys)
+        own = list(conditional.keys())
+        ends = dict(zip(own, accumulate(dims[key] for key in own), strict=True))
+        rows = {ends[key] - dims[key] + number: c for (key, number), c in excess.items() if key in ends}
+        if not rows or conditional.S().shape[1]:
+            return conditional, left
+        R = conditional.R()
+        units = np.zeros((len(R), len(rows)))
+        units[list(rows), range(len(rows))] = np.sqrt(list(rows.values()))
+        V = np.linalg.solve(R.T, units)
+        if np.linalg.norm(V, 2) ** 2 > _EXCESS:
+            return conditional, left
+        d = np.linalg.solve(np.eye(len(R)) - V @ V.T, conditional.d())
+        terms = [(key, R[:, ends[key] - dims[key] : ends[key]]) for key in own]
+        return gtsam.GaussianConditional(terms, len(own), d, gtsam.noiseModel.Unit.Create(len(d))), left
+
+    return eliminate
 
 
 def _divided(factors: Sequence[Factor], boundaries: Sequence[StepBoundary]) -> list[StepBoundary]:
