@@ -149,17 +149,20 @@ class VectorizedFactor:
         square, loss = _squares(self.residuals(values)), self._loss_in_force
         return np.ones(len(square)) if loss is None else loss.weight(square)
 
-    def excess(self, values: gtsam.Values) -> tuple[int, int, float] | None:
+    def excess(self, values: gtsam.Values) -> tuple[int, int, Array] | None:
         """What `Ensemble.at` with `mixed` has too much: a variable, which of its numbers, and information about that.
 
-        None: nothing.
+        Of (2,) the first is of the residuals alone. The second, what they have in common with the Jacobian, is right
+        where all else is at its minimum, and may be anything elsewhere. None: there is nothing too much.
         """
         if self.model.turning is None or self.compress:
             return None
         block, number = self.model.turning
-        key, squares = self.columns[block], _squares(self.residuals(values)[:, :2])
+        key, evaluation, weights = self.columns[block], self._at(values), self._weights(values)
         assert isinstance(key, int), "a number that turns rows is shared"
-        return key, number, float(squares @ self._weights(values))
+        x, z = evaluation.residuals[:, :2].T
+        by = evaluation.jacobians()[block][:, :2, number]
+        return key, number, np.array([weights @ (x**2 + z**2), weights @ (by[:, 0] * z - by[:, 1] * x)])
 
     def under(self, loss: TruncatedLoss | None) -> VectorizedFactor:
         """The same factor with another loss, if it has one at all."""

@@ -39,9 +39,9 @@ _ERROR_TOLERANCE = 1e-5
 # A step that was to lower the error by less than this, half a sigma, and does by less than a third of it has only
 # to do with what is of second order: noise, which is all that a sensor at rest tells of a mount or a delay.
 _LITTLE = 0.15
-# A step off by more than this from what it foresaw leaves states unsettled; the next one is misled by them if it gains
-# less than it foresaw by more than a share of that, and in all.
-_OFF, _MISLED = 0.1, 0.01
+# A step off by more than this from what it foresaw leaves states off the floor; the next one is misled by them if it
+# gains less than it foresaw by more than a share of that, and in all. One off by less than the last leaves them there.
+_OFF, _MISLED, _ON = 0.1, 0.01, 1e-3
 # Parts of a step along a valley that are tried, and whether what is known of shared variables returns to the floor in
 # each of the steps that the states then have for it.
 _SHARES, _RETURNS = (1.0, 0.3, 0.1, 0.03), (False, False, True, True)
@@ -51,14 +51,14 @@ _WRONG_LENGTH, _LONGEST = 0.2, 10.0
 
 @dataclass(frozen=True)
 class Solution:
-    """Values at a minimum of a system, and how it was reached; `unsettled`: the states may be off the floor yet."""
+    """Values at a minimum of a system, how it was reached, and whether states are on the floor; None: nobody knows."""
 
     system: System
     values: gtsam.Values
     converged: bool
     message: str
     iterations: int
-    unsettled: bool = False
+    on_floor: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def minimize(
     tolerance: float = _ERROR_TOLERANCE,
     most: int = MOST_ITERATIONS,
     most_damping: float = MOST_DAMPING,
-    unsettled: bool = False,
+    on_floor: bool | None = None,
 ) -> Solution:
     """Values with the least error, by steps that are damped (Levenberg-Marquardt) only where full ones fail.
 
@@ -96,14 +96,14 @@ def minimize(
         tolerance: of the error above its minimum; where residuals are larger than their noise it may be more.
         most: iterations, after which it counts as not converged.
         most_damping: in units of an unknown's own information, beyond which no step is left.
-        unsettled: the states may be off the floor at the start.
+        on_floor: whether the states are at the start; None: nobody knows.
     """
     error, damping = system.error(values), 0.0
     if not np.isfinite(error):
         return Solution(system, values, False, "the residuals at the start are not finite", 0)
     near = _near(system, error, tolerance)
     for iteration in range(1, most + 1):
-        move, damping = _move(system, values, error, near, damping, most_damping, unsettled)
+        move, damping = _move(system, values, error, near, damping, most_damping, on_floor)
         if move is None:
             return Solution(system, values, False, f"no step lowers the error of {error:.6g}", iteration)
         before, values, error = error, move.values, move.error
@@ -111,9 +111,11 @@ def minimize(
         small = move.foreseen < _LITTLE and fall < 0.3 * move.foreseen
         near = _near(system, error, tolerance)
         enough = small or min(fall, off) < near + 1e-13 * before + 1e-10 * error
-        unsettled = damping == 0.0 and off > _OFF and not move.on_floor
+        if not move.last:
+            told = damping == 0.0 and not _ON <= off <= _OFF
+            on_floor = move.on_floor or (off < _ON if told else None)
         if move.last or (damping == 0.0 and not move.halfway and enough):
-            return Solution(system, values, True, f"converged after {iteration} iterations", iteration, unsettled)
+            return Solution(system, values, True, f"converged after {iteration} iterations", iteration, on_floor)
         damping = damping / 10.0 if damping > 1e-6 else 0.0
     return Solution(system, values, False, f"not converged after {most} iterations", most)
 
@@ -125,12 +127,12 @@ def _move(
     near: float,
     damping: float,
     most_damping: float,
-    unsettled: bool,
+    on_floor: bool | None,
 ) -> tuple[_Move | None, float]:
     """The next move, None if there is none, and the damping that it took."""
     linear = _linearized(system, values)
     while damping <= most_damping:
-        delta, foreseen = _step(system, values, linear, damping)
+        delta, foreseen = _step(system, values, linear, damping, on_floor is True)
         move = None
         if delta is not None and damping > 0.0:
             move = _lower(error, _there(system, values, delta, foreseen))
@@ -138,7 +140,7 @@ def _move(
             move = _there(system, values, delta, foreseen)
             return (replace(move, last=True) if move.error < error else _stay(values, error)), damping
         elif delta is not None:
-            move = _full(system, values, error, linear, delta, foreseen, unsettled)
+            move = _full(system, values, error, linear, delta, foreseen, on_floor)
             if move is None and foreseen < _LITTLE:
                 return _stay(values, error), damping
         if move is not None:
@@ -149,7 +151,7 @@ def _move(
 
 def _stay(values: gtsam.Values, error: float) -> _Move:
     """No further move, since the minimum is as near as need be."""
-    return _Move(values, error, 0.0, on_floor=True, last=True)
+    return _Move(values, error, 0.0, last=True)
 
 
 def _near(system: System, error: float, tolerance: float) -> float:
@@ -164,12 +166,12 @@ def _full(
     linear: Linear | None,
     delta: gtsam.VectorValues,
     foreseen: float,
-    unsettled: bool,
+    on_floor: bool | None,
 ) -> _Move | None:
     """Where an undamped step leads, or what is better there; None: nowhere that is lower."""
     move = _there(system, values, delta, foreseen)
     fall = error - move.error
-    if unsettled and foreseen - fall > max(_MISLED, _MISLED * foreseen):
+    if on_floor is False and foreseen - fall > max(_MISLED, _MISLED * foreseen):
         alone = _states_alone(system, values, linear)
         if alone.error < min(error, move.error):
             return alone
@@ -249,12 +251,12 @@ def _linearized(system: System, values: gtsam.Values) -> Linear | None:
 
 
 def _step(
-    system: System, values: gtsam.Values, linear: Linear | None, damping: float
+    system: System, values: gtsam.Values, linear: Linear | None, damping: float, on_floor: bool
 ) -> tuple[gtsam.VectorValues | None, float]:
     """One (damped) step, None if the system is singular, and by how much it should lower the error."""
     try:
         if damping > 0.0:
             linear = system.linearized(values, damping) if linear is None else linear.damped(damping)
-        return (None, 0.0) if linear is None else linear.step()
+        return (None, 0.0) if linear is None else linear.step(on_floor)
     except (RuntimeError, IndeterminateError):
         return None, 0.0

@@ -34,7 +34,7 @@ from pipelines.solvers.triangular import Triangular, conditionals_of, rows_of
 
 Shown = TypeVar("Shown")
 # Variable and which of its numbers -> information about it that a linear system has too much.
-Excess = dict[tuple[int, int], float]
+Excess = dict[tuple[int, int], Array]
 Elimination = Callable[
     [gtsam.GaussianFactorGraph, gtsam.Ordering], tuple[gtsam.GaussianConditional, gtsam.GaussianFactor]
 ]
@@ -110,7 +110,7 @@ class Stretch:
             if excess is not None:
                 found = (v.excess(values) for v in _vectorized(self.factors))
                 for key, number, information in filter(None, found):
-                    excess[key, number] = excess.get((key, number), 0.0) + information
+                    excess[key, number] = excess.get((key, number), np.zeros(2)) + information
             return self.graph.linearize(values)
 
 
@@ -313,9 +313,15 @@ class Linear:
         delta.update(still)
         return delta
 
-    def step(self) -> tuple[gtsam.VectorValues, float]:
-        """The same, by gtsam's own solution, and by how much it lowers the error. Raises RuntimeError if singular."""
-        function = without_excess(self.excess, self.values.dims()) if self.excess else gtsam.EliminateQR
+    def step(self, on_floor: bool = False) -> tuple[gtsam.VectorValues, float]:
+        """The same, by gtsam's own solution, and by how much it lowers the error. Raises RuntimeError if singular.
+
+        `on_floor`: the states are where they are likeliest, so that all of the excess is known.
+        """
+        function: Elimination = gtsam.EliminateQR
+        if self.excess:
+            too_much = {place: each.sum() if on_floor else each[0] for place, each in self.excess.items()}
+            function = without_excess(too_much, self.values.dims())
         delta = self.graph.optimize(self.system.ordering, function)
         gradient, keys = self.graph.gradientAtZero(), list(self.graph.keyVector())
         return delta, self._follow(delta) - 0.5 * float(gradient.vector(keys) @ delta.vector(keys))
@@ -468,7 +474,7 @@ class System:
             return residuals_of(self.factors, values)
 
 
-def without_excess(excess: Excess, dims: Mapping[int, int]) -> Elimination:
+def without_excess(excess: Mapping[tuple[int, int], float], dims: Mapping[int, int]) -> Elimination:
     """Elimination by QR of a system whose last clique then moves as if it knew so much less.
 
     With R x = d of that clique, U the roots of what is too much and V = R'^-1 U, (R'R - UU') x = R'd has the same R and
@@ -482,7 +488,7 @@ def without_excess(excess: Excess, dims: Mapping[int, int]) -> Elimination:
         conditional, left = gtsam.EliminateQR(factors, keys)
         own = list(conditional.keys())
         ends = dict(zip(own, accumulate(dims[key] for key in own), strict=True))
-        rows = {ends[key] - dims[key] + number: c for (key, number), c in excess.items() if key in ends}
+        rows = {ends[key] - dims[key] + number: c for (key, number), c in excess.items() if key in ends and c > 0.0}
         if not rows or conditional.S().shape[1]:
             return conditional, left
         R = conditional.R()

@@ -64,7 +64,9 @@ def optimize(
             values, iterations = plain_but_held.values, iterations + plain_but_held.iterations
         values, more = _relaxed(unweighed, loss, values, float(norms.max()))
         iterations += more
-    final, sound = _truncated(unweighed, loss, values, plain.values, most, plain.unsettled and not outlying)
+    # What is cut off was part of what the states settled among.
+    on_floor = None if (norms > loss.gate).any() and (plain.on_floor or outlying) else plain.on_floor
+    final, sound = _truncated(unweighed, loss, values, plain.values, most, on_floor)
     iterations += final.iterations
     if outlying and not (sound and final.converged):
         # Among few measurements outliers lead plain least squares far beyond what the priors allow, and what is found
@@ -175,14 +177,14 @@ def _truncated(
     values: gtsam.Values,
     plain: gtsam.Values,
     most: int,
-    unsettled: bool = False,
+    on_floor: bool | None = None,
 ) -> tuple[Solution, bool]:
-    """Least squares on what lies inside the gate, from some values, perhaps unsettled, and whether most do.
+    """Least squares on what lies inside the gate, from some values, and whether most do.
 
     Where few do it is least squares on all, from plain values.
     """
     truncated = unweighed.under(loss)
-    final = minimize(truncated, values, most=most, unsettled=unsettled)
+    final = minimize(truncated, values, most=most, on_floor=on_floor)
     used = np.concatenate([r.used for r in truncated.residuals(final.values).values()])
     if used.mean() < _FEWEST_USED:
         return minimize(unweighed, plain, most=most), False
