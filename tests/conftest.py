@@ -51,11 +51,24 @@ def example_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return site
 
 
+# It is there until all tests are done, and its threads look around fifty times a second where nobody looks at them.
+QUIET = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "500ms",
+    "distributed.admin.system-monitor.interval": "10s",
+}
+
+
 @pytest.fixture(scope="session")
 def local_cluster() -> Iterator[str]:
     """Address of a cluster with two workers."""
     distributed = pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
-    with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster:
+    import dask
+
+    with (
+        dask.config.set(QUIET),
+        distributed.LocalCluster(2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster,
+    ):
         yield cluster.scheduler_address
 
 
