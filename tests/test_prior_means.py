@@ -27,8 +27,14 @@ from tests.one_graph import one_graph
 from tests.short_problems import head_problem
 
 KNOWN = "noise_known: 0\n"
-# An indexer's samples at the usual rate take twice as long.
-COARSE = {"gyro_rate_hz": 100.0}
+# About both axes, each at two attitudes of the other: a third of the usual schedule.
+SHORT = {
+    "positions": [
+        {"axis": axis, "other_deg": other, "turns": 1.0} for axis in ("outer", "inner") for other in (0.0, 180.0)
+    ]
+}
+# And an indexer's samples at the usual rates take four times as long.
+COARSE = {"gyro_rate_hz": 50.0, "encoder_rate_hz": 50.0, **SHORT}
 # Sigma by hand, and of what the recording says: about equal, so that both count.
 MOUNT, SIGMA = np.array([0.06, -0.08, 0.03]), 1e-3
 
@@ -63,19 +69,14 @@ def test_a_sigma_of_zero_fixes_a_parameter_where_it_is_said_to_be() -> None:
 
 
 def test_incremental_takes_the_same_prior() -> None:
-    problem = alidade.open(alidade.simulate("indexer", None, seed=1)).problem()
-    truth = problem_value(problem, "theta_y")
+    simulated = alidade.simulate("indexer", SHORT, seed=1)
+    problem, truth = alidade.open(simulated).problem(), simulated.truth["theta_y"]
     problem = believing(problem, [independent(["theta_y"], [truth + 3e-6], [1e-7])])
     batch, incremental = (solve(problem) for solve in (solve_batch, solve_incremental))
     row = batch.names.index("theta_y")
     assert abs(batch.values[row] - truth) > 2e-6  # the prior counts
     assert abs(incremental.values[row] - batch.values[row]) < 0.1 * batch.sigmas[row]
     assert incremental.sigmas[row] == pytest.approx(batch.sigmas[row], rel=0.05)
-
-
-def problem_value(problem: Problem, name: str) -> float:
-    estimate = solve_batch(problem)
-    return float(estimate.values[estimate.names.index(name)])
 
 
 def test_the_rest_of_a_prior_of_several_numbers_stays() -> None:
