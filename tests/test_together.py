@@ -34,8 +34,14 @@ from tests.broad_trials import TRIALS, converted
 from tests.one_graph import one_graph, solved
 
 EXACT = "noise_known: 0\nsensors: ideal\n"
-# An indexer's samples at the usual rates take four times as long.
-COARSE = {"gyro_rate_hz": 50.0, "encoder_rate_hz": 50.0}
+# An indexer's samples at the usual rates, over all of its schedule, take ten times as long.
+COARSE = {
+    "gyro_rate_hz": 50.0,
+    "encoder_rate_hz": 50.0,
+    "positions": [
+        {"axis": axis, "other_deg": other, "turns": 1.0} for axis in ("outer", "inner") for other in (0.0, 180.0)
+    ],
+}
 
 
 def sessions(name: str, seeds: Sequence[int], config: str, scenario: object = None) -> list[Session]:
@@ -330,8 +336,11 @@ def test_a_recording_that_does_not_fit_is_named() -> None:
 
 def test_the_command_takes_several_recordings(tmp_path: Path) -> None:
     paths = [tmp_path / f"{name}.mcap" for name in ("march", "june")]
+    scenario = tmp_path / "coarse.yaml"
+    scenario.write_text(json.dumps({**COARSE, "sensors": "ideal"}))
     for seed, path in enumerate(paths):
-        CliRunner().invoke(app, ["simulate", "indexer", "--seed", str(seed), "--out", str(path)])
+        how = ["--scenario", str(scenario), "--seed", str(seed), "--out", str(path)]
+        CliRunner().invoke(app, ["simulate", "indexer", *how])
     out = tmp_path / "out"
     ended = CliRunner().invoke(app, ["calibrate", *map(str, paths), "--out", str(out)])
     assert ended.exit_code == 0, ended.output
