@@ -25,7 +25,7 @@ MOUNTS, PRIOR = slice(0, 4), 0.1
 
 
 @cache
-def resting(seed: int, duration_s: float = 60.0) -> tuple[Problem, Array]:
+def resting(seed: int, duration_s: float = 40.0) -> tuple[Problem, Array]:
     """A gimbal on a carrier at rest, mounted as its priors let it be."""
     still = {"carrier": EulerMotion(), "image_rate_hz": 5.0, "gyro_rate_hz": 50.0}
     return made("los", drawn_los(seed, duration_s=duration_s, **still), seed)
