@@ -14,6 +14,7 @@ import pytest
 from datasets.broad import CONFIG as BROAD_CONFIG
 from pipelines.config import load_config
 from pipelines.methods import method
+from pipelines.methods.indexer.simulation import Position
 from pipelines.recording import messages
 from pipelines.recording.reading import open_recording
 from pipelines.session import calibrate
@@ -31,8 +32,12 @@ SWAY = EulerMotion(
 BRIEF: dict[str, dict[str, Any]] = {
     "head": {"duration_s": 5.0, "gyro_rate_hz": 50.0, "platform_gyro_rate_hz": 50.0, "vision_rate_hz": 10.0},
     "los": {"duration_s": 5.0, "carrier": SWAY, "gyro_rate_hz": 50.0, "gimbal_rate_hz": 50.0, "image_rate_hz": 5.0},
-    "indexer": {"gyro_rate_hz": 5.0, "encoder_rate_hz": 5.0},
-    "cube": {"poses": 3, "static_s": 2.0},
+    "indexer": {
+        "gyro_rate_hz": 5.0,
+        "encoder_rate_hz": 5.0,
+        "positions": [Position(axis="outer", other_deg=0.0, turns=1.0)],
+    },
+    "cube": {"poses": 3, "static_s": 1.0, "imu_rate_hz": 50.0},
 }
 
 
