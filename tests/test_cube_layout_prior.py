@@ -30,7 +30,7 @@ def _scenario(poses: int, tag_mount: float) -> CubeScenario:
         poses=poses,
         static_s=1.5,
         turn_rad_s=1.6,
-        camera=CubeCamera(rate_hz=5.0),
+        camera=CubeCamera(rate_hz=2.5),
         errors=Errors(tag_mount=tag_mount),
         magnetometer=None,
     )
