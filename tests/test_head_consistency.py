@@ -94,7 +94,7 @@ class Run:
 
 @cache
 def clean(solve: Solve) -> Run:
-    return Run(scenario(duration_s=12), 1, solve)
+    return Run(scenario(duration_s=12, gyro_rate_hz=50, platform_gyro_rate_hz=50), 1, solve)
 
 
 def assert_consistent(runs: Sequence[Run]) -> None:
