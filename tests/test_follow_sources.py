@@ -41,7 +41,7 @@ SCENARIO = LosScenario(
         pitch=[Swing(amplitude_deg=5, frequency_hz=0.27)],
         yaw=[Swing(amplitude_deg=6, frequency_hz=0.23)],
     ),
-    image_rate_hz=6.0,
+    image_rate_hz=4.0,
     gyro_rate_hz=50.0,
     gimbal_rate_hz=50.0,
     sensors=IDEAL,
