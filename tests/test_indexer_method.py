@@ -41,7 +41,7 @@ def _solve(scenario: IndexerScenario, seed: int) -> tuple[Estimate, np.ndarray]:
 
 def _scenario(name: str) -> IndexerScenario:
     """Of ideal sensors, and no more samples than it takes."""
-    coarse = {"gyro_rate_hz": 100.0, "encoder_rate_hz": 100.0}
+    coarse = {"gyro_rate_hz": 50.0, "encoder_rate_hz": 50.0}
     return load_scenario(IndexerScenario, f"indexer_{name}").model_copy(update={"sensors": IDEAL, **coarse})
 
 
@@ -140,7 +140,7 @@ def test_errors_agree_with_the_covariance(runs: int, name: str) -> None:
 
 def _effect(seed: int, **effects: float) -> tuple[Estimate, np.ndarray]:
     scenario = load_scenario(IndexerScenario, "indexer_nominal").model_copy(
-        update={"effects": effects, "gyro_rate_hz": 100.0}
+        update={"effects": effects, "gyro_rate_hz": 50.0, "encoder_rate_hz": 50.0}
     )
     return _solve(scenario, seed)
 
