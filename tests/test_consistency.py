@@ -103,8 +103,8 @@ def test_noise_stated_three_times_too_small_is_no_cause_and_told(head: Case) -> 
     assert told.endswith(" rad is used, 3 times what the config states.")
 
 
-def test_noise_known_exactly_and_three_times_too_small_does_not_fit(head: Case) -> None:
-    find, data, config = head
+def test_noise_known_exactly_and_three_times_too_small_does_not_fit() -> None:
+    find, data, config = head_of(5.0)
     known = with_noise(config, vision_attitude=1.0 / 3.0).model_copy(update={"noise_known": 0.0})
     calibration = Session(find, data, known, Arrays(find, data)).calibrate()
     assert calibration.status == "inconsistent"
