@@ -38,7 +38,9 @@ def session(scenario: HeadScenario, tmp_path_factory: pytest.TempPathFactory) ->
 @pytest.fixture(scope="module")
 def brief(scenario: HeadScenario, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """For what takes long: a few seconds of few pictures and of sensors without errors."""
-    short = scenario.model_copy(update={"duration_s": 4.0, "vision_rate_hz": 8.0, "sensors": IDEAL})
+    short = scenario.model_copy(
+        update={"duration_s": 4.0, "vision_rate_hz": 5.0, "gyro_rate_hz": 100.0, "sensors": IDEAL}
+    )
     return _written(tmp_path_factory.mktemp("brief") / "s.mcap", short)
 
 
