@@ -43,7 +43,7 @@ BRISK = EulerMotion(
 )
 # Longer than it takes until the past is marginalised out for the first time, 40 s.
 SCENARIO = LosScenario(
-    duration_s=49.0, carrier=BRISK, image_rate_hz=6.0, gyro_rate_hz=50.0, gimbal_rate_hz=50.0, sensors=IDEAL
+    duration_s=49.0, carrier=BRISK, image_rate_hz=3.0, gyro_rate_hz=50.0, gimbal_rate_hz=50.0, sensors=IDEAL
 )
 
 # Another process that records: what is in one file, into another, in pieces; from some time on it waits for a file.
