@@ -36,11 +36,12 @@ def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def integrate(gyro: np.ndarray, rate_hz: float) -> np.ndarray:
     """Attitude at the end of each sample's interval in the frame at the start of the first."""
-    steps = so3.exp(gyro / rate_hz)
-    path = [so3.identity()]
-    for step in steps:
-        path.append(so3.multiply(path[-1], step))
-    return np.array(path[1:])
+    path, whole = so3.exp(gyro / rate_hz), 1
+    # Each the product of the last `whole` steps, of twice as many every time.
+    while whole < len(path):
+        path[whole:] = so3.multiply(path[:-whole], path[whole:])
+        whole *= 2
+    return path
 
 
 @pytest.mark.parametrize("latitude", [None, 40.0])
