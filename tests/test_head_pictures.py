@@ -43,7 +43,7 @@ def sigmas_off(path: Path) -> tuple[np.ndarray, str]:
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    settings = scenario(duration_s=9, vision_rate_hz=8)
+    settings = scenario(duration_s=8, vision_rate_hz=6)
     return written(tmp_path_factory.mktemp("pictures") / "s.mcap", settings, 1)
 
 
@@ -60,7 +60,7 @@ def test_every_parameter_from_pictures_alone(session: Path) -> None:
 
 def test_attitudes_seen_in_pictures_are_the_boards(session: Path) -> None:
     """Mounts and time offset included; their errors fit the covariance that came with them."""
-    settings = scenario(duration_s=9, vision_rate_hz=8)
+    settings = scenario(duration_s=8, vision_rate_hz=6)
     exact = settings.model_copy(update={"noise": settings.noise.model_copy(update={"vision_attitude": 0.0})})
     expected, _ = simulate_head(exact, 1)
     data = read(session)
@@ -77,13 +77,13 @@ def test_attitudes_seen_in_pictures_are_the_boards(session: Path) -> None:
 def test_outages_have_no_pictures_and_png_is_read(tmp_path: Path) -> None:
     settings = scenario(
         duration_s=3,
-        vision_rate_hz=8,
+        vision_rate_hz=4,
         vision_outages_s=[(1.0, 2.0)],
         pictures={"format": "png"},
     )
     path = written(tmp_path / "s.mcap", settings, 2)
     t = read(path).vision_t
-    assert len(t) == 16
+    assert len(t) == 8
     assert not ((t >= 1.0) & (t < 2.0)).any()
     _, first = next(open_recording(path).images("/camera/image/compressed"))
     assert first.startswith(b"\x89PNG")
