@@ -35,7 +35,7 @@ _HEAD: dict[str, Any] = {"duration_s": 15, "vision_rate_hz": 10, "gyro_rate_hz":
 _FREE_CAMERA: dict[str, float | None] = {f"camera_mount_{axis}": 0.35 for axis in "xyz"}
 _INDEXER: dict[str, Any] = {"gyro_rate_hz": 50, "encoder_rate_hz": 50, "record_moves": False}
 _OUTER = [Position(axis="outer", other_deg=0.0), Position(axis="outer", other_deg=180.0)]
-_CUBE: dict[str, Any] = {"static_s": 2, "imu_rate_hz": 50, "camera": {"rate_hz": 5}}
+_CUBE: dict[str, Any] = {"static_s": 1.5, "imu_rate_hz": 50, "camera": {"rate_hz": 2}}
 
 
 def predicted(scenario: _Scenario) -> Prediction:
