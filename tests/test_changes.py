@@ -19,10 +19,9 @@ from pipelines.reports.result import Calibration
 from pipelines.session import Session
 from pipelines.solvers.joint import join
 from pipelines.together import calibrate_together
+from tests.short_problems import COARSE
 
 NAMES = ("arm_mount_x", "arm_mount_y", "arm_mount_z", "own")
-# An indexer's samples at the usual rates take four times as long.
-COARSE = {"gyro_rate_hz": 50.0, "encoder_rate_hz": 50.0}
 RATES = dict.fromkeys(NAMES[:3], 0.0)
 
 
@@ -146,7 +145,7 @@ def moved() -> Calibration:
 
 def test_a_change_is_told_in_words_and_numbers(moved: Calibration, tmp_path: Path) -> None:
     assert moved.status == "inconsistent"
-    assert "The device is not the same in all recordings. theta_y changed by -0.4" in moved.headline
+    assert "The device is not the same in all recordings. theta_y changed by -0.5" in moved.headline
     assert "arcsec between 20 December 2026 and 19 January 2027" in moved.headline
     moved.write(tmp_path)
     found = json.loads((tmp_path / "result.json").read_text())["changes"]

@@ -23,10 +23,10 @@ from pipelines.simulation.simulated import Simulated
 from pipelines.solvers.batch import solve_batch
 from tests.browser import fits
 from tests.command import Command
+from tests.short_problems import COARSE
 
 MOVED_ARCSEC = 0.5
 # As many samples as it takes; those of the usual rates take four times as long.
-COARSE = {"gyro_rate_hz": 50.0, "encoder_rate_hz": 50.0}
 
 
 def written(path: Path, simulated: Simulated) -> Path:
@@ -103,7 +103,8 @@ def test_a_recording_that_says_nothing_gives_no_verdict() -> None:
 
 def test_head_mounts_that_turned_are_noticed(tmp_path: Path) -> None:
     """A helmet mount that turned by 0.3 deg, with everything else of the head's estimated too."""
-    scenario = method("head").settings("head_mounts").model_dump()
+    rates = {"gyro_rate_hz": 100.0, "platform_gyro_rate_hz": 100.0, "vision_rate_hz": 15.0}
+    scenario = method("head").settings("head_mounts").model_dump() | rates
     mount = scenario["helmet_mount_deg"]
     first = simulate("head", scenario, seed=1)
     opened(first).calibrate().write(tmp_path)

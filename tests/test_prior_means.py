@@ -24,17 +24,9 @@ from pipelines.sharing import walks
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.incremental import solve_incremental
 from tests.one_graph import one_graph
-from tests.short_problems import head_problem
+from tests.short_problems import COARSE, FOUR_POSITIONS, head_problem
 
 KNOWN = "noise_known: 0\n"
-# About both axes, each at two attitudes of the other: a third of the usual schedule.
-SHORT = {
-    "positions": [
-        {"axis": axis, "other_deg": other, "turns": 1.0} for axis in ("outer", "inner") for other in (0.0, 180.0)
-    ]
-}
-# And an indexer's samples at the usual rates take four times as long.
-COARSE = {"gyro_rate_hz": 50.0, "encoder_rate_hz": 50.0, **SHORT}
 # Sigma by hand, and of what the recording says: about equal, so that both count.
 MOUNT, SIGMA = np.array([0.06, -0.08, 0.03]), 1e-3
 
@@ -69,7 +61,7 @@ def test_a_sigma_of_zero_fixes_a_parameter_where_it_is_said_to_be() -> None:
 
 
 def test_incremental_takes_the_same_prior() -> None:
-    simulated = alidade.simulate("indexer", SHORT, seed=1)
+    simulated = alidade.simulate("indexer", FOUR_POSITIONS, seed=1)
     problem, truth = alidade.open(simulated).problem(), simulated.truth["theta_y"]
     problem = believing(problem, [independent(["theta_y"], [truth + 3e-6], [1e-7])])
     batch, incremental = (solve(problem) for solve in (solve_batch, solve_incremental))

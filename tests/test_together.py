@@ -32,16 +32,9 @@ from pipelines.solvers.joint import join
 from pipelines.together import calibrate_together
 from tests.broad_trials import TRIALS, converted
 from tests.one_graph import one_graph, solved
+from tests.short_problems import COARSE
 
 EXACT = "noise_known: 0\nsensors: ideal\n"
-# An indexer's samples at the usual rates, over all of its schedule, take ten times as long.
-COARSE = {
-    "gyro_rate_hz": 50.0,
-    "encoder_rate_hz": 50.0,
-    "positions": [
-        {"axis": axis, "other_deg": other, "turns": 1.0} for axis in ("outer", "inner") for other in (0.0, 180.0)
-    ],
-}
 
 
 def sessions(name: str, seeds: Sequence[int], config: str, scenario: object = None) -> list[Session]:
