@@ -117,7 +117,7 @@ def test_what_no_motion_can_tell_gets_no_change(tmp_path: Path) -> None:
     """delta_pz and delta_gz asked for apart: only their difference is ever known."""
     asked = tmp_path / "config.yaml"
     asked.write_text("priors: {delta_pz: 0.1, delta_gz: 0.1}\n")
-    good = scenario_file(tmp_path, "{duration_s: 6, image_rate_hz: 10, gyro_rate_hz: 100, gimbal_rate_hz: 100}")
+    good = scenario_file(tmp_path, "{duration_s: 6, image_rate_hz: 5, gyro_rate_hz: 50, gimbal_rate_hz: 50}")
     plan = make_plan("los", good, asked)
     assert plan.now.assessment.status == "unobservable"
     for name in ("delta_pz", "delta_gz"):
