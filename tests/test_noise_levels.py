@@ -235,10 +235,10 @@ def silent(data: Any) -> Any:
     return data if seen is None else replace(data, sightings=replace(seen, covariance=None))
 
 
-def unstated(method: str, grade: str, seeds: Sequence[int]) -> float:
+def unstated(method: str, grade: str, seeds: Sequence[int], **changes: float) -> float:
     """NEES per number of recordings whose noise nobody states."""
     sensors = NAVIGATION.get(method, {}) if grade == "navigation" else {}
-    scenario = {**CASES[method][0], "sensors": sensors, "noise": GRADES[method][grade]}
+    scenario = {**CASES[method][0], "sensors": sensors, "noise": GRADES[method][grade], **changes}
     nees = []
     for seed in seeds:
         simulated = simulate(method, scenario, seed=seed)
@@ -261,10 +261,14 @@ def test_nothing_stated_and_honest(method: str, grade: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("method", "grade"), [pytest.param("head", "consumer", marks=pytest.mark.slow), ("indexer", "navigation")]
+    ("method", "grade", "rates"),
+    [
+        pytest.param("head", "consumer", {}, marks=pytest.mark.slow),
+        ("indexer", "navigation", {"gyro_rate_hz": 50.0, "encoder_rate_hz": 50.0}),
+    ],
 )
-def test_nothing_stated_and_honest_on_a_few(method: str, grade: str) -> None:
-    assert 0.6 < unstated(method, grade, range(3)) < 1.6
+def test_nothing_stated_and_honest_on_a_few(method: str, grade: str, rates: dict[str, float]) -> None:
+    assert 0.6 < unstated(method, grade, range(3), **rates) < 1.6
 
 
 def test_white_noise_of_a_sensor_in_motion() -> None:
