@@ -161,7 +161,9 @@ def test_clocks_that_drift_for_a_quarter_of_an_hour() -> None:
 
 def test_a_clock_is_guessed_over_an_hour() -> None:
     """One that has gone wrong by as much as half a swing takes."""
-    scenario = _drifting(3600.0, 5e-4).model_copy(update={"image_rate_hz": 2.0, "gyro_rate_hz": 50.0})
+    scenario = _drifting(3600.0, 5e-4).model_copy(
+        update={"image_rate_hz": 2.0, "gyro_rate_hz": 50.0, "gimbal_rate_hz": 50.0}
+    )
     data, truth = simulate_los(scenario, 1)
     made = problem(data, _config(scenario))
     taken = np.array([step.time for step in made.steps(20)])
