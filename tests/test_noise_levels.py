@@ -76,7 +76,9 @@ def test_all_noise_stated_wrong(method: str, factor: float) -> None:
 
 
 def test_the_incremental_solver_finds_them_too() -> None:
-    simulated = simulate("head", {"duration_s": 10.0, "vision_rate_hz": 12.0, "sensors": {}}, seed=1)
+    simulated = simulate(
+        "head", {"duration_s": 10.0, "vision_rate_hz": 8.0, "gyro_rate_hz": 100.0, "sensors": {}}, seed=1
+    )
     right_config = load_config(simulated.config.encode())
     wrong_config = stated(right_config, {"vision_attitude": 3.0, "gyro_density": 1.0 / 3.0})
     as_it_is, wrong = (methods.method("head").problem(simulated.data, each) for each in (right_config, wrong_config))

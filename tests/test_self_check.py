@@ -17,7 +17,7 @@ from pipelines.methods.los.recording import write_los
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from tests.builders import IDEAL
 
-SCENARIO = LosScenario(duration_s=6.0, image_rate_hz=10.0, gyro_rate_hz=100.0, gimbal_rate_hz=100.0, sensors=IDEAL)
+SCENARIO = LosScenario(duration_s=6.0, image_rate_hz=6.0, gyro_rate_hz=50.0, gimbal_rate_hz=50.0, sensors=IDEAL)
 
 
 def _estimate(values: list[float]) -> Estimate:
