@@ -83,7 +83,7 @@ def test_what_is_weak_gets_advice_and_a_motion_that_mends_it(tmp_path: Path) -> 
     """Without sway in azimuth delta_px cannot be told from delta_gx and delta_gy."""
     weak = scenario_file(
         tmp_path,
-        "{duration_s: 12, image_rate_hz: 10, gyro_rate_hz: 100, gimbal_rate_hz: 100, azimuth_deg: 20, elevation_deg: 0,"
+        "{duration_s: 12, image_rate_hz: 5, gyro_rate_hz: 50, gimbal_rate_hz: 50, azimuth_deg: 20, elevation_deg: 0,"
         " carrier: {roll: [{amplitude_deg: 6, frequency_hz: 0.21}], pitch: [{amplitude_deg: 5, frequency_hz: 0.17}]}}",
     )
     plan = make_plan("los", weak, require={"delta_px": 5e-4}, most_steps=2)
