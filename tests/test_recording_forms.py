@@ -19,6 +19,7 @@ from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.methods import method, simulate
 from pipelines.methods.head.topics import VISION_ATTITUDE
+from pipelines.methods.indexer.simulation import Position
 from pipelines.recording import messages, series
 from pipelines.recording.checks import density
 from pipelines.recording.gyro import read_gyro
@@ -32,6 +33,7 @@ from pipelines.simulation.motion import EulerMotion, Swing
 from tests import forms, live
 from tests.forms import header, ros2_recording
 from tests.recorded import T0, assert_same, session
+from tests.short_problems import FOUR_POSITIONS
 from tests.turning import turning, write_csv
 
 BRISK = EulerMotion(
@@ -884,7 +886,17 @@ def test_stamps_that_were_not_measured_are_told(stamps: Any, logged: Any, says: 
             "/los/error",
             "time_offset",
         ),
-        ("indexer", None, {"gyro_rate_hz": 20.0, "encoder_rate_hz": 20.0}, "/indexer/joint_states", "encoder_delay"),
+        (
+            "indexer",
+            None,
+            {
+                "gyro_rate_hz": 20.0,
+                "encoder_rate_hz": 20.0,
+                "positions": [Position.model_validate(each) for each in FOUR_POSITIONS["positions"]],
+            },
+            "/indexer/joint_states",
+            "encoder_delay",
+        ),
     ],
 )
 def test_log_times_in_place_of_stamps_stand_in_the_sigma_of_the_delay(
@@ -938,7 +950,8 @@ def test_a_covariance_no_gyro_has_is_not_believed(tmp_path: Path) -> None:
 
 
 def test_the_same_calibration_out_of_another_form(tmp_path: Path) -> None:
-    simulate("head", "head_mounts", 2, tmp_path / "s.mcap")
+    chosen, rates = method("head"), {"gyro_rate_hz": 100.0, "platform_gyro_rate_hz": 100.0, "vision_rate_hz": 15.0}
+    chosen.write(tmp_path / "s.mcap", chosen.simulate(chosen.settings("head_mounts").model_copy(update=rates), 2))
     config = tmp_path / "c.yaml"
     config.write_bytes(open_recording(tmp_path / "s.mcap").attachment("alidade.yaml") or b"")
     bag = forms.rosbag1(tmp_path / "s.mcap", tmp_path / "s.bag")
