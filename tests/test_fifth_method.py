@@ -17,7 +17,7 @@ from tests.command import Run
 ROOT = Path(__file__).parents[1]
 EXAMPLE = ROOT / "docs" / "examples" / "gyro_pair"
 SHORT = """
-duration_s: 16
+duration_s: 8
 gyro_a: {rate_hz: 100}
 gyro_b: {rate_hz: 120, density: 2.0e-4}
 """
