@@ -35,7 +35,7 @@ SWAY = EulerMotion(
     pitch=[Swing(amplitude_deg=8, frequency_hz=0.31)],
     roll=[Swing(amplitude_deg=12, frequency_hz=0.21)],
 )
-LOS = LosScenario(duration_s=20.0, carrier=SWAY, image_rate_hz=20.0, gyro_rate_hz=100.0, gimbal_rate_hz=100.0)
+LOS = LosScenario(duration_s=20.0, carrier=SWAY, image_rate_hz=12.0, gyro_rate_hz=100.0, gimbal_rate_hz=100.0)
 INDEXER = IndexerScenario(gyro_rate_hz=50.0, encoder_rate_hz=50.0)
 CUBE = CubeScenario(poses=14)
 
