@@ -259,7 +259,7 @@ def test_a_step_goes_without_the_excess() -> None:
     linear = system.linearized(values, mixed=True)
     assert linear.excess is not None
     (((key, number), excess),) = linear.excess.items()
-    assert excess[0] == pytest.approx(2 * 600, rel=0.2)
+    assert excess[0] == pytest.approx(2 * 300, rel=0.2)
     H, g = linear.graph.hessian(system.ordering)
     keys = [system.ordering.at(i) for i in range(system.ordering.size())]
     sizes = [values.dims()[k] for k in keys]
