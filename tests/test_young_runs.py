@@ -142,7 +142,8 @@ def test_no_sigma_is_far_beyond_its_prior(seed: int) -> None:
     for step in islice(problem.steps(1), 11):
         following.add_step(step)
         if following.started:
-            sigmas = np.sqrt(np.diag(following.covariance()))
+            # As it is though withheld.
+            sigmas = np.sqrt(np.diag(following._covariance()))
             widest = max(widest, float(np.max(sigmas / [q.scale for q in problem.quantities])))
     assert 0.9 < widest < 1.5
 

@@ -152,7 +152,7 @@ def _covariance(problem: Problem, found: _Found, current_keys: Mapping[int, int]
         ordering, information = about.system.ordering, found.noise.information
         marginal = joint_covariance(problem, about.graph, ordering, about.values, current_keys, information)
     bent = second_order(problem, about, marginal, current_keys)
-    return marginal if bent is None else marginal + bent
+    return marginal if bent is None else marginal + bent.covariance
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from functools import cache
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.graph.problem import Array, Attitudes, ChiSquare, Course, Estimate, Factor, History, Problem, Step
 from pipelines.solvers.assembly import CHUNK, Assembly
@@ -43,6 +44,7 @@ from pipelines.solvers.state import State, explained, require_known, require_sou
 from pipelines.solvers.system import Linear
 from pipelines.solvers.weighing import optimize, with_levels
 from pipelines.solvers.window import Keyframes, Window
+from pipelines.solvers.withheld import covariance_without, values_without, with_prior
 
 DEFAULT_WINDOW = 1.0
 
@@ -61,6 +63,8 @@ _FEW_STEPS = 100
 _LOST, _MORE, _MOVED, _FAR = 0.5, 1.05, 0.2, 0.02
 # ... so many steps in a row were rejected, or more than this share of measurements: the run may have lost its way.
 _DOUBTED, _TOO_MANY = 5, 0.25
+# Where so many are rejected of fewer than this, which of them are wrong cannot be told: what is, may agree by chance.
+_FEW = 20
 # Later the past is marginalised out this often, s.
 MARGINALIZE_EVERY = 20.0
 # Of the steps marginalised out so many are freed with each new one: a thousand at once take longer than an update.
@@ -156,6 +160,8 @@ class Run:
         # Of a young run: information that is its states' noise, and covariance that linear systems do not know of.
         self._noise: Array | None = None
         self._bent: Array | None = None
+        # (n,) of a young run, numbers of which the covariance of second order has not gone far enough yet.
+        self._beyond = np.ones(len(problem.quantities), dtype=bool)
         self._course: Callable[[], Course | None] = _no_course  # of the last batch solution while young
 
     @classmethod
@@ -216,11 +222,24 @@ class Run:
             self._continue_from(State.of(step.time, known, about, list(known.keyVector()), self._stamps))
 
     def values(self) -> Array:
-        """The parameters now, as reported."""
-        return reported(self.problem, self._estimate(), self.current_keys)
+        """The parameters now, as reported, at their priors those of which nothing can be told yet."""
+        return values_without(self._values(), self.withheld, self.problem)
 
     def covariance(self) -> Array:
-        """Joint covariance of the parameters now."""
+        """Joint covariance of these."""
+        return covariance_without(self._covariance(), self.withheld, self.problem)
+
+    @property
+    def withheld(self) -> NDArray[np.bool_]:
+        """(n,) numbers of a young run of which nothing can be told yet; those without a prior are never withheld."""
+        if not self._young:
+            return np.zeros(len(self.problem.quantities), dtype=bool)
+        return with_prior(self.problem) & (self._beyond | self.innovations.undecided(_FEW, _TOO_MANY))
+
+    def _values(self) -> Array:
+        return reported(self.problem, self._estimate(), self.current_keys)
+
+    def _covariance(self) -> Array:
         assert self._smoother is not None
         try:
             information = information_of(self._smoother.covariance(self.keys))
@@ -246,14 +265,16 @@ class Run:
         return self.innovations.chi_square()
 
     def finish(self, seconds: float) -> Estimate:
-        """The estimate after the last step added. More steps may follow."""
+        """The estimate after the last step added, with nothing withheld, as batch has it. More steps may follow."""
         if self._young and self._solved is not None and len(self.past) > self._solved.steps:
             self._reinitialize()
-        return replace(self.estimate(), seconds={"solve": seconds})
+        return replace(self._estimated(self._values(), self._covariance()), seconds={"solve": seconds})
 
     def estimate(self) -> Estimate:
         """The estimate now. Raises IndeterminateError when it is no finite number."""
-        values, covariance = self.values(), self.covariance()
+        return self._estimated(self.values(), self.covariance())
+
+    def _estimated(self, values: Array, covariance: Array) -> Estimate:
         if not (np.isfinite(values).all() and np.isfinite(covariance).all()):
             raise IndeterminateError(f"the estimate at {self.time:.3f} s is not a finite number")
         history, n = self.history.array.copy(), len(values)
@@ -367,7 +388,7 @@ class Run:
                 self.way, self._course = Way.of(self._course()), _no_course
             self.attitudes.clear()
         self._record(whole.keyframes if from_start else last, values)
-        self._solved = _Solved(since, len(self.past), self.values(), np.sqrt(np.diag(self.covariance())))
+        self._solved = _Solved(since, len(self.past), self._values(), np.sqrt(np.diag(self._covariance())))
         self.innovations.begin_count()
 
     def _whole(self) -> Assembly:
@@ -429,7 +450,13 @@ class Run:
             return
         if noise is not None:
             self._noise = noise.information
-        self._bent = second_order(self.problem, about, self.covariance(), self.current_keys)
+        bent = second_order(self.problem, about, self._covariance(), self.current_keys)
+        self._bent = None if bent is None else bent.covariance
+        # What has been told once is told from then on.
+        if bent is None:
+            self._beyond[:] = False
+        elif self._beyond.any():
+            self._beyond &= bent.beyond()
 
     def _spurious(self, about: Linear) -> Spurious | None:
         """What of the information of a linearised solution is its states' noise."""
@@ -445,7 +472,7 @@ class Run:
         # The past is folded as soon as it may be, not when it happens to be solved again.
         if since >= _GROWTH * solved.since or solved.since < _YOUNG <= since:
             return True
-        moved, scales = np.abs(self.values() - solved.values), self._scales
+        moved, scales = np.abs(self._values() - solved.values), self._scales
         if (moved > _LOST * scales).any():
             return True
         if len(self.past) < _MORE * solved.steps:

@@ -91,6 +91,13 @@ class Innovations:
         chance = 2.0 * np.sqrt(share * (1.0 - share) * self.tried)
         return self.rejected_in_a_row >= in_a_row or self.refused > share * self.tried + chance
 
+    def undecided(self, few: int, share: float) -> bool:
+        """Whether there are fewer measurements than that in all, and more than a share of them is rejected."""
+        if sum(map(len, self.families.values())) >= few:
+            return False
+        used = [used for rows in self.families.values() for used in rows.array[:, 1]]
+        return used.count(0.0) > share * len(used)
+
     def accept(self, factor: Factor, prediction: Prediction, gated: bool) -> Factor | None:
         """What of a factor is to be used, the measurements whose innovation lies within the gate; notes all of them."""
         measurement = factor.measurement
