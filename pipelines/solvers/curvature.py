@@ -107,9 +107,9 @@ class SecondOrder:
     @cached_property
     def _roots(self) -> tuple[Array, Array]:
         """Square roots (m, .) of the free numbers' covariance with second order, and of what half the way misses."""
-        halves, _ = self.floor.slopes(0.5 * self.ways)
+        halves, _ = self.floor.slopes(0.5 * self.ways[:, :_DRAWS])
         known = np.linalg.cholesky(np.diag(self.floor.sigmas**2) + self.variance)
-        missed = np.hstack(list(halves - 0.5 * self.slopes)) / np.sqrt(len(halves))
+        missed = np.hstack(list(halves - 0.5 * self.slopes[:_DRAWS])) / np.sqrt(len(halves))
         return self.floor.vectors @ known, self.floor.vectors @ missed
 
 
