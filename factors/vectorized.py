@@ -160,9 +160,8 @@ class VectorizedFactor:
         block, number = self.model.turning
         key, evaluation, weights = self.columns[block], self._at(values), self._weights(values)
         assert isinstance(key, int), "a number that turns rows is shared"
-        x, z = evaluation.residuals[:, :2].T
-        by = evaluation.jacobians()[block][:, :2, number]
-        return key, number, np.array([weights @ (x**2 + z**2), weights @ (by[:, 0] * z - by[:, 1] * x)])
+        added, by = _at_right_angles(evaluation.residuals), evaluation.jacobians()[block][:, :2, number]
+        return key, number, np.array([weights @ _squares(added), weights @ (by * added).sum(axis=1)])
 
     def under(self, loss: TruncatedLoss | None) -> VectorizedFactor:
         """The same factor with another loss, if it has one at all."""
@@ -281,9 +280,13 @@ class VectorizedFactor:
 def _turned(blocks: Sequence[Array], residuals: Array, block: int, number: int) -> tuple[Array, ...]:
     """Jacobians by blocks, that by a number which turns the first two rows with the residuals turned likewise."""
     by = blocks[block].copy()
-    by[:, 0, number] += residuals[:, 1]
-    by[:, 1, number] -= residuals[:, 0]
+    by[:, :2, number] += _at_right_angles(residuals)
     return *blocks[:block], by, *blocks[block + 1 :]
+
+
+def _at_right_angles(residuals: Array) -> Array:
+    """The first two rows (n, 2) of residuals (n, m), turned back in their plane."""
+    return np.stack([residuals[:, 1], -residuals[:, 0]], axis=1)
 
 
 # Where a block (n, m, d) is added to the whole Jacobian: offset and strides, bytes, where its keys follow each other
