@@ -54,18 +54,19 @@ def test_at_rest_mounts_stay_where_their_priors_have_them(seed: int, monkeypatch
     found = solve_batch(problem)
     assert found.converged
     assert np.abs(found.values[MOUNTS]).max() < 0.1 * PRIOR
-    assert np.sqrt(np.diag(found.covariance)[MOUNTS]).min() > 0.9 * PRIOR
+    assert np.sqrt(np.diag(found.covariance)[MOUNTS]).min() > 0.98 * PRIOR
     assert found.course is not None
     assert np.abs(found.course.values[-1] - found.values)[MOUNTS].max() < 0.05 * PRIOR
     monkeypatch.setattr(batch, "without_pull", lambda _, solution, *__: solution)
     assert np.abs(solve_batch(problem).values[MOUNTS]).max() > PRIOR
 
 
-def test_nor_do_they_move_online() -> None:
-    problem, _ = resting(3, 12.0)
+@pytest.mark.parametrize("duration_s", [4.0, 8.0, 12.0])
+def test_nor_do_they_move_online(duration_s: float) -> None:
+    problem, _ = resting(3, duration_s)
     found = solve_incremental(problem)
     assert np.abs(found.values[MOUNTS]).max() < 0.2 * PRIOR
-    assert np.sqrt(np.diag(found.covariance)[MOUNTS]).min() > 0.9 * PRIOR
+    assert np.sqrt(np.diag(found.covariance)[MOUNTS]).min() > 0.98 * PRIOR
 
 
 def test_it_is_a_minimum_that_says_nothing_more() -> None:

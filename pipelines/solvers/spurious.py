@@ -11,8 +11,7 @@ Introduction to the Bootstrap", 1993, chapter 10).
 
 What noise seems to tell has a sigma and a value: the noise of a gyro that drives a gimbal at rest moves the mounting
 angles by as much as their priors let it, some of them always to the same side. So combinations of which most of the
-information is noise, and those that have moved farther than little information could move them, are to be held where
-the priors have them, and all that is told of them counts as noise.
+information is noise are to be held where the priors have them, and all that is told of them counts as noise.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipelines.graph.problem import Array, Problem
-from pipelines.solvers.marginals import IndeterminateError, joint_information, prior_units, reported
+from pipelines.solvers.marginals import IndeterminateError, joint_information, prior_units
 from pipelines.solvers.system import Linear
 
 # Directions in which sigma is beyond this share of the prior are looked at; in others noise adds next to nothing.
@@ -33,9 +32,6 @@ _TOLD = 0.01
 _DRAWS = 3
 # Of more than this share of noise it is all that is told.
 _MOSTLY = 0.5
-# What tells less than this, in units of the prior's information, moves an estimate by so many of the sigmas that it has
-# beforehand, and by less than this part of a prior's sigma at least; of more, the true value may be a rare one.
-_LITTLE, _FAR, _LEAST = 0.2, 3.0, 0.2
 # More than this is a prior, in units of the default one's information.
 _SOME = 0.1
 
@@ -71,11 +67,13 @@ def information_of_noise(
     doubtful = _doubtful(problem, keys, covariance)
     if not doubtful:
         return None
-    system, values = about.system, about.values
+    values, ordering = about.values, about.system.ordering
+    # Far from the solution, measurements would be rejected that count there.
+    system = about.system.without_rejected(values)
     try:
         moved = about.drawn(set(values.keys()) - set(doubtful), _DRAWS, np.random.default_rng(0))
         graphs = (about.graph, *map(system.linearize, moved))
-        own, *elsewhere = (joint_information(graph, system.ordering, keys) for graph in graphs)
+        own, *elsewhere = (joint_information(graph, ordering, keys) for graph in graphs)
     except (RuntimeError, IndeterminateError):
         return None
     noise = np.mean(elsewhere, axis=0) - own
@@ -83,12 +81,10 @@ def information_of_noise(
     own, noise = unit.T @ own @ unit, unit.T @ noise @ unit
     priors = [problem.quantities[i].prior_sigma for i in free]
     prior = np.diag([(s / sigma) ** 2 if sigma else 0.0 for s, sigma in zip(scale, priors, strict=True)])
-    means = np.array([problem.quantities[i].prior_mean for i in free])
-    off = (reported(problem, values, current_keys)[free] - means) / scale
     eigenvalues, vectors = np.linalg.eigh(own)
     weak = vectors[:, eigenvalues < _WEAK**-2.0]
     told, noise, loose = (weak.T @ each @ weak for each in (own - prior, noise, prior))
-    held = _held(told, noise, loose, weak.T @ off)
+    held = _held(told, noise, loose)
     others = np.eye(len(held.T)) - held.T @ held
     information = told - others @ (told - _part(told, noise)) @ others
     return Spurious(weak @ information @ weak.T, held @ weak.T)
@@ -107,19 +103,16 @@ def _doubtful(problem: Problem, keys: Sequence[int], covariance: Array) -> list[
     return found
 
 
-def _held(told: Array, noise: Array, prior: Array, off: Array) -> Array:
-    """Directions (k, m) of which more than half of what is told (m, m) is noise, or that have moved too far for it.
+def _held(told: Array, noise: Array, prior: Array) -> Array:
+    """Directions (k, m) of which more than half of what is told (m, m) is noise.
 
-    `prior` is the priors' information (m, m), `off` (m,) by how much the estimate is off their means.
+    `prior` is the priors' information (m, m).
     """
     information, axes = np.linalg.eigh(told)
-    information = np.maximum(information, 0.0)
     seeming, known = ((axes * (each @ axes)).sum(axis=0) for each in (noise, prior))
-    moves = np.sqrt(information / np.maximum(known * (known + information), 1e-300))
     mostly = (information > _TOLD) & (seeming > _MOSTLY * information)
-    pulled = (information < _LITTLE * known) & (np.abs(off @ axes) > np.maximum(_FAR * moves, _LEAST))
     # Without a prior there is nowhere to be held.
-    return np.asarray(axes[:, (mostly | pulled) & (known > _SOME)].T)
+    return np.asarray(axes[:, mostly & (known > _SOME)].T)
 
 
 def _part(told: Array, noise: Array) -> Array:
