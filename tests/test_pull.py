@@ -14,12 +14,13 @@ from pipelines.solvers import batch
 from pipelines.solvers.assembly import CHUNK, Assembly
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.gauss_newton import Solution
-from pipelines.solvers.incremental import solve_incremental
+from pipelines.solvers.incremental import DEFAULT_WINDOW, solve_incremental
 from pipelines.solvers.marginals import joint_covariance, joint_information
 from pipelines.solvers.noise_levels import weigh
 from pipelines.solvers.pull import without_pull
 from pipelines.solvers.spurious import information_of_noise
 from pipelines.solvers.weighing import optimize, with_levels
+from pipelines.solvers.window import Window
 
 MOUNTS, PRIOR = slice(0, 4), 0.1
 
@@ -61,10 +62,10 @@ def test_at_rest_mounts_stay_where_their_priors_have_them(seed: int, monkeypatch
     assert np.abs(solve_batch(problem).values[MOUNTS]).max() > PRIOR
 
 
-@pytest.mark.parametrize("duration_s", [4.0, 8.0])
-def test_nor_do_they_move_online(duration_s: float) -> None:
+@pytest.mark.parametrize(("duration_s", "window"), [(4.0, DEFAULT_WINDOW), (8.0, DEFAULT_WINDOW), (6.0, None)])
+def test_nor_do_they_move_online(duration_s: float, window: Window) -> None:
     problem, _ = resting(3, duration_s)
-    found = solve_incremental(problem)
+    found = solve_incremental(problem, window)
     assert np.abs(found.values[MOUNTS]).max() < 0.2 * PRIOR
     assert np.sqrt(np.diag(found.covariance)[MOUNTS]).min() > 0.98 * PRIOR
 

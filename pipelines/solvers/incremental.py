@@ -29,6 +29,7 @@ from pipelines.solvers.history import sequential_history
 from pipelines.solvers.innovations import Innovations, Prediction
 from pipelines.solvers.linearity import is_linear
 from pipelines.solvers.marginals import (
+    HELD,
     IndeterminateError,
     information_of,
     joint_covariance,
@@ -419,7 +420,7 @@ class Run:
         if about is None:
             about = solution.system.linearized(solution.values)
         noise = self._spurious(about) if self._young else None
-        if solution.converged and self.window is not None:
+        if solution.converged:
             unpulled = without_pull(self.problem, solution, noise, self.current_keys)
             if unpulled is not solution:
                 solution, about = unpulled, unpulled.system.linearized(unpulled.values)
@@ -431,7 +432,7 @@ class Run:
     ) -> None:
         """Start the smoother from a solution `since` s after the first step, and fold the past if it may be."""
         grown = self._young and since >= max(_YOUNG, self._looked) and len(self.past) >= _FEW_STEPS
-        if grown and (self.window is None or since >= _OLDEST):
+        if grown and since >= _OLDEST:
             self._young = False
         self._restart(about, stamps)
         self._correct(about, noise)
@@ -501,8 +502,10 @@ class Run:
         values, loss = about.values, about.system.loss
         if self.window is None:
             past = (f for step in self.past for f in weigh(step.factors, self.levels))
-            factors = [used_part(f, values, loss) for f in past]
-            self._start([unweighed(f) for f in factors if f is not None], values, stamps)
+            factors = [unweighed(f) for f in (used_part(f, values, loss) for f in past) if f is not None]
+            # What rests pull at in these is balanced from then on.
+            forces = [f for f in about.system.factors if f.family == HELD]
+            self._start(factors + forces, values, stamps)
             return
         state = State.of(self.time, about.graph, values, _in_use(values, stamps), stamps)
         if self._young:
