@@ -147,7 +147,7 @@ def test_workers_killed_at_random_cost_nothing(start: Start, recordings: Path, t
     command = start("pipelines.cli", what, *words[what], "--jobs", 3, "--out", out)
     killed = 0
     # Each after two more results: workers take seconds to start, and some work must end.
-    while len(finished(out)) < COUNT - 8:
+    while len(finished(out)) < COUNT - 4:
         until(partial(has_finished, len(finished(out)) + 2, out))
         time.sleep(rng.uniform(0.0, 0.1))
         # All may be on their way up again, and the one chosen may just have ended.
