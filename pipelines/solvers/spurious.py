@@ -67,13 +67,13 @@ def information_of_noise(
     doubtful = _doubtful(problem, keys, covariance)
     if not doubtful:
         return None
-    values, ordering = about.values, about.system.ordering
+    values = about.values
     # Far from the solution, measurements would be rejected that count there.
     system = about.system.without_rejected(values)
     try:
         moved = about.drawn(set(values.keys()) - set(doubtful), _DRAWS, np.random.default_rng(0))
         graphs = (about.graph, *map(system.linearize, moved))
-        own, *elsewhere = (joint_information(graph, ordering, keys) for graph in graphs)
+        own, *elsewhere = (joint_information(graph, system.ordering, keys) for graph in graphs)
     except (RuntimeError, IndeterminateError):
         return None
     noise = np.mean(elsewhere, axis=0) - own
