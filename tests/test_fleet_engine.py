@@ -145,11 +145,12 @@ SHORT = "{duration_s: 10, gyro_rate_hz: 100, vision_rate_hz: 20, truth_rate_hz: 
 def test_workers_killed_at_random_cost_nothing(start: Start, tmp_path: Path, what: str) -> None:
     """Every result is there once, and is the one that an undisturbed process computes."""
     out, scenario, rng = tmp_path / "out", tmp_path / "short.yaml", random.Random(7)
-    # Long enough that some are left when a worker is chosen, however slowly that goes.
-    recordings = written(tmp_path, 30.0) if what == "fleet" else tmp_path
     scenario.write_text(SHORT)
+    if what == "fleet":
+        # Long enough that some are left when a worker is chosen, however slowly that goes.
+        written(tmp_path, 30.0)
     words: dict[str, tuple[object, ...]] = {
-        "fleet": (recordings / "*.mcap",),
+        "fleet": (tmp_path / "*.mcap",),
         "montecarlo": ("head", "--scenario", scenario, "--runs", COUNT, "--solvers", "batch"),
     }
     command = start("pipelines.cli", what, *words[what], "--jobs", 3, "--out", out)
@@ -171,7 +172,7 @@ def test_workers_killed_at_random_cost_nothing(start: Start, tmp_path: Path, wha
     assert len(entries) == COUNT
     kept = {entry["name"]: untimed(entry["result"]) for entry in entries}
     if what == "fleet":
-        found = find([f"{recordings}/*.mcap"])
+        found = find([f"{tmp_path}/*.mcap"])
         alone = {name: untimed(calibrate_recording(each, Settings())) for name, each in found.items()}
     else:
         settings = method("head").settings(str(scenario))
