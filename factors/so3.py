@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 _SMALL = 1e-2
 # So many rows fit into a processor's cache with all that is made of them on the way.
 _ROWS = 8192
+# Of so few rows, calls of numpy take longer than what they do: products with tables are the fewest.
+_FEW = 300
 
 _Function = TypeVar("_Function", bound=Callable[..., Array])
 
@@ -48,6 +50,17 @@ def _in_cache(function: _Function) -> _Function:
     return cast(_Function, some_at_a_time)
 
 
+def _few(*given: Array) -> bool:
+    """Whether arrays (..., d) have few rows."""
+    return all(array.size <= _FEW * array.shape[-1] for array in given)
+
+
+def _products(a: Array, b: Array) -> Array:
+    """Products of all numbers of a (..., d) and b (..., e), (..., d e)."""
+    products = a[..., :, None] * b[..., None, :]
+    return products.reshape(*products.shape[:-2], a.shape[-1] * b.shape[-1])
+
+
 def identity(shape: int | tuple[int, ...] = ()) -> Array:
     """Identity rotations, shape (*shape, 4)."""
     shape = (shape,) if isinstance(shape, int) else shape
@@ -71,6 +84,11 @@ def inverse(q: ArrayLike) -> Array:
 def multiply(p: ArrayLike, q: ArrayLike) -> Array:
     """aRb, bRc -> aRc."""
     p, q = np.asarray(p, dtype=float), np.asarray(q, dtype=float)
+    return _products(p, q) @ _PRODUCT if _few(p, q) else _by_components(p, q)
+
+
+def _by_components(p: Array, q: Array) -> Array:
+    """Their product."""
     pw, px, py, pz = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
     qw, qx, qy, qz = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     w = pw * qw - px * qx - py * qy - pz * qz
@@ -94,6 +112,8 @@ def compose(*rotations: ArrayLike) -> Array:
 def rotate(q: ArrayLike, v: ArrayLike) -> Array:
     """Coordinates in a of the vectors v, shape (..., 3), given in b; q is aRb."""
     q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
+    if _few(q, v):
+        return np.asarray((matrix(q) @ v[..., None])[..., 0])
     u = q[..., 1:]
     t = 2.0 * cross(u, v)
     return v + q[..., :1] * t + cross(u, t)
@@ -148,6 +168,8 @@ def log(q: ArrayLike) -> Array:
 def matrix(q: ArrayLike) -> Array:
     """Quaternions -> rotation matrices, shape (..., 3, 3)."""
     q = np.asarray(q, dtype=float)
+    if _few(q):
+        return (_products(q, q) @ _MATRIX).reshape(*q.shape[:-1], 3, 3)
     w, x, y, z = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     out = np.empty((*q.shape[:-1], 3, 3))
     out[..., 0, 0] = 1.0 - 2.0 * (y * y + z * z)
@@ -196,25 +218,33 @@ def right_jacobian(phi: ArrayLike) -> Array:
     safe = np.where(small, 1.0, angle)
     a = np.where(small, 0.5 - square / 24.0, (1.0 - np.cos(safe)) / safe**2)
     b = np.where(small, 1.0 / 6.0 - square / 120.0, (safe - np.sin(safe)) / safe**3)
-    x, y, z = phi[..., 0], phi[..., 1], phi[..., 2]
-    ax, ay, az, bx, by, bz = a * x, a * y, a * z, b * x, b * y, b * z
-    out = np.empty((*phi.shape, 3))
-    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = 1.0 - by * y - bz * z, bx * y + az, bx * z - ay
-    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = bx * y - az, 1.0 - bx * x - bz * z, by * z + ax
-    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = bx * z + ay, by * z - ax, 1.0 - bx * x - by * y
-    return out
+    return _polynomial(phi, -a, b)
 
 
+@_in_cache
 def right_jacobian_inverse(phi: ArrayLike) -> Array:
     """J with Log(Exp(phi) * Exp(d)) = phi + J d to first order (same source, eq. 144)."""
     phi = np.asarray(phi, dtype=float)
-    square = (phi * phi).sum(axis=-1)[..., None, None]
+    square = (phi * phi).sum(axis=-1)
     angle = np.sqrt(square)
     small = angle < _SMALL
     safe = np.where(small, 1.0, angle)
-    a = np.where(small, 1.0 / 12.0 + square / 720.0, 1.0 / safe**2 - 0.5 / (safe * np.tan(0.5 * safe)))
-    k = hat(phi)
-    return np.eye(3) + 0.5 * k + a * (k @ k)
+    b = np.where(small, 1.0 / 12.0 + square / 720.0, 1.0 / safe**2 - 0.5 / (safe * np.tan(0.5 * safe)))
+    return _polynomial(phi, np.full_like(b, 0.5), b)
+
+
+def _polynomial(phi: Array, a: Array, b: Array) -> Array:
+    """I + a hat(phi) + b hat(phi)^2, (..., 3, 3), of phi (..., 3) and a, b (...)."""
+    if _few(phi):
+        terms = (a[..., None] * phi) @ _HAT + (b[..., None] * _products(phi, phi)) @ _SQUARE
+        return np.asarray(terms.reshape(*phi.shape, 3) + np.eye(3))
+    x, y, z = phi[..., 0], phi[..., 1], phi[..., 2]
+    ax, ay, az, bx, by, bz = a * x, a * y, a * z, b * x, b * y, b * z
+    out = np.empty((*phi.shape, 3))
+    out[..., 0, 0], out[..., 0, 1], out[..., 0, 2] = 1.0 - by * y - bz * z, bx * y - az, bx * z + ay
+    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = bx * y + az, 1.0 - bx * x - bz * z, by * z - ax
+    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = bx * z - ay, by * z + ax, 1.0 - bx * x - by * y
+    return out
 
 
 def align(a: ArrayLike, b: ArrayLike, weights: ArrayLike = 1.0) -> Array:
@@ -257,3 +287,19 @@ def to_gtsam(q: ArrayLike) -> gtsam.Rot3:
 
     w, x, y, z = np.asarray(q, dtype=float).tolist()
     return gtsam.Rot3(w, x, y, z)
+
+
+def _tables() -> tuple[Array, Array, Array, Array]:
+    """What products of numbers add to a quaternion product, to the matrix of q, to hat(v), and to its square.
+
+    Of the first two each row is for a product of components, in the order w, x, y, z; of the last two for a number of
+    v, or a product of two. Matrices are by rows.
+    """
+    components, axes = np.eye(4), np.eye(3)
+    product = _by_components(components[:, None], components)
+    turned = np.einsum("avm,mbk->abkv", product, product * np.array([1.0, -1.0, -1.0, -1.0])[:, None])
+    square = np.einsum("aim,bmj->abij", hat(axes), hat(axes))
+    return product.reshape(16, 4), turned[..., 1:, 1:].reshape(16, 9), hat(axes).reshape(3, 9), square.reshape(9, 9)
+
+
+_PRODUCT, _MATRIX, _HAT, _SQUARE = _tables()

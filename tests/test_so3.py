@@ -71,6 +71,19 @@ def test_right_jacobian_inverse(phi: np.ndarray) -> None:
     np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), product.shape), atol=1e-9)
 
 
+def test_many_rows_and_few() -> None:
+    """Both are evaluated in different ways."""
+    phi, other = RNG.normal(size=(2, 40_000, 3))
+    q, p = so3.exp(phi), so3.exp(other)
+    of_many = [so3.multiply(q, p), so3.rotate(q, other), so3.matrix(q)]
+    of_many += [so3.right_jacobian(phi), so3.right_jacobian_inverse(phi), so3.cross(phi, other)]
+    some = slice(19_900, 20_100)
+    of_few = [so3.multiply(q[some], p[some]), so3.rotate(q[some], other[some]), so3.matrix(q[some])]
+    of_few += [so3.right_jacobian(phi[some]), so3.right_jacobian_inverse(phi[some]), so3.cross(phi[some], other[some])]
+    for many, few in zip(of_many, of_few, strict=True):
+        np.testing.assert_allclose(many[some], few, rtol=0.0, atol=1e-14)
+
+
 def test_broadcasts() -> None:
     q, v = so3.exp(RNG.normal(size=(5, 1, 3))), RNG.normal(size=(7, 3))
     assert so3.rotate(q, v).shape == (5, 7, 3)
