@@ -142,26 +142,7 @@ class VectorizedFactor:
 
     def used(self, values: gtsam.Values) -> NDArray[np.bool_]:
         """Which of the n measurements the loss lets count; all of them without one."""
-        return self._weights(values) > 0.5
-
-    def _weights(self, values: gtsam.Values) -> Array:
-        """By which the loss lets the n measurements count."""
-        square, loss = _squares(self.residuals(values)), self._loss_in_force
-        return np.ones(len(square)) if loss is None else loss.weight(square)
-
-    def excess(self, values: gtsam.Values) -> tuple[int, int, Array] | None:
-        """What `Ensemble.at` with `mixed` has too much: a variable, which of its numbers, and information about that.
-
-        Of (2,) the first is of the residuals alone. The second, what they have in common with the Jacobian, is right
-        where all else is at its minimum, and may be anything elsewhere. None: there is nothing too much.
-        """
-        if self.model.turning is None or self.compress:
-            return None
-        block, number = self.model.turning
-        key, evaluation, weights = self.columns[block], self._at(values), self._weights(values)
-        assert isinstance(key, int), "a number that turns rows is shared"
-        added, by = _at_right_angles(evaluation.residuals), evaluation.jacobians()[block][:, :2, number]
-        return key, number, np.array([weights @ _squares(added), weights @ (by * added).sum(axis=1)])
+        return _counting(_squares(self.residuals(values)), self._loss_in_force) > 0.5
 
     def under(self, loss: TruncatedLoss | None) -> VectorizedFactor:
         """The same factor with another loss, if it has one at all."""
@@ -365,6 +346,15 @@ class Ensemble:
             for group in self._groups:
                 group.take()
 
+    def excess(self, loss: TruncatedLoss | None = None) -> Iterator[tuple[int, int, Array]]:
+        """What `at` with `mixed` has too much at the values it was last given, factor by factor.
+
+        A variable, which of its numbers, and (2,) information about that: the first is of the residuals alone; the
+        second, what they have in common with the Jacobian, is right where all else is at its minimum, and may be
+        anything elsewhere.
+        """
+        return chain.from_iterable(group.excess(loss) for group in self._groups)
+
 
 @contextmanager
 def residuals_at(
@@ -401,6 +391,7 @@ class _Group:
         ends = np.cumsum([len(f.model.time) for f in factors]).tolist()
         self._spans = list(zip([0, *ends[:-1]], ends, strict=True))
         self._columns = [self._column(i, places.setdefault(block, {})) for i, block in enumerate(factors[0].blocks)]
+        self._whole: _Evaluation | None = None
         self._parts: list[_Evaluation] = []
 
     def _column(self, i: int, places: dict[int, int]) -> NDArray[np.intp]:
@@ -424,13 +415,40 @@ class _Group:
         for rows, block in zip(self._columns, self._factors[0].blocks, strict=True):
             array = read[block][rows]
             blocks.append(np.broadcast_to(array, (n, array.shape[1])))
-        whole = _Evaluation(*self._model(*blocks))
+        whole = self._whole = _Evaluation(*self._model(*blocks))
         self._parts = [whole.part(start, stop) for start, stop in self._spans]
 
     def give(self, loss: TruncatedLoss | None, mixed: bool) -> None:
         for factor, part in zip(self._factors, self._parts, strict=True):
             factor._given = part.weighed(factor.weights), None if factor.loss is None else loss
             factor._mixed = mixed
+
+    def excess(self, loss: TruncatedLoss | None) -> Iterator[tuple[int, int, Array]]:
+        """As Ensemble.excess has it."""
+        turning, first = self._model.turning, self._factors[0]
+        if turning is None or first.compress:
+            return
+        assert self._whole is not None, "evaluated before"
+        block, number = turning
+        weights = self._weights
+        residuals = weights * self._whole.residuals
+        added = _at_right_angles(residuals)
+        by = weights[:, :2] * self._whole.jacobians()[block][:, :2, number]
+        counting = _counting(_squares(residuals), None if first.loss is None else loss)
+        information = counting[:, None] * np.stack([_squares(added), (by * added).sum(axis=1)], axis=1)
+        sums = np.add.reduceat(information, [start for start, _ in self._spans])
+        for factor, each in zip(self._factors, sums, strict=True):
+            key = factor.columns[block]
+            assert isinstance(key, int), "a number that turns rows is shared"
+            yield key, number, each
+
+    @property
+    def _weights(self) -> Array:
+        """Of all rows, (n or 1, m)."""
+        if all(factor.weights is None for factor in self._factors):
+            return np.ones((1, self._model.rows))
+        of = [(len(f.model.time), f.model.rows, f.weights) for f in self._factors]
+        return np.concatenate([np.ones((n, m)) if weights is None else weights for n, m, weights in of])
 
     def take(self) -> None:
         for factor in self._factors:
@@ -484,7 +502,7 @@ def _kind(factor: VectorizedFactor) -> Hashable:
     model: Any = factor.model
     shared = tuple(_hashable(getattr(model, f.name)) for f in fields(model) if f.name not in stacked)
     absent = tuple(getattr(model, name) is None for name in stacked)
-    return type(model), shared, absent, model.rows, model.blocks
+    return type(model), shared, absent, model.rows, model.blocks, factor.loss is None, factor.compress
 
 
 def _hashable(value: Any) -> Hashable:
@@ -516,6 +534,11 @@ def _square(residuals: Array) -> float:
     """Sum of all squares."""
     flat = residuals.ravel()
     return float(flat @ flat)
+
+
+def _counting(squares: Array, loss: TruncatedLoss | None) -> Array:
+    """By how much a loss lets measurements count whose sums of squares are (n,)."""
+    return np.ones(len(squares)) if loss is None else loss.weight(squares)
 
 
 def _squares(residuals: Array) -> Array:

@@ -93,9 +93,14 @@ class Stretch:
         ensemble = None if self.ensemble is None else Ensemble(_vectorized(factors))
         return replace(self, factors=factors, graph=graph_of(factors), ensemble=ensemble)
 
-    def at(self, values: gtsam.Values, loss: TruncatedLoss | None, mixed: bool = False) -> AbstractContextManager[None]:
-        """Within the block the factors answer for these values, under the loss; `mixed` as Ensemble.at has it."""
-        return (self.ensemble or Ensemble(_vectorized(self.factors))).at(values, loss, mixed)
+    def at(self, values: gtsam.Values, loss: TruncatedLoss | None) -> AbstractContextManager[None]:
+        """Within the block the factors answer for these values, under the loss."""
+        return self._together.at(values, loss)
+
+    @property
+    def _together(self) -> Ensemble:
+        """Its vectorised factors."""
+        return self.ensemble or Ensemble(_vectorized(self.factors))
 
     def error(self, values: gtsam.Values, loss: TruncatedLoss | None) -> float:
         """Half the sum of squares."""
@@ -106,10 +111,10 @@ class Stretch:
         self, values: gtsam.Values, loss: TruncatedLoss | None, excess: Excess | None = None
     ) -> gtsam.GaussianFactorGraph:
         """The linear system about the values; with the mixed second derivatives where their `excess` is asked for."""
-        with self.at(values, loss, excess is not None):
+        ensemble = self._together
+        with ensemble.at(values, loss, excess is not None):
             if excess is not None:
-                found = (v.excess(values) for v in _vectorized(self.factors))
-                for key, number, information in filter(None, found):
+                for key, number, information in ensemble.excess(loss):
                     excess[key, number] = excess.get((key, number), np.zeros(2)) + information
             return self.graph.linearize(values)
 
