@@ -77,6 +77,10 @@ class SecondOrder:
     slopes: Array
     variance: Array
 
+    def share(self) -> float:
+        """What it adds to the variance of the combination of numbers that gains most by it, over what that had."""
+        return float(np.linalg.eigvalsh(self.variance / np.outer(self.floor.sigmas, self.floor.sigmas))[-1])
+
     def beyond(self) -> NDArray[np.bool_]:
         """(n,) which reported numbers have a part in what is of higher order still; of the others the covariance holds.
 

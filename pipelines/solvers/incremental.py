@@ -27,7 +27,7 @@ from pipelines.solvers.curvature import second_order
 from pipelines.solvers.gauss_newton import Solution
 from pipelines.solvers.history import sequential_history
 from pipelines.solvers.innovations import Innovations, Prediction
-from pipelines.solvers.linearity import is_linear
+from pipelines.solvers.linearity import BENT, is_linear
 from pipelines.solvers.marginals import (
     HELD,
     IndeterminateError,
@@ -58,10 +58,11 @@ _FIRST, _GROWTH = 1.0, 1.25
 _YOUNG, _OLDEST = 40.0, 600.0
 # ... and for so many steps: few large ones cost little to solve again.
 _FEW_STEPS = 100
-# It is solved at once when a parameter has moved by _LOST of its prior's sigma, as where motion begins after a rest. If
-# there is _MORE to go by than before, it is while what is known of the parameters bends, when they have moved by _MOVED
-# of the sigmas they had then and by _FAR of their priors', or when ...
-_LOST, _MORE, _MOVED, _FAR = 0.5, 1.05, 0.2, 0.02
+# It is solved at once when a parameter has moved by _LOST of its prior's sigma, as where motion begins after a rest, or
+# when what is known of the parameters bends and a sigma has come down to _HALF, as where another axis begins to move.
+# If there is _MORE to go by than before, it is while what is known bends, after _YOUNG s only if a sigma has come down
+# to _BETTER, when they have moved by _MOVED of the sigmas they had then and by _FAR of their priors', or when ...
+_LOST, _HALF, _MORE, _BETTER, _MOVED, _FAR = 0.5, 0.5, 1.05, 0.9, 0.2, 0.02
 # ... so many steps in a row were rejected, or more than this share of measurements: the run may have lost its way.
 _DOUBTED, _TOO_MANY = 5, 0.25
 # Where so many are rejected of fewer than this, which of them are wrong cannot be told: what is, may agree by chance.
@@ -108,12 +109,14 @@ class _Solved:
         since: s, from the first step to the last.
         steps: their number.
         values, sigmas: (n,) of the reported numbers.
+        first: (n,) these sigmas without what is of second order.
     """
 
     since: float
     steps: int
     values: Array
     sigmas: Array
+    first: Array
 
 
 class Run:
@@ -389,7 +392,8 @@ class Run:
                 self.way, self._course = Way.of(self._course()), _no_course
             self.attitudes.clear()
         self._record(whole.keyframes if from_start else last, values)
-        self._solved = _Solved(since, len(self.past), self._values(), np.sqrt(np.diag(self._covariance())))
+        sigmas = np.sqrt(np.diag(self._covariance()))
+        self._solved = _Solved(since, len(self.past), self._values(), sigmas, self._first_order)
         self.innovations.begin_count()
 
     def _whole(self) -> Assembly:
@@ -435,20 +439,22 @@ class Run:
         if grown and since >= _OLDEST:
             self._young = False
         self._restart(about, stamps)
-        self._correct(about, noise)
+        corrected = self._correct(about, noise)
         if grown and self._young:
             self._looked = _GROWTH * since
-            # Neither correction is carried on once the past is folded.
-            corrected = self._noise is not None or self._bent is not None
-            if not corrected and is_linear(self.problem, solution, self.keys):
+            # Corrections are not carried on once the past is folded.
+            if not corrected and is_linear(self.problem, solution, self.keys, in_use(about.values, stamps)):
                 self._young = False
                 self._restart(about, stamps)
 
-    def _correct(self, about: Linear, noise: Spurious | None) -> None:
-        """Find what of a young run's covariance its linear system has wrong; of another nothing is known."""
+    def _correct(self, about: Linear, noise: Spurious | None) -> bool:
+        """Find what of a young run's covariance its linear system has wrong, and whether that matters.
+
+        Of a run that is not young nothing is known.
+        """
         self._noise = self._bent = None
         if not self._young:
-            return
+            return False
         if noise is not None:
             self._noise = noise.information
         bent = second_order(self.problem, about, self._covariance(), self.current_keys)
@@ -458,6 +464,7 @@ class Run:
             self._beyond[:] = False
         elif self._beyond.any():
             self._beyond &= bent.beyond()
+        return noise is not None or (bent is not None and bent.share() > BENT)
 
     def _spurious(self, about: Linear) -> Spurious | None:
         """What of the information of a linearised solution is its states' noise."""
@@ -474,13 +481,29 @@ class Run:
         if since >= _GROWTH * solved.since or solved.since < _YOUNG <= since:
             return True
         moved, scales = np.abs(self._values() - solved.values), self._scales
-        if (moved > _LOST * scales).any():
+        left = self._left(solved)
+        if left < _HALF or (moved > _LOST * scales).any():
             return True
         if len(self.past) < _MORE * solved.steps:
             return False
-        if self._bent is not None or self.innovations.doubtful(_DOUBTED, _TOO_MANY):
+        if self._bent is not None and (since < _YOUNG or left < _BETTER):
+            return True
+        if self.innovations.doubtful(_DOUBTED, _TOO_MANY):
             return True
         return bool((moved > np.maximum(_MOVED * solved.sigmas, _FAR * scales)).any())
+
+    def _left(self, solved: _Solved) -> float:
+        """To what share any sigma has come down since; 1 unless what is known bends."""
+        if self._bent is None:
+            return 1.0
+        free = solved.first > 0.0
+        return float((self._first_order[free] / solved.first[free]).min(initial=1.0))
+
+    @property
+    def _first_order(self) -> Array:
+        """(n,) sigmas of the reported numbers as linear systems have them."""
+        variance = np.diag(self._covariance())
+        return np.sqrt(variance if self._bent is None else np.maximum(variance - np.diag(self._bent), 0.0))
 
     @property
     def _scales(self) -> Array:
@@ -507,7 +530,7 @@ class Run:
             forces = [f for f in about.system.factors if f.family == HELD]
             self._start(factors + forces, values, stamps)
             return
-        state = State.of(self.time, about.graph, values, _in_use(values, stamps), stamps)
+        state = State.of(self.time, about.graph, values, in_use(values, stamps), stamps)
         if self._young:
             self._start([state.factor], state.values, state.stamps)
         else:
@@ -528,7 +551,7 @@ class Run:
             raise IndeterminateError(explained(error)) from None
 
 
-def _in_use(values: gtsam.Values, stamps: Mapping[int, float]) -> list[int]:
+def in_use(values: gtsam.Values, stamps: Mapping[int, float]) -> list[int]:
     """The variables that later steps may refer to: those used in the last moment and those that never age."""
     latest = max(stamps.values(), default=-np.inf)
     return [key for key in values.keys() if stamps.get(key, np.inf) >= latest]

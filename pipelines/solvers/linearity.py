@@ -12,23 +12,30 @@ from pipelines.solvers.marginals import IndeterminateError, coordinate_inverse, 
 
 # So many points about the estimate are tried, in pairs.
 _PAIRS = 4
-# By this part the error there may differ from what the linear system foresees: sigmas are then wrong by half as much.
-_BENT = 0.15
+# By this part the error there, or a variance, may differ from what the linear system foresees: sigmas are then wrong by
+# half as much.
+BENT = 0.15
 
 
-def is_linear(problem: Problem, solution: Solution, keys: Sequence[int]) -> bool:
-    """Whether the error is what its linearisation foresees at parameters drawn from their covariance, states following.
+def is_linear(problem: Problem, solution: Solution, keys: Sequence[int], kept: Sequence[int]) -> bool:
+    """Whether the error is what its linearisation foresees at parameters drawn from their covariance.
 
+    What is kept follows the parameters by the linearisation, as it will once the past is folded; all other states are
+    where they are likeliest then. (Where these too follow by the linearisation they may leave the error's floor, as
+    along a camera's roll, though the floor itself is as foreseen.)
     Where it is not, the past must not be folded into a Gaussian: motion to come may move the parameters so far.
 
     Args:
         problem: the graph's.
         solution: its minimum.
         keys: variables that hold the parameters.
+        kept: those that the Gaussian is to be of.
     """
     values, system = solution.values, solution.system
     linear, error = system.linearized(values), system.error(values)
-    ends = np.cumsum([values.dims()[key] for key in keys])
+    dims = values.dims()
+    ends = np.cumsum([dims[key] for key in keys])
+    still = {key: np.zeros(dims[key]) for key in kept}
     generator = np.random.default_rng(0)
     try:
         information = joint_information(linear.graph, system.ordering, keys)
@@ -40,9 +47,13 @@ def is_linear(problem: Problem, solution: Solution, keys: Sequence[int]) -> bool
         for drawn in generator.standard_normal((_PAIRS, len(free))):
             for z in (drawn, -drawn):
                 moves = dict(zip(keys, np.split(root @ z, ends[:-1]), strict=True))
-                delta, _ = linear.holding(moves).step()
-                foreseen = 0.5 * float(z @ z)
-                if not abs(system.error(values.retract(delta)) - error - foreseen) < _BENT * foreseen:
+                there = values.retract(linear.holding(moves).step()[0])
+                foreseen, most = error + 0.5 * float(z @ z), BENT * 0.5 * float(z @ z)
+                off = system.error(there) - foreseen
+                # What is kept of a graph in stretches may be one stretch's own.
+                if off > most and len(system.stretches) == 1:
+                    off = system.error(there.retract(system.linearized(there).holding(still).step()[0])) - foreseen
+                if not abs(off) < most:
                     return False
     except (RuntimeError, IndeterminateError, np.linalg.LinAlgError):
         return False
