@@ -145,12 +145,12 @@ def second_order(
         generator, n = np.random.default_rng(0), len(floor.sigmas)
         slopes, moved = np.zeros((0, n, n)), np.zeros((0, n))
         for count, slight in _SLIGHT.items():
-            more = floor.slopes(generator.standard_normal((n, count - len(slopes))))
+            more = floor.slopes(floor.vectors.T @ generator.standard_normal((n, count - len(slopes))))
             slopes, moved = np.concatenate([slopes, more[0]]), np.concatenate([moved, more[1]])
             bent = 0.5 * np.square(slopes).sum(axis=2) + 0.25 * np.square((slopes @ moved[:, :, None])[:, :, 0])
             if (bent.sum(axis=0) / floor.sigmas**2).max() < slight:
                 return None
-        ways = _balanced(_bending(slopes, floor.sigmas), generator)
+        ways = _balanced(_bending(slopes, floor.sigmas), floor.vectors.T, generator)
         slopes, moved = floor.slopes(ways)
     except (RuntimeError, IndeterminateError, np.linalg.LinAlgError):
         return None
@@ -247,10 +247,16 @@ def _bending(slopes: Array, sigmas: Array) -> Array:
     return np.asarray(ways[: max(1, int(np.sum(sizes**2 > _STRAIGHT * len(slopes))))])
 
 
-def _balanced(along: Array, generator: np.random.Generator) -> Array:
-    """Draws (n, k), their parts along r unit rows (r, n) in sets of r at right angles, each sqrt(r) long."""
+def _balanced(along: Array, turned: Array, generator: np.random.Generator) -> Array:
+    """Draws (n, k), their parts along r unit rows (r, n) in sets of r at right angles, each sqrt(r) long.
+
+    They are drawn in the numbers' scales and `turned` (n, n) from these to the directions: of directions of which as
+    much is known rounding decides which they are, and of rows their signs.
+    """
     r = len(along)
-    sets = [np.linalg.qr(generator.standard_normal((r, r)))[0] for _ in range(-(-_DRAWS // r))]
-    inside = np.sqrt(r) * np.hstack(sets)
-    drawn = generator.standard_normal((along.shape[1], inside.shape[1]))
+    drawn = turned @ generator.standard_normal((along.shape[1], r * -(-_DRAWS // r)))
+    inside = along @ drawn
+    for begin in range(0, inside.shape[1], r):
+        Q, R = np.linalg.qr(inside[:, begin : begin + r])
+        inside[:, begin : begin + r] = np.sqrt(r) * np.where(np.diag(R) < 0.0, -Q, Q)
     return np.asarray(drawn + along.T @ (inside - along @ drawn))

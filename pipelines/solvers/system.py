@@ -470,8 +470,11 @@ class System:
 
     def without_rejected(self, values: gtsam.Values) -> System:
         """The same system with the measurements alone that count at the values, wherever it is asked from then on."""
+        factors = self.factors
         with self.at(values):
-            return self.made_of([without_rejected(f, f, values) for f in self.factors]).under(None)
+            kept = [without_rejected(f, f, values) for f in factors]
+        same = all(one is other for one, other in zip(kept, factors, strict=True))
+        return (self if same else self.made_of(kept)).under(None)
 
     def residuals(self, values: gtsam.Values) -> dict[str, Residuals]:
         """Residuals of all measurements, by family."""
