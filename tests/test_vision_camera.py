@@ -79,7 +79,9 @@ def test_jacobians_are_those_of_differences(name: str) -> None:
     camera = FISHEYE if name == "equidistant" else Camera(640, 480, K, PINHOLES[name][0], np.array(PINHOLES[name][1]))
     points, h = np.vstack([POINTS[:50], [0.0, 0.0, 1.1]]), 1e-6
     by_point = [(camera.project(points + h * e) - camera.project(points - h * e)) / (2 * h) for e in np.eye(3)]
-    np.testing.assert_allclose(camera.by_point(points), np.stack(by_point, axis=-1), atol=1e-5)
+    pixels, jacobian = camera.project_with_jacobian(points)
+    np.testing.assert_allclose(jacobian, np.stack(by_point, axis=-1), atol=1e-5)
+    np.testing.assert_allclose(pixels, camera.project(points), rtol=0.0, atol=1e-9)
     given = camera.intrinsics
     by_intrinsics = [
         (camera.with_intrinsics(given + h * e).project(points) - camera.with_intrinsics(given - h * e).project(points))

@@ -97,8 +97,8 @@ class Camera:
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         return replace(self, K=K, coefficients=intrinsics[4:])
 
-    def by_point(self, points: Array) -> Array:
-        """Jacobian (..., 2, 3) of the pixels by the points, shape (..., 3); NaN behind the camera."""
+    def project_with_jacobian(self, points: Array) -> tuple[Array, Array]:
+        """Pixels (..., 2) as `project` has them, and their Jacobian (..., 2, 3) by the points; NaN behind it."""
         z = points[..., 2]
         if self.distortion_model == "equidistant":
             flat = points[..., :2]
@@ -112,12 +112,15 @@ class Camera:
             J[..., :2] = scale[..., None, None] * np.eye(2)
             J[..., :2] += ((slope * z / square) - scale)[..., None, None] * out[..., :, None] * out[..., None, :]
             J[..., 2] = -(slope * rho / square)[..., None] * out
-            return np.asarray(J * self.focal[:, None])
-        z = np.where(z > 0, z, np.nan)
-        flat = points[..., :2] / z[..., None]
-        _, bent = self._distort(flat)
-        by_flat = np.concatenate([np.broadcast_to(np.eye(2), (*flat.shape, 2)), -flat[..., None]], axis=-1)
-        return np.asarray(self.focal[:, None] * (bent @ (by_flat / z[..., None, None])))
+            bent = scale[..., None] * flat
+        else:
+            z = np.where(z > 0, z, np.nan)
+            flat = points[..., :2] / z[..., None]
+            bent, by_flat = self._distort(flat)
+            J = np.empty((*points.shape[:-1], 2, 3))
+            J[..., :2] = by_flat / z[..., None, None]
+            J[..., 2] = -(J[..., :2] @ flat[..., None])[..., 0]
+        return bent * self.focal + self.centre, self.focal[:, None] * J
 
     def by_intrinsics(self, points: Array) -> Array:
         """Jacobian (..., 2, 4 + n) of the pixels of points, shape (..., 3), by `intrinsics`; NaN behind the camera."""

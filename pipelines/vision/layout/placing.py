@@ -138,13 +138,12 @@ def vote(bundle: Bundle, sights: Sights, found: Flips, told: Sides) -> tuple[Arr
     places = so3.rotate(bRc, found.place[:, None] - position[:, :, None]).reshape(-1, 3)
     keep = _some(np.flatnonzero(np.repeat(there.ravel(), 2)), _PROPOSALS)
     bRt, place = proposals[keep], places[keep]
-    # Errors of a picture's pose in what it says of the tag, marginalised.
-    spread = np.asarray(np.linalg.inv(told.information[sights.picture] + 1e-12 * np.eye(6)), dtype=float)
+    known = told.information[sights.picture] + 1e-12 * np.eye(6)
     odds = np.where(there, told.cost[sights.picture] - told.cost[sights.picture, :1], np.inf)
     cost = np.zeros(len(keep))
     for round_ in range(_ROUNDS + 1):
         far = FAR * 4.0 ** max(0, 4 - round_)
-        squares, gradient, information = _against(bundle, sights, cRb, position, spread, bRt, place)
+        squares, gradient, information = _against(bundle, sights, cRb, position, known, bRt, place)
         squares = np.where(there, squares + odds, np.inf)
         side = squares.argmin(axis=2)[..., None]
         squares = np.take_along_axis(squares, side, 2)[..., 0]
@@ -164,9 +163,12 @@ def vote(bundle: Bundle, sights: Sights, found: Flips, told: Sides) -> tuple[Arr
 
 
 def _against(
-    bundle: Bundle, sights: Sights, cRb: Array, position: Array, spread: Array, bRt: Array, place: Array
+    bundle: Bundle, sights: Sights, cRb: Array, position: Array, known: Array, bRt: Array, place: Array
 ) -> tuple[Array, Array, Array]:
-    """Of each proposal (h) in each sight (s) and side (2): squares, gradient (6,), information (6, 6) for the tag."""
+    """Of each proposal (h) in each sight (s) and side (2): squares, gradient (6,), information (6, 6) for the tag.
+
+    Errors of the picture's pose, of which so much is `known` (s, 2, 6, 6) by others, are marginalised.
+    """
     h, s = len(bRt), len(sights)
     shape = (h, s, 2)
     proposal, sight, side = (a.ravel() for a in np.indices(shape))
@@ -174,9 +176,11 @@ def _against(
     camera = bundle.camera[sights.picture][sight]
     seen = Sights(np.arange(len(sight)), proposal, sights.corners[sight], sights.sigma[sight])
     rows = linearized(Bundle.of(bundle.cameras, camera, body, cRb[sight, side], position[sight, side]), seen)
-    A, B = rows.by_picture, rows.by_tag
-    weight = np.linalg.inv(np.eye(8) + A @ spread[sight, side] @ np.swapaxes(A, 1, 2))
-    Bw = np.swapaxes(B, 1, 2) @ weight
-    squares = np.einsum("mi,mij,mj->m", rows.miss, weight, rows.miss)
-    gradient = (Bw @ rows.miss[..., None])[..., 0]
-    return squares.reshape(shape), gradient.reshape(*shape, 6), (Bw @ B).reshape(*shape, 6, 6)
+    A, B, miss = rows.by_picture, rows.by_tag, rows.miss[..., None]
+    At, Bt = np.swapaxes(A, 1, 2), np.swapaxes(B, 1, 2)
+    by_pose, crossing = At @ miss, At @ B
+    moved = np.linalg.solve(known[sight, side] + At @ A, np.concatenate([by_pose, crossing], axis=2))
+    squares = rows.squares - (by_pose * moved[..., :1]).sum(axis=(1, 2))
+    taken = np.swapaxes(crossing, 1, 2) @ moved
+    gradient = (Bt @ miss - taken[..., :1])[..., 0]
+    return squares.reshape(shape), gradient.reshape(*shape, 6), (Bt @ B - taken[..., 1:]).reshape(*shape, 6, 6)

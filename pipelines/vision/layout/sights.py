@@ -117,7 +117,7 @@ def linearized(bundle: Bundle, sights: Sights) -> Rows:
     seen, by_point = np.empty((m, 4, 2)), np.empty((m, 4, 2, 3))
     for k, camera in enumerate(bundle.cameras):
         mine = bundle.camera[sights.picture] == k
-        seen[mine], by_point[mine] = camera.project(points[mine]), camera.by_point(points[mine])
+        seen[mine], by_point[mine] = camera.project_with_jacobian(points[mine])
     good = np.asarray((np.abs(seen) < _FARTHEST).all(axis=2) & np.isfinite(by_point).all(axis=(2, 3)))
     weight = 1.0 / sights.sigma[:, None, None]
     miss = np.where(good[..., None], weight * (seen - sights.corners), _BEHIND)
@@ -126,5 +126,6 @@ def linearized(bundle: Bundle, sights: Sights) -> Rows:
     in_b = by_turned @ so3.matrix(so3.exp(w * t)) if t.any() else by_turned
     by_picture = np.concatenate([-by_turned @ so3.hat(turned), by_point], axis=-1)
     by_tag = np.concatenate([-in_b @ so3.matrix(bRt)[:, None] @ so3.hat(local), in_b], axis=-1)
-    velocity = so3.rotate(at_middle, so3.cross(w, turned)) + v
+    moving = bundle.motion.any()
+    velocity = so3.rotate(at_middle, so3.cross(w, turned)) + v if moving else np.zeros_like(points)
     return Rows(miss.reshape(m, 8), by_picture.reshape(m, 8, 6), by_tag.reshape(m, 8, 6), points, velocity, by_point)
