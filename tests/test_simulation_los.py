@@ -155,11 +155,12 @@ def test_long_recordings_are_simulated_block_by_block(
     latitude_deg: float | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loss = Loss(start_s=0.4, end_s=0.7, azimuth_step_deg=5.0)
-    scenario = LosScenario(duration_s=1.0, latitude_deg=latitude_deg, losses=[loss])
+    scenario = LosScenario(duration_s=2.0, latitude_deg=latitude_deg, losses=[loss])
     whole, truth = simulate_los(scenario, 0)
-    monkeypatch.setattr(simulation, "_BLOCK", 123)
-    blocks, its_truth = simulate_los(scenario, 0)
-    for name in ("gyro", "force", "gimbal", "error"):
-        # To rounding: so few rows as a block has here are multiplied in another way than many.
-        np.testing.assert_allclose(getattr(blocks, name), getattr(whole, name), rtol=0.0, atol=1e-12)
-    assert its_truth == pytest.approx(truth, rel=1e-12)
+    # Few rows are multiplied in another way than many, with other rounding.
+    for block, rounding in ((640, 0.0), (123, 1e-12)):
+        monkeypatch.setattr(simulation, "_BLOCK", block)
+        blocks, its_truth = simulate_los(scenario, 0)
+        for name in ("gyro", "force", "gimbal", "error"):
+            np.testing.assert_allclose(getattr(blocks, name), getattr(whole, name), rtol=0.0, atol=rounding)
+        assert its_truth == pytest.approx(truth, rel=1e-12)
