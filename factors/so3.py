@@ -88,7 +88,7 @@ def multiply(p: ArrayLike, q: ArrayLike) -> Array:
 
 
 def _by_components(p: Array, q: Array) -> Array:
-    """Their product."""
+    """The product, component by component."""
     pw, px, py, pz = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
     qw, qx, qy, qz = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
     w = pw * qw - px * qx - py * qy - pz * qz

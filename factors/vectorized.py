@@ -346,14 +346,14 @@ class Ensemble:
             for group in self._groups:
                 group.take()
 
-    def excess(self, loss: TruncatedLoss | None = None) -> Iterator[tuple[int, int, Array]]:
-        """What `at` with `mixed` has too much at the values it was last given, factor by factor.
+    def excess(self) -> Iterator[tuple[int, int, Array]]:
+        """What `mixed` has too much, factor by factor; to be asked within the block of `at`.
 
         A variable, which of its numbers, and (2,) information about that: the first is of the residuals alone; the
         second, what they have in common with the Jacobian, is right where all else is at its minimum, and may be
         anything elsewhere.
         """
-        return chain.from_iterable(group.excess(loss) for group in self._groups)
+        return chain.from_iterable(group.excess() for group in self._groups)
 
 
 @contextmanager
@@ -423,7 +423,7 @@ class _Group:
             factor._given = part.weighed(factor.weights), None if factor.loss is None else loss
             factor._mixed = mixed
 
-    def excess(self, loss: TruncatedLoss | None) -> Iterator[tuple[int, int, Array]]:
+    def excess(self) -> Iterator[tuple[int, int, Array]]:
         """As Ensemble.excess has it."""
         turning, first = self._model.turning, self._factors[0]
         if turning is None or first.compress:
@@ -434,7 +434,7 @@ class _Group:
         residuals = weights * self._whole.residuals
         added = _at_right_angles(residuals)
         by = weights[:, :2] * self._whole.jacobians()[block][:, :2, number]
-        counting = _counting(_squares(residuals), None if first.loss is None else loss)
+        counting = _counting(_squares(residuals), first._loss_in_force)
         information = counting[:, None] * np.stack([_squares(added), (by * added).sum(axis=1)], axis=1)
         sums = np.add.reduceat(information, [start for start, _ in self._spans])
         for factor, each in zip(self._factors, sums, strict=True):

@@ -392,8 +392,9 @@ class Run:
                 self.way, self._course = Way.of(self._course()), _no_course
             self.attitudes.clear()
         self._record(whole.keyframes if from_start else last, values)
-        sigmas = np.sqrt(np.diag(self._covariance()))
-        self._solved = _Solved(since, len(self.past), self._values(), sigmas, self._first_order)
+        variance = np.diag(self._covariance())
+        first = self._first_order(variance)
+        self._solved = _Solved(since, len(self.past), self._values(), np.sqrt(variance), first)
         self.innovations.begin_count()
 
     def _whole(self) -> Assembly:
@@ -497,12 +498,11 @@ class Run:
         if self._bent is None:
             return 1.0
         free = solved.first > 0.0
-        return float((self._first_order[free] / solved.first[free]).min(initial=1.0))
+        first = self._first_order(np.diag(self._covariance()))
+        return float((first[free] / solved.first[free]).min(initial=1.0))
 
-    @property
-    def _first_order(self) -> Array:
-        """(n,) sigmas of the reported numbers as linear systems have them."""
-        variance = np.diag(self._covariance())
+    def _first_order(self, variance: Array) -> Array:
+        """(n,) sigmas as linear systems have them, of reported numbers that have these variances (n,) in all."""
         return np.sqrt(variance if self._bent is None else np.maximum(variance - np.diag(self._bent), 0.0))
 
     @property

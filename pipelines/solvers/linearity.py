@@ -48,12 +48,13 @@ def is_linear(problem: Problem, solution: Solution, keys: Sequence[int], kept: S
             for z in (drawn, -drawn):
                 moves = dict(zip(keys, np.split(root @ z, ends[:-1]), strict=True))
                 there = values.retract(linear.holding(moves).step()[0])
-                foreseen, most = error + 0.5 * float(z @ z), BENT * 0.5 * float(z @ z)
-                off = system.error(there) - foreseen
+                rise = 0.5 * float(z @ z)
+                off = system.error(there) - error - rise
                 # What is kept of a graph in stretches may be one stretch's own.
-                if off > most and len(system.stretches) == 1:
-                    off = system.error(there.retract(system.linearized(there).holding(still).step()[0])) - foreseen
-                if not abs(off) < most:
+                if off > BENT * rise and len(system.stretches) == 1:
+                    there = there.retract(system.linearized(there).holding(still).step()[0])
+                    off = system.error(there) - error - rise
+                if not abs(off) < BENT * rise:
                     return False
     except (RuntimeError, IndeterminateError, np.linalg.LinAlgError):
         return False

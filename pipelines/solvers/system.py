@@ -114,7 +114,7 @@ class Stretch:
         ensemble = self._together
         with ensemble.at(values, loss, excess is not None):
             if excess is not None:
-                for key, number, information in ensemble.excess(loss):
+                for key, number, information in ensemble.excess():
                     excess[key, number] = excess.get((key, number), np.zeros(2)) + information
             return self.graph.linearize(values)
 

@@ -98,7 +98,7 @@ class Camera:
         return replace(self, K=K, coefficients=intrinsics[4:])
 
     def project_with_jacobian(self, points: Array) -> tuple[Array, Array]:
-        """Pixels (..., 2) as `project` has them, and their Jacobian (..., 2, 3) by the points; NaN behind it."""
+        """Pixels (..., 2) as `project` has them, and their Jacobian (..., 2, 3) by the points, NaN where they are."""
         z = points[..., 2]
         if self.distortion_model == "equidistant":
             flat = points[..., :2]
