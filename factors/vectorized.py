@@ -1,16 +1,16 @@
 """The bridge from vectorised models to gtsam: many measurements in one CustomFactor.
 
-The bridge gathers the blocks from gtsam's Values, calls the model, weighs outliers down and lays the Jacobians out as
-gtsam wants them. One Python call for 20 measurements costs little more than for one.
+The bridge gathers the blocks from gtsam's Values and calls the model; `factors.answers` weighs outliers down and lays
+the Jacobians out. One Python call for 20 measurements costs little more than for one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import chain
 from typing import Any
 
@@ -19,39 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import so3
+from factors.answers import Answers, Evaluation, Places, counting, laid_out, places_of, squares_of
 from factors.loss import TruncatedLoss
 from factors.model import POSE3, ROT3, Array, Block, Keys, Model, Residuals, check, dimension, width
 
 # Models of these types, rows and blocks were seen to give what they declare.
 _CHECKED: set[Hashable] = set()
-
-
-class _Evaluation:
-    """A model's residuals at some values, and its Jacobians once asked for."""
-
-    def __init__(self, residuals: Array, linearize: Callable[[], tuple[Array, ...]]) -> None:
-        self.residuals = residuals
-        self._linearize: Callable[[], tuple[Array, ...]] | None = linearize
-        self._jacobians: tuple[Array, ...] = ()
-
-    def jacobians(self) -> tuple[Array, ...]:
-        if self._linearize is not None:
-            self._jacobians, self._linearize = self._linearize(), None
-        return self._jacobians
-
-    def part(self, start: int, stop: int) -> _Evaluation:
-        """That of some consecutive measurements."""
-        return _Evaluation(
-            self.residuals[start:stop], lambda: tuple(jacobian[start:stop] for jacobian in self.jacobians())
-        )
-
-    def weighed(self, weights: Array | None) -> _Evaluation:
-        """With rows multiplied by weights (n, m); None: as it is."""
-        if weights is None:
-            return self
-        return _Evaluation(
-            weights * self.residuals, lambda: tuple(weights[..., None] * jacobian for jacobian in self.jacobians())
-        )
 
 
 def _same(a: Any, b: Any) -> bool:
@@ -92,14 +65,13 @@ class VectorizedFactor:
             for key in [column] if isinstance(column, int) else column:
                 slots.setdefault(key, len(slots))
         self.keys = list(slots)
-        self._slots = [
+        self.slots = [
             slots[column] if isinstance(column, int) else [slots[key] for key in column] for column in self.columns
         ]
         unknowns = sum(map(dimension, self.blocks))
-        self._dim = unknowns + 1 if self.compress else len(self.model.time) * self.model.rows
-        self._last: tuple[list[Any], _Evaluation] | None = None
-        self._given: tuple[_Evaluation, TruncatedLoss | None] | None = None
-        self._mixed = False
+        self.dim = unknowns + 1 if self.compress else len(self.model.time) * self.model.rows
+        self._last: tuple[list[Any], Evaluation] | None = None
+        self._given: tuple[Answers, int] | None = None
 
     def _require_fit(self) -> None:
         """Raise ValueError unless model, blocks and keys belong together."""
@@ -127,7 +99,7 @@ class VectorizedFactor:
         It is not kept here: the two would keep each other for good, since Python's garbage collector cannot see what
         gtsam holds.
         """
-        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(self._dim), self.keys, self._evaluate)
+        return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(self.dim), self.keys, self._evaluate)
 
     def residuals(self, values: gtsam.Values) -> Array:
         """Whitened residuals (n, m) at the values, outliers included."""
@@ -136,13 +108,11 @@ class VectorizedFactor:
     def rows(self, values: gtsam.Values) -> tuple[Array, Array]:
         """Residuals (n * m,) and their Jacobian (n * m, d) on the factor's keys, neither weighed nor compressed."""
         evaluation = self._at(values)
-        jacobians: list[Array] = [np.empty(0)] * len(self.keys)
-        self._lay_out(evaluation.jacobians(), jacobians)
-        return evaluation.residuals.ravel(), np.concatenate(jacobians, axis=1)
+        return evaluation.residuals.ravel(), laid_out(evaluation.jacobians(), self.places, 1)[0]
 
     def used(self, values: gtsam.Values) -> NDArray[np.bool_]:
         """Which of the n measurements the loss lets count; all of them without one."""
-        return _counting(_squares(self.residuals(values)), self._loss_in_force) > 0.5
+        return counting(squares_of(self.residuals(values)), self._loss_in_force) > 0.5
 
     def under(self, loss: TruncatedLoss | None) -> VectorizedFactor:
         """The same factor with another loss, if it has one at all."""
@@ -176,23 +146,24 @@ class VectorizedFactor:
 
     @property
     def _loss_in_force(self) -> TruncatedLoss | None:
-        return self.loss if self._given is None else self._given[1]
+        return self.loss if self._given is None else self._given[0].loss
 
-    def _at(self, values: gtsam.Values) -> _Evaluation:
+    def _at(self, values: gtsam.Values) -> Evaluation:
         """The model at the values.
 
         The last evaluation is kept: a solver asks for the error, then for the Jacobians at the same values, and a
         smoother asks again and again while its linearisation point stays.
         """
         if self._given is not None:
-            return self._given[0]
+            answers, i = self._given
+            return answers.part(i)
         variables = [
             variable
             for column, block in zip(self.columns, self.blocks, strict=True)
             for variable in _read(values, [column] if isinstance(column, int) else column, block)
         ]
         if self._last is None or not all(map(_same, variables, self._last[0])):
-            self._last = variables, _Evaluation(*self.model(*self._arrays(variables))).weighed(self.weights)
+            self._last = variables, Evaluation(*self.model(*self._arrays(variables))).weighed(self.weights)
         return self._last[1]
 
     def _arrays(self, variables: list[Any]) -> Iterator[Array]:
@@ -206,105 +177,14 @@ class VectorizedFactor:
             start = stop
 
     def _evaluate(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        evaluation = self._at(values)
-        residuals, loss = evaluation.residuals, self._loss_in_force
-        if jacobians is None:
-            if loss is None and not self.compress:
-                return residuals.ravel()
-            error = np.zeros(self._dim)
-            error[0] = np.sqrt(_square(residuals) if loss is None else loss.cost(_squares(residuals)).sum())
-            return error
-        blocks = evaluation.jacobians()
-        if loss is not None:
-            root = np.sqrt(loss.weight(_squares(residuals)))[:, None]
-            residuals = root * residuals
-            blocks = tuple(root[..., None] * b for b in blocks)
-        if self.compress:
-            return self._compressed(residuals, blocks, jacobians)
-        if self._mixed and self.model.turning is not None:
-            blocks = _turned(blocks, residuals, *self.model.turning)
-        self._lay_out(blocks, jacobians)
-        return residuals.ravel()
+        answers, i = self._given or (Answers([self], self._at(values), None, self.loss), 0)
+        return answers.error(i) if jacobians is None else answers.linear(i, jacobians)
 
     @cached_property
-    def _places(self) -> tuple[list[slice], list[_Place]]:
-        """As `_places` says."""
-        slots = tuple(each if isinstance(each, int) else tuple(each) for each in self._slots)
-        return _places(len(self.model.time), self.model.rows, slots, tuple(map(dimension, self.blocks)))
-
-    def _lay_out(self, blocks: Sequence[Array], jacobians: list[Array]) -> None:
-        n, m = blocks[0].shape[:2]
-        columns, targets = self._places
-        whole = np.zeros((n * m, columns[-1].stop))
-        for target, block in zip(targets, blocks, strict=True):
-            if isinstance(target, tuple):
-                place = np.ndarray(block.shape, whole.dtype, whole, *target)
-                place += block
-            else:
-                whole.reshape(-1)[target] += block
-        for slot, column in enumerate(columns):
-            jacobians[slot] = whole[:, column]
-
-    def _compressed(self, residuals: Array, blocks: Sequence[Array], jacobians: list[Array]) -> Array:
-        rows = [b.reshape(-1, b.shape[2]) for b in blocks]
-        A = np.concatenate(rows, axis=1) if len(rows) > 1 else rows[0]
-        R, d, rest = square_root(A.T @ A, A.T @ residuals.ravel(), _square(residuals))
-        start = 0
-        for slot, block in zip(self._slots, blocks, strict=True):
-            assert isinstance(slot, int)
-            stop = start + block.shape[2]
-            jacobians[slot] = np.vstack([R[:, start:stop], np.zeros((1, stop - start))])
-            start = stop
-        return np.append(d, rest)
-
-
-def _turned(blocks: Sequence[Array], residuals: Array, block: int, number: int) -> tuple[Array, ...]:
-    """Jacobians by blocks, that by a number which turns the first two rows with the residuals turned likewise."""
-    by = blocks[block].copy()
-    by[:, :2, number] += _at_right_angles(residuals)
-    return *blocks[:block], by, *blocks[block + 1 :]
-
-
-def _at_right_angles(residuals: Array) -> Array:
-    """The first two rows (n, 2) of residuals (n, m), turned back in their plane."""
-    return np.stack([residuals[:, 1], -residuals[:, 0]], axis=1)
-
-
-# Where a block (n, m, d) is added to the whole Jacobian: offset and strides, bytes, where its keys follow each other
-# evenly, or the elements.
-_Place = tuple[int, tuple[int, int, int]] | NDArray[np.intp]
-
-
-@lru_cache(maxsize=1000)
-def _places(
-    n: int, m: int, slots: tuple[int | tuple[int, ...], ...], dimensions: tuple[int, ...]
-) -> tuple[list[slice], list[_Place]]:
-    """The columns of each key in the whole Jacobian (n, m, width), and where each block is added.
-
-    Most factors of a graph have the same.
-
-    Args:
-        n, m: measurements, and the rows of each.
-        slots: of each block the position of its key, or of each measurement's, among the factor's keys.
-        dimensions: of each block.
-    """
-    widths: dict[int, int] = {}
-    for own, size in zip(slots, dimensions, strict=True):
-        widths |= dict.fromkeys([own] if isinstance(own, int) else own, size)
-    ends = np.cumsum([widths[slot] for slot in range(len(widths))])
-    columns = [slice(int(end) - widths[slot], int(end)) for slot, end in enumerate(ends)]
-    width = int(ends[-1])
-    rows = (np.arange(n * m) * width).reshape(n, m, 1)
-    targets: list[_Place] = []
-    for own, size in zip(slots, dimensions, strict=True):
-        first = ends[[own] * n if isinstance(own, int) else list(own)] - size
-        apart = int(first[min(1, n - 1)] - first[0])
-        if (np.diff(first) == apart).all():
-            one = np.dtype(float).itemsize
-            targets.append((int(first[0]) * one, ((m * width + apart) * one, width * one, one)))
-        else:
-            targets.append(rows + first[:, None, None] + np.arange(size))
-    return columns, targets
+    def places(self) -> Places:
+        """Where blocks lie in the Jacobian by all keys, see `places_of`."""
+        slots = tuple(each if isinstance(each, int) else tuple(each) for each in self.slots)
+        return places_of(len(self.model.time), self.model.rows, slots, tuple(map(dimension, self.blocks)))
 
 
 class Ensemble:
@@ -370,16 +250,13 @@ def residuals_at(
                 given = [factor._given for factor in factors]
             for factor, each in zip(factors, given, strict=True):
                 assert each is not None
-                factor._given = _Evaluation(each[0].residuals, _no_jacobians), each[1]
+                each[0].forget_jacobians()
+                factor._given = each
         yield
     finally:
         for factors in parts:
             for factor in factors:
                 factor._given = None
-
-
-def _no_jacobians() -> tuple[Array, ...]:
-    raise RuntimeError("evaluated for residuals alone")
 
 
 class _Group:
@@ -388,11 +265,8 @@ class _Group:
     def __init__(self, factors: Sequence[VectorizedFactor], places: dict[Block, dict[int, int]]) -> None:
         self._factors = factors
         self._model = _stack([f.model for f in factors])
-        ends = np.cumsum([len(f.model.time) for f in factors]).tolist()
-        self._spans = list(zip([0, *ends[:-1]], ends, strict=True))
         self._columns = [self._column(i, places.setdefault(block, {})) for i, block in enumerate(factors[0].blocks)]
-        self._whole: _Evaluation | None = None
-        self._parts: list[_Evaluation] = []
+        self._whole: Evaluation | None = None
 
     def _column(self, i: int, places: dict[int, int]) -> NDArray[np.intp]:
         """The place of the variable that each measurement takes in a column; only one if they share it."""
@@ -410,49 +284,40 @@ class _Group:
         return whole[:1] if (whole == whole[:1]).all() else whole
 
     def evaluate(self, read: Mapping[Block, Array]) -> None:
-        n = self._spans[-1][1]
+        n = len(self._model.time)
         blocks = []
         for rows, block in zip(self._columns, self._factors[0].blocks, strict=True):
             array = read[block][rows]
             blocks.append(np.broadcast_to(array, (n, array.shape[1])))
-        whole = self._whole = _Evaluation(*self._model(*blocks))
-        self._parts = [whole.part(start, stop) for start, stop in self._spans]
+        self._whole = Evaluation(*self._model(*blocks))
 
     def give(self, loss: TruncatedLoss | None, mixed: bool) -> None:
-        for factor, part in zip(self._factors, self._parts, strict=True):
-            factor._given = part.weighed(factor.weights), None if factor.loss is None else loss
-            factor._mixed = mixed
+        assert self._whole is not None, "evaluated before"
+        loss = None if self._factors[0].loss is None else loss
+        answers = Answers(self._factors, self._whole, self._weights, loss, mixed)
+        for i, factor in enumerate(self._factors):
+            factor._given = answers, i
 
     def excess(self) -> Iterator[tuple[int, int, Array]]:
         """As Ensemble.excess has it."""
         turning, first = self._model.turning, self._factors[0]
         if turning is None or first.compress:
             return
-        assert self._whole is not None, "evaluated before"
-        block, number = turning
-        weights = self._weights
-        residuals = weights * self._whole.residuals
-        added = _at_right_angles(residuals)
-        by = weights[:, :2] * self._whole.jacobians()[block][:, :2, number]
-        counting = _counting(_squares(residuals), first._loss_in_force)
-        information = counting[:, None] * np.stack([_squares(added), (by * added).sum(axis=1)], axis=1)
-        sums = np.add.reduceat(information, [start for start, _ in self._spans])
-        for factor, each in zip(self._factors, sums, strict=True):
-            key = factor.columns[block]
-            assert isinstance(key, int), "a number that turns rows is shared"
-            yield key, number, each
+        assert first._given is not None, "within the block of `at`"
+        answers, _ = first._given
+        yield from answers.excess(*turning)
 
-    @property
-    def _weights(self) -> Array:
-        """Of all rows, (n or 1, m)."""
+    @cached_property
+    def _weights(self) -> Array | None:
+        """(N, m) of all rows; None: all are one."""
         if all(factor.weights is None for factor in self._factors):
-            return np.ones((1, self._model.rows))
+            return None
         of = [(len(f.model.time), f.model.rows, f.weights) for f in self._factors]
         return np.concatenate([np.ones((n, m)) if weights is None else weights for n, m, weights in of])
 
     def take(self) -> None:
         for factor in self._factors:
-            factor._given, factor._mixed = None, False
+            factor._given = None
 
 
 @dataclass(frozen=True)
@@ -530,22 +395,6 @@ def _take(whole: Any, rows: NDArray[np.intp]) -> Any:
     return replace(whole, **{name: _take(getattr(whole, name), rows) for name in whole.stacked})
 
 
-def _square(residuals: Array) -> float:
-    """Sum of all squares."""
-    flat = residuals.ravel()
-    return float(flat @ flat)
-
-
-def _counting(squares: Array, loss: TruncatedLoss | None) -> Array:
-    """By how much a loss lets measurements count whose sums of squares are (n,)."""
-    return np.ones(len(squares)) if loss is None else loss.weight(squares)
-
-
-def _squares(residuals: Array) -> Array:
-    """Sum of squares of each measurement (n,)."""
-    return np.einsum("nm,nm->n", residuals, residuals)
-
-
 def _read(values: gtsam.Values, keys: Sequence[int], block: Block) -> list[Any]:
     """Values of variables of one kind."""
     if block is ROT3:
@@ -575,17 +424,3 @@ def _name(key: int) -> str:
     """A variable as people write it."""
     symbol = gtsam.Symbol(key)
     return str(symbol.string()) if symbol.chr() else str(key)
-
-
-def square_root(information: Array, projection: Array, square: float) -> tuple[Array, Array, float]:
-    """Rows (R, d) and a rest with |A x + e|^2 = |R x + d|^2 + rest^2, given A'A, A'e and e'e.
-
-    Works for singular A'A too: directions without information get empty rows.
-    """
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    eigenvalues, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    known = eigenvalues > len(scale) * np.finfo(float).eps
-    root = np.sqrt(np.where(known, eigenvalues, 0.0))
-    R = root[:, None] * vectors.T * scale
-    d = np.where(known, vectors.T @ (projection / scale), 0.0) / np.where(known, root, 1.0)
-    return R, d, max(square - float(d @ d), 0.0) ** 0.5

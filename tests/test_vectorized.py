@@ -13,10 +13,11 @@ import pytest
 
 import factors
 from factors import so3
+from factors.answers import square_root
 from factors.loss import TruncatedLoss
 from factors.model import POSE3, Array, Keys, Model, Residuals
 from factors.testing import assert_jacobians
-from factors.vectorized import Ensemble, VectorizedFactor, square_root
+from factors.vectorized import Ensemble, VectorizedFactor
 
 
 @dataclass(frozen=True)
