@@ -61,6 +61,11 @@ def _products(a: Array, b: Array) -> Array:
     return products.reshape(*products.shape[:-2], a.shape[-1] * b.shape[-1])
 
 
+def _square(v: Array) -> Array:
+    """Squared lengths (...) of vectors (..., d), or of one number; a sum over so short an axis takes numpy longer."""
+    return np.asarray(np.einsum("...i,...i->...", v, v) if v.ndim else v * v)
+
+
 def identity(shape: int | tuple[int, ...] = ()) -> Array:
     """Identity rotations, shape (*shape, 4)."""
     shape = (shape,) if isinstance(shape, int) else shape
@@ -146,10 +151,11 @@ def hat(v: ArrayLike) -> Array:
 def exp(phi: ArrayLike) -> Array:
     """Rotation vectors, shape (..., 3), rad -> quaternions."""
     phi = np.asarray(phi, dtype=float)
-    half = 0.5 * np.sqrt((phi * phi).sum(axis=-1))
+    # The least angle only avoids 0 / 0.
+    half = np.maximum(0.5 * np.sqrt(_square(phi)), 1e-150)
     out = np.empty((*phi.shape[:-1], 4))
     out[..., 0] = np.cos(half)
-    out[..., 1:] = phi * (0.5 * np.sinc(half / np.pi))[..., None]
+    out[..., 1:] = phi * (0.5 * np.sin(half) / half)[..., None]
     return out
 
 
@@ -157,7 +163,7 @@ def log(q: ArrayLike) -> Array:
     """Quaternions -> rotation vectors, shape (..., 3), of length pi at most."""
     q = np.asarray(q, dtype=float)
     w, v = q[..., 0], q[..., 1:]
-    sine = np.sqrt((v * v).sum(axis=-1))
+    sine = np.sqrt(_square(v))
     angle = 2.0 * np.arctan2(sine, np.abs(w))
     # angle / sine -> 2 / w at zero; the guard only avoids 0 / 0.
     factor = np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
@@ -212,7 +218,7 @@ def right_jacobian(phi: ArrayLike) -> Array:
     Solà, Deray, Atchuthan, "A micro Lie theory", 2018, eq. 143, with hat(phi)^2 = phi phi' - phi'phi I.
     """
     phi = np.asarray(phi, dtype=float)
-    square = (phi * phi).sum(axis=-1)
+    square = _square(phi)
     angle = np.sqrt(square)
     small = angle < _SMALL
     safe = np.where(small, 1.0, angle)
@@ -225,7 +231,7 @@ def right_jacobian(phi: ArrayLike) -> Array:
 def right_jacobian_inverse(phi: ArrayLike) -> Array:
     """J with Log(Exp(phi) * Exp(d)) = phi + J d to first order (same source, eq. 144)."""
     phi = np.asarray(phi, dtype=float)
-    square = (phi * phi).sum(axis=-1)
+    square = _square(phi)
     angle = np.sqrt(square)
     small = angle < _SMALL
     safe = np.where(small, 1.0, angle)
