@@ -61,14 +61,15 @@ def test_a_second_axis_after_a_minute_of_one() -> None:
     """It is solved anew while knowledge grows tenfold, and folded once the last attitude follows as foreseen, too.
 
     Between solutions, three seconds apart, the joint error was 94 of 35; folded at once sigmas were 0.67 of batch's.
+    With seeds 2 and 3 all was rejected for a second, the joint error 100 and 96.
     """
-    for seed in (4, 7):
+    for seed in (2, 3, 4, 7):
         carrier = beginning(LOS.carrier, {"yaw": 0.0, "pitch": 62.0, "roll": 62.0})
         problem, truth = made("los", drawn_los(seed, duration_s=86.0, carrier=carrier), seed)
         run = Run(problem, DEFAULT_WINDOW)
         for step in problem.steps(1):
             run.add_step(step)
-            if step.time > 62.8:
+            if step.time > 62.3:
                 assert nees(run.values(), run.covariance(), truth)[0] < 66.0
         batch = solve_batch(problem)
         np.testing.assert_allclose(np.sqrt(np.diag(run.covariance())), batch.sigmas, rtol=0.1)

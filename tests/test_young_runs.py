@@ -9,11 +9,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from benchmarks.young import CASES, beginning, followed, made, nees, report, run
+from benchmarks.batch import IDEAL
+from benchmarks.young import CASES, LOS, beginning, followed, made, nees, report, run
+from pipelines.config import load_config
 from pipelines.graph.problem import Array, Estimate, Problem
 from pipelines.methods.head.simulation import HeadScenario
+from pipelines.methods.los import graph as los
+from pipelines.methods.los.simulation import los_config, simulate_los
 from pipelines.settings import Sensors
 from pipelines.simulation.motion import EulerMotion
+from pipelines.solvers import incremental
 from pipelines.solvers.assembly import CHUNK, Assembly
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.incremental import Run, solve_incremental
@@ -162,3 +167,21 @@ def test_the_first_attitudes_of_a_tumbled_magnetometer() -> None:
     found = [run("tumble", "rest", seed) for seed in range(2, 6)]
     assert not any(f.message for f in found)
     assert np.mean([f.nees for f in found], axis=0).max() < 30.0
+
+
+def test_a_run_that_rejects_all_is_solved_anew_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not when it has grown by a twentieth, which may take seconds; but not twice for the same reason."""
+    for name, never in {"_GROWTH": np.inf, "_MORE": np.inf, "_LOST": np.inf, "_HALF": 0.0}.items():
+        monkeypatch.setattr(incremental, name, never)
+    scenario = LOS.model_copy(update={"duration_s": 4.0, "sensors": IDEAL})
+    data, _ = simulate_los(scenario, 3)
+    wrong = (data.image_t > 2.0) & (data.image_t < 3.2)
+    moved = data.error + 0.01 * wrong[:, None]
+    problem = los.problem(replace(data, error=moved), load_config(los_config(scenario).encode()))
+    following, solved = Run(problem, 1.0), []
+    for step in problem.steps(1):
+        before = following.moments
+        following.add_step(step)
+        solved += [step.time] if following.moments > before else []
+    assert len(solved) == 2
+    assert 2.0 < solved[1] < 2.6

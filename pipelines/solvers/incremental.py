@@ -63,7 +63,8 @@ _FEW_STEPS = 100
 # If there is _MORE to go by than before, it is while what is known bends, after _YOUNG s only if a sigma has come down
 # to _BETTER, when they have moved by _MOVED of the sigmas they had then and by _FAR of their priors', or when ...
 _LOST, _HALF, _MORE, _BETTER, _MOVED, _FAR = 0.5, 0.5, 1.05, 0.9, 0.2, 0.02
-# ... so many steps in a row were rejected, or more than this share of measurements: the run may have lost its way.
+# ... so many steps in a row were rejected, or more than this share of measurements: the run may have lost its way. If
+# the last solution was not already due to that, it is solved at once.
 _DOUBTED, _TOO_MANY = 5, 0.25
 # Where so many are rejected of fewer than this, which of them are wrong cannot be told: what is, may agree by chance.
 _FEW = 20
@@ -110,6 +111,7 @@ class _Solved:
         steps: their number.
         values, sigmas: (n,) of the reported numbers.
         first: (n,) these sigmas without what is of second order.
+        doubted: whether too many measurements had been rejected since the one before.
     """
 
     since: float
@@ -117,6 +119,7 @@ class _Solved:
     values: Array
     sigmas: Array
     first: Array
+    doubted: bool
 
 
 class Run:
@@ -371,7 +374,7 @@ class Run:
 
     def _reinitialize(self) -> None:
         """Solve everything since the base in batch and start the smoother from it, without the outliers."""
-        from_start, whole = self.base is None, self._whole()
+        from_start, whole, doubted = self.base is None, self._whole(), self._doubted
         solution, about, noise = self._solution(whole)
         self._trouble = "" if solution.converged else f"the first {self.time:.1f} s: {solution.message}"
         values, system = solution.values, solution.system
@@ -394,7 +397,7 @@ class Run:
         self._record(whole.keyframes if from_start else last, values)
         variance = np.diag(self._covariance())
         first = self._first_order(variance)
-        self._solved = _Solved(since, len(self.past), self._values(), np.sqrt(variance), first)
+        self._solved = _Solved(since, len(self.past), self._values(), np.sqrt(variance), first, doubted)
         self.innovations.begin_count()
 
     def _whole(self) -> Assembly:
@@ -469,8 +472,7 @@ class Run:
 
     def _spurious(self, about: Linear) -> Spurious | None:
         """What of the information of a linearised solution is its states' noise."""
-        linear, ordering = about.graph, about.system.ordering
-        covariance = joint_covariance(self.problem, linear, ordering, about.values, self.current_keys)
+        covariance = joint_covariance(self.problem, about, self.current_keys)
         return information_of_noise(self.problem, about, covariance, self.current_keys)
 
     def _due(self, since: float) -> bool:
@@ -483,15 +485,20 @@ class Run:
             return True
         moved, scales = np.abs(self._values() - solved.values), self._scales
         left = self._left(solved)
-        if left < _HALF or (moved > _LOST * scales).any():
+        if left < _HALF or (moved > _LOST * scales).any() or (self._doubted and not solved.doubted):
             return True
         if len(self.past) < _MORE * solved.steps:
             return False
         if self._bent is not None and (since < _YOUNG or left < _BETTER):
             return True
-        if self.innovations.doubtful(_DOUBTED, _TOO_MANY):
+        if self._doubted:
             return True
         return bool((moved > np.maximum(_MOVED * solved.sigmas, _FAR * scales)).any())
+
+    @property
+    def _doubted(self) -> bool:
+        """Whether too many measurements were rejected since the last batch solution."""
+        return self.innovations.doubtful(_DOUBTED, _TOO_MANY)
 
     def _left(self, solved: _Solved) -> float:
         """To what share any sigma has come down since; 1 unless what is known bends."""
