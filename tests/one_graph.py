@@ -81,7 +81,7 @@ def solved(problem: Problem) -> tuple[dict[str, float], dict[str, float]]:
     values, system = solution.values, solution.system
     for _ in range(4):
         values = values.retract(system.linearize(values).optimize(system.ordering, gtsam.EliminateQR))
-    covariance = joint_covariance(problem, system.linearize(values), system.ordering, values, whole.current_keys)
+    covariance = joint_covariance(problem, system.linearized(values), whole.current_keys)
     names = [q.name for q in problem.quantities]
     numbers, sigmas = reported(problem, values, whole.current_keys).tolist(), np.sqrt(np.diag(covariance)).tolist()
     return dict(zip(names, numbers, strict=True)), dict(zip(names, sigmas, strict=True))

@@ -12,7 +12,7 @@ import pytest
 from pipelines.graph.problem import Array, Factor, Parameter, Problem, Quantity
 from pipelines.solvers.assembly import Assembly
 from pipelines.solvers.influence import Influence, influence, uncertainty_budget
-from pipelines.solvers.marginals import IndeterminateError, joint_covariance, ordering_of
+from pipelines.solvers.marginals import IndeterminateError, joint_information, ordering_of, reported_covariance
 from pipelines.solvers.system import System
 from pipelines.solvers.weighing import optimize
 from tests.short_problems import head_problem, los_problem
@@ -49,8 +49,9 @@ def test_squares_sum_to_the_covariance(case: Solved) -> None:
     total = sum(rows @ rows.T for *_, rows in found.rows())
     scale = np.sqrt(np.outer(np.diag(found.covariance), np.diag(found.covariance)))
     np.testing.assert_allclose(total / scale, found.covariance / scale, atol=1e-9)
-    ordering = case.system.ordering
-    whole = joint_covariance(case.problem, case.linear, ordering, case.values, case.current_keys)
+    keys = [case.current_keys.get(p.key, p.key) for p in case.problem.parameters]
+    information = joint_information(case.linear, case.system.ordering, keys)
+    whole = reported_covariance(case.problem.parameters, information, case.values, keys)
     quantities = case.problem.quantities
     free = [i for i, q in enumerate(quantities) if q.prior_sigma != 0.0]
     assert found.names == tuple(quantities[i].name for i in free)

@@ -41,8 +41,8 @@ def minimum(problem: Problem) -> tuple[Solution, Solution]:
     factors = weigh(whole.factors, problem.noises)
     solution = optimize(factors, whole.initial, whole.shared(problem), problem.loss)
     solution, _, about, _ = with_levels(problem, whole.factors, solution, problem.noises)
-    known = problem, about.graph, about.system.ordering, about.values, whole.current_keys
-    noise = information_of_noise(problem, about, joint_covariance(*known), whole.current_keys)
+    covariance = joint_covariance(problem, about, whole.current_keys)
+    noise = information_of_noise(problem, about, covariance, whole.current_keys)
     current_keys = dict(whole.current_keys)
     held = without_pull(problem, solution, noise, current_keys)
     current_keys.update({p.key: p.key + 1000 for p in problem.parameters})

@@ -13,10 +13,11 @@ import pytest
 from rich.console import Console
 
 from pipelines import progress
-from pipelines.graph.problem import Estimate, Problem
+from pipelines.graph.problem import Array, Estimate, Factor, Problem
 from pipelines.solvers import system
 from pipelines.solvers.assembly import CHUNK, Assembly
 from pipelines.solvers.batch import solve_batch
+from pipelines.solvers.marginals import joint_information
 from tests.short_problems import head_problem, los_problem
 
 
@@ -74,6 +75,41 @@ def test_states_follow_where_what_is_shared_is_moved(whole: bool, monkeypatch: p
         for key in values.keys():
             expected = step.at(key) - still.at(key)
             np.testing.assert_allclose(values.localCoordinates(followed).at(key), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("make", [los_problem, head_problem])
+@pytest.mark.parametrize("whole", [True, False])
+def test_what_is_said_of_what_is_shared(
+    make: Callable[[], Problem], whole: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The rows that are eliminated last say what is left where all else is marginalised out."""
+    assembly = Assembly.of(make().steps(CHUNK))
+    shared = assembly.shared(make())
+    alone = system.System.of(assembly.factors, shared, None, assembly.boundaries)
+    parts = alone if whole else stretches(monkeypatch, make())[0].under(None)
+    for keys in (shared, shared[::-1]):
+        expected = joint_information(alone.linearize(assembly.initial), alone.ordering, keys)
+        scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+        found = parts.linearized(assembly.initial).information(keys)
+        np.testing.assert_allclose(found / scale, expected / scale, atol=1e-9)
+
+
+def test_of_what_nothing_is_said_there_is_no_information() -> None:
+    """A triangular factor there is none."""
+    a, b = gtsam.symbol("a", 0), gtsam.symbol("b", 0)
+    known = gtsam.PriorFactorVector(a, np.zeros(2), gtsam.noiseModel.Isotropic.Sigma(2, 0.5))
+    silent = gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [a, b], _silent)
+    alone = system.System.of([Factor("prior", known), Factor("silent", silent)], [a, b], None)
+    values = gtsam.Values()
+    values.insert(a, np.zeros(2))
+    values.insert(b, np.zeros(1))
+    np.testing.assert_allclose(alone.linearized(values).information([b, a]), np.diag([0.0, 4.0, 4.0]), atol=1e-12)
+
+
+def _silent(_: gtsam.CustomFactor, __: gtsam.Values, jacobians: list[Array] | None) -> Array:
+    if jacobians is not None:
+        jacobians[0], jacobians[1] = np.zeros((1, 2)), np.zeros((1, 1))
+    return np.zeros(1)
 
 
 def test_progress_is_shown(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
@@ -141,6 +177,7 @@ import alidade
 from benchmarks.measure import peak_mib, resident_mib
 from pipelines.solvers import system
 from pipelines.solvers.batch import solve_batch
+from pipelines.solvers.marginals import joint_information
 
 system._UNDIVIDED, system._STRETCH, system._KEPT = 10_000, 600, 0
 scenario = {"duration_s": float(sys.argv[1]), "gyro_rate_hz": 100.0, "gimbal_rate_hz": 100.0}

@@ -149,8 +149,7 @@ def _covariance(problem: Problem, found: _Found, current_keys: Mapping[int, int]
     """Of the reported numbers (n, n), without information that is noise, and with what is of second order."""
     marginal, about = found.marginal, found.about
     if found.noise is not None:
-        ordering, information = about.system.ordering, found.noise.information
-        marginal = joint_covariance(problem, about.graph, ordering, about.values, current_keys, information)
+        marginal = joint_covariance(problem, about, current_keys, found.noise.information)
     bent = second_order(problem, about, marginal, current_keys)
     return marginal if bent is None else marginal + bent.covariance
 
@@ -215,9 +214,7 @@ def _known(
     """What was known at some moments, covariance of the reported numbers at the end, and what of that is noise."""
     linear, ordering, values = about.graph, about.system.ordering, about.values
     course = sequential_history(problem, linear, ordering, values, about.boundaries)
-    marginal = (
-        joint_covariance(problem, linear, ordering, values, current_keys) if course is None else course.covariance[-1]
-    )
+    marginal = joint_covariance(problem, about, current_keys) if course is None else course.covariance[-1]
     return course, marginal, information_of_noise(problem, about, marginal, current_keys)
 
 

@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 from pipelines.graph.problem import Array, Problem
 from pipelines.solvers.marginals import (
     IndeterminateError,
-    joint_information,
     marginal,
     ordering_of,
     prior_units,
@@ -195,7 +194,7 @@ class _Floor:
         values, keys = about.values, [current_keys.get(p.key, p.key) for p in problem.parameters]
         free, scale, unit = prior_units(problem.parameters, values, keys)
         system = about.system.without_rejected(values)
-        information = unit.T @ joint_information(about.graph, system.ordering, keys) @ unit
+        information = unit.T @ about.information(keys) @ unit
         eigenvalues, vectors = np.linalg.eigh(information)
         if eigenvalues[0] < _ANYWHERE:
             return None

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipelines.graph.problem import Problem
 from pipelines.solvers.gauss_newton import Solution
-from pipelines.solvers.marginals import IndeterminateError, coordinate_inverse, joint_information
+from pipelines.solvers.marginals import IndeterminateError, coordinate_inverse
 
 # So many points about the estimate are tried, in pairs.
 _PAIRS = 4
@@ -38,7 +38,7 @@ def is_linear(problem: Problem, solution: Solution, keys: Sequence[int], kept: S
     still = {key: np.zeros(dims[key]) for key in kept}
     generator = np.random.default_rng(0)
     try:
-        information = joint_information(linear.graph, system.ordering, keys)
+        information = linear.information(keys)
         free = np.flatnonzero([q.prior_sigma != 0.0 for q in problem.quantities])
         scale = np.array([q.scale for q in problem.quantities])[free]
         unit = coordinate_inverse(problem.parameters, values, keys)[:, free] * scale

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.graph.problem import Array, ChiSquare, Factor, History, Parameter, Problem
+
+if TYPE_CHECKING:
+    from pipelines.solvers.system import Linear
 
 # A direction the data and priors say nothing about gets this many times its prior scale as sigma, so that it can be
 # named with the others instead of making the system unsolvable.
@@ -38,12 +42,7 @@ def ordering_of(keys: Iterable[int]) -> gtsam.Ordering:
 
 
 def joint_covariance(
-    problem: Problem,
-    linear: gtsam.GaussianFactorGraph,
-    ordering: gtsam.Ordering,
-    values: gtsam.Values,
-    current_keys: Mapping[int, int],
-    noise: Array | None = None,
+    problem: Problem, about: Linear, current_keys: Mapping[int, int], noise: Array | None = None
 ) -> Array:
     """Covariance (n, n) of the reported numbers, everything else marginalised out; works for singular systems.
 
@@ -53,7 +52,7 @@ def joint_covariance(
         IndeterminateError: another variable is undetermined.
     """
     keys = [current_keys.get(p.key, p.key) for p in problem.parameters]
-    return reported_covariance(problem.parameters, joint_information(linear, ordering, keys), values, keys, noise)
+    return reported_covariance(problem.parameters, about.information(keys), about.values, keys, noise)
 
 
 def joint_information(linear: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering, keys: Sequence[int]) -> Array:

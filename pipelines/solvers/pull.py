@@ -62,7 +62,7 @@ def without_pull(
             return found
         found = replace(held, iterations=found.iterations + held.iterations)
         about = found.system.linearized(found.values)
-        covariance = joint_covariance(problem, about.graph, about.system.ordering, about.values, current_keys)
+        covariance = joint_covariance(problem, about, current_keys)
         noise = information_of_noise(problem, about, covariance, current_keys)
     return solution if noise is None else found
 

@@ -72,8 +72,8 @@ def information_of_noise(
     system = about.system.without_rejected(values)
     try:
         moved = about.drawn(set(values.keys()) - set(doubtful), _DRAWS, np.random.default_rng(0))
-        graphs = (about.graph, *map(system.linearize, moved))
-        own, *elsewhere = (joint_information(graph, system.ordering, keys) for graph in graphs)
+        elsewhere = [joint_information(system.linearize(there), system.ordering, keys) for there in moved]
+        own = about.information(keys)
     except (RuntimeError, IndeterminateError):
         return None
     noise = np.mean(elsewhere, axis=0) - own

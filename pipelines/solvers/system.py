@@ -29,7 +29,7 @@ from pipelines import progress
 from pipelines.graph.problem import Array, Factor, Residuals
 from pipelines.solvers.assembly import StepBoundary
 from pipelines.solvers.history import MOMENTS
-from pipelines.solvers.marginals import eliminated, marginal, ordering_of
+from pipelines.solvers.marginals import IndeterminateError, eliminated, joint_information, marginal, ordering_of
 from pipelines.solvers.triangular import Triangular, conditionals_of, rows_of
 
 Shown = TypeVar("Shown")
@@ -298,6 +298,17 @@ class Linear:
             start, end = end, end + dims[key]
             delta.insert(key, move[start:end])
         return self.holding({key: delta.at(key) for key in shared}).step()[0] if self.has_states else delta
+
+    def information(self, keys: Sequence[int]) -> Array:
+        """(d, d) of the variables that all measurements share, in this order, all others marginalised out.
+
+        Raises IndeterminateError if one of these is not determined.
+        """
+        try:
+            return self.triangular.information(list(keys))
+        except IndeterminateError:
+            # Those asked for may be undetermined.
+            return joint_information(self.graph, self.system.ordering, keys)
 
     def solution(self) -> gtsam.VectorValues:
         """The move to the minimum. Raises IndeterminateError, naming a variable that is not determined."""

@@ -76,6 +76,20 @@ class Triangular:
             out[clique.own] = clique.R @ x[clique.own] + clique.S @ x[clique.above]
         return out
 
+    def information(self, last: list[int]) -> Array:
+        """(d, d) of the variables that were eliminated last, in this order, all others marginalised out."""
+        rows = rows_of(self.places, last)
+        column = dict(zip(rows.tolist(), range(len(rows)), strict=True))
+        R = np.zeros((len(rows), len(rows)))
+        for clique in self.cliques:
+            # Those eliminated last come last among a clique's own.
+            if clique.own[-1] in column:
+                own = [i for i, row in enumerate(clique.own.tolist()) if row in column]
+                at = [column[row] for row in clique.own[own].tolist()]
+                R[np.ix_(at, at)] = clique.R[np.ix_(own, own)]
+                R[np.ix_(at, [column[row] for row in clique.above.tolist()])] = clique.S[own]
+        return R.T @ R
+
     def forward(self, right: Array) -> Array:
         """(D, k) y with R'y = right where variables were eliminated, elsewhere what that leaves of the right side."""
         y = right.copy()
