@@ -14,7 +14,7 @@ import numpy as np
 from factors import so3
 from factors.preintegration import GyroPath, Increments
 from pipelines.graph.problem import Array
-from pipelines.graph.robust import improved
+from pipelines.graph.robust import fitted
 
 # A clock is guessed first from as much of a recording as takes it to go wrong by so much, s (sigma), far less than a
 # swing takes, then from so many times as much each time.
@@ -120,8 +120,7 @@ def guess_clock(
     while True:
         near = missing(until)
         if near is not None:
-            for _ in range(_PASSES):
-                x, covariance = improved(near(x), x, prior, sigma)
+            x, covariance = fitted(near, x, prior, sigma, _PASSES)
         if until >= last:
             break
         until *= _THEN

@@ -207,7 +207,7 @@ def coordinate_inverse(
     known = {} if blocks is None else blocks
     for p, key in zip(parameters, keys, strict=True):
         if key not in known:
-            known[key] = np.asarray(np.linalg.pinv(p.coordinates(values, key)[1]), dtype=float)
+            known[key] = _inverse(p.coordinates(values, key)[1])
     own = [known[key] for key in keys]
     inverse = np.zeros((sum(b.shape[0] for b in own), sum(b.shape[1] for b in own)))
     row = column = 0
@@ -215,6 +215,12 @@ def coordinate_inverse(
         inverse[row : row + block.shape[0], column : column + block.shape[1]] = block
         row, column = row + block.shape[0], column + block.shape[1]
     return inverse
+
+
+def _inverse(J: Array) -> Array:
+    """The pseudo-inverse; numbers that are a variable's own have none to be found."""
+    own = J.shape[0] == J.shape[1] and bool((np.eye(len(J)) == J).all())
+    return J if own else np.asarray(np.linalg.pinv(J), dtype=float)
 
 
 def chi_square(

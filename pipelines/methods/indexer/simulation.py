@@ -265,9 +265,11 @@ def _attitude(scenario: IndexerScenario, drives: list[_Drive], phases: Array, t:
     ex, ey, ez = np.eye(3)
     outer, inner = _angles(scenario, drives, phases, t)[..., None]
     k, w = scenario.wobble_per_turn, scenario.wobble_arcsec * ARCSEC
-    a, b = k * outer + phases[0, 0], k * inner + phases[1, 0]
-    outer_axis = so3.exp(w * (np.cos(a) * ey + np.sin(a) * ez))
-    inner_axis = so3.exp(w * (np.cos(b) * ex + np.sin(b) * ey))
+    outer_axis = inner_axis = so3.identity()
+    if w:
+        a, b = k * outer + phases[0, 0], k * inner + phases[1, 0]
+        outer_axis = so3.exp(w * (np.cos(a) * ey + np.sin(a) * ez))
+        inner_axis = so3.exp(w * (np.cos(b) * ex + np.sin(b) * ey))
     tilt = so3.exp(scenario.axis_nonperpendicularity_arcsec * ARCSEC * ey)
     x, y, z = np.deg2rad(scenario.mounting_deg)
     tRm = so3.compose(so3.exp(z * ez), so3.exp(y * ey), so3.exp(x * ex))

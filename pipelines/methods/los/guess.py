@@ -19,7 +19,7 @@ from factors.preintegration import GyroPath, Increments
 from pipelines.graph.clock import Clock, Miss, guess_clock, turns_near
 from pipelines.graph.priors import prior_sigmas
 from pipelines.graph.problem import Array, Parameter
-from pipelines.graph.robust import improved
+from pipelines.graph.robust import fitted
 
 # Pictures so far apart, s, are compared, long against their noise, and no more than so many pairs of them.
 _SPAN, _MOST_PAIRS = 1.0, 2000
@@ -161,8 +161,11 @@ def guess(
     if not len(i):
         return x[: len(names)], x[len(names) :]
     turns, read = gyro.increments(time[i], time[j]), (gimbal[i], gimbal[j])
-    for _ in range(_PASSES):
-        x, _ = improved(lambda x: _miss(x, names, turns, read, measured[i], measured[j]), x, prior, sigma)
+
+    def miss(x: Array) -> Array:
+        return _miss(x, names, turns, read, measured[i], measured[j])
+
+    x, _ = fitted(lambda _: miss, x, prior, sigma, _PASSES)
     return x[: len(names)], x[len(names) :]
 
 
