@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 _SMALL = 1e-2
 # So many rows fit into a processor's cache with all that is made of them on the way.
 _ROWS = 8192
+_IDENTITY = np.eye(3)
 # Of so few rows, calls of numpy take longer than what they do: products with tables are the fewest.
 _FEW = 300
 
@@ -219,11 +220,13 @@ def right_jacobian(phi: ArrayLike) -> Array:
     """
     phi = np.asarray(phi, dtype=float)
     square = _square(phi)
+    a, b = 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
     angle = np.sqrt(square)
     small = angle < _SMALL
-    safe = np.where(small, 1.0, angle)
-    a = np.where(small, 0.5 - square / 24.0, (1.0 - np.cos(safe)) / safe**2)
-    b = np.where(small, 1.0 / 6.0 - square / 120.0, (safe - np.sin(safe)) / safe**3)
+    if not small.all():
+        safe = np.where(small, 1.0, angle)
+        a = np.where(small, a, (1.0 - np.cos(safe)) / safe**2)
+        b = np.where(small, b, (safe - np.sin(safe)) / safe**3)
     return _polynomial(phi, -a, b)
 
 
@@ -232,10 +235,12 @@ def right_jacobian_inverse(phi: ArrayLike) -> Array:
     """J with Log(Exp(phi) * Exp(d)) = phi + J d to first order (same source, eq. 144)."""
     phi = np.asarray(phi, dtype=float)
     square = _square(phi)
+    b = 1.0 / 12.0 + square / 720.0
     angle = np.sqrt(square)
     small = angle < _SMALL
-    safe = np.where(small, 1.0, angle)
-    b = np.where(small, 1.0 / 12.0 + square / 720.0, 1.0 / safe**2 - 0.5 / (safe * np.tan(0.5 * safe)))
+    if not small.all():
+        safe = np.where(small, 1.0, angle)
+        b = np.where(small, b, 1.0 / safe**2 - 0.5 / (safe * np.tan(0.5 * safe)))
     return _polynomial(phi, np.full_like(b, 0.5), b)
 
 
@@ -243,7 +248,7 @@ def _polynomial(phi: Array, a: Array, b: Array) -> Array:
     """I + a hat(phi) + b hat(phi)^2, (..., 3, 3), of phi (..., 3) and a, b (...)."""
     if _few(phi):
         terms = (a[..., None] * phi) @ _HAT + (b[..., None] * _products(phi, phi)) @ _SQUARE
-        return np.asarray(terms.reshape(*phi.shape, 3) + np.eye(3))
+        return np.asarray(terms.reshape(*phi.shape, 3) + _IDENTITY)
     x, y, z = phi[..., 0], phi[..., 1], phi[..., 2]
     ax, ay, az, bx, by, bz = a * x, a * y, a * z, b * x, b * y, b * z
     out = np.empty((*phi.shape, 3))
