@@ -95,6 +95,8 @@ def _runs_twice(times: Stamps) -> tuple[int, float] | None:
 def _against_log(t_ns: Stamps, log_ns: Stamps) -> Step | None:
     """A step of the stamps that the log times do not make, and that lasts."""
     ahead = t_ns - log_ns
+    if ahead.max() - ahead.min() <= _SMALLEST * 1e9:
+        return None
     jumps = np.flatnonzero(np.abs(np.diff(ahead)) > _SMALLEST * 1e9)
     if not len(jumps):
         return None
