@@ -167,17 +167,19 @@ class Camera:
         k1, k2, p1, p2, k3, k4, k5, k6 = [*self.coefficients.tolist(), 0.0, 0.0, 0.0][:8]
         x, y = u[..., 0], u[..., 1]
         r2 = x * x + y * y
-        over, under = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-        radial = over / under
-        slope = (k1 + r2 * (2 * k2 + r2 * 3 * k3) - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / under
-        out = np.stack(
-            [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y],
-            axis=-1,
-        )
-        J = np.empty((*u.shape, 2))
-        J[..., 0, 0] = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
-        J[..., 0, 1] = J[..., 1, 0] = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-        J[..., 1, 1] = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+        radial, slope = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), k1 + r2 * (2 * k2 + r2 * 3 * k3)
+        if k4 or k5 or k6:
+            under = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+            radial = radial / under
+            slope = (slope - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / under
+        xy, xx, yy = 2 * x * y, 2 * x * x, 2 * y * y
+        out, J = np.empty(u.shape), np.empty((*u.shape, 2))
+        out[..., 0] = x * radial + p1 * xy + p2 * (r2 + xx)
+        out[..., 1] = y * radial + p1 * (r2 + yy) + p2 * xy
+        px, py = 2 * p1 * x + 2 * p2 * y, 2 * p2 * x + 2 * p1 * y
+        J[..., 0, 0] = radial + xx * slope + py + 4 * p2 * x
+        J[..., 0, 1] = J[..., 1, 0] = xy * slope + px
+        J[..., 1, 1] = radial + yy * slope + py + 4 * p1 * y
         return out, J
 
     def _undistort(self, flat: Array) -> Array:
