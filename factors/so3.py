@@ -23,9 +23,9 @@ Array = NDArray[np.float64]
 _SMALL = 1e-2
 # So many rows fit into a processor's cache with all that is made of them on the way.
 _ROWS = 8192
-_IDENTITY = np.eye(3)
 # Of so few rows, calls of numpy take longer than what they do: products with tables are the fewest.
 _FEW = 300
+_IDENTITY = np.eye(3)
 
 _Function = TypeVar("_Function", bound=Callable[..., Array])
 

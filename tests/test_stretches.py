@@ -95,7 +95,7 @@ def test_what_is_said_of_what_is_shared(
 
 
 def test_of_what_nothing_is_said_there_is_no_information() -> None:
-    """A triangular factor there is none."""
+    """Then there is no triangular factor."""
     a, b = gtsam.symbol("a", 0), gtsam.symbol("b", 0)
     known = gtsam.PriorFactorVector(a, np.zeros(2), gtsam.noiseModel.Isotropic.Sigma(2, 0.5))
     silent = gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(1), [a, b], _silent)

@@ -302,7 +302,7 @@ class Linear:
     def information(self, keys: Sequence[int]) -> Array:
         """(d, d) of the variables that all measurements share, in this order, all others marginalised out.
 
-        Raises IndeterminateError if one of these is not determined.
+        Raises IndeterminateError if one of the others is not determined.
         """
         try:
             return self.triangular.information(list(keys))
