@@ -114,7 +114,7 @@ class Answers:
         by = self._whole.jacobians()[block][:, :2, number]
         if self._weights is not None:
             by = self._weights[:, :2] * by
-        counts = counting(squares_of(self.residuals), self.loss)
+        counts = counting(self._squares, self.loss)
         information = counts[:, None] * np.stack([squares_of(added), (by * added).sum(axis=1)], axis=1)
         sums = np.add.reduceat(information, [start for start, _ in self._spans])
         for factor, each in zip(self._factors, sums, strict=True):
@@ -123,16 +123,20 @@ class Answers:
             yield key, number, each
 
     @cached_property
+    def _squares(self) -> Array:
+        """(N,) of all measurements."""
+        return squares_of(self.residuals)
+
+    @cached_property
     def _norms(self) -> list[float]:
         """Of the factors' errors."""
-        squares = squares_of(self.residuals)
-        costs = squares if self.loss is None else self.loss.cost(squares)
+        costs = self._squares if self.loss is None else self.loss.cost(self._squares)
         return np.sqrt(np.add.reduceat(costs, [start for start, _ in self._spans])).tolist()
 
     @cached_property
     def _root(self) -> Array:
         """(N, 1) by which the loss multiplies rows."""
-        return np.sqrt(counting(squares_of(self.residuals), self.loss))[:, None]
+        return np.sqrt(counting(self._squares, self.loss))[:, None]
 
     def _weighed(self, start: int, stop: int) -> Array:
         """Residuals (n, m) of some measurements under the loss."""

@@ -244,10 +244,8 @@ class Linear:
         """
         # These are eliminated last: their rows hold no other.
         own = rows_of(self.triangular.places, list(keys))
-        there = np.zeros((self.triangular.size, moves.shape[1]))
-        there[own] = moves
-        right = np.zeros_like(there)
-        right[own] = self.triangular.times(there)[own]
+        right = np.zeros((self.triangular.size, moves.shape[1]))
+        right[own] = self.triangular.root(list(keys)) @ moves
         return self._moved(right)
 
     def _moved(self, right: Array, own: Callable[[Part], Array] | None = None) -> list[gtsam.Values]:
@@ -305,10 +303,11 @@ class Linear:
         Raises IndeterminateError if one of the others is not determined.
         """
         try:
-            return self.triangular.information(list(keys))
+            R = self.triangular.root(list(keys))
         except IndeterminateError:
             # Those asked for may be undetermined.
             return joint_information(self.graph, self.system.ordering, keys)
+        return R.T @ R
 
     def solution(self) -> gtsam.VectorValues:
         """The move to the minimum. Raises IndeterminateError, naming a variable that is not determined."""

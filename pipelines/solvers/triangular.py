@@ -69,15 +69,8 @@ class Triangular:
             out[clique.own, 0] = clique.d
         return out
 
-    def times(self, x: Array) -> Array:
-        """(D, k) R x where variables were eliminated, elsewhere zero."""
-        out = np.zeros_like(x)
-        for clique in self.cliques:
-            out[clique.own] = clique.R @ x[clique.own] + clique.S @ x[clique.above]
-        return out
-
-    def information(self, last: list[int]) -> Array:
-        """(d, d) of the variables that were eliminated last, in this order, all others marginalised out."""
+    def root(self, last: list[int]) -> Array:
+        """(d, d) R of the variables that were eliminated last, in this order: what it says of them alone."""
         rows = rows_of(self.places, last)
         column = dict(zip(rows.tolist(), range(len(rows)), strict=True))
         R = np.zeros((len(rows), len(rows)))
@@ -88,7 +81,7 @@ class Triangular:
                 at = [column[row] for row in clique.own[own].tolist()]
                 R[np.ix_(at, at)] = clique.R[np.ix_(own, own)]
                 R[np.ix_(at, [column[row] for row in clique.above.tolist()])] = clique.S[own]
-        return R.T @ R
+        return R
 
     def forward(self, right: Array) -> Array:
         """(D, k) y with R'y = right where variables were eliminated, elsewhere what that leaves of the right side."""
