@@ -272,7 +272,7 @@ def test_workers_of_another_version_are_refused(start: Start, scheduler: str, re
 
 
 def test_a_scheduler_without_workers_is_told(scheduler: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(engine, "_REACH", 2.0)
+    monkeypatch.setattr(engine, "_REACH", 1.0)
     with pytest.raises(InputError, match=f"{scheduler} has no workers: start some with `dask worker {scheduler}`"):
         cluster(scheduler, None).__enter__()
 

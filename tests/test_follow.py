@@ -201,8 +201,8 @@ def test_a_recording_that_stops_growing_unfinished_gives_what_is_there(whole: Pa
     raw = tmp_path / "raw.mcap"
     assert _recorder(whole, raw, chunks=False).wait() == 0
     session = _unfinished(raw, tmp_path / "s.mcap", 0.4)
-    calibration, views, said = _follow(session, Settings(patience=1.5))
-    assert said[-1] == "nothing new for 1.5 s: the recording is not finished, the result is that of what is there"
+    calibration, views, said = _follow(session, Settings(patience=0.5))
+    assert said[-1] == "nothing new for 0.5 s: the recording is not finished, the result is that of what is there"
     assert 16.0 < calibration.facts.duration_s < 24.0
     assert views[-1].values is not None
     assert views[-1].time > views[0].time
@@ -266,7 +266,7 @@ def test_no_mcap(tmp_path: Path) -> None:
 def test_too_little_to_calibrate_is_the_readers_own_line(whole: Path, tmp_path: Path) -> None:
     session = _unfinished(whole, tmp_path / "s.mcap", 0.002)
     with pytest.raises(InputError, match=re.escape(str(session))):
-        _follow(session, Settings(patience=1.0))
+        _follow(session, Settings(patience=0.3))
 
 
 def test_a_checkpoint_of_another_config_is_refused(whole: Path, tmp_path: Path) -> None:

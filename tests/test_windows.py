@@ -17,10 +17,10 @@ from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.incremental import Run, solve_incremental
 from pipelines.solvers.window import Keyframes, parse_window
 
-# More than twice as many keyframes as a window of twenty holds.
+# More than twice as many keyframes as a window of ten holds.
 SMALL: dict[str, dict[str, Any]] = {
-    "los": {"duration_s": 8.0, "image_rate_hz": 6.0, "gyro_rate_hz": 50.0, "gimbal_rate_hz": 50.0},
-    "head": {"duration_s": 8.0, "vision_rate_hz": 6.0, "gyro_rate_hz": 50.0},
+    "los": {"duration_s": 5.0, "image_rate_hz": 6.0, "gyro_rate_hz": 50.0, "gimbal_rate_hz": 50.0},
+    "head": {"duration_s": 5.0, "vision_rate_hz": 6.0, "gyro_rate_hz": 50.0},
     "indexer": {"gyro_rate_hz": 50.0, "encoder_rate_hz": 50.0},
     "cube": {},
 }
@@ -40,7 +40,7 @@ def in_batch(method: str) -> tuple[Problem, Estimate]:
 @pytest.mark.parametrize(
     "method", [pytest.param(name, marks=[pytest.mark.slow] if name == "cube" else []) for name in SMALL]
 )
-@pytest.mark.parametrize("window", [Keyframes(20), None])
+@pytest.mark.parametrize("window", [Keyframes(10), None])
 def test_every_window_ends_where_batch_does(method: str, window: float | None) -> None:
     problem, batch = in_batch(method)
     incremental = solve_incremental(problem, window)
