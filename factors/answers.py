@@ -1,7 +1,7 @@
 """What factors answer gtsam when it asks for their errors and Jacobians, of models that were evaluated as one.
 
-Measurements are weighed, by their factor's weights and by the loss in force, and their Jacobians laid out as gtsam
-wants them, those of a few factors of the same form at a time.
+Measurements are weighed, by their factor's weights and by the loss in force, and laid out as the linear systems [A, b]
+that gtsam wants, those of a few factors of the same form at a time.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, lru_cache
 from itertools import takewhile
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from factors.model import Array
 if TYPE_CHECKING:
     from factors.vectorized import VectorizedFactor
 
-# Jacobians of so many factors are laid out at once: few enough to stay in the cache.
+# Linear systems of so many factors are laid out at once: few enough to stay in the cache.
 _AT_A_TIME = 16
 
 
@@ -54,7 +54,7 @@ class Evaluation:
 class Answers:
     """What factors answer gtsam whose models were evaluated as one: errors, residuals and Jacobians under a loss.
 
-    Jacobians are laid out for a few factors at a time, as gtsam asks for them in turn.
+    Linear systems are laid out for a few factors at a time, as they are asked for in turn.
 
     Attributes:
         loss: in force; None counts all in full.
@@ -75,7 +75,7 @@ class Answers:
         ends = np.cumsum([len(factor.model.time) for factor in factors]).tolist()
         self._spans = list(zip([0, *ends[:-1]], ends, strict=True))
         self._turning = factors[0].model.turning if mixed and not factors[0].compress else None
-        self._first, self._laid = 0, np.zeros((0, 0, 0))  # Jacobians of some factors, from the first of them on
+        self._first, self._laid = 0, np.zeros((0, 0, 0))  # linear systems of some factors, from the first of them on
 
     def part(self, i: int) -> Evaluation:
         """The evaluation of a factor, whatever the loss."""
@@ -93,16 +93,19 @@ class Answers:
 
     def linear(self, i: int, jacobians: list[Array]) -> Array:
         """A factor's error, and its Jacobians by its keys."""
-        start, stop = self._spans[i]
-        residuals = self._weighed(start, stop)
+        augmented = self.augmented(i)
+        for slot, column in enumerate(self._factors[i].places.columns):
+            jacobians[slot] = augmented[:, column]
+        return -augmented[:, -1]
+
+    def augmented(self, i: int) -> Array:
+        """A factor's linear system [A, b] by all its keys: Jacobians, and the errors' negatives."""
         if self._factors[i].compress:
-            return _compressed(residuals, self._blocks(start, stop), self._factors[i].slots, jacobians)
+            start, stop = self._spans[i]
+            return _compressed(self._weighed(start, stop), self._blocks(start, stop))
         if not self._first <= i < self._first + len(self._laid):
             self._lay_out(i)
-        laid, (columns, _) = self._laid[i - self._first], self._factors[i].places
-        for slot, column in enumerate(columns):
-            jacobians[slot] = laid[:, column]
-        return residuals.ravel()
+        return np.asarray(self._laid[i - self._first])
 
     def forget_jacobians(self) -> None:
         """Answer with residuals alone from now on."""
@@ -155,32 +158,27 @@ class Answers:
         return blocks
 
     def _lay_out(self, first: int) -> None:
-        """Lay out Jacobians of factors of the same form, from this one on."""
+        """Lay out the linear systems of factors of the same form, from this one on."""
         places = self._factors[first].places
         like = takewhile(lambda factor: factor.places is places, self._factors[first : first + _AT_A_TIME])
         count = sum(1 for _ in like)
         start, stop = self._spans[first][0], self._spans[first + count - 1][1]
-        self._first, self._laid = first, laid_out(self._blocks(start, stop), places, count)
+        self._first = first
+        self._laid = laid_out(self._blocks(start, stop), self._weighed(start, stop), places, count)
 
 
 def _no_jacobians() -> tuple[Array, ...]:
     raise RuntimeError("evaluated for residuals alone")
 
 
-def _compressed(
-    residuals: Array, blocks: Sequence[Array], slots: Sequence[int | list[int]], jacobians: list[Array]
-) -> Array:
+def _compressed(residuals: Array, blocks: Sequence[Array]) -> Array:
     """The square root of the normal equations, and one more row that keeps the error exact."""
     rows = [b.reshape(-1, b.shape[2]) for b in blocks]
     A = np.concatenate(rows, axis=1) if len(rows) > 1 else rows[0]
     R, d, rest = square_root(A.T @ A, A.T @ residuals.ravel(), _square(residuals))
-    start = 0
-    for slot, block in zip(slots, blocks, strict=True):
-        assert isinstance(slot, int)
-        stop = start + block.shape[2]
-        jacobians[slot] = np.vstack([R[:, start:stop], np.zeros((1, stop - start))])
-        start = stop
-    return np.append(d, rest)
+    augmented = np.zeros((len(R) + 1, len(R) + 1))
+    augmented[:-1, :-1], augmented[:-1, -1], augmented[-1, -1] = R, -d, -rest
+    return augmented
 
 
 def _scaled(blocks: Sequence[Array], by: Array) -> tuple[Array, ...]:
@@ -200,16 +198,28 @@ def _at_right_angles(residuals: Array) -> Array:
     return np.stack([residuals[:, 1], -residuals[:, 0]], axis=1)
 
 
-# Where a block (n, m, d) is added to the whole Jacobian: offset and strides, bytes, where its keys follow each other
+# Where a block (n, m, d) is added to the whole system: offset and strides, bytes, where its keys follow each other
 # evenly, or the elements.
 _Place = tuple[int, tuple[int, int, int]] | NDArray[np.intp]
-# The columns of each key, and the place of each block.
-Places = tuple[list[slice], list[_Place]]
+
+
+class Places(NamedTuple):
+    """How a factor's linear system [A, b] is laid out.
+
+    Attributes:
+        columns: of each key.
+        widths: the same as numbers of columns, and that of b.
+        targets: the place of each block.
+    """
+
+    columns: list[slice]
+    widths: list[int]
+    targets: list[_Place]
 
 
 @lru_cache(maxsize=1000)
 def places_of(n: int, m: int, slots: tuple[int | tuple[int, ...], ...], dimensions: tuple[int, ...]) -> Places:
-    """The columns of each key in the whole Jacobian (n, m, width), and where each block is added.
+    """The columns of each key in the whole system (n, m, width), and where each block is added.
 
     Most factors of a graph have the same.
 
@@ -223,7 +233,7 @@ def places_of(n: int, m: int, slots: tuple[int | tuple[int, ...], ...], dimensio
         widths |= dict.fromkeys([own] if isinstance(own, int) else own, size)
     ends = np.cumsum([widths[slot] for slot in range(len(widths))])
     columns = [slice(int(end) - widths[slot], int(end)) for slot, end in enumerate(ends)]
-    width = int(ends[-1])
+    width = int(ends[-1]) + 1
     rows = (np.arange(n * m) * width).reshape(n, m, 1)
     targets: list[_Place] = []
     for own, size in zip(slots, dimensions, strict=True):
@@ -234,16 +244,16 @@ def places_of(n: int, m: int, slots: tuple[int | tuple[int, ...], ...], dimensio
             targets.append((int(first[0]) * one, ((m * width + apart) * one, width * one, one)))
         else:
             targets.append(rows + first[:, None, None] + np.arange(size))
-    return columns, targets
+    return Places(columns, [*(column.stop - column.start for column in columns), 1], targets)
 
 
-def laid_out(blocks: Sequence[Array], places: Places, count: int) -> Array:
-    """Jacobians by all keys (count, n * m, width) of so many factors of the same form, from those by blocks."""
-    columns, targets = places
-    total, m = blocks[0].shape[:2]
-    rows, width = total // count * m, columns[-1].stop
-    whole = np.zeros((count, rows, width))
-    for target, block in zip(targets, blocks, strict=True):
+def laid_out(blocks: Sequence[Array], residuals: Array, places: Places, count: int) -> Array:
+    """Linear systems [A, b] (count, n * m, width) of so many factors of the same form, from Jacobians by blocks."""
+    total, m = residuals.shape
+    rows = total // count * m
+    whole = np.zeros((count, rows, places.columns[-1].stop + 1))
+    np.negative(residuals.reshape(count, rows), out=whole[:, :, -1])
+    for target, block in zip(places.targets, blocks, strict=True):
         each = block.reshape(count, -1, m, block.shape[2])
         if isinstance(target, tuple):
             offset, strides = target

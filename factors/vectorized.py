@@ -108,7 +108,14 @@ class VectorizedFactor:
     def rows(self, values: gtsam.Values) -> tuple[Array, Array]:
         """Residuals (n * m,) and their Jacobian (n * m, d) on the factor's keys, neither weighed nor compressed."""
         evaluation = self._at(values)
-        return evaluation.residuals.ravel(), laid_out(evaluation.jacobians(), self.places, 1)[0]
+        residuals = evaluation.residuals
+        return residuals.ravel(), laid_out(evaluation.jacobians(), residuals, self.places, 1)[0, :, :-1]
+
+    def linearized(self, values: gtsam.Values) -> gtsam.JacobianFactor:
+        """What `factor.linearize` gives, in a quarter of the time: gtsam takes it from there key by key."""
+        answers, i = self._answering(values)
+        system = gtsam.VerticalBlockMatrix(self.places.widths, answers.augmented(i))
+        return gtsam.JacobianFactor(gtsam.GaussianConditional(self.keys, 0, system))
 
     def used(self, values: gtsam.Values) -> NDArray[np.bool_]:
         """Which of the n measurements the loss lets count; all of them without one."""
@@ -177,12 +184,16 @@ class VectorizedFactor:
             start = stop
 
     def _evaluate(self, _: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
-        answers, i = self._given or (Answers([self], self._at(values), None, self.loss), 0)
+        answers, i = self._answering(values)
         return answers.error(i) if jacobians is None else answers.linear(i, jacobians)
+
+    def _answering(self, values: gtsam.Values) -> tuple[Answers, int]:
+        """Who answers for these values, and for which factor."""
+        return self._given or (Answers([self], self._at(values), None, self.loss), 0)
 
     @cached_property
     def places(self) -> Places:
-        """Where blocks lie in the Jacobian by all keys, see `places_of`."""
+        """Where blocks lie in the system by all keys, see `places_of`."""
         slots = tuple(each if isinstance(each, int) else tuple(each) for each in self.slots)
         return places_of(len(self.model.time), self.model.rows, slots, tuple(map(dimension, self.blocks)))
 

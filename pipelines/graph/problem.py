@@ -143,6 +143,10 @@ class Factor:
         """The vectorised factor behind it, whichever it is."""
         return self.measurement or self.process
 
+    def linearized(self, values: gtsam.Values) -> gtsam.GaussianFactor:
+        """About the values."""
+        return self.factor.linearize(values) if self.vectorized is None else self.vectorized.linearized(values)
+
 
 def _no_values() -> gtsam.Values:
     import gtsam

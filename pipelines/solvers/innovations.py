@@ -15,7 +15,7 @@ from pipelines.graph.problem import Array, ChiSquare, Factor, Residuals
 from pipelines.solvers.marginals import ordering_of
 from pipelines.solvers.rows import Rows
 from pipelines.solvers.smoother import Smoother, slices
-from pipelines.solvers.system import graph_of, residuals_of
+from pipelines.solvers.system import linear_graph_of, residuals_of
 
 # After so many rejections in a row it is the prediction that is wrong: take the measurement.
 _MOST_REJECTED = 10
@@ -61,7 +61,7 @@ class Prediction:
 
     @cached_property
     def _process(self) -> gtsam.GaussianFactorGraph:
-        return graph_of(self.processes).linearize(self.about)
+        return linear_graph_of(self.processes, self.about)
 
 
 @dataclass

@@ -11,7 +11,7 @@ import numpy as np
 from factors.loss import TruncatedLoss
 from pipelines.graph.problem import Array, Factor
 from pipelines.solvers.marginals import ordering_of
-from pipelines.solvers.system import graph_of
+from pipelines.solvers.system import graph_of, linear_graph_of
 
 # Move of a variable, in its own units (rad, rad/s, s), that makes iSAM2 linearise its factors anew.
 _RELINEARIZE = 1e-2
@@ -105,7 +105,7 @@ class FixedLag:
         self._begun.insert(values)
         self._vectors.update(key for key in values.keys() if _is_vector(values, key))
         self._stamps.update(stamps)
-        graph = graph_of(factors).linearize(self._begun)
+        graph = linear_graph_of(factors, self._begun)
         first = self._oldest({key for f in factors for key in f.factor.keys()}.union(stamps))
         graph.push_back(self._known(first))
         del self._past[first:]
@@ -196,7 +196,7 @@ def slices(keys: Sequence[int], dims: Mapping[int, int]) -> dict[int, slice]:
 
 def linearized(factor: Factor, values: gtsam.Values) -> Factor:
     """The factor as it is about the values, for good."""
-    return Factor(factor.family, gtsam.LinearContainerFactor(factor.factor.linearize(values), values))
+    return Factor(factor.family, gtsam.LinearContainerFactor(factor.linearized(values), values))
 
 
 def unweighed(factor: Factor) -> Factor:

@@ -95,7 +95,7 @@ def require_sound(factors: Sequence[Factor], values: gtsam.Values, time: float) 
     """
     require_known(factors, values, time)
     for f in factors:
-        linear = f.factor.linearize(values)
+        linear = f.linearized(values)
         if linear is not None and not np.isfinite(linear.augmentedJacobian()).all():
             moment = time if f.measurement is None else float(f.measurement.model.time[0])
             raise InputError(

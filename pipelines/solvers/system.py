@@ -116,7 +116,7 @@ class Stretch:
             if excess is not None:
                 for key, number, information in ensemble.excess():
                     excess[key, number] = excess.get((key, number), np.zeros(2)) + information
-            return self.graph.linearize(values)
+            return linear_graph_of(self.factors, values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -583,6 +583,14 @@ def graph_of(factors: Sequence[Factor]) -> gtsam.NonlinearFactorGraph:
     graph = gtsam.NonlinearFactorGraph()
     for f in factors:
         graph.add(f.factor)
+    return graph
+
+
+def linear_graph_of(factors: Sequence[Factor], values: gtsam.Values) -> gtsam.GaussianFactorGraph:
+    """The linear system of the factors about the values, in their order."""
+    graph = gtsam.GaussianFactorGraph()
+    for f in factors:
+        graph.push_back(f.linearized(values))
     return graph
 
 
