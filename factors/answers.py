@@ -125,16 +125,25 @@ class Answers:
             assert isinstance(key, int), "a number that turns rows is shared"
             yield key, number, each
 
+    @property
+    def total(self) -> float:
+        """The error of all factors together: half the sum of squares, as the loss counts them."""
+        return 0.5 * float(self._costs.sum())
+
     @cached_property
     def _squares(self) -> Array:
         """(N,) of all measurements."""
         return squares_of(self.residuals)
 
     @cached_property
+    def _costs(self) -> Array:
+        """(N,) of all measurements under the loss."""
+        return self._squares if self.loss is None else np.asarray(self.loss.cost(self._squares))
+
+    @cached_property
     def _norms(self) -> list[float]:
         """Of the factors' errors."""
-        costs = self._squares if self.loss is None else self.loss.cost(self._squares)
-        return np.sqrt(np.add.reduceat(costs, [start for start, _ in self._spans])).tolist()
+        return np.sqrt(np.add.reduceat(self._costs, [start for start, _ in self._spans])).tolist()
 
     @cached_property
     def _root(self) -> Array:

@@ -237,6 +237,11 @@ class Ensemble:
             for group in self._groups:
                 group.take()
 
+    @property
+    def error(self) -> float:
+        """Half the sum of squares of all factors; to be asked within the block of `at`."""
+        return sum(group.answers.total for group in self._groups)
+
     def excess(self) -> Iterator[tuple[int, int, Array]]:
         """What `mixed` has too much, factor by factor; to be asked within the block of `at`.
 
@@ -311,12 +316,17 @@ class _Group:
 
     def excess(self) -> Iterator[tuple[int, int, Array]]:
         """As Ensemble.excess has it."""
-        turning, first = self._model.turning, self._factors[0]
-        if turning is None or first.compress:
+        turning = self._model.turning
+        if turning is None or self._factors[0].compress:
             return
-        assert first._given is not None, "within the block of `at`"
-        answers, _ = first._given
-        yield from answers.excess(*turning)
+        yield from self.answers.excess(*turning)
+
+    @property
+    def answers(self) -> Answers:
+        """What was given."""
+        given = self._factors[0]._given
+        assert given is not None, "within the block of `at`"
+        return given[0]
 
     @cached_property
     def _weights(self) -> Array | None:

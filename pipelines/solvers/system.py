@@ -61,14 +61,14 @@ class Stretch:
 
     Attributes:
         factors: as they are.
-        graph: the same for gtsam.
+        others: those of them that are not vectorised.
         inner: variables that no other stretch holds, in the order of their elimination; of a graph in one piece none.
         outer: which of the factors hold none of these.
         ensemble: the vectorised ones among the factors, kept where there is but one stretch.
     """
 
     factors: Sequence[Factor]
-    graph: gtsam.NonlinearFactorGraph
+    others: gtsam.NonlinearFactorGraph
     inner: gtsam.Ordering
     outer: Sequence[int]
     ensemble: Ensemble | None
@@ -76,7 +76,7 @@ class Stretch:
     @classmethod
     def alone(cls, factors: Sequence[Factor]) -> Stretch:
         """A graph in one piece."""
-        return cls(factors, graph_of(factors), gtsam.Ordering(), range(len(factors)), Ensemble(_vectorized(factors)))
+        return cls(factors, _others(factors), gtsam.Ordering(), range(len(factors)), Ensemble(_vectorized(factors)))
 
     @classmethod
     def of(cls, factors: Sequence[Factor], joint: set[int]) -> Stretch:
@@ -86,12 +86,12 @@ class Stretch:
         held = joint.intersection(graph.keyVector())
         whole = elimination_ordering(graph, sorted(held))
         inner = ordering_of(whole.at(i) for i in range(whole.size() - len(held)))
-        return cls(factors, graph, inner, outer, None)
+        return cls(factors, _others(factors), inner, outer, None)
 
     def made_of(self, factors: Sequence[Factor]) -> Stretch:
         """The same with other noise."""
         ensemble = None if self.ensemble is None else Ensemble(_vectorized(factors))
-        return replace(self, factors=factors, graph=graph_of(factors), ensemble=ensemble)
+        return replace(self, factors=factors, others=_others(factors), ensemble=ensemble)
 
     def at(self, values: gtsam.Values, loss: TruncatedLoss | None) -> AbstractContextManager[None]:
         """Within the block the factors answer for these values, under the loss."""
@@ -104,8 +104,9 @@ class Stretch:
 
     def error(self, values: gtsam.Values, loss: TruncatedLoss | None) -> float:
         """Half the sum of squares."""
-        with self.at(values, loss):
-            return float(self.graph.error(values))
+        ensemble = self._together
+        with ensemble.at(values, loss):
+            return ensemble.error + float(self.others.error(values))
 
     def linearize(
         self, values: gtsam.Values, loss: TruncatedLoss | None, excess: Excess | None = None
@@ -388,7 +389,7 @@ class System:
         ends = _divided(factors, boundaries)
         if len(ends) < 2:
             alone = Stretch.alone(factors)
-            return cls([alone], boundaries, elimination_ordering(alone.graph, shared), shared, loss)
+            return cls([alone], boundaries, elimination_ordering(graph_of(factors), shared), shared, loss)
         pieces = _pieces(factors, ends)
         joint = _joint(pieces, boundaries, shared)
         stretches = [Stretch.of(piece, set(joint)) for piece in pieces]
@@ -568,6 +569,10 @@ def _keys(ordering: gtsam.Ordering) -> list[int]:
 
 def _vectorized(factors: Sequence[Factor]) -> list[VectorizedFactor]:
     return [v for f in factors if (v := f.vectorized) is not None]
+
+
+def _others(factors: Sequence[Factor]) -> gtsam.NonlinearFactorGraph:
+    return graph_of([f for f in factors if f.vectorized is None])
 
 
 def without_rejected(factor: Factor, like: Factor, values: gtsam.Values) -> Factor:
