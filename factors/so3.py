@@ -224,22 +224,27 @@ def matrix(q: ArrayLike) -> Array:
 def from_matrix(r: ArrayLike) -> Array:
     """Rotation matrices, shape (..., 3, 3) -> quaternions with w >= 0."""
     r = np.asarray(r, dtype=float)
-    xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
-    wx, wy, wz = (r[..., 2, 1] - r[..., 1, 2]), (r[..., 0, 2] - r[..., 2, 0]), (r[..., 1, 0] - r[..., 0, 1])
-    xy, xz, yz = (r[..., 0, 1] + r[..., 1, 0]), (r[..., 0, 2] + r[..., 2, 0]), (r[..., 1, 2] + r[..., 2, 1])
-    # Four ways to the same quaternion, each scaled by one of its components; the largest one loses no digits.
-    ways = np.stack(
-        [
-            np.stack([1 + xx + yy + zz, wx, wy, wz], axis=-1),
-            np.stack([wx, 1 + xx - yy - zz, xy, xz], axis=-1),
-            np.stack([wy, xy, 1 - xx + yy - zz, yz], axis=-1),
-            np.stack([wz, xz, yz, 1 - xx - yy + zz], axis=-1),
-        ],
-        axis=-2,
-    )
+    ways = (r.reshape(*r.shape[:-2], 9) @ _WAYS + np.eye(4).ravel()).reshape(*r.shape[:-2], 4, 4)
+    # Each is scaled by one of the components; by the largest one it loses no digits.
     best = np.argmax(np.diagonal(ways, axis1=-2, axis2=-1), axis=-1)
     q = normalize(np.take_along_axis(ways, best[..., None, None], axis=-2)[..., 0, :])
     return np.where(q[..., :1] < 0.0, -q, q)
+
+
+def _ways(r: Array) -> Array:
+    """Four ways (..., 4, 4), rows, to the quaternion of a matrix, less the identity: 4 q q' - I."""
+    xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
+    wx, wy, wz = (r[..., 2, 1] - r[..., 1, 2]), (r[..., 0, 2] - r[..., 2, 0]), (r[..., 1, 0] - r[..., 0, 1])
+    xy, xz, yz = (r[..., 0, 1] + r[..., 1, 0]), (r[..., 0, 2] + r[..., 2, 0]), (r[..., 1, 2] + r[..., 2, 1])
+    return np.stack(
+        [
+            np.stack([xx + yy + zz, wx, wy, wz], axis=-1),
+            np.stack([wx, xx - yy - zz, xy, xz], axis=-1),
+            np.stack([wy, xy, yy - xx - zz, yz], axis=-1),
+            np.stack([wz, xz, yz, zz - xx - yy], axis=-1),
+        ],
+        axis=-2,
+    )
 
 
 @_in_cache
@@ -347,3 +352,5 @@ def _tables() -> tuple[Array, Array, Array, Array]:
 
 
 _PRODUCT, _MATRIX, _HAT, _SQUARE = _tables()
+# What the numbers of a rotation matrix, by rows, add to the ways to its quaternion.
+_WAYS = _ways(np.eye(9).reshape(9, 3, 3)).reshape(9, 16)
