@@ -42,6 +42,7 @@ HALF_SPAN = 0.025  # rates at the frames are means over so much to either side, 
 INVERSE_DEPTH, INVERSE_DEPTH_SIGMA = 0.3, 0.3
 GRAPH_STRIDE = 3  # of the frames in the graph
 STRIDE = 10  # frames between two views of the first guess
+STEP = 4  # frames from one such pair to the next
 # What a camera does that has no parallax to tell: it moves at no more than a few m/s.
 SPEED = 2.0
 FEWEST_COMMON = 10  # features of two views
@@ -174,7 +175,7 @@ def two_view_rotations(recording: Recording) -> tuple[Index, Index, Array]:
     ]
     pairs, rotations = [], []
     options = pycolmap.RANSACOptions(max_error=2.0, random_seed=0)
-    for i in range(0, len(recording.time) - STRIDE, 2):
+    for i in range(0, len(recording.time) - STRIDE, STEP):
         first, second = tracks[i], tracks[i + STRIDE]
         common = [track for track in first if track in second]
         if len(common) < FEWEST_COMMON:

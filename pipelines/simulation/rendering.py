@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, reduce
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +21,8 @@ Picture = NDArray[np.uint8]
 
 # A pixel is integrated over n by n parts of its area: (n, contrast of the texture in it, grey levels, up to which).
 _PARTS = ((1, 20.0), (2, 80.0), (4, np.inf))
+# About so many at a time, which stay in the cache with all that is made of them on the way.
+_PIXELS = 8192
 
 
 @cache
@@ -112,24 +114,22 @@ class Renderer:
         H = _ray_to_texel(quad)
         rays, dx, dy = self._rays[rows, columns], self._step_x[rows, columns], self._step_y[rows, columns]
         shape = rays.shape[:2]
-        q, qx, qy = (a.reshape(-1, 3) @ H.T for a in (rays, dx, dy))
+        q, qx, qy = (H @ a.reshape(-1, 3).T for a in (rays, dx, dy))
         with np.errstate(all="ignore"):
-            texel = q[:, :2] / q[:, 2:]
-            # How far one pixel reaches in texels, along its x and its y.
-            reach_x, reach_y = (d[:, :2] / q[:, 2:] - texel * (d[:, 2:] / q[:, 2:]) for d in (qx, qy))
-            width = np.sqrt(reach_x**2 + reach_y**2)
-        seen = (q[:, 2] > 0) & np.isfinite(width).all(axis=1)
-        size = np.array(quad.texture.shape[::-1], dtype=float)
-        seen &= ((texel > -width) & (texel < size + width)).all(axis=1)
-        share, grey = np.zeros(len(q)), np.zeros(len(q))
+            texel, width = _footprint(q, qx, qy)
+        seen = (q[2] > 0) & np.isfinite(width).all(axis=0)
+        size = np.array(quad.texture.shape[::-1], dtype=float)[:, None]
+        seen &= ((texel > -width) & (texel < size + width)).all(axis=0)
+        share, grey = np.zeros(len(seen)), np.zeros(len(seen))
         at = np.flatnonzero(seen)
         table = np.pad(quad.texture.cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
-        contrast, level = _contrast(quad.texture, texel[at], width[at])
+        contrast, level = _contrast(quad.texture, texel[:, at], width[:, at])
         share[at], grey[at] = 1.0, level
         least = 0.0
         for parts, most in _PARTS:
             part = at[(contrast > least) & (contrast <= most)]
-            share[part], grey[part] = _integrate(quad.texture, table, q[part], qx[part], qy[part], parts)
+            for some in np.array_split(part, len(part) // _PIXELS + 1):
+                share[some], grey[some] = _integrate(quad.texture, table, q[:, some], qx[:, some], qy[:, some], parts)
             least = most
         return share.reshape(shape), grey.reshape(shape)
 
@@ -150,6 +150,17 @@ def _ray_to_texel(quad: Quad) -> Array:
     return np.asarray(np.stack([u, v, normal]) * np.sign(reach))
 
 
+def _footprint(q: Array, qx: Array, qy: Array) -> tuple[Array, Array]:
+    """Where pixels lie in the texture (2, n), and how far they reach there along its axes (2, n), texels.
+
+    Args:
+        q, qx, qy: (3, n) of rays and of their steps from pixel to pixel, as `_ray_to_texel` has them.
+    """
+    texel = q[:2] / q[2]
+    reach_x, reach_y = (d[:2] / q[2] - texel * (d[2] / q[2]) for d in (qx, qy))
+    return texel, np.sqrt(reach_x**2 + reach_y**2)
+
+
 def _contrast(texture: Array, texel: Array, width: Array) -> tuple[Array, Array]:
     """The texture's contrast within each pixel, and its grey level where that is zero.
 
@@ -158,13 +169,13 @@ def _contrast(texture: Array, texel: Array, width: Array) -> tuple[Array, Array]
     rows, columns = texture.shape
     # The footprint lies within this box even when it is turned by 45 degrees.
     reach = 0.75 * width + 1e-9
-    low, high = texel - reach, texel + reach
-    inside = (low >= 0).all(axis=1) & (high < (columns, rows)).all(axis=1)
-    small = (reach < 0.5).all(axis=1)
-    i0, i1 = (np.clip(p, 0, (columns - 1, rows - 1)).astype(np.intp) for p in (low, high))
+    low, high, size = texel - reach, texel + reach, np.array([[columns], [rows]])
+    inside = (low >= 0).all(axis=0) & (high < size).all(axis=0)
+    small = (reach < 0.5).all(axis=0)
+    i0, i1 = (np.clip(p, 0, size - 1).astype(np.intp) for p in (low, high))
     grey = texture.ravel()
-    corners = [grey[r * columns + c] for r in (i0[:, 1], i1[:, 1]) for c in (i0[:, 0], i1[:, 0])]
-    contrast = np.maximum.reduce(corners) - np.minimum.reduce(corners)
+    corners = [grey[r * columns + c] for r in (i0[1], i1[1]) for c in (i0[0], i1[0])]
+    contrast = reduce(np.maximum, corners) - reduce(np.minimum, corners)
     # Between the corners of a wide footprint there are more texels; their contrast is guessed from the corners'.
     contrast = np.where(small, contrast, np.maximum(2.0 * contrast, 1.0))
     return np.where(inside, contrast, np.inf), corners[0]
@@ -172,21 +183,18 @@ def _contrast(texture: Array, texel: Array, width: Array) -> tuple[Array, Array]
 
 def _integrate(texture: Array, table: Array, q: Array, qx: Array, qy: Array, parts: int) -> tuple[Array, Array]:
     """Share and mean grey of pixels: the mean over parts by parts of their area; `table`: the summed texture."""
-    rows, columns = texture.shape
+    size = np.array(texture.shape[::-1], dtype=float)[:, None]
     offsets = (np.arange(parts) + 0.5) / parts - 0.5
-    share, grey = np.zeros(len(q)), np.zeros(len(q))
+    share, grey = np.zeros(q.shape[1]), np.zeros(q.shape[1])
     for x in offsets:
         for y in offsets:
-            p = q + x * qx + y * qy
-            texel = p[:, :2] / p[:, 2:]
-            reach_x, reach_y = (d[:, :2] / p[:, 2:] - texel * (d[:, 2:] / p[:, 2:]) for d in (qx, qy))
+            texel, width = _footprint(q + x * qx + y * qy, qx, qy)
             # A box with the footprint's own spread along each axis of the texture.
-            width = np.maximum(np.sqrt(reach_x**2 + reach_y**2) / parts, 1e-9)
-            low = np.clip(texel - 0.5 * width, 0, (columns, rows))
-            high = np.clip(texel + 0.5 * width, 0, (columns, rows))
+            width = np.maximum(width / parts, 1e-9)
+            low, high = (np.clip(texel + end * width, 0, size) for end in (-0.5, 0.5))
             total = _box_sum(table, low, high)
-            area = 1.0 / width.prod(axis=1)
-            share += (high - low).prod(axis=1) * area
+            area = 1.0 / (width[0] * width[1])
+            share += (high[0] - low[0]) * (high[1] - low[1]) * area
             grey += total * area
     return share / parts**2, grey / np.maximum(share, 1e-12)
 
@@ -204,7 +212,7 @@ def _box_sum(table: Array, low: Array, high: Array) -> Array:
         i += columns
         return np.asarray(upper * (1 - down) + (flat[i] * (1 - right) + flat[i + 1] * right) * down)
 
-    (x0, y0), (x1, y1) = low.T, high.T
+    (x0, y0), (x1, y1) = low, high
     return at(x1, y1) - at(x0, y1) - at(x1, y0) + at(x0, y0)
 
 
