@@ -244,10 +244,10 @@ def _commanded(scenario: IndexerScenario, drives: list[_Drive], t: Array) -> Arr
     """Axis angles (2, N), rad, that the drives follow. Ripple comes with the angle, as cogging does."""
     angles = np.zeros((2, len(t)))
     for drive in drives:
-        moving = slice(int(np.searchsorted(t, drive.start)), None)
-        turned = drive.turned(t[moving])
+        begin, end = np.searchsorted(t, [drive.start, drive.start + drive.duration])
         k = scenario.ripple_per_turn
-        angles[drive.axis, moving] += turned + scenario.ripple / k * np.sin(k * turned)
+        for some, turned in ((slice(begin, end), drive.turned(t[begin:end])), (slice(end, None), drive.angle)):
+            angles[drive.axis, some] += turned + scenario.ripple / k * np.sin(k * turned)
     return angles
 
 
