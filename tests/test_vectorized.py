@@ -158,8 +158,35 @@ def test_an_ensemble_evaluates_what_its_factors_would() -> None:
             assert graph.error(others) != pytest.approx(error)
         with ensemble.at(values):
             assert graph.error(values) == pytest.approx(error, rel=1e-14)
+            assert ensemble.error == pytest.approx(error, rel=1e-14)
             np.testing.assert_allclose(graph.linearize(values).augmentedJacobian(), jacobian, rtol=1e-14)
     assert graph.error(others) != pytest.approx(error)
+
+
+@pytest.mark.parametrize("compress", [False, True])
+@pytest.mark.parametrize("loss", [None, TruncatedLoss(2.0), TruncatedLoss(2.0, mu=0.1)])
+def test_a_system_made_in_one_piece_is_what_gtsam_asks_for_key_by_key(
+    loss: TruncatedLoss | None, compress: bool
+) -> None:
+    tied: tuple[Keys, Keys] = (0, 1) if compress else ([0, 1, 0, 2, 1, 0], 5)
+    factor = _line(6).on(*tied, loss=loss, compress=compress)
+    factor = factor.weighed(np.random.default_rng(2).uniform(0.5, 2.0, (6, 2)))
+    values, rng = gtsam.Values(), np.random.default_rng(3)
+    for key in factor.keys:
+        values.insert(key, rng.normal(size=2 if key == factor.keys[-1] else 3))
+
+    def assert_same() -> None:
+        whole, asked = factor.linearized(values), factor.factor.linearize(values)
+        assert type(whole) is gtsam.JacobianFactor
+        assert list(whole.keys()) == list(asked.keys())
+        np.testing.assert_array_equal(whole.augmentedJacobian(), asked.augmentedJacobian())
+
+    assert_same()
+    ensemble = Ensemble([factor])
+    for within in (None, TruncatedLoss(1.0)):
+        with ensemble.at(values, within):
+            assert_same()
+            assert ensemble.error == pytest.approx(factor.factor.error(values), rel=1e-14)
 
 
 def test_the_loss_in_force_is_that_of_the_evaluation() -> None:
