@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import gtsam
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 
 # Below this angle (rad) the closed forms lose more digits to cancellation than their series truncate.
 _SMALL = 1e-2
@@ -62,19 +63,30 @@ def _products(a: Array, b: Array) -> Array:
     return products.reshape(*products.shape[:-2], a.shape[-1] * b.shape[-1])
 
 
-def _pair(q: Array) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-    """The complex numbers a = w + x i and b = y + z i of quaternions a + b j, views where they can be.
+def _complex(v: Array) -> Complex:
+    """Numbers (..., 2 k) taken in pairs as complex ones (..., k), a view where it can be."""
+    return np.asarray((v if v.strides[-1] == v.itemsize else v.copy()).view(complex))
+
+
+def _pair(q: Array) -> tuple[Complex, Complex]:
+    """The complex numbers a = w + x i and b = y + z i of quaternions a + b j.
 
     A product takes four multiplications of these in place of sixteen, since j c is c* j.
     """
-    numbers = (q if q.strides[-1] == q.itemsize else q.copy()).view(complex)
+    numbers = _complex(q)
     return numbers[..., 0], numbers[..., 1]
 
 
+def _by_conjugate(a: Complex, b: Complex) -> Complex:
+    """a b*.
+
+    As a call: of many, numpy would write `a * b.conj()` into the conjugate, and round otherwise than of few.
+    """
+    return np.multiply(a, b.conj())
+
+
 def _square(v: Array) -> Array:
-    """Squared lengths (...) of vectors (..., 3), or of one number; a sum over so short an axis takes numpy longer."""
-    if not v.ndim:
-        return np.asarray(v * v)
+    """Squared lengths (...) of vectors (..., 3); a sum over so short an axis takes numpy longer."""
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
     return np.asarray(x * x + y * y + z * z)
 
@@ -109,8 +121,8 @@ def _product(p: Array, q: Array) -> Array:
     """(a + b j) (c + d j)."""
     (a, b), (c, d) = _pair(p), _pair(q)
     first, second = a * c, a * d
-    first -= b * d.conj()
-    second += b * c.conj()
+    first -= _by_conjugate(b, d)
+    second += _by_conjugate(b, c)
     out = np.empty((*first.shape, 2), dtype=complex)
     out[..., 0], out[..., 1] = first, second
     return out.view(float)
@@ -131,21 +143,15 @@ def rotate(q: ArrayLike, v: ArrayLike) -> Array:
     if _few(q, v):
         return np.asarray((matrix(q) @ v[..., None])[..., 0])
     # v is x i + c j. Of q v q* the part by j is a^2 c + b^2 c* - 2 i a b x, the other (|a|^2 - |b|^2) x + 2 Im(a b* c).
-    (a, b), (x, c) = _pair(q), (v[..., 0], _planar(v))
-    across = a * a * c
-    across += b * b * c.conj()
-    ab = a * b
+    (a, b), x, c = _pair(q), v[..., 0], _complex(v[..., 1:])[..., 0]
+    across = np.multiply(a * a, c)
+    across += _by_conjugate(b * b, c)
+    ab, mixed = a * b, np.multiply(_by_conjugate(a, b), c)
     out = np.empty((*across.shape, 3))
-    out[..., 0] = (1.0 - 2.0 * (b.real**2 + b.imag**2)) * x + 2.0 * (a * b.conj() * c).imag
+    out[..., 0] = (1.0 - 2.0 * (b.real**2 + b.imag**2)) * x + 2.0 * mixed.imag
     out[..., 1] = across.real + 2.0 * ab.imag * x
     out[..., 2] = across.imag - 2.0 * ab.real * x
     return out
-
-
-def _planar(v: Array) -> NDArray[np.complex128]:
-    """y + z i of vectors."""
-    plane = v[..., 1:]
-    return np.asarray((plane if plane.strides[-1] == plane.itemsize else plane.copy()).view(complex)[..., 0])
 
 
 @_in_cache
@@ -175,10 +181,11 @@ def hat(v: ArrayLike) -> Array:
 def exp(phi: ArrayLike) -> Array:
     """Rotation vectors, shape (..., 3), rad -> quaternions."""
     phi = np.asarray(phi, dtype=float)
+    phi = phi if phi.ndim else np.full(3, phi)  # no angle about any axis, as formulas have it where nothing is known
     # The least angle only avoids 0 / 0.
     half = np.maximum(0.5 * np.sqrt(_square(phi)), 1e-150)
     out = np.empty((*phi.shape[:-1], 4))
-    if phi.size <= 3 * _FEW:
+    if _few(phi):
         out[..., 0] = np.cos(half)
         out[..., 1:] = phi * (0.5 * np.sin(half) / half)[..., None]
         return out
@@ -211,7 +218,7 @@ def matrix(q: ArrayLike) -> Array:
         return (_products(q, q) @ _MATRIX).reshape(*q.shape[:-1], 3, 3)
     # As `rotate` has it, of the axes.
     a, b = _pair(q)
-    aa, bb, ab, mixed = a * a, b * b, a * b, a * b.conj()
+    aa, bb, ab, mixed = a * a, b * b, a * b, _by_conjugate(a, b)
     out = np.empty((*a.shape, 3, 3))
     out[..., 0, 0] = 1.0 - 2.0 * (b.real**2 + b.imag**2)
     out[..., 0, 1], out[..., 0, 2] = 2.0 * mixed.imag, 2.0 * mixed.real
