@@ -240,8 +240,9 @@ def places_of(n: int, m: int, slots: tuple[int | tuple[int, ...], ...], dimensio
     widths: dict[int, int] = {}
     for own, size in zip(slots, dimensions, strict=True):
         widths |= dict.fromkeys([own] if isinstance(own, int) else own, size)
-    ends = np.cumsum([widths[slot] for slot in range(len(widths))])
-    columns = [slice(int(end) - widths[slot], int(end)) for slot, end in enumerate(ends)]
+    by_slot = [widths[slot] for slot in range(len(widths))]
+    ends = np.cumsum(by_slot)
+    columns = [slice(int(end) - size, int(end)) for size, end in zip(by_slot, ends, strict=True)]
     width = int(ends[-1]) + 1
     rows = (np.arange(n * m) * width).reshape(n, m, 1)
     targets: list[_Place] = []
@@ -253,7 +254,7 @@ def places_of(n: int, m: int, slots: tuple[int | tuple[int, ...], ...], dimensio
             targets.append((int(first[0]) * one, ((m * width + apart) * one, width * one, one)))
         else:
             targets.append(rows + first[:, None, None] + np.arange(size))
-    return Places(columns, [*(column.stop - column.start for column in columns), 1], targets)
+    return Places(columns, [*by_slot, 1], targets)
 
 
 def laid_out(blocks: Sequence[Array], residuals: Array, places: Places, count: int) -> Array:

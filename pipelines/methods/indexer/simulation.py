@@ -119,11 +119,10 @@ class _Drive:
         return abs(self.angle) / self.speed + self.speed / self.acceleration
 
     def turned(self, t: Array) -> Array:
-        """Angle turned by the time t, rad: the rate is a trapezoid."""
+        """Angle turned by the time t, while it moves, rad: the rate is a trapezoid."""
         ramp, s = self.speed / self.acceleration, t - self.start
-        corners = [(0.0, 1.0), (ramp, -1.0), (self.duration - ramp, -1.0), (self.duration, 1.0)]
-        path = sum(sign * np.maximum(s - corner, 0.0) ** 2 for corner, sign in corners)
-        return np.asarray(np.sign(self.angle) * 0.5 * self.acceleration * path)
+        even, braking = (np.maximum(s - corner, 0.0) for corner in (ramp, self.duration - ramp))
+        return np.asarray(np.sign(self.angle) * 0.5 * self.acceleration * (s**2 - even**2 - braking**2))
 
 
 def simulate_indexer(scenario: IndexerScenario, seed: int) -> tuple[IndexerData, dict[str, float]]:
