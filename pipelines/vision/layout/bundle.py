@@ -15,6 +15,8 @@ _STEPS = 40
 _DIAGONAL = np.arange(6)
 # A step that changes the cost by less than this share ends the adjustment.
 _SETTLED = 1e-10
+# A picture whose step changes its cost by less than this share stays there.
+_STEADY = 1e-6
 
 
 def moved(bundle: Bundle, shared: Array, pictures: Array, additional: Additional) -> Bundle:
@@ -88,45 +90,46 @@ def refined_pictures(
 ) -> tuple[Bundle, Array, Array]:
     """Pictures one by one with the tags where they are; costs (f,) and information (f, 6, 6) of their poses too."""
     f = len(bundle.cRb)
-    damping = np.full(f, 1e-3)
     rows = linearized(bundle, sights)
-    cost = np.asarray(np.bincount(sights.picture, loss(rows.squares, far), f), dtype=float)
+    cost, damping = _costs(rows, sights, far, f), np.full(f, 1e-3)
+    own, gradient = _own(rows, sights, far, f)
+    going = own[:, 0, 0] > 0.0
     for _ in range(steps):
-        own, gradient = _own(rows, sights, weights(rows, far), f)
-        damped = own.copy()
-        damped[:, _DIAGONAL, _DIAGONAL] *= 1.0 + damping[:, None]
-        damped[own[:, 0, 0] <= 0.0] = np.eye(6)
-        step = -np.linalg.solve(damped, gradient[..., None])[..., 0]
+        seen = sights[going[sights.picture]]
+        if not len(seen):
+            break
+        damped = own[going]
+        damped[:, _DIAGONAL, _DIAGONAL] *= 1.0 + damping[going, None]
+        step = np.zeros((f, 6))
+        step[going] = -np.linalg.solve(damped, gradient[going, :, None])[..., 0]
         after = replace(
             bundle,
             cRb=so3.multiply(bundle.cRb, so3.exp(step[:, :3])),
             position=bundle.position + step[:, 3:],
         )
-        there = linearized(after, sights)
-        now = np.bincount(sights.picture, loss(there.squares, far), f)
-        better = now < cost
-        damping = np.where(better, 0.1 * damping, 10.0 * damping)
-        done = not (cost - now > 1e-6 * cost).any()
+        there = linearized(after, seen)
+        now = _costs(there, seen, far, f)
+        better = going & (now < cost)
         bundle = replace(
             bundle,
             cRb=np.where(better[:, None], after.cRb, bundle.cRb),
             position=np.where(better[:, None], after.position, bundle.position),
         )
-        mine = better[sights.picture][:, None]
-        rows = replace(
-            rows,
-            miss=np.where(mine, there.miss, rows.miss),
-            by_picture=np.where(mine[..., None], there.by_picture, rows.by_picture),
-        )
-        cost = np.minimum(now, cost)
-        if done:
-            break
-    return bundle, np.asarray(cost, dtype=float), _own(rows, sights, weights(rows, far), f)[0]
+        own[better], gradient[better] = (each[better] for each in _own(there, seen, far, f))
+        damping = np.where(better, 0.1 * damping, 10.0 * damping)
+        going &= np.abs(cost - now) > _STEADY * cost
+        cost = np.where(better, now, cost)
+    return bundle, cost, own
 
 
-def _own(rows: Rows, sights: Sights, weight: Array, f: int) -> tuple[Array, Array]:
+def _costs(rows: Rows, sights: Sights, far: float, f: int) -> Array:
+    """(f,) of the pictures."""
+    return np.asarray(np.bincount(sights.picture, loss(rows.squares, far), f), dtype=float)
+
+
+def _own(rows: Rows, sights: Sights, far: float, f: int) -> tuple[Array, Array]:
     """Information (f, 6, 6) and gradient (f, 6) of the pictures' poses."""
-    At = np.swapaxes(rows.by_picture, 1, 2) * weight[:, None, None]
+    At = np.swapaxes(rows.by_picture, 1, 2) * weights(rows, far)[:, None, None]
     own, gradient = np.zeros((f, 6, 6)), np.zeros((f, 6))
     np.add.at(own, sights.picture, At @ rows.by_picture)
     np.add.at(gradient, sights.picture, (At @ rows.miss[..., None])[..., 0])

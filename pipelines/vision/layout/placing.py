@@ -25,6 +25,8 @@ FAR = 8.0 * 4.0**2
 # A vote hears so many pictures, and so many proposals.
 _PICTURES, _PROPOSALS = 40, 32
 _ROUNDS = 8
+# A proposal whose step would lower its cost by less than this stays where it is.
+_STAYS = 0.01
 _LEAST_DAMPING = 1e-9
 # Adjustments on the way.
 _ON_THE_WAY = 4
@@ -140,14 +142,14 @@ def vote(bundle: Bundle, sights: Sights, found: Flips, told: Sides) -> tuple[Arr
     bRt, place = proposals[keep], places[keep]
     known = told.information[sights.picture] + 1e-12 * np.eye(6)
     odds = np.where(there, told.cost[sights.picture] - told.cost[sights.picture, :1], np.inf)
-    cost = np.zeros(len(keep))
+    cost, going = np.zeros(len(keep)), np.arange(len(keep))
     for round_ in range(_ROUNDS + 1):
         far = FAR * 4.0 ** max(0, 4 - round_)
-        squares, gradient, information = _against(bundle, sights, cRb, position, known, bRt, place)
+        squares, gradient, information = _against(bundle, sights, cRb, position, known, bRt[going], place[going])
         squares = np.where(there, squares + odds, np.inf)
         side = squares.argmin(axis=2)[..., None]
         squares = np.take_along_axis(squares, side, 2)[..., 0]
-        cost = loss(squares, far).sum(axis=1)
+        cost[going] = loss(squares, far).sum(axis=1)
         if round_ == _ROUNDS:
             break
         weight = (far / (far + squares)) ** 2
@@ -155,9 +157,16 @@ def vote(bundle: Bundle, sights: Sights, found: Flips, told: Sides) -> tuple[Arr
         H = np.take_along_axis(information, side[..., None, None], 2)[:, :, 0]
         H = np.einsum("hs,hsij->hij", weight, H)
         H += _LEAST_DAMPING * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(6)
-        step = -np.linalg.solve(H, np.einsum("hs,hsi->hi", weight, g)[..., None])[..., 0]
+        g = np.einsum("hs,hsi->hi", weight, g)
+        step = -np.linalg.solve(H, g[..., None])[..., 0]
         step *= np.minimum(1.0, 0.3 / np.maximum(np.linalg.norm(step[:, :3], axis=1), 1e-12))[:, None]
-        bRt, place = so3.multiply(bRt, so3.exp(step[:, :3])), place + step[:, 3:]
+        if far == FAR:
+            more = -(step * g).sum(axis=1) > _STAYS
+            going, step = going[more], step[more]
+            if not len(going):
+                break
+        bRt[going] = so3.multiply(bRt[going], so3.exp(step[:, :3]))
+        place[going] += step[:, 3:]
     order = np.argsort(cost)
     return bRt[order], place[order], cost[order]
 

@@ -84,36 +84,70 @@ class Bundle:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Reprojection errors (m, 8) in sigmas and their Jacobians.
+    """Reprojection errors in sigmas, and their Jacobians, which are found when they are first asked for.
 
-    By [delta, epsilon]: cRb Exp(delta), position + epsilon of pictures, `by_picture` (m, 8, 6), and bRt Exp(delta),
-    position + epsilon of tags, `by_tag` (m, 8, 6). `points` and `velocity` (m, 4, 3) are the corners in the camera's
-    frame when they were seen, m and m/s, and `by_point` (m, 4, 2, 3) is how errors follow them.
+    Attributes:
+        miss: (m, 8) predicted - seen.
+        points: (m, 4, 3) m, the corners in the camera's frame when they were seen.
+        by_point: (m, 4, 2, 3) how errors follow these.
+        cRb: (m, 1, 4) of the picture, at its middle row.
+        turn: (m, 4, 4) of the body from then until its corner is seen, None where no shutter rolls.
+        turned: (m, 4, 3) m, the corners in the body's frame, turned so.
+        bRt: (m, 4) of the tag.
+        local: (m, 4, 3) m, the corners in the tag's frame.
+        motion: (m, 1, 6) of the body, as a bundle has it.
     """
 
     miss: Array
-    by_picture: Array
-    by_tag: Array
     points: Array
-    velocity: Array
     by_point: Array
+    cRb: Array
+    turn: Array | None
+    turned: Array
+    bRt: Array
+    local: Array
+    motion: Array
 
     @cached_property
     def squares(self) -> Array:
         """(m,) sums of squares."""
         return np.asarray((self.miss**2).sum(axis=1))
 
+    @cached_property
+    def by_picture(self) -> Array:
+        """(m, 8, 6) by [delta, epsilon] of pictures: cRb Exp(delta), position + epsilon."""
+        by = np.concatenate([-self._by_turned @ so3.hat(self.turned), self.by_point], axis=-1)
+        return by.reshape(-1, 8, 6)
+
+    @cached_property
+    def by_tag(self) -> Array:
+        """(m, 8, 6) by [delta, epsilon] of tags: bRt Exp(delta), position + epsilon."""
+        in_b = self._by_turned if self.turn is None else self._by_turned @ so3.matrix(self.turn)
+        in_t = in_b @ so3.matrix(self.bRt)[:, None]
+        return np.concatenate([-in_t @ so3.hat(self.local), in_b], axis=-1).reshape(-1, 8, 6)
+
+    @property
+    def velocity(self) -> Array:
+        """(m, 4, 3) m/s, of the corners in the camera's frame."""
+        w, v = np.split(self.motion, 2, axis=-1)
+        return np.asarray(so3.rotate(self.cRb, so3.cross(w, self.turned)) + v)
+
+    @cached_property
+    def _by_turned(self) -> Array:
+        return np.asarray(self.by_point @ so3.matrix(self.cRb))
+
 
 def linearized(bundle: Bundle, sights: Sights) -> Rows:
     """Errors (predicted - seen) of all sights and how they follow the poses."""
     m, body = len(sights), bundle.body
-    at_middle, bRt = bundle.cRb[sights.picture][:, None], body.bRt[sights.tag]
-    w, v = np.split(bundle.motion[sights.picture][:, None], 2, axis=-1)
+    cRb, bRt, motion = bundle.cRb[sights.picture][:, None], body.bRt[sights.tag], bundle.motion[sights.picture][:, None]
+    w, v = np.split(motion, 2, axis=-1)
     t = (bundle.line_time[bundle.camera[sights.picture], None] * bundle.lines(sights))[..., None]
     local = SQUARE * body.size[sights.tag][:, None, None]
     in_body = body.position[sights.tag][:, None] + so3.rotate(bRt[:, None], local)
-    turned = so3.rotate(so3.exp(w * t), in_body) if t.any() else in_body
-    points = so3.rotate(at_middle, turned) + bundle.position[sights.picture][:, None] + v * t
+    turn = so3.exp(w * t) if t.any() else None
+    turned = in_body if turn is None else so3.rotate(turn, in_body)
+    points = so3.rotate(cRb, turned) + bundle.position[sights.picture][:, None] + v * t
     seen, by_point = np.empty((m, 4, 2)), np.empty((m, 4, 2, 3))
     for k, camera in enumerate(bundle.cameras):
         mine = bundle.camera[sights.picture] == k
@@ -122,10 +156,4 @@ def linearized(bundle: Bundle, sights: Sights) -> Rows:
     weight = 1.0 / sights.sigma[:, None, None]
     miss = np.where(good[..., None], weight * (seen - sights.corners), _BEHIND)
     by_point = np.where(good[..., None, None], weight[..., None] * by_point, 0.0)
-    by_turned = by_point @ so3.matrix(at_middle)
-    in_b = by_turned @ so3.matrix(so3.exp(w * t)) if t.any() else by_turned
-    by_picture = np.concatenate([-by_turned @ so3.hat(turned), by_point], axis=-1)
-    by_tag = np.concatenate([-in_b @ so3.matrix(bRt)[:, None] @ so3.hat(local), in_b], axis=-1)
-    moving = bundle.motion.any()
-    velocity = so3.rotate(at_middle, so3.cross(w, turned)) + v if moving else np.zeros_like(points)
-    return Rows(miss.reshape(m, 8), by_picture.reshape(m, 8, 6), by_tag.reshape(m, 8, 6), points, velocity, by_point)
+    return Rows(miss.reshape(m, 8), points, by_point, cRb, turn, turned, bRt, local, motion)
