@@ -31,7 +31,7 @@ def los_at_rest(seed: int) -> Problem:
     return los.problem(simulate_los(LOS, seed)[0], load_config(los_config(LOS).encode()))
 
 
-@pytest.mark.parametrize("seed", [0, 1, 5])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 5))])
 @pytest.mark.parametrize(
     ("make", "missing"),
     [(head_at_rest, "nod and shake the head"), (los_at_rest, "sway")],

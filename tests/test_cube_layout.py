@@ -18,6 +18,7 @@ from pipelines.methods.cube.simulation import simulate_cube
 from pipelines.methods.cube.topics import CubeConfig
 from pipelines.methods.cube.writing import write_cube
 from pipelines.recording.reading import open_recording
+from pipelines.vision.layout import Layout
 from tests.browser import fits
 from tests.command import Command
 from tests.pages import Page
@@ -38,6 +39,21 @@ def _session(path: Path, seed: int, scenario: CubeScenario = SCENARIO) -> dict[s
     data, truth = simulate_cube(scenario, seed)
     write_cube(path, data, truth, cube_config(scenario))
     return truth
+
+
+@pytest.fixture(scope="module")
+def hidden(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording in which one tag is in no picture."""
+    path = tmp_path_factory.mktemp("hidden") / "5.mcap"
+    _session(path, 5, SCENARIO.model_copy(update={"cube": TagCube(hidden=(19,))}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def layout(hidden: Path) -> Layout:
+    """What that recording tells."""
+    recording = open_recording(hidden)
+    return cube_layout([(recording, load_config(recording.attachment("alidade.yaml")))])
 
 
 def test_tags_are_found_where_they_are_with_honest_sigmas(tmp_path: Path) -> None:
@@ -63,10 +79,7 @@ def test_tags_are_found_where_they_are_with_honest_sigmas(tmp_path: Path) -> Non
     assert 0.6 < np.mean(squares) < 1.5
 
 
-def test_layout_as_a_config_reads_back(tmp_path: Path) -> None:
-    _session(tmp_path / "s.mcap", 4)
-    recording = open_recording(tmp_path / "s.mcap")
-    layout = cube_layout([(recording, load_config(recording.attachment("alidade.yaml")))])
+def test_layout_as_a_config_reads_back(layout: Layout, tmp_path: Path) -> None:
     (tmp_path / "cube.yaml").write_text(layout_yaml(layout))
     config = load_config(None, tmp_path / "cube.yaml")
     for k, tag in enumerate(layout.body.ids.tolist()):
@@ -74,10 +87,7 @@ def test_layout_as_a_config_reads_back(tmp_path: Path) -> None:
         np.testing.assert_allclose(config.section(CubeConfig).tags[tag].rotation, layout.body.bRt[k], rtol=1e-9)
 
 
-def test_a_tag_never_seen_is_not_placed(tmp_path: Path) -> None:
-    _session(tmp_path / "s.mcap", 5, SCENARIO.model_copy(update={"cube": TagCube(hidden=(19,))}))
-    recording = open_recording(tmp_path / "s.mcap")
-    layout = cube_layout([(recording, load_config(recording.attachment("alidade.yaml")))])
+def test_a_tag_never_seen_is_not_placed(layout: Layout) -> None:
     assert layout.unplaced == {19: "in no picture"}
     assert "tag 19 could not be placed: in no picture" in layout_yaml(layout)
 
@@ -94,11 +104,9 @@ def test_one_tag_alone_places_nothing(tmp_path: Path) -> None:
         cube_layout([(recording, load_config(recording.attachment("alidade.yaml")))])
 
 
-def test_the_command_says_what_was_found(alidade: Command, tmp_path: Path) -> None:
-    hidden = SCENARIO.model_copy(update={"cube": TagCube(hidden=(19,))})
-    _session(tmp_path / "5.mcap", 5, hidden)
+def test_the_command_says_what_was_found(hidden: Path, alidade: Command, tmp_path: Path) -> None:
     out = tmp_path / "cube.yaml"
-    run = alidade("cube-layout", tmp_path / "5.mcap", tmp_path / "5.mcap", "--out", out, "--refine-camera")
+    run = alidade("cube-layout", hidden, hidden, "--out", out, "--refine-camera")
     assert run.code == 0
     assert "5 of 6 tags placed" in run.out
     assert "tag 19 could not be placed: in no picture" in run.out
@@ -111,17 +119,15 @@ def test_the_command_says_what_was_found(alidade: Command, tmp_path: Path) -> No
     assert "distortion 1" in page.text
 
 
-def test_the_page_takes_no_name_from_the_config(alidade: Command, tmp_path: Path) -> None:
-    _session(tmp_path / "s.mcap", 5)
-    run = alidade("cube-layout", tmp_path / "s.mcap", "--out", tmp_path / "cube.html")
+def test_the_page_takes_no_name_from_the_config(hidden: Path, alidade: Command, tmp_path: Path) -> None:
+    run = alidade("cube-layout", hidden, "--out", tmp_path / "cube.html")
     assert run.code == 2
     assert "call it .yaml" in run.err
     assert not (tmp_path / "cube.html").exists()
 
 
-def test_with_json_it_prints_the_tags_and_nothing_else(alidade: Command, tmp_path: Path) -> None:
-    _session(tmp_path / "5.mcap", 5, SCENARIO.model_copy(update={"cube": TagCube(hidden=(19,))}))
-    run = alidade("cube-layout", tmp_path / "5.mcap", "--out", tmp_path / "cube.yaml", "--json")
+def test_with_json_it_prints_the_tags_and_nothing_else(hidden: Path, alidade: Command, tmp_path: Path) -> None:
+    run = alidade("cube-layout", hidden, "--out", tmp_path / "cube.yaml", "--json")
     found = json.loads(run.out)
     assert [tag["id"] for tag in found["tags"]] == [16, 17, 18, 20, 21]
     assert found["unplaced"] == {"19": "in no picture"}

@@ -90,10 +90,16 @@ def start() -> Iterator[Start]:
 @pytest.fixture
 def scheduler(start: Start, tmp_path: Path) -> str:
     """Address of a scheduler in a process of its own."""
-    file = tmp_path / "scheduler.json"
-    start("dask", "scheduler", "--host", "127.0.0.1", "--port", 0, "--no-dashboard", "--scheduler-file", file)
-    until(file.exists)
-    return str(json.loads(file.read_text())["address"])
+    return scheduling(start, tmp_path)[1]
+
+
+def scheduling(start: Start, folder: Path) -> tuple[subprocess.Popen[str], str]:
+    """A scheduler's process and address."""
+    file = folder / "scheduler.json"
+    process = start("dask", "scheduler", "--host", "127.0.0.1", "--port", 0, "--no-dashboard", "--scheduler-file", file)
+    # The file is there before it is written.
+    told = until(lambda: file.exists() and file.read_text())
+    return process, str(json.loads(told)["address"])
 
 
 def worker(start: Start, scheduler: str, root: Path = ROOT) -> subprocess.Popen[str]:
@@ -299,10 +305,8 @@ def test_overhead_order_and_faults(local_cluster: str) -> None:
 
 
 def test_a_scheduler_that_dies_midway_is_told(start: Start, recordings: Path, tmp_path: Path) -> None:
-    file, out = tmp_path / "scheduler.json", tmp_path / "out"
-    process = start("dask", "scheduler", "--host", "127.0.0.1", "--port", 0, "--no-dashboard", "--scheduler-file", file)
-    until(file.exists)
-    address = str(json.loads(file.read_text())["address"])
+    out = tmp_path / "out"
+    process, address = scheduling(start, tmp_path)
     worker(start, address)
     command = start("pipelines.cli", "fleet", recordings / "*.mcap", "--scheduler", address, "--out", out)
     until(lambda: len(finished(out)) >= 2)

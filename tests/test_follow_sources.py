@@ -200,7 +200,7 @@ def test_a_bridge_is_asked_for_sensors_alone(whole: Path, config: Path) -> None:
     schema, channel, log_ns, _ = sent[0]
     text = replace(schema, name="std_msgs/msg/String", data=b"string data")
     other = text, replace(channel, topic="/chatter"), log_ns, b"\0\1\0\0\2\0\0\0a\0"
-    with Bridge([other, *sent], 8.0, also=("/chatter",)) as bridge:
+    with Bridge([other, *sent], 40.0, also=("/chatter",)) as bridge:
         follow(source_of(bridge.url, None, lambda _: None), Settings(config=config), lambda: bridge.is_over)
         assert bridge.subscribed == {"/imu", "/gimbal/joint_states", "/los/error"}
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import gtsam
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from factors import so3
 from factors.attitude import ahrs_factors
 from factors.gyro import GyroIncrementFactor, carried, corrected, symmetric
 from factors.model import Array
-from factors.preintegration import GyroPath
+from factors.preintegration import GyroPath, Increments
 from factors.testing import assert_jacobians
 from factors.vectorized import Ensemble
 from tests.numerics import assert_rows_are_independent
@@ -27,6 +29,8 @@ DRIVERS = {0: None, 6: None, 9: WARMTH[:, None], 15: FORCE, 18: np.column_stack(
 BIAS, BIAS_HAT = np.array([0.01, -0.02, 0.015]), np.array([0.005, -0.01, 0.0])
 SCALE = np.array([1.0, -0.7, 0.4, -0.5, 0.8, 0.3])
 G = np.array([0.2, -0.9, 0.5, 1.0, 0.3, -0.6, 0.1, 0.7, -0.4])
+START = np.linspace(0.5, 15.0, N)
+WINDOWS = START, START + np.linspace(0.01, 0.9, N)
 
 
 def _read(scale: Array, g: Array, bias: Array) -> GyroPath:
@@ -115,16 +119,22 @@ def _blocks(angle: float, size: float, errors: int, platform: bool = False) -> l
     return [*attitudes, gyro[0], *([gyro[1][:, :errors]] if errors else []), *base]
 
 
-def _factor(rows: NDArray[np.intp], errors: int, platform: bool = False) -> GyroIncrementFactor:
-    path = GyroPath(T, RATE, BIAS_HAT, DRIVERS[errors])
-    base = GyroPath(T, 0.3 * np.roll(RATE, 1, axis=1), 0.5 * BIAS_HAT)
-    start = np.linspace(0.5, 15.0, N)
-    stop = start + np.linspace(0.01, 0.9, N)
-    turns, base_turns = (p.increments(start, stop, scale=errors > 0)[rows] for p in (path, base))
-    sigma = np.linspace(0.5, 2.0, N)[rows]
+@cache
+def _increments(errors: int, platform: bool) -> tuple[Increments, GyroPath]:
+    """Of the gyro or the platform's, and its path."""
     if platform:
-        return GyroIncrementFactor(stop[rows], turns, path, sigma, base_turns, base)
-    return GyroIncrementFactor(stop[rows], turns, path, sigma)
+        path = GyroPath(T, 0.3 * np.roll(RATE, 1, axis=1), 0.5 * BIAS_HAT)
+    else:
+        path = GyroPath(T, RATE, BIAS_HAT, DRIVERS[errors])
+    return path.increments(*WINDOWS, scale=errors > 0), path
+
+
+def _factor(rows: NDArray[np.intp], errors: int, platform: bool = False) -> GyroIncrementFactor:
+    (turns, path), (base_turns, base) = (_increments(errors, platform) for platform in (False, True))
+    stop, sigma = WINDOWS[1][rows], np.linspace(0.5, 2.0, N)[rows]
+    if platform:
+        return GyroIncrementFactor(stop, turns[rows], path, sigma, base_turns[rows], base)
+    return GyroIncrementFactor(stop, turns[rows], path, sigma)
 
 
 CASES = [(errors, platform) for errors in (0, 6, 9, 15, 18) for platform in (False, True) if errors or not platform]

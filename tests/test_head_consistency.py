@@ -193,7 +193,7 @@ def test_unobservable_mount_ends_with_code_3(tmp_path: Path) -> None:
     assert "turn the platform" in result.output
 
 
-@pytest.mark.parametrize("fraction", [0.05, 0.2])
+@pytest.mark.parametrize("fraction", [pytest.param(0.05, marks=pytest.mark.slow), 0.2])
 def test_outliers_cost_no_more_than_the_frames_they_spoil(fraction: float) -> None:
     """The solution is the one without the spoilt frames, as if these had been known beforehand."""
     settings = scenario(duration_s=30, outlier_fraction=fraction)

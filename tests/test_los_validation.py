@@ -37,7 +37,7 @@ def test_replay_with_nothing_compensated_is_the_recording() -> None:
     np.testing.assert_allclose(drifting.before, data.error[:, :2] - data.error[0, :2])
 
 
-@pytest.mark.parametrize("name", ["los_nominal", "los_outliers"])
+@pytest.mark.parametrize("name", [pytest.param("los_nominal", marks=pytest.mark.slow), "los_outliers"])
 def test_second_recording_is_stabilised_by_the_angles_of_the_first(name: str) -> None:
     scenario = load_scenario(LosScenario, name).model_copy(update={"image_rate_hz": 25.0, "sensors": IDEAL})
     first, _ = simulate_los(scenario, 1)

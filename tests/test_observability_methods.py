@@ -87,7 +87,7 @@ def test_a_motion_that_leaves_a_direction_open_is_told_so(
         LosScenario(**_LOS, sensors=IDEAL),
         IndexerScenario(**_INDEXER),
         HeadScenario(**_HEAD, head=_SWAY, platform=_MANOEUVRE),
-        CubeScenario(**_CUBE, poses=18),
+        pytest.param(CubeScenario(**_CUBE, poses=18), marks=pytest.mark.slow),
     ],
     ids=["los", "indexer", "head", "cube"],
 )

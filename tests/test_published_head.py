@@ -66,7 +66,7 @@ def test_analytic_derivatives_are_the_numerical_ones() -> None:
             np.testing.assert_allclose(by_rate[:, i], (up - down) / (2 * h), rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_published_test_on_the_turntable(seed: int) -> None:
     """Static error within 0.35 deg, bias settled within 2 s, better than vision alone."""
     scenario = load_scenario(HeadScenario, "head_turntable")

@@ -49,7 +49,10 @@ def _sampled(camera: Camera, quad: Quad, pixels: np.ndarray, background: float, 
 
 
 @each_camera
-@pytest.mark.parametrize("turn", [[0.0, 0.0, 0.0], [0.3, -0.4, 0.5], [-0.7, 0.2, 2.2]])
+@pytest.mark.parametrize(
+    "turn",
+    [[0.3, -0.4, 0.5], *(pytest.param(turn, marks=pytest.mark.slow) for turn in ([0.0, 0.0, 0.0], [-0.7, 0.2, 2.2]))],
+)
 def test_pixels_are_means_over_their_areas(camera: Camera, turn: list[float]) -> None:
     rng = np.random.default_rng(1)
     quad = tag_quad(7, 0.1, so3.multiply(so3.exp(turn), FACING), [0.004, -0.003, 0.4])

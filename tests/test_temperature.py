@@ -147,7 +147,9 @@ def test_nonsense_is_refused(celsius: object, t: object, said: str, tmp_path: Pa
         told(tmp_path, celsius, t)
 
 
-@METHODS
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("indexer", "cube"))) for name in SHORT]
+)
 def test_a_slope_that_is_told_is_found_and_one_that_is_not_spoils_the_bias(name: str) -> None:
     made = simulated(name, 1, **SLOPES[name], **BRIEF.get(name, {}))
     problem = session_of(name, made).problem()

@@ -37,10 +37,17 @@ def in_batch(method: str) -> tuple[Problem, Estimate]:
     return problem, solve_batch(problem)
 
 
+QUICK = [("los", None), ("indexer", None), ("head", Keyframes(10))]
+
+
 @pytest.mark.parametrize(
-    "method", [pytest.param(name, marks=[pytest.mark.slow] if name == "cube" else []) for name in SMALL]
+    ("method", "window"),
+    [
+        pytest.param(name, window, marks=[pytest.mark.slow] * ((name, window) not in QUICK), id=f"{name}-{window}")
+        for name in SMALL
+        for window in (Keyframes(10), None)
+    ],
 )
-@pytest.mark.parametrize("window", [Keyframes(10), None])
 def test_every_window_ends_where_batch_does(method: str, window: float | None) -> None:
     problem, batch = in_batch(method)
     incremental = solve_incremental(problem, window)
