@@ -54,9 +54,9 @@ def _assert_same(estimate: Estimate, batch: Estimate) -> None:
     ("name", "window"),
     [
         ("ideal", 1.0),
-        ("rough", None),
         ("two_positions", None),
         pytest.param("large_angles", 1.0, marks=pytest.mark.slow),
+        pytest.param("rough", None, marks=pytest.mark.slow),
         pytest.param("ideal", None, marks=pytest.mark.slow),
         pytest.param("rough", 1.0, marks=pytest.mark.slow),
         pytest.param("large_angles", None, marks=pytest.mark.slow),

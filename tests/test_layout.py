@@ -214,7 +214,7 @@ def _waved(tags: int, pictures: int, seed: int, line_time: float, rate_hz: float
     return Scene(body, found, np.zeros(0)), time
 
 
-@pytest.mark.parametrize("line_time", [0.0, 2e-5])
+@pytest.mark.parametrize("line_time", [pytest.param(0.0, marks=pytest.mark.slow), 2e-5])
 def test_a_shutter_that_rolls_is_told(line_time: float) -> None:
     drawn, time = _waved(7, 75, 0, line_time)
     layout = estimate_layout([Shots(CAMERA, drawn.pictures, time.tolist())], drawn.given())

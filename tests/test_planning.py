@@ -63,7 +63,7 @@ def errors_in_sigmas(scenario: LosScenario | HeadScenario, prediction: Predictio
     return np.array(out)
 
 
-@pytest.mark.parametrize("scenario", [LOS, HEAD], ids=["los", "head"])
+@pytest.mark.parametrize("scenario", [LOS, pytest.param(HEAD, marks=pytest.mark.slow)], ids=["los", "head"])
 def test_plan_against_outcome(scenario: LosScenario | HeadScenario) -> None:
     """Sigmas reported by simulated runs agree within 20 %, and their errors scatter by them."""
     name = "los" if isinstance(scenario, LosScenario) else "head"

@@ -102,7 +102,7 @@ CASES: dict[str, tuple[dict[str, Any] | None, str, float]] = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", [pytest.param(case, marks=[pytest.mark.slow] * (case == "indexer")) for case in CASES])
 def test_yesterdays_result_with_todays_recording_is_both_together(case: str, tmp_path: Path) -> None:
     """Against both in one graph, whose only difference is where the first recording is linearised."""
     name = case.split()[0]
