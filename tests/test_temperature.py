@@ -85,6 +85,9 @@ BRIEF: dict[str, dict[str, Any]] = {
 # As sensors of the usual grade, shorter where there are many.
 STUDIED: dict[str, dict[str, Any]] = {"los": {"sensors": {}, "duration_s": 15}, "tumble": {}}
 METHODS = pytest.mark.parametrize("name", SHORT)
+SLOW_BUT_THREE = pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("indexer", "cube"))) for name in SHORT]
+)
 SLOW_BUT_HEAD = pytest.mark.parametrize(
     "name", [name if name == "head" else pytest.param(name, marks=pytest.mark.slow) for name in SHORT]
 )
@@ -147,9 +150,7 @@ def test_nonsense_is_refused(celsius: object, t: object, said: str, tmp_path: Pa
         told(tmp_path, celsius, t)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("indexer", "cube"))) for name in SHORT]
-)
+@SLOW_BUT_THREE
 def test_a_slope_that_is_told_is_found_and_one_that_is_not_spoils_the_bias(name: str) -> None:
     made = simulated(name, 1, **SLOPES[name], **BRIEF.get(name, {}))
     problem = session_of(name, made).problem()
@@ -204,7 +205,7 @@ def assert_consistent(name: str, seeds: range) -> None:
     assert low < total < high
 
 
-@METHODS
+@SLOW_BUT_THREE
 def test_errors_fit_their_covariance(name: str) -> None:
     assert_consistent(name, range(2))
 
