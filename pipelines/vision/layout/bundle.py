@@ -8,7 +8,7 @@ import numpy as np
 
 from factors import so3
 from pipelines.vision.layout.additional import Additional
-from pipelines.vision.layout.normal import normal_equations
+from pipelines.vision.layout.normal import normal_equations, of_pictures
 from pipelines.vision.layout.sights import Array, Bundle, Rows, Sights, linearized
 
 _STEPS = 40
@@ -92,7 +92,7 @@ def refined_pictures(
     f = len(bundle.cRb)
     rows = linearized(bundle, sights)
     cost, damping = _costs(rows, sights, far, f), np.full(f, 1e-3)
-    own, gradient = _own(rows, sights, far, f)
+    own, gradient, _ = of_pictures(sights, rows, weights(rows, far), f)
     going = own[:, 0, 0] > 0.0
     for _ in range(steps):
         seen = sights[going[sights.picture]]
@@ -115,7 +115,8 @@ def refined_pictures(
             cRb=np.where(better[:, None], after.cRb, bundle.cRb),
             position=np.where(better[:, None], after.position, bundle.position),
         )
-        own[better], gradient[better] = (each[better] for each in _own(there, seen, far, f))
+        new, slope, _ = of_pictures(seen, there, weights(there, far), f)
+        own[better], gradient[better] = new[better], slope[better]
         damping = np.where(better, 0.1 * damping, 10.0 * damping)
         going &= np.abs(cost - now) > _STEADY * cost
         cost = np.where(better, now, cost)
@@ -125,12 +126,3 @@ def refined_pictures(
 def _costs(rows: Rows, sights: Sights, far: float, f: int) -> Array:
     """(f,) of the pictures."""
     return np.asarray(np.bincount(sights.picture, loss(rows.squares, far), f), dtype=float)
-
-
-def _own(rows: Rows, sights: Sights, far: float, f: int) -> tuple[Array, Array]:
-    """Information (f, 6, 6) and gradient (f, 6) of the pictures' poses."""
-    At = np.swapaxes(rows.by_picture, 1, 2) * weights(rows, far)[:, None, None]
-    own, gradient = np.zeros((f, 6, 6)), np.zeros((f, 6))
-    np.add.at(own, sights.picture, At @ rows.by_picture)
-    np.add.at(gradient, sights.picture, (At @ rows.miss[..., None])[..., 0])
-    return own, gradient

@@ -56,10 +56,7 @@ def normal_equations(
 ) -> Normal:
     """Normal equations of weighted errors; tag number `fixed` stays, Levenberg's damping is relative."""
     f = len(bundle.cRb)
-    At = np.swapaxes(rows.by_picture, 1, 2) * weights[:, None, None]
-    own, gradient = np.zeros((f, 6, 6)), np.zeros((f, 6))
-    np.add.at(own, sights.picture, At @ rows.by_picture)
-    np.add.at(gradient, sights.picture, (At @ rows.miss[..., None])[..., 0])
+    own, gradient, At = of_pictures(sights, rows, weights, f)
     information, vector, across = _of_tags(bundle, sights, rows, weights, At)
     free = np.repeat(np.arange(len(bundle.body.ids)) != fixed, 6)
     if additional.free.any():
@@ -79,6 +76,15 @@ def normal_equations(
     information = information - across.reshape(6 * f, -1).T @ flat
     vector = vector - flat.T @ gradient.ravel()
     return Normal(free, np.asarray(information, dtype=float), vector, across, inverse, gradient)
+
+
+def of_pictures(sights: Sights, rows: Rows, weights: Array, f: int) -> tuple[Array, Array, Array]:
+    """Information (f, 6, 6) and gradient (f, 6) of the pictures' poses, and the weighted Jacobians' transposes."""
+    At = np.swapaxes(rows.by_picture, 1, 2) * weights[:, None, None]
+    own, gradient = np.zeros((f, 6, 6)), np.zeros((f, 6))
+    np.add.at(own, sights.picture, At @ rows.by_picture)
+    np.add.at(gradient, sights.picture, (At @ rows.miss[..., None])[..., 0])
+    return own, gradient, At
 
 
 def _of_tags(bundle: Bundle, sights: Sights, rows: Rows, weights: Array, At: Array) -> tuple[Array, Array, Array]:
