@@ -76,10 +76,9 @@ def test_windows_between_stamps_and_backwards() -> None:
 
 def test_jacobians_of_increments_against_differences() -> None:
     """Each entry of S, G and c, by integrating the changed samples."""
-    start = np.linspace(0.5, 15.0, N)
-    stop = start + np.linspace(0.001, 1.5, N)
+    stop = START + np.linspace(0.001, 1.5, N)
     path = GyroPath(T, RATE, BIAS_HAT, DRIVERS[18])
-    turns = path.increments(start, stop, scale=True)
+    turns = path.increments(START, stop, scale=True)
     assert turns.scale_jacobian is not None
     assert turns.driver_jacobian is not None
     h = 1e-5
@@ -87,7 +86,7 @@ def test_jacobians_of_increments_against_differences() -> None:
         for entry in range(3 * vector.shape[1]):
             D = h * np.eye(3 * vector.shape[1])[entry].reshape(3, -1)
             less, more = (
-                GyroPath(T, RATE - sign * vector @ D.T, BIAS_HAT).increments(start, stop).wxyz for sign in (-1, 1)
+                GyroPath(T, RATE - sign * vector @ D.T, BIAS_HAT).increments(START, stop).wxyz for sign in (-1, 1)
             )
             numeric = so3.log(so3.multiply(so3.inverse(less), more)) / (2.0 * h)
             np.testing.assert_allclose(jacobian[..., entry], numeric, atol=2e-5 * np.abs(numeric).max())
@@ -130,7 +129,7 @@ def _increments(errors: int, platform: bool) -> tuple[Increments, GyroPath]:
 
 
 def _factor(rows: NDArray[np.intp], errors: int, platform: bool = False) -> GyroIncrementFactor:
-    (turns, path), (base_turns, base) = (_increments(errors, platform) for platform in (False, True))
+    (turns, path), (base_turns, base) = _increments(errors, False), _increments(errors, True)
     stop, sigma = WINDOWS[1][rows], np.linspace(0.5, 2.0, N)[rows]
     if platform:
         return GyroIncrementFactor(stop, turns[rows], path, sigma, base_turns[rows], base)
@@ -153,12 +152,11 @@ def test_increment_rows_are_independent(errors: int, platform: bool) -> None:
 
 def test_a_platform_of_known_errors() -> None:
     """The residual is zero where both gyros' errors are what they are."""
-    start = np.linspace(0.5, 15.0, N)
     base_rate = 0.3 * np.roll(RATE, 1, axis=1)
     scale, g = 1e-2 * SCALE, 1e-4 * G
     gyro = _read(scale, g, BIAS)
     base = GyroPath(T, base_rate @ (np.eye(3) + symmetric(-scale)).T - BIAS)
-    windows = start, start + 0.05
+    windows = START, START + 0.05
     model = GyroIncrementFactor(
         windows[1], gyro.increments(*windows, scale=True), gyro, np.ones(N), base.increments(*windows, scale=True), base
     )
@@ -175,12 +173,11 @@ def test_carried_over_short_windows() -> None:
     """As corrected increments, and the rate at the end is the true one."""
     scale, g = 1e-2 * SCALE, 1e-4 * G
     gyro = _read(scale, g, BIAS)
-    start = np.linspace(0.5, 15.0, N)
-    stop = start + np.linspace(-0.02, 0.03, N)
+    stop = START + np.linspace(-0.02, 0.03, N)
     got, rate, _ = carried(
-        gyro, start, 0.5 * (start + stop), stop, np.tile(BIAS, (N, 1)), np.tile([*scale, *g], (N, 1))
+        gyro, START, 0.5 * (START + stop), stop, np.tile(BIAS, (N, 1)), np.tile([*scale, *g], (N, 1))
     )
-    true = GyroPath(T, RATE).increments(start, stop)
+    true = GyroPath(T, RATE).increments(START, stop)
     # A scale of 1e-2 times the rate's second derivative, 50 rad/s^3, times the window's cube over 24.
     np.testing.assert_allclose(so3.log(so3.multiply(so3.inverse(true.wxyz), got)), 0.0, atol=6e-7)
     # The errors are those of the middle of the window: 1e-2 of what the rate changes in half of it.
@@ -195,18 +192,17 @@ def test_a_gyro_that_warms_up(errors: int) -> None:
     felt = FORCE @ g.reshape(3, 3).T if errors == 18 else 0.0
     measured = RATE @ (np.eye(3) + symmetric(scale)).T + felt + np.outer(WARMTH, slope) + BIAS
     path = GyroPath(T, measured, BIAS_HAT, DRIVERS[errors])
-    start = np.linspace(0.5, 15.0, N)
-    stop = start + 0.05
+    stop = START + 0.05
     bias, known = np.tile(BIAS, (N, 1)), np.tile(numbers, (N, 1))
-    true = GyroPath(T, RATE).increments(start, stop).wxyz
+    true = GyroPath(T, RATE).increments(START, stop).wxyz
     ways = (
-        corrected(path.increments(start, stop, scale=True), bias - BIAS_HAT, known)[0],
-        carried(path, start, start + 0.025, stop, bias, known)[0],
+        corrected(path.increments(START, stop, scale=True), bias - BIAS_HAT, known)[0],
+        carried(path, START, START + 0.025, stop, bias, known)[0],
     )
     for got, limit in zip(ways, (3e-7, 4e-6), strict=True):
         np.testing.assert_allclose(so3.log(so3.multiply(so3.inverse(true), got)), 0.0, atol=limit)
     without = np.tile([*numbers[:-3], 0.0, 0.0, 0.0], (N, 1))
-    cold, _ = corrected(path.increments(start, stop, scale=True), bias - BIAS_HAT, without)
+    cold, _ = corrected(path.increments(START, stop, scale=True), bias - BIAS_HAT, without)
     assert np.abs(so3.log(so3.multiply(so3.inverse(true), cold))).max() > 1e-4
 
 
@@ -220,9 +216,8 @@ def test_errors_as_variables_need_derivatives_by_them() -> None:
 
 
 def test_equals_the_native_factor_where_the_gyro_is_perfect() -> None:
-    start = np.linspace(0.5, 15.0, N)
     path = GyroPath(T, RATE, BIAS_HAT, FORCE)
-    turns = path.increments(start, start + 0.1, scale=True)
+    turns = path.increments(START, START + 0.1, scale=True)
     i, j, bias, _ = _blocks(0.4, 0.0, 15)
     keys_i, keys_j, keys_bias = (list(range(k, k + N)) for k in (0, N, 2 * N))
     values = gtsam.Values()
@@ -234,8 +229,8 @@ def test_equals_the_native_factor_where_the_gyro_is_perfect() -> None:
     values.insert(errors, np.zeros(15))
     sigma = np.linspace(0.5, 2.0, N)
     keys = keys_i, keys_j, keys_bias
-    ours = GyroIncrementFactor(start + 0.1, turns, path, sigma).on(*keys, errors)
-    perfect = GyroIncrementFactor(start + 0.1, path.increments(start, start + 0.1), path, sigma).on(*keys)
+    ours = GyroIncrementFactor(START + 0.1, turns, path, sigma).on(*keys, errors)
+    perfect = GyroIncrementFactor(START + 0.1, path.increments(START, START + 0.1), path, sigma).on(*keys)
     graph = gtsam.NonlinearFactorGraph()
     for factor in ahrs_factors(keys_i, keys_j, keys_bias, turns, BIAS_HAT, sigma**2):
         graph.add(factor)

@@ -66,7 +66,8 @@ def test_at_rest_mounts_stay_where_their_priors_have_them(seed: int, monkeypatch
     ("duration_s", "window"),
     [
         (4.0, DEFAULT_WINDOW),
-        *(pytest.param(*longer, marks=pytest.mark.slow) for longer in ((12.0, DEFAULT_WINDOW), (4.0, None))),
+        pytest.param(12.0, DEFAULT_WINDOW, marks=pytest.mark.slow),
+        pytest.param(4.0, None, marks=pytest.mark.slow),
     ],
 )
 def test_nor_do_they_move_online(duration_s: float, window: Window) -> None:

@@ -84,13 +84,18 @@ BRIEF: dict[str, dict[str, Any]] = {
 }
 # As sensors of the usual grade, shorter where there are many.
 STUDIED: dict[str, dict[str, Any]] = {"los": {"sensors": {}, "duration_s": 15}, "tumble": {}}
-METHODS = pytest.mark.parametrize("name", SHORT)
-SLOW_BUT_THREE = pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in ("indexer", "cube"))) for name in SHORT]
-)
-SLOW_BUT_HEAD = pytest.mark.parametrize(
-    "name", [name if name == "head" else pytest.param(name, marks=pytest.mark.slow) for name in SHORT]
-)
+
+
+def methods(*quick: str) -> pytest.MarkDecorator:
+    """Every method, those not named slowly."""
+    return pytest.mark.parametrize(
+        "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in quick)) for name in SHORT]
+    )
+
+
+METHODS = methods(*SHORT)
+SLOW_BUT_THREE = methods("los", "head", "tumble")
+SLOW_BUT_HEAD = methods("head")
 
 
 def simulated(name: str, seed: int = 0, **changes: object) -> Simulated:

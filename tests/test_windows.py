@@ -37,6 +37,7 @@ def in_batch(method: str) -> tuple[Problem, Estimate]:
     return problem, solve_batch(problem)
 
 
+# Each method and each window once.
 QUICK = [("los", None), ("indexer", None), ("head", Keyframes(10))]
 
 
