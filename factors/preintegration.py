@@ -28,7 +28,7 @@ _UNEVEN = 0.05
 # A pause between samples longer than this many intervals is a gap.
 _GAP = 1.5
 # Sample intervals integrated together, and how many such blocks are kept.
-_BLOCK, _KEPT = 1 << 16, 16
+_BLOCK, _KEPT = 1 << 16, 48
 # Windows looked up together.
 _TOGETHER = 20_000
 
@@ -70,8 +70,8 @@ class Increments:
 class GyroPath:
     """A gyro stream integrated once; the rotation over any window then costs the same as a look-up.
 
-    It is integrated block by block. The last blocks looked at are kept, a million samples, and those of a longer
-    stream are integrated anew when they are needed. Stamps and rates as given stay at hand as `t` and `read`.
+    It is integrated block by block. The first blocks looked at are kept, three million samples, and the others of a
+    longer stream are integrated anew when they are needed. Stamps and rates as given stay at hand as `t` and `read`.
 
     Args:
         t: (N,) stamps, s, increasing, N >= 2.
@@ -117,7 +117,9 @@ class GyroPath:
             rate = (mean - self.bias_hat - trapezoid_excess(t, mean))[inner]
             drivers = (driving - trapezoid_excess(t, driving))[inner]
             if len(self._kept) == _KEPT:
-                del self._kept[next(iter(self._kept))]
+                # Streams are gone through from start to end again and again: what was kept longest comes next. The last
+                # third is what is looked at now.
+                del self._kept[list(self._kept)[-max(_KEPT // 3, 2)]]
             self._kept[number] = _Block(t[inner], rate, drivers, self._starts[number])
         return self._kept[number]
 

@@ -128,6 +128,25 @@ def test_a_long_stream_is_integrated_block_by_block(monkeypatch: pytest.MonkeyPa
     assert len(path._kept) == 3
 
 
+def test_a_pass_over_a_long_stream_integrates_no_block_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows looked up together span two blocks, and are gone through several times."""
+    monkeypatch.setattr(preintegration, "_BLOCK", 64)
+    monkeypatch.setattr(preintegration, "_KEPT", 9)
+    monkeypatch.setattr(preintegration, "_TOGETHER", 10)
+    t, rate = _stream(n=2_000)
+    path, made = GyroPath(t, rate), list[int]()
+    block = preintegration._Block
+
+    def counted(*parts: np.ndarray) -> object:
+        made.append(len(parts))
+        return block(*parts)
+
+    monkeypatch.setattr(preintegration, "_Block", counted)
+    ends = np.linspace(t[0], t[-1], 200)
+    path.increments(ends[:-1], ends[1:], scale=True)
+    assert 0 < len(made) < 2_000 / 64
+
+
 def test_names_wrong_shapes() -> None:
     with pytest.raises(ValueError, match=r"stamps \(N,\) and rates \(N, 3\)"):
         GyroPath(np.arange(3.0), np.zeros((4, 3)))

@@ -153,10 +153,12 @@ def _prepare(
                 return _prepare(replace(data, image_t=data.image_t + moved), config, clock=guessed)
     else:
         mount, bias_hat = before.mount, before.chain.gyro.bias_hat
+    carried = initial_attitudes(chains, time, camera(used.angles, mount, parameters.names), measured, gyro)
+    del gyro  # Another as large follows.
     chain = GyroChain.over(
         time,
         used.starts,
-        initial_attitudes(chains, time, camera(used.angles, mount, parameters.names), measured, gyro),
+        carried,
         GyroPath(data.gyro_t, data.gyro, bias_hat, driving),
         density=noises["gyro_density"].used,
         walk=noises["gyro_bias_walk"].used,
