@@ -114,9 +114,7 @@ class VectorizedFactor:
     def linearized(self, values: gtsam.Values) -> gtsam.JacobianFactor:
         """What `factor.linearize` gives, in a third of the time: that has gtsam take Jacobians key by key."""
         answers, i = self._answering(values)
-        system = gtsam.VerticalBlockMatrix(self.places.widths, answers.augmented(i))
-        # Only a conditional, here of nothing, can be made of a whole matrix in Python.
-        return gtsam.JacobianFactor(gtsam.GaussianConditional(self.keys, 0, system))
+        return jacobian_factor(self.keys, self.places.widths, answers.augmented(i))
 
     def used(self, values: gtsam.Values) -> NDArray[np.bool_]:
         """Which of the n measurements the loss lets count; all of them without one."""
@@ -197,6 +195,15 @@ class VectorizedFactor:
         """Where blocks lie in the system by all keys, see `places_of`."""
         slots = tuple(each if isinstance(each, int) else tuple(each) for each in self.slots)
         return places_of(len(self.model.time), self.model.rows, slots, tuple(map(dimension, self.blocks)))
+
+
+def jacobian_factor(keys: list[int], widths: list[int], augmented: Array) -> gtsam.JacobianFactor:
+    """The linear factor of a whole system [A, b] (m, width); `widths` of its keys' columns, one after the other, and b.
+
+    Only a conditional, here of nothing, can be made of a whole matrix in Python.
+    """
+    system = gtsam.VerticalBlockMatrix(widths, augmented)
+    return gtsam.JacobianFactor(gtsam.GaussianConditional(keys, 0, system))
 
 
 class Ensemble:

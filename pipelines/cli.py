@@ -100,7 +100,7 @@ _Scenario = Annotated[
 ]
 _Scheduler = Annotated[str | None, typer.Option(help="Of a dask cluster, tcp://host:8786; default: this machine.")]
 _Jobs = Annotated[int | None, typer.Option(help="Local worker processes; default: one a core.")]
-_PictureJobs = Annotated[int | None, typer.Option("--jobs", help="Processes for many pictures; default: one a core.")]
+_OwnJobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Processes to be used; default: one a core.")]
 _Strict = Annotated[bool, typer.Option("--strict", help="Refuse a recording of which anything is lost.")]
 _AutoTopics = Annotated[bool, typer.Option("--auto-topics", help="Take the topics that `info` suggests.")]
 _NoCheck = Annotated[bool, typer.Option("--no-check", help="Do not hold an incremental result against batch.")]
@@ -135,7 +135,7 @@ def calibrate(
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: SESSION-SOLVER.")] = None,
     strict: _Strict = False,
     auto_topics: _AutoTopics = False,
-    jobs: _PictureJobs = None,
+    jobs: _OwnJobs = None,
     prior: _Prior = None,
     no_check: _NoCheck = False,
     as_json: Json = False,
@@ -147,13 +147,12 @@ def calibrate(
     """
     from tempfile import TemporaryDirectory
 
-    from pipelines import progress, terminal
+    from pipelines import parallel, progress, terminal
     from pipelines.errors import InputError
     from pipelines.recording.opening import recordings_of, told
     from pipelines.reports.write import adopt_parts, write_part, write_results
     from pipelines.session import calibrate as run
     from pipelines.together import calibrate_device
-    from pipelines.vision import parallel
 
     recordings, folder = recordings_of(sessions), out or _beside(sessions[0], solver.value)
     if len(recordings) > 1:
@@ -195,24 +194,25 @@ def compare(
     out: Annotated[Path | None, typer.Option(help="Folder for compare.html, which also splits the recording.")] = None,
     strict: _Strict = False,
     auto_topics: _AutoTopics = False,
+    jobs: _OwnJobs = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
     """The published, batch and incremental solvers side by side, with errors where the truth is known."""
-    from pipelines import progress, terminal
+    from pipelines import parallel, progress, terminal
     from pipelines.reports.compare import write_compare
     from pipelines.session import calibrate as run
     from pipelines.session import self_agreement
 
     solvers = ["published", "batch", "incremental"]
-    with progress.shown(quiet or as_json):
+    with progress.shown(quiet or as_json), parallel.processes(jobs):
         calibrations = run(session, solvers, method, config, parse_window(window), strict, auto_topics, prior=prior)
     if as_json:
         terminal.show_json(calibrations)
     else:
         terminal.show(calibrations)
     if out is not None:
-        with progress.shown(quiet), progress.doing("solving parts of the recording"):
+        with progress.shown(quiet), parallel.processes(jobs), progress.doing("solving parts of the recording"):
             written = write_compare(out, calibrations, *self_agreement(session, method, config))
         if not as_json:
             terminal.say(f"Comparison in {written}")
@@ -266,6 +266,7 @@ def validate(
     config: ConfigFile = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the page; default: SESSION-validation.")] = None,
     strict: _Strict = False,
+    jobs: _OwnJobs = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -273,12 +274,12 @@ def validate(
 
     Exit code 0 it holds, 2 unusable input, 3 the recording cannot say, 4 it does not hold.
     """
-    from pipelines import progress, terminal
+    from pipelines import parallel, progress, terminal
     from pipelines.reports.plain_json import validation_json
     from pipelines.validate import table, write_validation
     from pipelines.validate import validate as run
 
-    with progress.shown(quiet or as_json), progress.doing("validating"):
+    with progress.shown(quiet or as_json), parallel.processes(jobs), progress.doing("validating"):
         validated = run(session, calibration, method, config, strict)
         written = write_validation(out or _beside(session, "validation"), validated)
     if as_json:

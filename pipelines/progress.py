@@ -47,6 +47,12 @@ def shown(quiet: bool = False) -> Iterator[None]:
             _bars = None
 
 
+def hide() -> None:
+    """Show nothing from now on, as in a process whose terminal is another one's."""
+    global _bars
+    _bars = None
+
+
 @contextmanager
 def doing(what: str, total: float | None = None) -> Iterator[Callable[[float], None]]:
     """Shows work; the function it gives says how much of the total is done."""

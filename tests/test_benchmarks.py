@@ -89,6 +89,6 @@ def test_scipy_gets_the_rows_of_our_graph() -> None:
     from benchmarks.peers import los_peers
 
     problem, rows = los_peers()
-    factors, values = build(problem, CHUNK)
+    factors, values, _ = build(problem, CHUNK)
     ours = sum(f.factor.error(values) for f in factors)
     assert 0.5 * np.square(rows.residuals(rows.x0)).sum() == pytest.approx(ours, rel=1e-2)

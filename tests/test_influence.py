@@ -11,7 +11,7 @@ import pytest
 
 from pipelines.graph.problem import Array, Factor, Parameter, Problem, Quantity
 from pipelines.solvers.assembly import Assembly
-from pipelines.solvers.influence import Influence, influence, uncertainty_budget
+from pipelines.solvers.influence import FactorRows, Influence, influence, uncertainty_budget
 from pipelines.solvers.marginals import IndeterminateError, joint_information, ordering_of, reported_covariance
 from pipelines.solvers.system import System
 from pipelines.solvers.weighing import optimize
@@ -44,9 +44,18 @@ def case(request: pytest.FixtureRequest) -> Solved:
     return solved(make())
 
 
+def rows_of(found: Influence) -> list[Array]:
+    """Of every factor, in time order."""
+    return [row for part in found.ask(_derivatives) for row in part]
+
+
+def _derivatives(rows: FactorRows) -> list[Array]:
+    return [row for *_, row in rows]
+
+
 def test_squares_sum_to_the_covariance(case: Solved) -> None:
     found = case.found
-    total = sum(rows @ rows.T for *_, rows in found.rows())
+    total = sum(rows @ rows.T for rows in rows_of(found))
     scale = np.sqrt(np.outer(np.diag(found.covariance), np.diag(found.covariance)))
     np.testing.assert_allclose(total / scale, found.covariance / scale, atol=1e-9)
     keys = [case.current_keys.get(p.key, p.key) for p in case.problem.parameters]
@@ -76,7 +85,7 @@ def test_rows_are_those_of_the_dense_system(case: Solved) -> None:
         key = case.current_keys.get(p.key, p.key)
         free = [q.prior_sigma != 0.0 for q in p.quantities]
         expected.append((p.coordinates(case.values, key)[1] @ inverse[place[key]])[free])
-    streamed = np.concatenate([rows for *_, rows in case.found.rows()], axis=1)
+    streamed = np.concatenate(rows_of(case.found), axis=1)
     sigmas = np.sqrt(np.diag(case.found.covariance))[:, None]
     np.testing.assert_allclose(streamed / sigmas, np.concatenate(expected) / sigmas, atol=1e-6)
 
@@ -127,7 +136,7 @@ def _of_line(noise: Array | None = None) -> tuple[Problem, gtsam.GaussianFactorG
 
 def test_a_measurement_moves_the_parameters_as_foretold() -> None:
     _, linear, found = _of_line()
-    rows = [rows for *_, rows in found.rows()]
+    rows = rows_of(found)
     for i in range(5):
         noise = np.zeros(5)
         noise[i] = 0.37

@@ -7,6 +7,7 @@ from rich.console import Console
 
 from benchmarks.detection import cube_picture
 from pipelines import progress
+from pipelines.parallel import processes
 from pipelines.vision import parallel
 
 
@@ -36,7 +37,7 @@ def test_tags_by_several_processes_are_those_by_one_in_order(monkeypatch: pytest
     encoded = cv2.imencode(".png", picture)[1].tobytes()
     images = [(k, encoded if k % 4 else b"broken") for k in range(8)]
     alone = list(parallel.detections(images, camera=camera))
-    with parallel.processes(2):
+    with processes(2):
         together = list(parallel.detections(iter(images), camera=camera))
     assert [t for t, _ in together] == [t for t, _ in alone] == list(range(8))
     for (_, a), (_, b) in zip(together, alone, strict=True):

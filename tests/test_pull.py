@@ -75,6 +75,8 @@ def test_nor_do_they_move_online(duration_s: float, window: Window) -> None:
     found = solve_incremental(problem, window)
     assert np.abs(found.values[MOUNTS]).max() < 0.2 * PRIOR
     assert np.sqrt(np.diag(found.covariance)[MOUNTS]).min() > 0.98 * PRIOR
+    if found.course is not None:
+        assert np.abs(found.course.values[-1] - found.values)[MOUNTS].max() < 0.05 * PRIOR
 
 
 def test_it_is_a_minimum_that_says_nothing_more() -> None:

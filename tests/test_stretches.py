@@ -12,12 +12,15 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from pipelines import progress
+from pipelines import parallel, progress
 from pipelines.graph.problem import Array, Estimate, Factor, Problem
 from pipelines.solvers import system
 from pipelines.solvers.assembly import CHUNK, Assembly
 from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.marginals import joint_information
+from pipelines.solvers.coloured import added_variance
+from pipelines.solvers.influence import influence
+from pipelines.solvers.marginals import IndeterminateError, joint_information
+from pipelines.solvers.stretch import Keep
 from tests.short_problems import head_problem, los_problem
 
 
@@ -119,10 +122,15 @@ def test_progress_is_shown(monkeypatch: pytest.MonkeyPatch, capfd: pytest.Captur
     assert "stretch by stretch" in capfd.readouterr().err
 
 
-@pytest.mark.parametrize(("make", "kept"), [(los_problem, system._KEPT), (head_problem, 0)])
-def test_it_is_the_same_solution(make: Callable[[], Problem], kept: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whether a stretch's elimination is kept or not."""
-    monkeypatch.setattr(system, "_KEPT", kept)
+@pytest.mark.parametrize(
+    ("make", "keep"), [(los_problem, Keep.ALL), (los_problem, Keep.TREES), (head_problem, Keep.NOTHING)]
+)
+def test_it_is_the_same_solution(make: Callable[[], Problem], keep: Keep, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However much is kept of a stretch."""
+    if keep is not Keep.ALL:
+        monkeypatch.setattr(system, "_KEPT", 0)
+    if keep is Keep.NOTHING:
+        monkeypatch.setattr(system, "_KEPT_TREES", 0)
     whole = solve_batch(make(), budget=True, device=[make().quantities[0].name])
     parts = divided(monkeypatch, make())
     sigmas = np.maximum(whole.sigmas, 1e-12)
@@ -166,6 +174,75 @@ def test_it_is_the_same_solution(make: Callable[[], Problem], kept: int, monkeyp
         np.testing.assert_allclose(got, expected, rtol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("make", "kept"), [(los_problem, 150_000), pytest.param(head_problem, 0, marks=pytest.mark.slow)]
+)
+def test_several_processes_find_the_same(
+    make: Callable[[], Problem], kept: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To the last digit, and the budget, the strongest measurements and what other graphs would say with it."""
+    monkeypatch.setattr(system, "_WORTH_WHILE", 1)
+    monkeypatch.setattr(system, "_KEPT", kept)
+    problem = make()
+    stretches(monkeypatch, problem)
+    changed = [("again", problem)]
+    alone, together = (_with_processes(problem, changed, jobs) for jobs in (1, 3))
+    for name in ("values", "covariance", "budget", "moved", "strongest", "rejected", "chi_square", "levels", "message"):
+        np.testing.assert_equal(getattr(together, name), getattr(alone, name), name)
+    assert alone.course is not None
+    assert together.course is not None
+    np.testing.assert_array_equal(together.course.covariance, alone.course.covariance)
+
+
+def _with_processes(problem: Problem, changed: list[tuple[str, Problem]], jobs: int) -> Estimate:
+    with parallel.processes(jobs):
+        found = solve_batch(problem, budget=True, changed=changed)
+    assert found.moved is not None
+    assert list(found.moved) == ["again"]
+    return found
+
+
+def test_colours_of_a_family_that_a_stretch_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As those of one piece."""
+    problem = los_problem()
+    parts, values = stretches(monkeypatch, problem)
+    lacking = set(map(id, parts.stretches[1].factors))
+    factors = [
+        Factor.of("others", f.measurement, f.beside) if id(f) in lacking and f.measurement is not None else f
+        for f in parts.factors
+    ]
+    keys = Assembly.of(problem.steps(CHUNK)).current_keys
+    one, several = (
+        added_variance(influence(problem, of.linearized(values), keys), {"los": np.array([0.4, 0.2])})["los"]
+        for of in (system.System.of(factors, parts.shared, None), parts.made_of(factors).under(None))
+    )
+    assert one.max() > 0.0
+    np.testing.assert_allclose(several, one, rtol=1e-6)
+
+
+def test_several_processes_name_a_state_that_is_not_determined(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one does."""
+    monkeypatch.setattr(system, "_WORTH_WHILE", 1)
+    found, values = stretches(monkeypatch, los_problem())
+    lost = found.stretches[1].inner[0]
+    free = found.made_of([_silenced(f) if lost in f.factor.keys() else f for f in found.factors])
+    said = []
+    for jobs in (1, 2):
+        with parallel.processes(jobs):
+            linear = free.linearized(values)
+            with pytest.raises(IndeterminateError, match="does not determine the state") as raised:
+                linear.drawn([], 1, np.random.default_rng(0))
+        said.append(str(raised.value))
+    assert said[0] == said[1]
+
+
+def _silenced(factor: Factor) -> Factor:
+    """One that says nothing."""
+    assert factor.vectorized is not None
+    of = Factor.process_of if factor.measurement is None else Factor.of
+    return of(factor.family, factor.vectorized.weighed(np.zeros(factor.vectorized.model.rows)), factor.beside)
+
+
 # Solving may take so much, MiB, of what 8 GiB allow for ten minutes of ten hours.
 ALLOWED = 4096.0 * 10.0 / 600.0
 
@@ -179,7 +256,7 @@ from pipelines.solvers import system
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.marginals import joint_information
 
-system._UNDIVIDED, system._STRETCH, system._KEPT = 10_000, 600, 0
+system._UNDIVIDED, system._STRETCH, system._KEPT, system._KEPT_TREES = 10_000, 600, 0, 0
 scenario = {"duration_s": float(sys.argv[1]), "gyro_rate_hz": 100.0, "gimbal_rate_hz": 100.0}
 problem = alidade.open(alidade.simulate("los", scenario)).problem()
 before = resident_mib()

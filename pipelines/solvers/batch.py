@@ -212,8 +212,10 @@ def _known(
     problem: Problem, about: Linear, current_keys: Mapping[int, int]
 ) -> tuple[Course | None, Array, Spurious | None]:
     """What was known at some moments, covariance of the reported numbers at the end, and what of that is noise."""
-    linear, ordering, values = about.graph, about.system.ordering, about.values
-    course = sequential_history(problem, linear, ordering, values, about.boundaries)
+    system, values = about.system, about.values
+    course = sequential_history(
+        problem, about.graph, system.ordering, values, about.boundaries, system.boundaries[0].time
+    )
     marginal = joint_covariance(problem, about, current_keys) if course is None else course.covariance[-1]
     return course, marginal, information_of_noise(problem, about, marginal, current_keys)
 

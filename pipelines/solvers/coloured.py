@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from pipelines.graph.problem import Array, Factor, Problem, Residuals
-from pipelines.solvers.influence import Influence
+from pipelines.solvers.influence import FactorRows, Influence
 
 # Families of fewer measurements are too short to tell their colour.
 _FEWEST = 100
@@ -117,15 +117,22 @@ def added_variance(found: Influence, colours: Mapping[str, Array]) -> dict[str, 
             lengths[f.family] += len(f.measurement.model.time)
     for start in range(0, len(found.names) if colours else 0, _AT_A_TIME):
         part = found.part(slice(start, start + _AT_A_TIME))
-        rows: dict[str, list[Array]] = {family: [] for family in colours}
-        for factor, _, row in part.rows():
-            if factor.family in colours:
-                rows[factor.family].append(row.T)
+        rows = part.ask(_of_families, list(colours))
         for family, correlation in colours.items():
-            L = np.concatenate(rows[family]).reshape(lengths[family], -1, len(part.names))
+            L = np.concatenate([each[family] for each in rows if family in each])
+            L = L.reshape(lengths[family], -1, len(part.names))
             more = 2.0 * correlation @ _products(L, len(correlation))
             added[family][start : start + len(part.names)] = np.maximum(more, 0.0)
     return added
+
+
+def _of_families(rows: FactorRows, families: Sequence[str]) -> dict[str, Array]:
+    """Family -> influence (m, p) of all its rows, where there are any."""
+    found: dict[str, list[Array]] = {}
+    for factor, _, row in rows:
+        if factor.family in families:
+            found.setdefault(factor.family, []).append(row.T)
+    return {family: np.concatenate(of) for family, of in found.items()}
 
 
 def _products(L: Array, lags: int) -> Array:

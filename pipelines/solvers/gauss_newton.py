@@ -256,7 +256,7 @@ def _step(
     """One (damped) step, None if the system is singular, and by how much it should lower the error."""
     try:
         if damping > 0.0:
-            linear = system.linearized(values, damping) if linear is None else linear.damped(damping)
+            linear = system.linearized(values, damping, mixed=True) if linear is None else linear.damped(damping)
         return (None, 0.0) if linear is None else linear.step(on_floor)
     except (RuntimeError, IndeterminateError):
         return None, 0.0

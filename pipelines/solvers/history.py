@@ -10,14 +10,13 @@ from collections.abc import Mapping, Sequence
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.graph.problem import Array, Course, Problem
 from pipelines.solvers.assembly import StepBoundary
 from pipelines.solvers.marginals import coordinate_inverse, ordering_of, reported, reported_covariance
 
-# Moments at which the recording is looked back upon.
-MOMENTS = 50
+# The recording is looked back upon at so many moments.
+_MOMENTS = 50
 
 
 def sequential_history(
@@ -26,6 +25,7 @@ def sequential_history(
     ordering: gtsam.Ordering,
     values: gtsam.Values,
     boundaries: Sequence[StepBoundary],
+    start: float,
 ) -> Course | None:
     """What was known at some of the boundaries, the last among them, all linearised at the values.
 
@@ -34,7 +34,8 @@ def sequential_history(
         linear: its factors linearised at the values, in their order.
         ordering: of the whole; states are eliminated in this order.
         values: the final estimate.
-        boundaries: ends of all steps, in time order.
+        boundaries: ends of steps, in time order, all of them or those of the moments at least.
+        start: end of the first of all steps, s.
 
     Returns None when states are not determined until a later step, or there is but one moment.
     """
@@ -46,16 +47,18 @@ def sequential_history(
     blocks: dict[int, Array] = {}
     held_at_first: list[int] | None = None
     steady = np.ones(len(problem.quantities), dtype=bool)
-    moments = _moments(boundaries)
+    moments = [boundaries[i] for i in moments_of(boundaries, start)]
     if len(moments) < 2:
         return None
     for boundary in moments:
         held = [boundary.current_keys.get(p.key, p.key) for p in problem.parameters]
         held_at_first = held_at_first or held
         steady &= np.repeat(np.equal(held, held_at_first), [len(p.quantities) for p in problem.parameters])
-        for i in range(begin, boundary.factors):
+        # What comes after the last one belongs to it.
+        end = linear.size() if boundary is moments[-1] else boundary.factors
+        for i in range(begin, end):
             carried.push_back(linear.at(i))
-        begin = boundary.factors
+        begin = end
         try:
             past = sorted({k for k in _keys(carried) if last[k] < begin} - set(held), key=place.__getitem__)
             carried = _without(carried, past)
@@ -68,12 +71,12 @@ def sequential_history(
     return Course(time, numbers, covariances, steady)
 
 
-def _moments(boundaries: Sequence[StepBoundary]) -> list[StepBoundary]:
-    """Boundaries spread over the recording, the last one among them."""
+def moments_of(boundaries: Sequence[StepBoundary], start: float) -> list[int]:
+    """Which boundaries are looked back upon: spread over the time since the start, the last one among them."""
     times = np.array([boundary.time for boundary in boundaries])
-    wanted = np.linspace(times[0], times[-1], MOMENTS + 1)[1:]
-    chosen: NDArray[np.intp] = np.unique(np.searchsorted(times, wanted).clip(max=len(boundaries) - 1))
-    return [boundaries[i] for i in chosen]
+    wanted = np.linspace(start, times[-1], _MOMENTS + 1)[1:]
+    chosen: list[int] = np.unique(np.searchsorted(times, wanted).clip(max=len(boundaries) - 1)).tolist()
+    return chosen
 
 
 def _keys(graph: gtsam.GaussianFactorGraph) -> list[int]:

@@ -386,9 +386,10 @@ class Run:
         self._begin(solution, about, noise, whole.timestamps, since)
         if from_start:
             self.moments += 1
+            ends = whole.boundaries
             self._course = cache(
                 lambda: sequential_history(
-                    self.problem, system.linearize(values), system.ordering, values, system.boundaries
+                    self.problem, system.linearize(values), system.ordering, values, ends, ends[0].time
                 )
             )
             if not self._young:
@@ -418,7 +419,6 @@ class Run:
             self.keys,
             self.problem.loss,
             held=self.problem.assumed,
-            boundaries=whole.boundaries,
         )
         about = None
         if solution.converged:

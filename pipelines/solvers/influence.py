@@ -16,15 +16,19 @@ matrix of all rows is ever there.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
 
 from pipelines.graph.problem import Array, Factor, Problem, Pull
 from pipelines.solvers.marginals import HELD
+from pipelines.solvers.stretch import Part
 from pipelines.solvers.system import Linear
+
+Answer = TypeVar("Answer")
 
 # Family of the priors, which are told one by one.
 _PRIOR = "prior"
@@ -50,11 +54,15 @@ class Influence:
         """The same of some of the numbers."""
         return Influence(self.names[of], self.linear, self.solutions[:, of], self.covariance[of, of])
 
-    def rows(self) -> Iterator[tuple[Factor, gtsam.GaussianFactor, Array]]:
-        """Each factor, it linearised, and the derivative (n, m) of the numbers by its m whitened residuals."""
-        for part, solutions in self.linear.solved(self.solutions):
-            for i, (factor, (A, rows)) in enumerate(zip(part.factors, part.blocks(), strict=True)):
-                yield factor, part.graph.at(i), (A @ solutions[rows]).T
+    def ask(self, question: Callable[..., Answer], *args: Any) -> list[Answer]:
+        """What a question gives of the rows of every part of the graph, in time order.
+
+        Args:
+            question: a function at the top of a module, since it may be asked in another process; takes the rows: each
+                factor, it linearised, and the derivative (n, m) of the numbers by its m whitened residuals.
+            args: what it takes besides.
+        """
+        return self.linear.ask(_with_rows, [(held, question, *args) for held in self.linear.handed(self.solutions)])
 
     def moves(self, changed: Linear) -> Array:
         """(n,) by how much the numbers are elsewhere at the minimum of a graph that is a little different.
@@ -65,12 +73,29 @@ class Influence:
         Args:
             changed: that graph, linearised where this one is.
         """
-        moved = np.zeros(len(self.names))
-        for (part, solutions), other in zip(self.linear.solved(self.solutions), changed.parts(), strict=True):
-            keys = list(part.triangular.places)
-            before, after = part.graph.gradientAtZero(), other.graph.gradientAtZero()
-            moved -= solutions.T @ (after.vector(keys) - before.vector(keys))
-        return moved
+        given = list(zip(self.linear.handed(self.solutions), changed.ask(_gradient), strict=True))
+        return np.asarray(np.sum(self.linear.ask(_moves, given), axis=0))
+
+
+# What is asked of a part's rows.
+FactorRows = Iterator[tuple[Factor, gtsam.GaussianFactor, Array]]
+
+
+def _with_rows(part: Part, held: Array, question: Callable[[FactorRows], Answer], *args: Any) -> Answer:
+    solutions = part.solved(held)
+    blocks = zip(part.stretch.factors, part.blocks(), strict=True)
+    rows = ((factor, part.graph.at(i), (A @ solutions[rows]).T) for i, (factor, (A, rows)) in enumerate(blocks))
+    return question(rows, *args)
+
+
+def _gradient(part: Part) -> Array:
+    """(D,) of a part's error."""
+    return np.asarray(part.graph.gradientAtZero().vector(part.stretch.keys))
+
+
+def _moves(part: Part, held: Array, changed: Array) -> Array:
+    """(n,) what a part with a changed gradient (D,) has in the moves of the numbers."""
+    return np.asarray(-part.solved(held).T @ (changed - _gradient(part)))
 
 
 def influence(problem: Problem, linear: Linear, current_keys: Mapping[int, int]) -> Influence:
@@ -112,20 +137,11 @@ def uncertainty_budget(problem: Problem, found: Influence, added: Mapping[str, A
         found: the influence of its residuals.
         added: family -> variance (n,) that the colour of its noise adds.
     """
-    by_key = {p.key: p for p in problem.parameters}
+    by_key = {p.key: [q.name for q in p.quantities] for p in problem.parameters}
     variances: dict[str, Array] = {}
-    for factor, linear, rows in found.rows():
-        if factor.family == HELD:  # no source of anything
-            continue
-        keys = linear.keys()
-        parameter = by_key.get(keys[0]) if factor.family == _PRIOR and len(keys) == 1 else None
-        squares = rows**2
-        if parameter is not None and squares.shape[1] == len(parameter.quantities):
-            parts = [(f"prior of {q.name}", squares[:, k]) for k, q in enumerate(parameter.quantities)]
-        else:
-            parts = [(factor.family, squares.sum(axis=1))]
-        for source, part in parts:
-            variances[source] = variances.get(source, np.zeros(len(found.names))) + part
+    for part in found.ask(_variances, by_key):
+        for source, variance in part.items():
+            variances[source] = variances.get(source, np.zeros(len(found.names))) + variance
     for family, more in added.items():
         variances[family] = variances[family] + more
     extra = {q.name: q.extra_sigma**2 for q in problem.quantities}
@@ -140,6 +156,24 @@ def uncertainty_budget(problem: Problem, found: Influence, added: Mapping[str, A
         )
         for j, name in enumerate(found.names)
     }
+
+
+def _variances(rows: FactorRows, by_key: Mapping[int, Sequence[str]]) -> dict[str, Array]:
+    """Source -> what the rows add to the variance of the numbers (n,); by variable the names of its numbers."""
+    variances: dict[str, Array] = {}
+    for factor, linear, row in rows:
+        if factor.family == HELD:  # no source of anything
+            continue
+        keys = linear.keys()
+        names = by_key.get(keys[0], ()) if factor.family == _PRIOR and len(keys) == 1 else ()
+        squares = row**2
+        if squares.shape[1] == len(names):
+            parts = [(f"prior of {name}", squares[:, k]) for k, name in enumerate(names)]
+        else:
+            parts = [(factor.family, squares.sum(axis=1))]
+        for source, part in parts:
+            variances[source] = variances.get(source, np.zeros(len(part))) + part
+    return variances
 
 
 def strongest(found: Influence, sigmas: Mapping[str, float], most: int) -> tuple[Pull, ...]:
@@ -159,22 +193,29 @@ def strongest(found: Influence, sigmas: Mapping[str, float], most: int) -> tuple
     scale = np.array([1.0 / sigmas[name] for name in names])
     if not names:
         return ()
+    pulls = [pull for part in found.ask(_pulls, columns, scale, most) for pull in part]
+    pulls.sort(key=lambda pull: -abs(pull[3]))
+    return tuple(Pull(family, time, names[number], move) for family, time, number, move in pulls[:most])
+
+
+def _pulls(rows: FactorRows, columns: Sequence[int], scale: Array, most: int) -> list[tuple[str, float, int, float]]:
+    """Family, time, which number and by how many sigmas: the measurements among the rows that move one of some most."""
     families: list[str] = []
     times: list[float] = []
     largest: list[tuple[Array, Array]] = []
-    for factor, linear, rows in found.rows():
+    for factor, linear, row in rows:
         vectorized = factor.vectorized
         if vectorized is None:
             continue
         time = vectorized.model.time[-1:] if vectorized.compress else vectorized.model.time
         _, r = linear.jacobian()
-        moves = (rows[columns] * scale[:, None] * r).reshape(len(names), len(time), -1).sum(axis=2)
+        moves = (row[columns] * scale[:, None] * r).reshape(len(columns), len(time), -1).sum(axis=2)
         which = np.abs(moves).argmax(axis=0)
         largest.append((which, moves[which, np.arange(len(time))]))
         families += [factor.family] * len(time)
         times += time.tolist()
     if not times:
-        return ()
+        return []
     numbers, moved = (np.concatenate(each) for each in zip(*largest, strict=True))
     first = np.argsort(-np.abs(moved), kind="stable")[:most]
-    return tuple(Pull(families[i], times[i], names[numbers[i]], float(moved[i])) for i in first.tolist())
+    return [(families[i], times[i], int(numbers[i]), float(moved[i])) for i in first.tolist()]

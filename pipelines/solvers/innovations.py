@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from factors.chi_square import gate
 from pipelines.graph.problem import Array, ChiSquare, Factor, Residuals
+from pipelines.solvers.linear_system import linear_graph_of
 from pipelines.solvers.marginals import ordering_of
 from pipelines.solvers.rows import Rows
 from pipelines.solvers.smoother import Smoother, slices
-from pipelines.solvers.system import linear_graph_of, residuals_of
+from pipelines.solvers.system import residuals_of
 
 # After so many rejections in a row it is the prediction that is wrong: take the measurement.
 _MOST_REJECTED = 10

@@ -27,7 +27,7 @@ def is_linear(problem: Problem, solution: Solution, keys: Sequence[int], kept: S
 
     Args:
         problem: the graph's.
-        solution: its minimum.
+        solution: its minimum, of a system in one piece.
         keys: variables that hold the parameters.
         kept: those that the Gaussian is to be of.
     """
@@ -50,8 +50,7 @@ def is_linear(problem: Problem, solution: Solution, keys: Sequence[int], kept: S
                 there = values.retract(linear.holding(moves).step()[0])
                 rise = 0.5 * float(z @ z)
                 off = system.error(there) - error - rise
-                # What is kept of a graph in stretches may be one stretch's own.
-                if off > BENT * rise and len(system.stretches) == 1:
+                if off > BENT * rise:
                     there = there.retract(system.linearized(there).holding(still).step()[0])
                     off = system.error(there) - error - rise
                 if not abs(off) < BENT * rise:

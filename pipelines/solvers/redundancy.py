@@ -3,70 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.graph.problem import Array, Factor
-from pipelines.solvers.system import Linear, Part, shown
+from pipelines.solvers.stretch import Part
+from pipelines.solvers.system import Linear
 
 # Elements of a row of a rejected measurement or a free prior.
 _EMPTY = 1e-12
 # Random right sides that tell traces: many where that costs little, few where every one tells enough.
 _SAMPLES, _MOST_SAMPLES, _SAMPLED_ROWS = 6, 60, 30_000
-
-
-@dataclass(frozen=True, eq=False)
-class _Rows:
-    """The rows of a stretch's linear system.
-
-    Attributes:
-        part: the stretch, whose matrix is A (m, D).
-        ends: (factors,) of the rows of each factor.
-        group: (m,) the label of each row.
-        counted: (m,) rejected measurements and free priors have empty rows, which are no measurements.
-        beside: by label, what compression took out of the system.
-    """
-
-    part: Part
-    ends: NDArray[np.intp]
-    group: NDArray[np.intp]
-    counted: NDArray[np.bool_]
-    beside: Array
-
-    @classmethod
-    def of(cls, part: Part, stands: Array, labels: dict[tuple[str, int], int]) -> _Rows:
-        """Of a part whose factors stand for so many rows; new labels are added."""
-        some = [np.asarray((np.abs(A) > _EMPTY).any(axis=1)) for A, _ in part.blocks()]
-        sizes, counted = [len(each) for each in some], np.concatenate(some)
-        group = np.concatenate([_labelled(f, size, labels) for f, size in zip(part.factors, sizes, strict=True)])
-        held = np.array([each.sum() for each in some])
-        measured = np.array([f.measurement is not None for f in part.factors])
-        # What compression took out of the system holds no unknowns: each such row is expected to be one.
-        ends = np.cumsum(sizes)
-        first = group[np.append(0, ends)[:-1]]
-        beside = np.bincount(first, np.where(measured, stands - held, 0.0), len(labels)).astype(float)
-        return cls(part, ends, group, counted, beside)
-
-    def across(self, x: Array) -> Array:
-        """(m, k) A x of x (D, k)."""
-        return np.concatenate([A @ x[rows] for A, rows in self.part.blocks()])
-
-    def back(self, y: Array) -> Array:
-        """(D, k) A'y of y (m, k)."""
-        out = np.zeros((self.part.triangular.size, y.shape[1]))
-        for (A, rows), own in zip(self.part.blocks(), np.split(y, self.ends[:-1]), strict=True):
-            out[rows] += A.T @ own
-        return out
-
-    def noise(self, signs: NDArray[np.int8]) -> Array:
-        """(m, k) of signs (m, k), none where nothing was measured."""
-        return np.where(self.counted[:, None], signs, 0.0)
-
-    def squares(self, left: Array) -> Array:
-        """By label, the mean over k of the squares of rows (m, k)."""
-        return np.asarray(np.bincount(self.group, (left**2).mean(axis=1), len(self.beside)), dtype=float)
 
 
 def expected_squares(linear: Linear, stands: Sequence[Array]) -> dict[tuple[str, int], float]:
@@ -82,34 +31,67 @@ def expected_squares(linear: Linear, stands: Sequence[Array]) -> dict[tuple[str,
     Raises:
         IndeterminateError: a variable is not determined.
     """
-    labels: dict[tuple[str, int], int] = {}
-    found: list[Array] = []
-    halfway: list[Array] = []
     ends = np.cumsum([sum(f.factor.dim() for f in stretch.factors) for stretch in linear.system.stretches]).tolist()
     samples = int(np.clip(_SAMPLED_ROWS // ends[-1], _SAMPLES, _MOST_SAMPLES))
     generator = np.random.default_rng(0)
     drawn = [generator.choice([-1.0, 1.0], ends[-1]).astype(np.int8) for _ in range(samples)]
     signs = np.split(np.stack(drawn, axis=1), ends[:-1])
-    joint = np.zeros((linear.triangular.size, samples))
-    for part, stood, its_signs in zip(linear.parts(), stands, signs, strict=True):
-        rows = _Rows.of(part, stood, labels)
-        reduced = part.triangular.forward(rows.back(rows.noise(its_signs)))
-        ours, its = linear.shared(part)
-        joint[ours] += reduced[its]
-        found.append(rows.beside)
-        halfway.append(reduced)
+    halfway = linear.ask(_halfway, list(zip(stands, signs, strict=True)))
+    joint = linear.gathered([each.held for each in halfway])
     joint = linear.triangular.back(linear.triangular.forward(joint))
-    for i in shown(range(len(stands))[::-1]):
-        # The last one is still at hand.
-        if i < len(stands) - 1:
-            part = linear.part(i)
-            rows = _Rows.of(part, stands[i], labels)
-        ours, its = linear.shared(part)
-        right = halfway.pop()
-        right[its] = joint[ours]
-        found.append(rows.squares(rows.across(part.triangular.back(right)) - rows.noise(signs[i])))
-    square = np.sum([np.pad(each, (0, len(labels) - len(each))) for each in found], axis=0)
-    return dict(zip(labels, square.tolist(), strict=True))
+    given = [(held, each.reduced, each.signs) for held, each in zip(linear.handed(joint), halfway, strict=True)]
+    found: dict[tuple[str, int], float] = {}
+    for each, squares in zip(halfway, linear.ask(_squares, given), strict=True):
+        summed = np.bincount(each.group, squares, len(each.labels)) + each.beside
+        for label, square in zip(each.labels, summed.tolist(), strict=True):
+            found[label] = found.get(label, 0.0) + square
+    return found
+
+
+class _Halfway(NamedTuple):
+    """A part before what others hold too is solved for.
+
+    Attributes:
+        signs: (m, k), none where nothing was measured: rows of rejected measurements and free priors are empty.
+        reduced: (D, k) their right side, as far as its own variables go.
+        held: (d, k) what that leaves of those that others hold too.
+        labels: families and their rows.
+        group: (m,) the label of each row.
+        beside: by label, what compression took out of the system.
+    """
+
+    signs: NDArray[np.int8]
+    reduced: Array
+    held: Array
+    labels: list[tuple[str, int]]
+    group: NDArray[np.intp]
+    beside: Array
+
+
+def _halfway(part: Part, stands: Array, signs: NDArray[np.int8]) -> _Halfway:
+    """A part's own variables eliminated from the right sides that signs (m, k) make."""
+    labels: dict[tuple[str, int], int] = {}
+    some = [np.asarray((np.abs(A) > _EMPTY).any(axis=1)) for A, _ in part.blocks()]
+    sizes, factors = [len(each) for each in some], part.stretch.factors
+    group = np.concatenate([_labelled(f, size, labels) for f, size in zip(factors, sizes, strict=True)])
+    counted = signs * np.concatenate(some)[:, None]
+    right = np.zeros((part.triangular.size, signs.shape[1]))
+    ends = np.cumsum(sizes)
+    for (A, rows), own in zip(part.blocks(), np.split(counted, ends[:-1]), strict=True):
+        right[rows] += A.T @ own
+    reduced = part.triangular.forward(right)
+    # What compression took out of the system holds no unknowns: each such row is expected to be one.
+    measured = np.array([f.measurement is not None for f in factors])
+    out = np.where(measured, stands - [each.sum() for each in some], 0.0)
+    beside = np.bincount(group[np.append(0, ends)[:-1]], out, len(labels)).astype(float)
+    return _Halfway(counted, reduced, reduced[part.held], list(labels), group, beside)
+
+
+def _squares(part: Part, held: Array, reduced: Array, signs: NDArray[np.int8]) -> Array:
+    """(m,) the mean over k of the squares that are left of signs (m, k) once all is solved for."""
+    x = part.solved(held, reduced)
+    left = np.concatenate([A @ x[rows] for A, rows in part.blocks()]) - signs
+    return np.asarray((left**2).mean(axis=1))
 
 
 def _labelled(factor: Factor, size: int, labels: dict[tuple[str, int], int]) -> NDArray[np.intp]:

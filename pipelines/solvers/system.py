@@ -3,152 +3,55 @@
 A long recording is divided into stretches of time. The variables that only one of them holds are eliminated there,
 which leaves, as square root of information, what the stretch says of the others; these rows of all stretches are the
 system that is solved. Where the others are known, a stretch's own variables follow by back substitution. That is the
-whole system's elimination in another order, hence exact, and only one stretch is linearised at a time: what memory
-holds of a state of many hours is its value and residuals. A stretch is linearised anew whenever it is needed, and of
-many hours eliminated, too.
+whole system's elimination in another order, hence exact. Stretches are looked at in several processes, where there may
+be more than one (`pipelines.parallel`); what these find is the same to the last digit.
 
-A short recording is one stretch of which nothing is eliminated in advance.
+Of a recording of many hours memory does not hold all that is made of its stretches: what of them is not kept, see Keep,
+is made anew whenever it is needed, one stretch at a time, and what is held of a state is its value and residuals. A
+short recording is one stretch of which nothing is eliminated in advance.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import accumulate, pairwise, product
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from factors.loss import TruncatedLoss
-from factors.vectorized import Ensemble, VectorizedFactor, residuals_at
-from pipelines import progress
+from factors.vectorized import jacobian_factor, residuals_at
 from pipelines.graph.problem import Array, Factor, Residuals
+from pipelines.parallel import Crew
 from pipelines.solvers.assembly import StepBoundary
-from pipelines.solvers.history import MOMENTS
-from pipelines.solvers.marginals import IndeterminateError, eliminated, joint_information, marginal, ordering_of
-from pipelines.solvers.triangular import Triangular, conditionals_of, rows_of
+from pipelines.solvers.history import moments_of
+from pipelines.solvers.linear_system import damped, elimination_ordering, graph_of
+from pipelines.solvers.marginals import IndeterminateError, joint_information, marginal, ordering_of
+from pipelines.solvers.stretch import Excess, Keep, Part, Stretch, StretchAt, vectorized
+from pipelines.solvers.triangular import Triangular, rows_of
 
-Shown = TypeVar("Shown")
-# Variable and which of its numbers -> information about it that a linear system has too much.
-Excess = dict[tuple[int, int], Array]
+Answer = TypeVar("Answer")
 Elimination = Callable[
     [gtsam.GaussianFactorGraph, gtsam.Ordering], tuple[gtsam.GaussianConditional, gtsam.GaussianFactor]
 ]
 
 # What is held is held this tightly, in the units of each variable.
 _HELD = 1e-12
-# A graph of more variables is divided, and into stretches of about so many, or fewer where that gives the history too
-# few moments.
-_UNDIVIDED, _STRETCH = 150_000, 3_000
-# Up to so many variables what back substitution needs of stretches is kept, 6 kB each; of more it is found anew.
-_KEPT = 400_000
+# A graph of more variables is divided, and into stretches of so many at most.
+_UNDIVIDED, _STRETCH = 15_000, 3_000
+# Up to so many variables all of the stretches is kept, 20 kB each, then what back substitution needs of them, 6 kB
+# each; of more it is found anew.
+_KEPT, _KEPT_TREES = 150_000, 400_000
+# A process is worth while for so many variables.
+_WORTH_WHILE = 5_000
 # Of the information that a system with mixed second derivatives has about a number no more than this share is too much.
 _EXCESS = 0.98
-
-
-def shown(stretches: Sequence[Shown]) -> Iterable[Shown]:
-    """Stretches, or their numbers, shown as they are taken where there are several."""
-    return stretches if len(stretches) == 1 else progress.track(stretches, "stretch by stretch", len(stretches))
-
-
-@dataclass(frozen=True, eq=False)
-class Stretch:
-    """Consecutive factors of a graph.
-
-    Attributes:
-        factors: as they are.
-        others: those of them that are not vectorised.
-        inner: variables that no other stretch holds, in the order of their elimination; of a graph in one piece none.
-        outer: which of the factors hold none of these.
-        ensemble: the vectorised ones among the factors, kept where there is but one stretch.
-    """
-
-    factors: Sequence[Factor]
-    others: gtsam.NonlinearFactorGraph
-    inner: gtsam.Ordering
-    outer: Sequence[int]
-    ensemble: Ensemble | None
-
-    @classmethod
-    def alone(cls, factors: Sequence[Factor]) -> Stretch:
-        """A graph in one piece."""
-        return cls(factors, _others(factors), gtsam.Ordering(), range(len(factors)), Ensemble(_vectorized(factors)))
-
-    @classmethod
-    def of(cls, factors: Sequence[Factor], joint: set[int]) -> Stretch:
-        """One of several, `joint` the variables that are not its own."""
-        graph = graph_of(factors)
-        outer = [i for i, f in enumerate(factors) if joint.issuperset(f.factor.keys())]
-        held = joint.intersection(graph.keyVector())
-        whole = elimination_ordering(graph, sorted(held))
-        inner = ordering_of(whole.at(i) for i in range(whole.size() - len(held)))
-        return cls(factors, _others(factors), inner, outer, None)
-
-    def made_of(self, factors: Sequence[Factor]) -> Stretch:
-        """The same with other noise."""
-        ensemble = None if self.ensemble is None else Ensemble(_vectorized(factors))
-        return replace(self, factors=factors, others=_others(factors), ensemble=ensemble)
-
-    def at(self, values: gtsam.Values, loss: TruncatedLoss | None) -> AbstractContextManager[None]:
-        """Within the block the factors answer for these values, under the loss."""
-        return self._together.at(values, loss)
-
-    @property
-    def _together(self) -> Ensemble:
-        """Its vectorised factors."""
-        return self.ensemble or Ensemble(_vectorized(self.factors))
-
-    def error(self, values: gtsam.Values, loss: TruncatedLoss | None) -> float:
-        """Half the sum of squares."""
-        ensemble = self._together
-        with ensemble.at(values, loss):
-            return ensemble.error + float(self.others.error(values))
-
-    def linearize(
-        self, values: gtsam.Values, loss: TruncatedLoss | None, excess: Excess | None = None
-    ) -> gtsam.GaussianFactorGraph:
-        """The linear system about the values; with the mixed second derivatives where their `excess` is asked for."""
-        ensemble = self._together
-        with ensemble.at(values, loss, excess is not None):
-            if excess is not None:
-                for key, number, information in ensemble.excess():
-                    excess[key, number] = excess.get((key, number), np.zeros(2)) + information
-            return linear_graph_of(self.factors, values)
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """A stretch about some values.
-
-    Attributes:
-        factors: of it.
-        graph: the same, linearised.
-        inner: as the stretch has it.
-        tree: of its own variables, if they are eliminated already.
-    """
-
-    factors: Sequence[Factor]
-    graph: gtsam.GaussianFactorGraph
-    inner: gtsam.Ordering
-    tree: gtsam.GaussianBayesTree | None = None
-
-    @cached_property
-    def triangular(self) -> Triangular:
-        """The triangular factor of its own variables. Raises IndeterminateError, naming one that is not determined."""
-        return Triangular.of(self.graph, self.inner, self.tree)
-
-    @cached_property
-    def _rows(self) -> list[NDArray[np.intp]]:
-        """The rows that the variables of each factor have in a vector."""
-        return [rows_of(self.triangular.places, self.graph.at(i).keys()) for i in range(self.graph.size())]
-
-    def blocks(self) -> Iterator[tuple[Array, NDArray[np.intp]]]:
-        """The rows of each linearised factor (m, d), and where in a vector its d numbers are."""
-        return ((self.graph.at(i).jacobian()[0], rows) for i, rows in enumerate(self._rows))
+_WHAT = "stretch by stretch"
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,21 +61,19 @@ class Linear:
     Attributes:
         system: the graph.
         values: about which.
-        damping: with which a stretch's own variables are held where they are.
         graph: what the stretches say of the variables that they share, all of it for a graph in one piece.
         families: of its factors, empty for those left of an elimination.
         boundaries: ends of stretches, counted in its factors; of a graph in one piece the ends of the steps.
-        trees: of the variables that each stretch alone holds, where they are kept.
+        crew: who has the stretches; None for a graph in one piece.
         excess: of a system with mixed second derivatives, see Ensemble.at; a step goes without it. None: it has none.
     """
 
     system: System
     values: gtsam.Values
-    damping: float
     graph: gtsam.GaussianFactorGraph
     families: Sequence[str]
     boundaries: Sequence[StepBoundary]
-    trees: Sequence[gtsam.GaussianBayesTree | None] = (None,)
+    crew: Crew[StretchAt] | None = None
     excess: Excess | None = None
 
     @cached_property
@@ -180,41 +81,44 @@ class Linear:
         """The triangular factor of `graph`. Raises IndeterminateError, naming a variable that is not determined."""
         return Triangular.of(self.graph, self.system.ordering)
 
-    def part(self, i: int) -> Part:
-        """A stretch; the only one of a graph in one piece is this system itself."""
-        if len(self.system.stretches) == 1:
-            return self._alone
-        mixed: Excess | None = None if self.excess is None else {}
-        found = self.system.part(self.system.stretches[i], self.values, self.damping, mixed)
-        return replace(found, tree=self.trees[i])
-
     @cached_property
     def _alone(self) -> Part:
         (stretch,) = self.system.stretches
-        return Part(stretch.factors, self.graph, stretch.inner)
+        return Part(stretch, self.graph)
 
-    def parts(self) -> Iterator[Part]:
-        """The stretches, one after the other."""
-        return map(self.part, shown(range(len(self.system.stretches))))
+    @cached_property
+    def _dims(self) -> dict[int, int]:
+        """Of all variables."""
+        dims: dict[int, int] = self.values.dims()
+        return dims
 
-    def shared(self, part: Part) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """The rows that the variables of `graph` which a part holds have in its vectors, and in the part's."""
-        ours, its = self.triangular.places, part.triangular.places
-        keys = [key for key in its if key in ours]
-        return rows_of(ours, keys), rows_of(its, keys)
-
-    def solved(self, joint: Array, own: Callable[[Part], Array] | None = None) -> Iterator[tuple[Part, Array]]:
-        """Every part with a vector of its variables that solves its own equations.
+    def ask(self, question: Callable[..., Answer], given: Sequence[tuple[Any, ...]] = ()) -> list[Answer]:
+        """What a question gives of every part, in time order.
 
         Args:
-            joint: (D, k) of the variables of `graph`.
-            own: a part's right side, all of its rows; without it is zero.
+            question: a function at the top of a module, since it may be asked in another process; takes a part.
+            given: for each part what it takes besides.
         """
-        for part in self.parts():
-            ours, its = self.shared(part)
-            right = np.zeros((part.triangular.size, joint.shape[1])) if own is None else own(part)
-            right[its] = joint[ours]
-            yield part, part.triangular.back(right)
+        given = given or [()] * len(self.system.stretches)
+        if self.crew is None:
+            return [question(self._alone, *args) for args in given]
+        return self.crew.ask(_asked, [(question, *args) for args in given], _WHAT)
+
+    def handed(self, joint: Array) -> list[Array]:
+        """Of (D, k) of the variables of `graph` what each part holds (d, k), see Part.held."""
+        return [joint[rows] for rows in self._rows_held]
+
+    def gathered(self, parts: Sequence[Array]) -> Array:
+        """(D, k) of the variables of `graph`, the sum of what the parts have for what they hold (d, k)."""
+        joint = np.zeros((self.triangular.size, parts[0].shape[1]))
+        for rows, part in zip(self._rows_held, parts, strict=True):
+            joint[rows] += part
+        return joint
+
+    @cached_property
+    def _rows_held(self) -> list[NDArray[np.intp]]:
+        """The rows that the variables of `graph` which each part holds have in a vector."""
+        return [rows_of(self.triangular.places, stretch.held) for stretch in self.system.stretches]
 
     def drawn(self, keys: Collection[int], count: int, generator: np.random.Generator) -> list[gtsam.Values]:
         """Values drawn from their covariance about these, by what some variables add to it.
@@ -222,16 +126,12 @@ class Linear:
         Raises:
             IndeterminateError: a variable is not determined.
         """
-        dims = self.values.dims()
-        units = {key: np.zeros((dims[key], count)) for key in self.values.keys()}
+        units = {key: np.zeros((self._dims[key], count)) for key in self.values.keys()}
         for k, (key, unit) in product(range(count), units.items()):
             if key in keys:
                 unit[:, k] = generator.standard_normal(len(unit))
-
-        def of(places: Mapping[int, slice]) -> Array:
-            return np.concatenate([units[key] for key in places])
-
-        return self._moved(of(self.triangular.places), lambda part: of(part.triangular.places))
+        own = [np.concatenate([units[key] for key in stretch.keys]) for stretch in self.system.stretches]
+        return self._moved(np.concatenate([units[key] for key in self.triangular.places]), own)
 
     def followed(self, keys: Sequence[int], moves: Array) -> list[gtsam.Values]:
         """Values with the variables that all measurements share moved, the others where they are likeliest then.
@@ -249,22 +149,31 @@ class Linear:
         right[own] = self.triangular.root(list(keys)) @ moves
         return self._moved(right)
 
-    def _moved(self, right: Array, own: Callable[[Part], Array] | None = None) -> list[gtsam.Values]:
-        """Values (k,) moved by R^-1 times (D, k) of the variables of `graph`, and of a part's own as in `solved`."""
+    def _moved(self, right: Array, own: Sequence[Array] | None = None) -> list[gtsam.Values]:
+        """Values (k,) moved by R^-1 times (D, k) of the variables of `graph`, and of each part's own, or zero."""
         joint = self.triangular.back(right)
-        moves = [gtsam.VectorValues() for _ in range(joint.shape[1])]
-        inserted: set[int] = set()
-        for part, x in self.solved(joint, own):
-            for key in part.triangular.places.keys() - inserted:
-                for move, column in zip(moves, x[part.triangular.places[key]].T, strict=True):
-                    move.insert(key, column)
-            inserted.update(key for key in part.triangular.places if key in self.triangular.places)
+        moves = self._vectors(self.triangular.places, joint)
+        rights: Sequence[Array | None] = own or [None] * len(self.system.stretches)
+        found = self.ask(_solved, list(zip(self.handed(joint), rights, strict=True)))
+        for stretch, x in zip(self.system.stretches, found, strict=True):
+            for move, more in zip(moves, self._vectors(stretch.inner, x), strict=True):
+                move.insert(more)
         return [self.values.retract(move) for move in moves]
+
+    def _vectors(self, keys: Iterable[int], columns: Array) -> list[gtsam.VectorValues]:
+        """Vectors (d, k) of some variables, one after the other, as gtsam has them."""
+        found = [gtsam.VectorValues() for _ in range(columns.shape[1])]
+        end = 0
+        for key in keys:
+            start, end = end, end + self._dims[key]
+            for vector, column in zip(found, columns.T, strict=True):
+                vector.insert(key, column[start:end])
+        return found
 
     def damped(self, damping: float) -> Linear:
         """With each unknown held where it is by so many times its own information."""
         if len(self.system.stretches) > 1:
-            return self.system.linearized(self.values, damping)
+            return self.system.linearized(self.values, damping, self.excess is not None)
         return replace(self, graph=damped(self.graph, damping))
 
     def holding(self, at: Mapping[int, Array]) -> Linear:
@@ -292,10 +201,7 @@ class Linear:
         known, axes = np.linalg.eigh(information)
         known = np.maximum(known, np.finfo(float).eps * known[-1])
         move = axes @ (axes.T @ slope / (known + np.sqrt(known[0] * known[-1])))
-        delta, dims, end = gtsam.VectorValues(), self.values.dims(), 0
-        for key in shared:
-            start, end = end, end + dims[key]
-            delta.insert(key, move[start:end])
+        (delta,) = self._vectors(shared, move[:, None])
         return self.holding({key: delta.at(key) for key in shared}).step()[0] if self.has_states else delta
 
     def information(self, keys: Sequence[int]) -> Array:
@@ -312,18 +218,15 @@ class Linear:
 
     def solution(self) -> gtsam.VectorValues:
         """The move to the minimum. Raises IndeterminateError, naming a variable that is not determined."""
-        solution = self.triangular.back(self.triangular.right)[:, 0]
-        delta = gtsam.VectorValues()
-        for key, place in self.triangular.places.items():
-            delta.insert(key, solution[place])
+        (delta,) = self._vectors(self.triangular.places, self.triangular.back(self.triangular.right))
         self._follow(delta)
         return delta
 
     def states_alone(self) -> gtsam.VectorValues:
         """The same with the variables that all measurements share held; raises RuntimeError if that is singular."""
-        dims, still = self.values.dims(), gtsam.VectorValues()
+        still = gtsam.VectorValues()
         for key in self.system.shared:
-            still.insert(key, np.zeros(dims[key]))
+            still.insert(key, np.zeros(self._dims[key]))
         delta, _ = self.holding({key: still.at(key) for key in self.system.shared}).step()
         # To the last digit, too.
         delta.update(still)
@@ -337,26 +240,20 @@ class Linear:
         function: Elimination = gtsam.EliminateQR
         if self.excess:
             too_much = {place: each.sum() if on_floor else each[0] for place, each in self.excess.items()}
-            function = without_excess(too_much, self.values.dims())
+            function = without_excess(too_much, self._dims)
         delta = self.graph.optimize(self.system.ordering, function)
         gradient, keys = self.graph.gradientAtZero(), list(self.graph.keyVector())
         return delta, self._follow(delta) - 0.5 * float(gradient.vector(keys) @ delta.vector(keys))
 
     def _follow(self, delta: gtsam.VectorValues) -> float:
         """Add stretches' own variables to a solution that has all others; by how much they alone lower the error."""
-        lowers = 0.0
-        for i, stretch in enumerate(shown(self.system.stretches)):
-            if not stretch.inner.size():
-                continue
-            tree = self.trees[i] or eliminated(self.part(i).graph, stretch.inner)[0]
-            # Those above come first.
-            for conditional in reversed(conditionals_of(tree, stretch.inner)):
-                solved, d = conditional.solve(delta), conditional.d()
-                lowers += 0.5 * float(d @ d)
-                for key in conditional.keys():
-                    if not delta.exists(key):
-                        delta.insert(key, solved.at(key))
-        return lowers
+        if self.crew is None:
+            return 0.0
+        stretches = self.system.stretches
+        found = self.crew.ask(StretchAt.follow, [([delta.at(key) for key in each.held],) for each in stretches], _WHAT)
+        for moves, _ in found:
+            delta.insert(moves)
+        return sum(lowers for _, lowers in found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,10 +262,12 @@ class System:
 
     Attributes:
         stretches: its factors, in time order.
-        boundaries: the stretches' ends; of a graph in one piece those of all steps.
+        boundaries: ends of all steps, where they are known.
         ordering: of the elimination of the variables that stretches share, those of all of them last.
         shared: the variables that all measurements share.
         loss: how those that may be outliers are weighed; None counts all in full.
+        ends: of several stretches.
+        keep: how much is kept of several stretches.
     """
 
     stretches: Sequence[Stretch]
@@ -376,6 +275,10 @@ class System:
     ordering: gtsam.Ordering
     shared: Sequence[int]
     loss: TruncatedLoss | None
+    ends: Sequence[StepBoundary] = ()
+    keep: Keep = Keep.ALL
+    # Who evaluated several stretches last, and has not linearised them; let go of with what comes after this system.
+    _evaluated: list[tuple[gtsam.Values, Crew[StretchAt]]] = field(default_factory=list, init=False, repr=False)
 
     @classmethod
     def of(
@@ -386,14 +289,15 @@ class System:
         boundaries: Sequence[StepBoundary] = (),
     ) -> System:
         """The system of some factors, divided at some of the boundaries if it is long."""
-        ends = _divided(factors, boundaries)
+        ends, size = _divided(factors, boundaries)
         if len(ends) < 2:
             alone = Stretch.alone(factors)
             return cls([alone], boundaries, elimination_ordering(graph_of(factors), shared), shared, loss)
+        keep = Keep.ALL if size <= _KEPT else Keep.TREES if size <= _KEPT_TREES else Keep.NOTHING
         pieces = _pieces(factors, ends)
         joint = _joint(pieces, boundaries, shared)
-        stretches = [Stretch.of(piece, set(joint)) for piece in pieces]
-        return cls(stretches, ends, ordering_of(joint), shared, loss)
+        stretches = [Stretch.of(piece, set(joint), keep) for piece in pieces]
+        return cls(stretches, boundaries, ordering_of(joint), shared, loss, ends, keep)
 
     @property
     def factors(self) -> Sequence[Factor]:
@@ -410,6 +314,7 @@ class System:
 
     def made_of(self, factors: Sequence[Factor]) -> System:
         """The same system with other noise: of factors on the same variables, one for one."""
+        self._evaluated.clear()
         begin, made = 0, []
         for stretch in self.stretches:
             made.append(stretch.made_of(factors[begin : begin + len(stretch.factors)]))
@@ -418,28 +323,34 @@ class System:
 
     def under(self, loss: TruncatedLoss | None) -> System:
         """The same system with another loss."""
+        self._evaluated.clear()
         return replace(self, loss=loss)
 
     @contextmanager
     def at(self, values: gtsam.Values) -> Iterator[None]:
-        """Within the block the factors answer for these values, under the system's loss; residuals alone if divided."""
-        if len(self.stretches) == 1:
-            with self.stretches[0].at(values, self.loss):
+        """Within the block the factors answer for these values, under the system's loss; of a long graph residuals."""
+        if self.keep is Keep.ALL:
+            with ExitStack() as stretches:
+                for stretch in self.stretches:
+                    stretches.enter_context(stretch.at(values, self.loss))
                 yield
         else:
-            with residuals_at([_vectorized(stretch.factors) for stretch in self.stretches], values, self.loss):
+            with residuals_at([vectorized(stretch.factors) for stretch in self.stretches], values, self.loss):
                 yield
+
+    def _about(self, values: gtsam.Values) -> Crew[StretchAt]:
+        """Several stretches about the values."""
+        self._evaluated.clear()
+        there = [StretchAt(stretch, values, self.loss, self.keep) for stretch in self.stretches]
+        return Crew(there, sum(len(stretch.inner) for stretch in self.stretches) // _WORTH_WHILE)
 
     def error(self, values: gtsam.Values) -> float:
         """Half the sum of squares."""
-        return sum(stretch.error(values, self.loss) for stretch in shown(self.stretches))
-
-    def part(self, stretch: Stretch, values: gtsam.Values, damping: float = 0.0, excess: Excess | None = None) -> Part:
-        """One of several stretches about the values, damped as `Linear.damping` says."""
-        graph = stretch.linearize(values, self.loss, excess)
-        if damping > 0.0:
-            graph = damped(graph, damping, _keys(stretch.inner))
-        return Part(stretch.factors, graph, stretch.inner)
+        if len(self.stretches) == 1:
+            return self.stretches[0].error(values, self.loss)
+        crew = self._about(values)
+        self._evaluated.append((values, crew))
+        return sum(crew.ask(StretchAt.error, [()] * len(self.stretches), _WHAT))
 
     def linearized(self, values: gtsam.Values, damping: float = 0.0, mixed: bool = False) -> Linear:
         """About the values, each unknown held there by so many times its information; `mixed` as Ensemble.at has it.
@@ -447,33 +358,33 @@ class System:
         Raises:
             IndeterminateError: one of several stretches does not determine a variable of its own; names it.
         """
+        if len(self.stretches) > 1:
+            return self._reduced(values, damping, mixed)
+        (alone,) = self.stretches
         excess: Excess | None = {} if mixed else None
-        if len(self.stretches) == 1:
-            (alone,) = self.stretches
-            graph, families = alone.linearize(values, self.loss, excess), [f.family for f in alone.factors]
-            if damping > 0.0:
-                graph = damped(graph, damping)
-            return Linear(self, values, damping, graph, families, self.boundaries, excess=excess)
-        graph, families, boundaries, trees = gtsam.GaussianFactorGraph(), [], [], []
-        kept = sum(stretch.inner.size() for stretch in self.stretches) <= _KEPT
-        for stretch, end in zip(shown(self.stretches), self.boundaries, strict=True):
-            part, outer = self.part(stretch, values, damping, excess), set(stretch.outer)
-            own = gtsam.GaussianFactorGraph()
-            for i in range(part.graph.size()):
-                if i in outer:
-                    graph.push_back(part.graph.at(i))
-                    families.append(stretch.factors[i].family)
-                else:
-                    own.push_back(part.graph.at(i))
-            tree, left = eliminated(own, stretch.inner)
-            trees.append(tree if kept else None)
-            for i in range(left.size()):
-                graph.push_back(left.at(i))
-                families.append("")
-            boundaries.append(end._replace(factors=graph.size()))
+        graph, families = alone.linearize(values, self.loss, excess), [f.family for f in alone.factors]
         if damping > 0.0:
             graph = damped(graph, damping)
-        return Linear(self, values, damping, graph, families, boundaries, trees, excess)
+        return Linear(self, values, graph, families, self.boundaries, excess=excess)
+
+    def _reduced(self, values: gtsam.Values, damping: float, mixed: bool) -> Linear:
+        """What several stretches say of what they share."""
+        known = [crew for where, crew in self._evaluated if where is values]
+        crew = known[0] if known else self._about(values)
+        self._evaluated.clear()
+        graph, families, boundaries = gtsam.GaussianFactorGraph(), [], []
+        excess: Excess = {}
+        told = crew.ask(StretchAt.reduced, [(damping, mixed)] * len(self.stretches), _WHAT)
+        for stretch, reduced, end in zip(self.stretches, told, self.ends, strict=True):
+            for rows in (*reduced.outer, *reduced.left):
+                graph.push_back(jacobian_factor(*rows))
+            families += [*(stretch.factors[i].family for i in stretch.outer), *[""] * len(reduced.left)]
+            boundaries.append(end._replace(factors=graph.size()))
+            for place, information in reduced.excess.items():
+                excess[place] = excess.get(place, np.zeros(2)) + information
+        if damping > 0.0:
+            graph = damped(graph, damping)
+        return Linear(self, values, graph, families, boundaries, crew, excess if mixed else None)
 
     def linearize(self, values: gtsam.Values) -> gtsam.GaussianFactorGraph:
         """What `linearized` says of the variables that stretches share, all of it for a graph in one piece."""
@@ -523,8 +434,11 @@ def without_excess(excess: Mapping[tuple[int, int], float], dims: Mapping[int, i
     return eliminate
 
 
-def _divided(factors: Sequence[Factor], boundaries: Sequence[StepBoundary]) -> list[StepBoundary]:
-    """Ends of stretches, each with about as many new variables as the others; none for a short graph."""
+def _divided(factors: Sequence[Factor], boundaries: Sequence[StepBoundary]) -> tuple[list[StepBoundary], int]:
+    """Ends of stretches, none for a short graph, and how many variables there are.
+
+    They end at the moments of the history and, where there are many variables between two, in between.
+    """
     seen: set[int] = set()
     count, begin = [], 0
     for boundary in boundaries:
@@ -533,9 +447,15 @@ def _divided(factors: Sequence[Factor], boundaries: Sequence[StepBoundary]) -> l
         begin = boundary.factors
         count.append(len(seen))
     if not count or len(seen) <= _UNDIVIDED:
-        return []
-    stretch = np.array(count) // min(_STRETCH, -(-len(seen) // MOMENTS))
-    return [boundaries[i] for i in (*np.flatnonzero(np.diff(stretch)), len(boundaries) - 1)]
+        return [], len(seen)
+    ends: set[int] = set()
+    before = 0
+    for moment in moments_of(boundaries, boundaries[0].time):
+        pieces = -(-(count[moment] - before) // _STRETCH)
+        wanted = np.linspace(before, count[moment], pieces + 1)[1:-1]
+        ends.update(np.searchsorted(count, wanted).tolist(), [moment])
+        before = count[moment]
+    return [boundaries[i] for i in sorted(ends)], len(seen)
 
 
 def _pieces(factors: Sequence[Factor], ends: Sequence[StepBoundary]) -> list[Sequence[Factor]]:
@@ -563,16 +483,15 @@ def _joint(
     return dict.fromkeys([*used][::-1])
 
 
-def _keys(ordering: gtsam.Ordering) -> list[int]:
-    return [ordering.at(i) for i in range(ordering.size())]
+def _asked(stretch: StretchAt, question: Callable[..., Answer], *args: Any) -> Answer:
+    """Asks a stretch as it was linearised."""
+    return question(stretch.part(), *args)
 
 
-def _vectorized(factors: Sequence[Factor]) -> list[VectorizedFactor]:
-    return [v for f in factors if (v := f.vectorized) is not None]
-
-
-def _others(factors: Sequence[Factor]) -> gtsam.NonlinearFactorGraph:
-    return graph_of([f for f in factors if f.vectorized is None])
+def _solved(part: Part, held: Array, right: Array | None) -> Array:
+    """(d, k) of a part's own variables, one after the other, see Part.solved."""
+    x = part.solved(held, right)
+    return x[rows_of(part.triangular.places, part.stretch.inner)]
 
 
 def without_rejected(factor: Factor, like: Factor, values: gtsam.Values) -> Factor:
@@ -581,61 +500,6 @@ def without_rejected(factor: Factor, like: Factor, values: gtsam.Values) -> Fact
         return factor
     weights = np.ones(1) if factor.measurement.weights is None else factor.measurement.weights
     return Factor.of(factor.family, factor.measurement.weighed(weights * used[:, None]))
-
-
-def graph_of(factors: Sequence[Factor]) -> gtsam.NonlinearFactorGraph:
-    """The gtsam graph of the factors, in their order."""
-    graph = gtsam.NonlinearFactorGraph()
-    for f in factors:
-        graph.add(f.factor)
-    return graph
-
-
-def linear_graph_of(factors: Sequence[Factor], values: gtsam.Values) -> gtsam.GaussianFactorGraph:
-    """The linear system of the factors about the values, in their order."""
-    graph = gtsam.GaussianFactorGraph()
-    for f in factors:
-        graph.push_back(f.linearized(values))
-    return graph
-
-
-def elimination_ordering(graph: gtsam.NonlinearFactorGraph, shared: Sequence[int]) -> gtsam.Ordering:
-    """Nested dissection of the chain with the shared variables last, which suits chains with a few common variables."""
-    # METIS wants variables that share a factor with another, or it brings the process down.
-    joined = gtsam.NonlinearFactorGraph()
-    alone = dict.fromkeys(shared)
-    for i in range(graph.size()):
-        keys = graph.at(i).keys()
-        if len(keys) > 1:
-            joined.push_back(graph.at(i))
-        else:
-            alone.update(dict.fromkeys(keys))
-    last = set(shared)
-    metis = gtsam.Ordering.MetisNonlinearFactorGraph(joined) if joined.size() else gtsam.Ordering()
-    chain = [metis.at(i) for i in range(metis.size()) if metis.at(i) not in last]
-    return ordering_of([*(alone.keys() - last - set(chain)), *chain, *shared])
-
-
-def damped(
-    linear: gtsam.GaussianFactorGraph, weight: float, keys: Collection[int] | None = None
-) -> gtsam.GaussianFactorGraph:
-    """The system with each unknown, or some, held where it is by `weight` times its own information."""
-    gradient = linear.gradientAtZero()
-    diagonal = {key: np.zeros(len(gradient.at(key))) for key in linear.keyVector()}
-    for i in range(linear.size()):
-        factor = linear.at(i)
-        squares = (factor.jacobian()[0] ** 2).sum(axis=0)
-        for key in factor.keys():
-            size = len(diagonal[key])
-            diagonal[key] += squares[:size]
-            squares = squares[size:]
-    out = gtsam.GaussianFactorGraph()
-    out.push_back(linear)
-    for key in diagonal if keys is None else keys:
-        scale = np.sqrt(weight * np.maximum(diagonal[key], 1e-6))
-        noise = gtsam.noiseModel.Unit.Create(len(scale))
-        out.add(gtsam.JacobianFactor(key, np.diag(scale), np.zeros(len(scale)), noise))
-    return out
 
 
 def residuals_of(factors: Sequence[Factor], values: gtsam.Values) -> dict[str, Residuals]:

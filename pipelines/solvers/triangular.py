@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
@@ -120,7 +120,7 @@ def places_of(linear: gtsam.GaussianFactorGraph) -> dict[int, slice]:
     return {key: slice(start, stop) for key, start, stop in zip(keys, [0, *ends], ends, strict=False)}
 
 
-def rows_of(places: Mapping[int, slice], keys: list[int]) -> NDArray[np.intp]:
+def rows_of(places: Mapping[int, slice], keys: Sequence[int]) -> NDArray[np.intp]:
     """Rows of some variables, one after the other."""
     return np.array([row for key in keys for row in range(places[key].start, places[key].stop)], dtype=np.intp)
 

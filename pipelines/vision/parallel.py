@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
-from contextlib import contextmanager
 from itertools import islice
 
 import numpy as np
 
+from pipelines.parallel import allowed
 from pipelines.vision.camera import Camera
 from pipelines.vision.tags import Detections, Picture, detect
 
@@ -23,19 +22,6 @@ _MANY = 100
 # Pictures under way for each process: memory does not grow with their number.
 _AHEAD = 4
 
-_jobs = 1
-
-
-@contextmanager
-def processes(jobs: int | None) -> Iterator[None]:
-    """Within the block so many processes may be used; None: one a core."""
-    global _jobs
-    before, _jobs = _jobs, jobs or os.cpu_count() or 1
-    try:
-        yield
-    finally:
-        _jobs = before
-
 
 def detections(
     images: Iterable[tuple[int, bytes]], family: str = "36h11", camera: Camera | None = None
@@ -45,18 +31,18 @@ def detections(
     Raises InputError as `detect` does.
     """
     stream = iter(images)
-    first = list(islice(stream, _MANY + 1)) if _jobs > 1 and multiprocessing.parent_process() is None else []
+    first = list(islice(stream, _MANY + 1)) if (jobs := allowed()) > 1 else []
     if len(first) <= _MANY:
         for t_ns, encoded in [*first, *stream] if first else stream:
             yield t_ns, _find(encoded, family, camera)
         return
-    pool = ProcessPoolExecutor(_jobs, multiprocessing.get_context("spawn"), _prepare)
+    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _prepare)
     under_way: deque[tuple[int, Future[Detections | None]]] = deque()
     try:
         for part in (first, stream):
             for t_ns, encoded in part:
                 under_way.append((t_ns, pool.submit(_find, encoded, family, camera)))
-                if len(under_way) >= _AHEAD * _jobs:
+                if len(under_way) >= _AHEAD * jobs:
                     t, found = under_way.popleft()
                     yield t, found.result()
         while under_way:
