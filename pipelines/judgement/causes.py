@@ -10,14 +10,16 @@ exactly and nothing else explains: noise large enough fits anything.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pipelines import parallel
 from pipelines.graph.problem import Estimate, Residuals
 from pipelines.judgement.halves import cut
 from pipelines.judgement.observability import Cause
-from pipelines.judgement.outcome import Outcome, outcome, quick_score
+from pipelines.judgement.outcome import Outcome, at_once, outcome, quick_score
 from pipelines.judgement.rejection import too_many_rejected
 from pipelines.judgement.trials import Trial, faults, trials
 from pipelines.settings import Config
@@ -43,6 +45,7 @@ _PROMISING = 0.97
 _RIVAL = 3.0
 # Noise this far from the one stated is worth a word.
 _NOTABLE = 1.1
+_WHAT = "looking for causes"
 
 
 def find_causes(method: Method, data: Any, config: Config, estimate: Estimate | None = None) -> tuple[Cause, ...]:
@@ -76,9 +79,10 @@ def find_causes(method: Method, data: Any, config: Config, estimate: Estimate | 
 
 def _explaining(method: Method, tried: Iterable[Trial], before: Outcome) -> list[tuple[Outcome, str]]:
     """The changes that explain the misfit, the best first, each with what is wrong in words."""
-    found = []
-    for label, changed, config in tried:
-        after = outcome(method, changed, config)
+    tried, found = list(tried), []
+    works = [partial(outcome, method, changed, config) for _, changed, config in tried]
+    solved = parallel.done(works, _WHAT, min((at_once(method, changed) for _, changed, _ in tried), default=1))
+    for (label, *_), after in zip(tried, solved, strict=True):
         if after is not None and _explains(before, after):
             found.append((after, _named(label, after)))
     return sorted(found, key=lambda each: each[0].factor)
@@ -89,9 +93,11 @@ def _screened(method: Method, data: Any, config: Config, before: Outcome) -> lis
     hypotheses = method.hypotheses()
     stretch = _worst_stretch(before.estimate.residuals, _SHORT) if hypotheses.cut else (-np.inf, np.inf)
     found = list(trials(method, data, config))
-    scores = [quick_score(method, cut(hypotheses, changed, *stretch), other) for _, changed, other in found]
-    enough = _PROMISING * quick_score(method, cut(hypotheses, data, *stretch), config)
-    enough = min(enough, _RIVAL * min(scores, default=np.inf))
+    looked_at = [*((changed, other) for _, changed, other in found), (data, config)]
+    short = [(cut(hypotheses, changed, *stretch), other) for changed, other in looked_at]
+    works = [partial(quick_score, method, *each) for each in short]
+    *scores, as_it_is = parallel.done(works, _WHAT, at_once(method, short[-1][0]))
+    enough = min(_PROMISING * as_it_is, _RIVAL * min(scores, default=np.inf))
     return [found[i] for i in np.argsort(scores)[:_MOST_NAMED] if scores[i] < enough]
 
 

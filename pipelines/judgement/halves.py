@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.graph.problem import Array, Problem
+from pipelines import parallel
+from pipelines.graph.problem import Array, Problem, Quantity
 from pipelines.graph.robust import robust_sigma
-from pipelines.judgement.outcome import outcome
+from pipelines.judgement.outcome import at_once, outcome, times_of
 from pipelines.settings import Config
 
 if TYPE_CHECKING:
@@ -63,25 +65,33 @@ def split_at(method: Method, data: Any, config: Config, middle: float) -> dict[s
     Those that a prior holds in either part are left out: they would agree whatever was recorded. A bias that walks
     differs between the parts by its walk too.
     """
-    hypotheses = method.hypotheses()
     start, stop = span(method, data)
-    parts = (start, middle), (middle, stop + 1.0)
-    first, second = (outcome(method, cut(hypotheses, data, *part), config) for part in parts)
-    if first is None or second is None:
+    sides = [partial(_side, method, data, config, *part) for part in ((start, middle), (middle, stop + 1.0))]
+    first, second = parallel.done(sides, "either side", at_once(method, data))
+    both = {name: (first[name], second[name]) for name in first if name in second}
+    return {
+        name: Halves(value, sigma, other, its_sigma)
+        for name, ((quantity, value, sigma), (_, other, its_sigma)) in both.items()
+        if quantity.determined(max(sigma, its_sigma))
+    }
+
+
+# A number with its value and sigma.
+_Number = tuple[Quantity, float, float]
+
+
+def _side(method: Method, data: Any, config: Config, start: float, stop: float) -> dict[str, _Number]:
+    """What [start, stop), s, of a recording determines by itself; nothing when it cannot be solved."""
+    found = outcome(method, cut(method.hypotheses(), data, start, stop), config)
+    if found is None:
         return {}
-    a, b = first.estimate, second.estimate
-    found = {}
-    for i, q in enumerate(first.quantities):
-        sigmas = float(a.sigmas[i]), float(b.sigmas[i])
-        if q.determined(max(sigmas)):
-            found[q.name] = Halves(float(a.values[i]), sigmas[0], float(b.values[i]), sigmas[1])
-    return found
+    numbers = zip(found.quantities, found.estimate.values.tolist(), found.estimate.sigmas.tolist(), strict=True)
+    return {number[0].name: number for number in numbers}
 
 
 def span(method: Method, data: Any) -> tuple[float, float]:
     """First and last stamp of a method's data, s; zeros where there is none."""
-    streams = [time for stamps in method.hypotheses().streams if (time := getattr(data, stamps)) is not None]
-    times = [time for time in streams if len(time)]
+    times = [time for time in times_of(method, data) if len(time)]
     return float(min((t[0] for t in times), default=0.0)), float(max((t[-1] for t in times), default=0.0))
 
 

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.graph.problem import ChiSquare, Estimate, Problem, Quantity
+from pipelines.graph.problem import Array, ChiSquare, Estimate, Problem, Quantity
 from pipelines.judgement.observability import Fit
+from pipelines.parallel import LostError
 from pipelines.settings import Config
 
 if TYPE_CHECKING:
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 _OUTLIERS = 0.1
 # Iterations after which a model that is right has long converged; one that is wrong may wander for many times as long.
 _ENOUGH = 15
+# Samples of trials that are made at the same time.
+_AT_ONCE = 10_000_000
 # Iterations of a quick score.
 _FEW = 5
 # A model that is right needs no more damping than this; one that needs more is not looked at any longer.
@@ -73,13 +76,16 @@ class Outcome:
 def outcome(method: Method, data: Any, config: Config) -> Outcome | None:
     """The batch solution; None when there is none.
 
-    A trial is made with data and noise that nobody recorded: whatever it raises ends the trial, and nothing else.
+    A trial is made with data and noise that nobody recorded: whatever it raises ends the trial, and nothing else,
+    but for a process that is lost, which says nothing of the trial.
     """
     from pipelines.solvers.batch import solve_batch
 
     try:
         problem = method.graph(data, config)
         return Outcome.of(problem, solve_batch(problem, _ENOUGH))
+    except LostError:
+        raise
     except Exception:
         return None
 
@@ -91,8 +97,20 @@ def quick_score(method: Method, data: Any, config: Config) -> float:
     """
     try:
         return _score(method.graph(data, config))
+    except LostError:
+        raise
     except Exception:
         return np.inf
+
+
+def at_once(method: Method, data: Any) -> int:
+    """How many trials are made at the same time, if there are so many processes: memory holds a graph of each."""
+    return max(_AT_ONCE // max((len(time) for time in times_of(method, data)), default=1), 1)
+
+
+def times_of(method: Method, data: Any) -> list[Array]:
+    """Of all streams that there are."""
+    return [time for name in method.hypotheses().streams if (time := getattr(data, name)) is not None]
 
 
 def _score(problem: Problem) -> float:
