@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import gtsam
@@ -21,7 +21,7 @@ from pipelines.methods.los import graph as los
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from pipelines.settings import Config, Sensors
 from pipelines.simulation.motion import EulerMotion, Swing
-from pipelines.solvers.assembly import CHUNK, Assembly
+from pipelines.solvers.assembly import CHUNK, Assembly, StepBoundary
 from pipelines.solvers.batch import solve_batch
 from pipelines.solvers.gauss_newton import Solution
 from pipelines.solvers.weighing import optimize
@@ -36,7 +36,8 @@ SWAY = EulerMotion(
     roll=[Swing(amplitude_deg=12, frequency_hz=0.07)],
 )
 
-Graph = tuple[list[Factor], gtsam.Values]
+# Factors, first guesses, and the ends of the steps.
+Graph = tuple[list[Factor], gtsam.Values, Sequence[StepBoundary]]
 
 
 def los_problem(keyframes: int, sensors: Sensors | None = None) -> Problem:
@@ -66,7 +67,7 @@ def head_recording(frames: int) -> tuple[HeadData, Config]:
 def build(problem: Problem, chunk: int) -> Graph:
     """The whole graph, `chunk` measurements in a factor."""
     whole = Assembly.of(problem.steps(chunk))
-    return whole.factors, whole.initial
+    return whole.factors, whole.initial, whole.boundaries
 
 
 def native(problem: Problem) -> Graph:
@@ -75,7 +76,7 @@ def native(problem: Problem) -> Graph:
     It is a BetweenFactorRot3 of the keyframe and one mount that all share: three rows where a LOS error has two, three
     shared unknowns where it has four and vision has ten.
     """
-    factors, values = build(problem, CHUNK)
+    factors, values, _ = build(problem, CHUNK)
     mounts = {p.key for p in problem.parameters} - {int(gtsam.symbol("b", 0))}
     kept = [f for f in factors if f.measurement is None and not mounts & set(f.factor.keys())]
     for key in mounts:
@@ -107,15 +108,16 @@ def with_mount(kept: list[Factor], values: gtsam.Values, seen: list[int], family
     for key in seen:
         measured = values.atRot3(key).compose(gtsam.Rot3.Expmap(sigma * rng.standard_normal(3)))
         kept.append(Factor(family, gtsam.BetweenFactorRot3(MOUNT, key, measured, noise)))
-    return kept, values
+    return kept, values, ()
 
 
 def solve(problem: Problem, graph: Graph) -> Solution:
     """By the batch solver's outer loop, ordering included."""
     present = set(graph[1].keys())
     shared = [key for key in [*(p.key for p in problem.parameters), MOUNT] if key in present]
-    loss = problem.loss if any(f.measurement for f in graph[0]) else None
-    return optimize(*graph, shared, loss)
+    factors, values, boundaries = graph
+    loss = problem.loss if any(f.measurement for f in factors) else None
+    return optimize(factors, values, shared, loss, boundaries=boundaries)
 
 
 def default_optimizer(graph: Graph) -> int:

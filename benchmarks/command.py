@@ -1,4 +1,4 @@
-"""The command line, whole processes: `alidade --help` and `alidade calibrate` on ten minutes of los."""
+"""The command line, whole processes: `alidade --help` and `alidade calibrate` on ten minutes and more of los."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import resource
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,23 +21,43 @@ from pipelines.methods.los.recording import write_los
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 
 MINUTES = LosScenario(duration_s=600.0, gyro_rate_hz=1000.0, gimbal_rate_hz=1000.0, image_rate_hz=50.0)
+HOUR = LosScenario(duration_s=3600.0, gyro_rate_hz=200.0, gimbal_rate_hz=200.0, image_rate_hz=50.0)
+Clock = Callable[[], float]
 _ALIDADE = (sys.executable, "-m", "pipelines.cli")
 
 
-def process(*command: str, rounds: int = 3) -> Cost:
-    """Median processor time of a command, the first run left out, and the peak memory of this one's children.
+def process(*command: str, rounds: int = 3, clock: Clock | None = None) -> Cost:
+    """Median time of a command, of the processors unless there is a clock, and the peak memory of its largest process.
 
-    Modules are compiled by the first run, as they are once it is installed.
+    The first run is left out: modules are compiled by it, as they are once it is installed.
     """
-    seconds = []
+    clock, seconds = clock or _of_children, []
     with tempfile.TemporaryDirectory() as compiled:
         environment = {**os.environ, "PYTHONPYCACHEPREFIX": compiled, "PYTHONDONTWRITEBYTECODE": ""}
         for _ in range(rounds + 1):
-            before = resource.getrusage(resource.RUSAGE_CHILDREN)
+            before = clock()
             subprocess.run(command, check=True, capture_output=True, env=environment)
-            after = resource.getrusage(resource.RUSAGE_CHILDREN)
-            seconds.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
-    return Cost(float(np.median(seconds[1:])), after.ru_maxrss / 1024.0)
+            seconds.append(clock() - before)
+    return Cost(float(np.median(seconds[1:])), resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024.0)
+
+
+def _of_children() -> float:
+    """Processor time of all processes that have ended, s."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def processes(scenario: LosScenario) -> Ratio:
+    """A calibration by two processes against one, on the clock."""
+    data, truth = simulate_los(scenario, 0)
+    with tempfile.TemporaryDirectory() as folder:
+        session = Path(folder) / "session.mcap"
+        write_los(session, data, truth, los_config(scenario))
+        command = (*_ALIDADE, "calibrate", str(session), "--out", str(Path(folder) / "out"), "--jobs")
+        a, b = (process(*command, jobs, rounds=1, clock=time.perf_counter) for jobs in ("2", "1"))
+    minutes = round(scenario.duration_s / 60.0)
+    compared = f"alidade calibrate, {minutes} min of los, by two processes over one, on the clock"
+    return Ratio(f"command.processes.{minutes}", compared, a.seconds / b.seconds, ours=a, theirs=b)
 
 
 def run() -> Iterator[Ratio]:
@@ -53,3 +74,5 @@ def run() -> Iterator[Ratio]:
     (b,) = costs([lambda: solve(problem, graph)])
     compared = "alidade calibrate, 10 min of los at 1 kHz, all outputs, over solving its native-only graph"
     yield Ratio("command.calibrate", compared, a.seconds / b.seconds, wanted=3.0, ours=a, theirs=b)
+    yield processes(MINUTES)
+    yield processes(HOUR)
