@@ -60,9 +60,9 @@ class Stretch:
     ensemble: Ensemble | None
 
     @classmethod
-    def alone(cls, factors: Sequence[Factor]) -> Stretch:
-        """A graph in one piece."""
-        held = sorted(graph_of(factors).keyVector())
+    def alone(cls, factors: Sequence[Factor], graph: gtsam.NonlinearFactorGraph) -> Stretch:
+        """A graph in one piece, as gtsam has it too."""
+        held = sorted(graph.keyVector())
         return cls(factors, _others(factors), (), held, range(len(factors)), Ensemble(vectorized(factors)))
 
     @classmethod

@@ -291,8 +291,9 @@ class System:
         """The system of some factors, divided at some of the boundaries if it is long."""
         ends, size = _divided(factors, boundaries)
         if len(ends) < 2:
-            alone = Stretch.alone(factors)
-            return cls([alone], boundaries, elimination_ordering(graph_of(factors), shared), shared, loss)
+            graph = graph_of(factors)
+            alone = Stretch.alone(factors, graph)
+            return cls([alone], boundaries, elimination_ordering(graph, shared), shared, loss)
         keep = Keep.ALL if size <= _KEPT else Keep.TREES if size <= _KEPT_TREES else Keep.NOTHING
         pieces = _pieces(factors, ends)
         joint = _joint(pieces, boundaries, shared)
