@@ -184,7 +184,7 @@ class McapFile(Container):
         for number, at in block.index_at.items():
             stream.seek(at)
             entries = np.frombuffer(stream.read(16 * block.counts[number]), "<u8")
-            index[number] = np.sort(entries[1::2].astype(np.int64))
+            index[number] = np.sort(entries[1::2].astype(np.int64), kind="stable")
         return (index, []) if index and records.is_whole_index(buffer, index) else records.walk(buffer)
 
     def _verify(self, stream: BinaryIO, block: Block) -> None:

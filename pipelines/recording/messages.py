@@ -120,14 +120,25 @@ class Layout:
 
     def agrees(self, messages: NDArray[np.uint8]) -> NDArray[np.bool_]:
         """Which of the messages, shape (n, size), have this layout."""
-        first = np.frombuffer(self.first, np.uint8)
+        first = np.frombuffer(self.first, np.uint8)[None]
         same = np.ones(len(messages), dtype=bool)
-        for start, end in self.fixed:
-            equal = messages[:, start:end] == first[start:end]
+        for run in self._fixed:
+            equal = run.of(messages) == run.of(first)
             # Nearly always all are, which is seen in less time than which.
             if not equal.all():
                 same &= equal.all(axis=1)
         return same
+
+    @cached_property
+    def _fixed(self) -> list[Leaf]:
+        """What has to be equal as the longest numbers there are, which compare in a third of the time of its bytes."""
+        found = []
+        for start, end in self.fixed:
+            for width in (8, 4, 2, 1):
+                count = (end - start) // width
+                found.append(Leaf("", start, np.dtype(f"u{width}"), count))
+                start += count * width
+        return [run for run in found if run.count]
 
 
 class MessageError(Exception):
