@@ -333,7 +333,8 @@ def interpolate(t: ArrayLike, q: ArrayLike, at: ArrayLike) -> Array:
 
 def from_gtsam(rotations: list[gtsam.Rot3]) -> Array:
     """gtsam rotations -> quaternions with w >= 0, shape (n, 4)."""
-    q = np.array([cast(Any, r.toQuaternion()).coeffs() for r in rotations]).reshape(-1, 4)[:, [3, 0, 1, 2]]
+    numbers: Any = [r.toQuaternion() for r in rotations]
+    q = np.array([q.coeffs() for q in numbers]).reshape(-1, 4)[:, [3, 0, 1, 2]]
     return np.where(q[:, :1] < 0.0, -q, q)
 
 

@@ -196,8 +196,9 @@ class GyroChain:
             before = max(nodes.start - 1, 0)
             self.bias.keep(step, range(before, now + 1), range(max(before - 1, 0), means.stop))
         for k in keyframes:
-            step.initial.insert(self.state(k), so3.to_gtsam(self.initial[k]))
-            step.timestamps[self.state(k)] = float(self.time[k])
+            key = self.state(k)
+            step.initial.insert(key, so3.to_gtsam(self.initial[k]))
+            step.timestamps[key] = float(self.time[k])
         after = np.array([k for k in keyframes if not self.starts[k]], dtype=np.intp)
         if len(after):
             step.factors.extend(self._increments(after))

@@ -82,6 +82,11 @@ class Stretch:
         return replace(self, factors=factors, others=_others(factors), ensemble=ensemble)
 
     @cached_property
+    def ordering(self) -> gtsam.Ordering:
+        """Of the inner ones."""
+        return ordering_of(self.inner)
+
+    @cached_property
     def keys(self) -> list[int]:
         """All of its variables, in their order: that of vectors."""
         return sorted([*self.inner, *self.held])
@@ -130,7 +135,7 @@ class Part:
     @cached_property
     def triangular(self) -> Triangular:
         """The triangular factor of its own variables. Raises IndeterminateError, naming one that is not determined."""
-        return Triangular.of(self.graph, ordering_of(self.stretch.inner), self.tree)
+        return Triangular.of(self.graph, self.stretch.ordering, self.tree)
 
     @cached_property
     def held(self) -> NDArray[np.intp]:
@@ -217,7 +222,7 @@ class StretchAt:
         own, others = gtsam.GaussianFactorGraph(), gtsam.GaussianFactorGraph()
         for i in range(graph.size()):
             (others if i in outer else own).push_back(graph.at(i))
-        tree, left = eliminated(own, ordering_of(self.stretch.inner))
+        tree, left = eliminated(own, self.stretch.ordering)
         if self.keep is not Keep.NOTHING:
             self._tree = tree
         if self.keep is Keep.ALL:
@@ -236,10 +241,9 @@ class StretchAt:
         delta, own, lowers = gtsam.VectorValues(), gtsam.VectorValues(), 0.0
         for key, move in zip(self.stretch.held, held, strict=True):
             delta.insert(key, move)
-        ordering = ordering_of(self.stretch.inner)
-        tree = self._tree or eliminated(self._linearized({}), ordering)[0]
+        tree = self._tree or eliminated(self._linearized({}), self.stretch.ordering)[0]
         # Those above come first.
-        for conditional in reversed(conditionals_of(tree, ordering)):
+        for conditional in reversed(conditionals_of(tree, self.stretch.ordering)):
             solved, d = conditional.solve(delta), conditional.d()
             lowers += 0.5 * float(d @ d)
             delta.insert(solved)

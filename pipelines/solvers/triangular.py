@@ -103,14 +103,15 @@ class Triangular:
 
 def conditionals_of(tree: gtsam.GaussianBayesTree, ordering: gtsam.Ordering) -> list[gtsam.GaussianConditional]:
     """Those of all variables of an ordering, each once, what is eliminated first before anything above it."""
-    # What is eliminated last in a clique is eliminated before anything above it.
-    conditionals: dict[int, gtsam.GaussianConditional] = {}
-    for i in range(ordering.size()):
-        conditional = tree[ordering.at(i)].conditional()
-        first = conditional.firstFrontalKey()
-        conditionals.pop(first, None)
-        conditionals[first] = conditional
-    return list(conditionals.values())
+    # From the last one back: what is above a clique has been seen when the last of its own comes.
+    found, seen = [], set[int]()
+    for i in reversed(range(ordering.size())):
+        key = ordering.at(i)
+        if key not in seen:
+            conditional = tree[key].conditional()
+            seen.update(conditional.keys())
+            found.append(conditional)
+    return found[::-1]
 
 
 def places_of(linear: gtsam.GaussianFactorGraph) -> dict[int, slice]:
