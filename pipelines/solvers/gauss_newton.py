@@ -176,7 +176,7 @@ def _full(
         if alone.error < min(error, move.error):
             return alone
     if fall < 0.0:
-        return _lower(error, _along_valley(system, values, error, delta, foreseen))
+        return _lower(error, _along_valley(system, values, error, delta, move))
     # A surrogate of the loss weighs anew with every step: of a few on the way nothing is to be learned.
     relaxed = system.loss is not None and np.isfinite(system.loss.mu)
     if not relaxed and abs(fall - foreseen) > _WRONG_LENGTH * foreseen:
@@ -211,22 +211,20 @@ def _states_alone(system: System, values: gtsam.Values, linear: Linear | None) -
     return _Move(values if candidate is None else candidate, error, 0.0, on_floor=True, halfway=True)
 
 
-def _along_valley(
-    system: System, values: gtsam.Values, error: float, delta: gtsam.VectorValues, foreseen: float
-) -> _Move:
-    """A place with a lower error on a step's way; its error infinite if there is none.
+def _along_valley(system: System, values: gtsam.Values, error: float, delta: gtsam.VectorValues, full: _Move) -> _Move:
+    """A place with a lower error on a step's way, `full` its end; its error infinite if there is none.
 
     The states are solved for anew with the shared variables held where the step takes them. Where these alone are off
     the floor, as a bias is once the mount has turned by which it is known, only what little is known about them stays
     where it is, as from the first in a graph without states. They go less far until that lowers the error.
     """
     for share in _SHARES:
-        candidate = values.retract(delta.scale(share))
+        candidate = full.values if share == 1.0 else values.retract(delta.scale(share))
         for known in _RETURNS:
             candidate, new_error = _returned(system, candidate, known)
             if new_error < error:
-                return _Move(candidate, new_error, foreseen, on_floor=True)
-    return _Move(values, np.inf, foreseen)
+                return _Move(candidate, new_error, full.foreseen, on_floor=True)
+    return _Move(values, np.inf, full.foreseen)
 
 
 def _returned(system: System, values: gtsam.Values, known: bool) -> tuple[gtsam.Values, float]:
