@@ -280,7 +280,7 @@ class Config(Section):
     sensors: SensorSheets = Sensors()  # data sheets; ideal: all figures 0
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None  # deg north; wins over fixes
     longitude_deg: Annotated[float, Field(ge=-180.0, le=360.0)] | None = None  # deg east
-    height: float | None = None  # m above the ellipsoid
+    altitude_m: float | None = None  # above the ellipsoid
     date: Date | None = None  # of the field model; default: the stamps
     _belief: Belief | None = PrivateAttr(None)
 

@@ -19,6 +19,7 @@ from pipelines.methods.head.recording import write_head
 from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from tests.browser import fits
 from tests.fleet_command import alidade
+from tests.forms import split
 
 pytest.importorskip("distributed", reason="needs the extra alidade[fleet]")
 pytest.importorskip("arro3.io", reason="needs the extra alidade[fleet]")
@@ -238,6 +239,32 @@ def test_recordings_come_from_other_file_systems(
     assert [(row["unit"], row["status"]) for row in rows] == [("U00", "calibrated"), ("U01", "calibrated")]
 
 
+def test_bag_folders_are_recordings(
+    calibrated: Path, forty: Path, local_cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By their names, by those of their parts, in an archive: each is one, with the numbers of the file it was."""
+    source = next(iter(sorted(forty.glob("U00*.mcap"))))
+    bags = tmp_path / "bags"
+    bags.mkdir()
+    bag = split(source, bags / "ride")
+    with (bag / "metadata.yaml").open("a") as metadata:
+        metadata.write("  custom_data:\n    unit: 007\n")
+    for pattern in ("ride", "*", "**/*.mcap", "ride/*"):
+        assert list(find([f"{bags}/{pattern}"])) == [str(bag)]
+    assert list(find([f"{bag}/ride_0.mcap"])) == [f"{bag}/ride_0.mcap"]
+    with zipfile.ZipFile(tmp_path / "campaign.zip", "w") as archive:
+        for path in sorted(bag.iterdir()):
+            archive.write(path, f"ride/{path.name}")
+    (tmp_path / "config.yaml").write_text(head_config(scenario((0.0, 0.0, 0.0))))
+    common = ("--config", tmp_path / "config.yaml", "--scheduler", local_cluster, "--out", tmp_path / "out")
+    assert alidade(monkeypatch, "fleet", bags / "*", f"zip://*::{tmp_path}/campaign.zip", *common) == 0
+    rows = rows_of(tmp_path / "out" / "fleet.csv")
+    (alone,) = (row for row in rows_of(calibrated / "fleet.csv") if row["unit"] == "U00")
+    assert [row["unit"] for row in rows] == ["007", "007"]
+    for row in rows:
+        assert float(row["helmet_mount_x"]) == pytest.approx(float(alone["helmet_mount_x"]), rel=1e-9)
+
+
 def test_unit_and_date_come_from_metadata(
     forty: Path, local_cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -312,7 +339,7 @@ def with_metadata(source: Path, target: Path, name: str, content: dict[str, str]
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["nowhere/*.mcap"], "no file matches nowhere/*.mcap"),
+        (["nowhere/*.mcap"], "no recording matches nowhere/*.mcap"),
         (["{forty}/*.mcap", "--names", "{unit}-{date}"], "does not fit --names {unit}-{date}"),
         (["{forty}/*.mcap", "--names", "unit"], "needs {unit}, {date} or both"),
         (["{forty}/*.mcap", "--method", "gyro"], "no method 'gyro'"),

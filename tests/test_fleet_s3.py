@@ -179,8 +179,8 @@ def test_faults_of_object_storage_are_one_line(
         assert (run.code, run.out, len(run.err.splitlines())) == (2, "", 1)
         return run.err
 
-    assert "no file matches s3://nowhere/*.mcap" in said("s3://nowhere/*.mcap")
-    assert "no file matches s3://campaign/*.mcap" in said("s3://campaign/*.mcap")
+    assert "no recording matches s3://nowhere/*.mcap" in said("s3://nowhere/*.mcap")
+    assert "no recording matches s3://campaign/*.mcap" in said("s3://campaign/*.mcap")
     assert "s3://campaign/last.json: cannot be read" in said(
         "s3://campaign/*.mcap", "--prior", "s3://campaign/last.json"
     )

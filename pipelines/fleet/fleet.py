@@ -7,7 +7,6 @@ Each worker reads its own recording and sends back a small mapping; nothing else
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
@@ -25,6 +24,7 @@ from pipelines.fleet.histories import packed
 from pipelines.fleet.isolated import failure, quarantined, run_isolated
 from pipelines.fleet.recordings import Recording, as_date, from_metadata, from_name, local
 from pipelines.fleet.store import Result, Store, settings_key
+from pipelines.recording.container import sha256_of, sha256_together
 from pipelines.reports.known import load_known
 from pipelines.sharing import walks
 
@@ -180,7 +180,7 @@ def calibrate_recording(
         known: SHA-256 of the recording and of the earlier calibration that the result known was made of.
     """
     try:
-        with local(recording.file) as path:
+        with local(recording.file, recording.is_bag) as path:
             told = _told(path)
             with _prior(settings, unit or told.get("unit") or Path(recording.file.path).stem) as prior:
                 result = {"sha256": _sha256(path), "prior_sha256": prior and _sha256(prior), **told}
@@ -283,5 +283,5 @@ def _placed(name: str, result: Result, told: Mapping[str, str]) -> Result:
 
 
 def _sha256(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    """Of a file, or of all that is in a folder."""
+    return sha256_together(map(sha256_of, sorted(path.iterdir()))) if path.is_dir() else sha256_of(path)

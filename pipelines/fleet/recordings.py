@@ -1,44 +1,54 @@
 """The recordings of a fleet: where they are, which unit each shows, and when.
 
-Paths are fsspec's: a folder of this machine or of a network file system, or s3://bucket/... with the package of that
-file system. A worker opens its recording by itself; what is not on a local file system is copied for that time.
+Each is a file or a bag folder. Paths are fsspec's: a folder of this machine or of a network file system, or
+s3://bucket/... with the package of that file system. A worker opens its recording by itself; what is not on a local
+file system is copied for that time.
 """
 
 from __future__ import annotations
 
 import datetime
 import re
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pipelines.errors import InputError
 from pipelines.fleet import require_extra
+from pipelines.recording.opening import BAG, LONGEST_METADATA, METADATA, bag_metadata, parts_of_bag
 
 if TYPE_CHECKING:
     from fsspec.core import OpenFile
 
+# Of a file or folder, as fsspec lists it.
+_Info = Mapping[str, Any]
 _FIELDS = {"{unit}": r"(?P<unit>.+?)", "{date}": r"(?P<date>\d{4}-?\d\d-?\d\d(?:T\d\d:?\d\d(?::?\d\d)?Z?)?)", "*": ".*"}
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A file of a fleet.
+    """A recording of a fleet.
 
     Attributes:
         file: where it is.
         tag: an object store's own mark of the content (ETag), as it lists it; None where there is none.
+        is_bag: whether it is a bag folder.
     """
 
     file: OpenFile
     tag: str | None = None
+    is_bag: bool = False
 
 
 def find(patterns: Sequence[str]) -> dict[str, Recording]:
-    """The files that match, by name, in order. Raises InputError when a pattern matches none or cannot be looked up."""
+    """The recordings that match, by name, in order: files, and bag folders in place of their parts.
+
+    Raises InputError when a pattern matches none or cannot be looked up.
+    """
     require_extra()
     from fsspec.core import OpenFile, url_to_fs
 
@@ -47,27 +57,59 @@ def find(patterns: Sequence[str]) -> dict[str, Recording]:
         with _told(pattern, "looked up"):
             fs, path = url_to_fs(pattern)
             fs.invalidate_cache()  # what was listed before may have changed
-            listed = fs.glob(path, detail=True).values()
-            matches = [i for i in listed if i["type"] == "file" or (i.get("islink") and fs.isfile(i["name"]))]
-        if not matches:
-            raise InputError(f"no file matches {pattern}")
-        for info in matches:
-            file = OpenFile(fs, info["name"])
+            bags, files = _bags_and_files(fs, fs.glob(path, detail=True))
+        if not bags and not files:
+            raise InputError(f"no recording matches {pattern}")
+        for address in (*bags, *files):
+            file, info = OpenFile(fs, address), files.get(address, {})
             name = file.path if _is_local(file) else file.full_name
-            found[name] = Recording(file, info.get("ETag") or info.get("etag"))
+            found[name] = Recording(file, info.get("ETag") or info.get("etag"), address in bags)
     return dict(sorted(found.items()))
 
 
+def _bags_and_files(fs: Any, listed: Mapping[str, _Info]) -> tuple[set[str], dict[str, _Info]]:
+    """Where the bag folders are among what a pattern lists, and the other files."""
+    files = {name: info for name, info in listed.items() if info["type"] == "file" or _links_to(fs.isfile, info)}
+    folders = {name for name, info in listed.items() if info["type"] == "directory" or _links_to(fs.isdir, info)}
+    # One that matches alone in its folder is a recording: to look beside each of a million would take hours.
+    beside = Counter(_folder(name) for name in files)
+    folders.update(folder for folder, count in beside.items() if count > 1)
+    parts = {folder: _parts(fs, folder) for folder in folders}
+    return (
+        {folder for folder, own in parts.items() if own},
+        {name: info for name, info in files.items() if name not in parts.get(_folder(name), ())},
+    )
+
+
+def _parts(fs: Any, folder: str) -> set[str]:
+    """Where the files of a bag are, its metadata.yaml among them; nothing if the folder is none."""
+    at = f"{folder}/" if folder else ""
+    try:
+        text = fs.cat_file(at + METADATA, end=LONGEST_METADATA).decode(errors="replace")
+    except FileNotFoundError:
+        return set()
+    names = parts_of_bag(bag_metadata(text))
+    return {at + name for part in names for name in (part, f"{part}.zstd", METADATA)}
+
+
+def _folder(name: str) -> str:
+    return name.rpartition("/")[0]
+
+
+def _links_to(kind: Callable[[str], bool], info: _Info) -> bool:
+    return bool(info.get("islink")) and kind(info["name"])
+
+
 @contextmanager
-def local(file: OpenFile) -> Iterator[Path]:
-    """The file on this machine. Raises InputError when it cannot be read."""
+def local(file: OpenFile, is_folder: bool = False) -> Iterator[Path]:
+    """The file, or folder, on this machine. Raises InputError when it cannot be read."""
     if _is_local(file):
         yield Path(file.path)
         return
     with TemporaryDirectory(prefix="alidade.") as folder:
         path = Path(folder) / Path(file.path).name
         with _told(file.full_name, "read"):
-            file.fs.get_file(file.path, str(path))
+            file.fs.get(file.path, str(path), recursive=True) if is_folder else file.fs.get_file(file.path, str(path))
         yield path
 
 
@@ -109,19 +151,26 @@ def from_metadata(path: Path) -> dict[str, str]:
     """Unit and date in the recording's metadata, as far as they are there.
 
     Any MCAP metadata record with a key `unit` or `date`, or the custom data of rosbag2 (`ros2 bag record --custom-data
-    unit=U17`).
+    unit=U17`), of a folder that in its metadata.yaml.
     """
+    found = _custom((path / METADATA).read_text(errors="replace")) if path.is_dir() else _recorded(path)
+    return {key: found[key] for key in ("unit", "date") if found.get(key)}
+
+
+def _recorded(path: Path) -> dict[str, str]:
+    """What the metadata records of an MCAP file say."""
     from mcap.reader import make_reader
 
     found: dict[str, str] = {}
     with path.open("rb") as stream:
         try:
             for record in make_reader(stream).iter_metadata():
-                found |= {k: v for k, v in {**_custom(record.metadata), **record.metadata}.items() if v}
+                own = {**_custom(record.metadata.get("serialized_metadata", "")), **record.metadata}
+                found |= {key: value for key, value in own.items() if value}
         except Exception:
             # A damaged file fails in any way here. What is wrong with it is told when its messages are read.
             return {}
-    return {key: found[key] for key in ("unit", "date") if key in found}
+    return found
 
 
 def as_date(text: str) -> datetime.datetime:
@@ -133,15 +182,16 @@ def as_date(text: str) -> datetime.datetime:
     return date if date.tzinfo else date.replace(tzinfo=datetime.UTC)
 
 
-def _custom(metadata: dict[str, str]) -> dict[str, str]:
-    """rosbag2's custom data: YAML inside one metadata record. All of it is text, `unit: 007` too."""
+def _custom(text: str) -> dict[str, str]:
+    """rosbag2's custom data, in YAML: in a metadata record or a metadata.yaml. All of it is text, `unit: 007` too."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
     try:
-        content = YAML(typ="base", pure=True).load(metadata.get("serialized_metadata", ""))
+        content = YAML(typ="base", pure=True).load(text)
     except YAMLError:
         return {}
+    content = content.get(BAG, content) if isinstance(content, dict) else {}
     custom = content.get("custom_data") if isinstance(content, dict) else None
     return custom if isinstance(custom, dict) else {}
 

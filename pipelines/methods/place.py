@@ -27,7 +27,7 @@ def read_place(recording: Recording, config: Config, fix: Topic) -> tuple[float 
 
     Raises InputError when there are fixes and none of them can be used.
     """
-    given = [config.latitude_deg, config.longitude_deg, config.height]
+    given = [config.latitude_deg, config.longitude_deg, config.altitude_m]
     if wanted(recording, config, fix) and None in given:
         found: list[float | None] = [*_median(recording, config.topic(fix))]
     else:

@@ -31,7 +31,7 @@ _IDENTITY = {ros1_bag.MAGIC: (4096, 8192), _SQLITE: (100, 4096)}
 _USUAL_IDENTITY = (0, 4096)
 # A compressed file may unpack to so many times its size, beyond so many bytes.
 _LARGEST_RATIO, _SMALL = 100, 1 << 28
-_METADATA, _LONGEST_METADATA = "metadata.yaml", 1 << 24
+METADATA, BAG, LONGEST_METADATA = "metadata.yaml", "rosbag2_bagfile_information", 1 << 24
 # What tells the parts of one recording from each other: their number, and their suffix.
 _PART_NAME = re.compile(r"(_\d+)?(\.[a-z0-9]+)+$")
 
@@ -65,8 +65,8 @@ def recordings_of(paths: Sequence[Path]) -> list[Where]:
     found: list[list[Path]] = []
     bags: dict[Path, list[Path]] = {}
     for path in paths:
-        metadata = path.with_name(_METADATA)
-        if path.is_file() and path.name in _listed(_metadata(metadata)):
+        metadata = path.with_name(METADATA)
+        if path.is_file() and path.name in parts_of_bag(_metadata(metadata)):
             bag = metadata.resolve()
             if bag in bags:
                 bags[bag].append(path)
@@ -163,13 +163,13 @@ def _unpacked(path: Path, strict: bool) -> Container:
 
 def _folder(path: Path, strict: bool) -> Container:
     """A folder: of a bag with its metadata.yaml, of the parts of one recording, or of a data set in EuRoC's form."""
-    metadata = _metadata(path / _METADATA)
-    listed = _listed(metadata)
+    metadata = _metadata(path / METADATA)
+    listed = parts_of_bag(metadata)
     if listed:
         there = [found for name in listed if (found := _stored(path / name)) is not None]
         lost = [name for name in listed if _stored(path / name) is None]
         if not there:
-            raise InputError(f"{path}: none of the files is there that its {_METADATA} names: {', '.join(lost)}")
+            raise InputError(f"{path}: none of the files is there that its {METADATA} names: {', '.join(lost)}")
         remarks = [f"{len(lost)} of {len(listed)} parts are not there: {', '.join(lost)}"] if lost else []
         if remarks and strict:
             raise InputError(f"{path}: {remarks[0]}; --strict reads nothing of which anything is lost")
@@ -220,19 +220,24 @@ def parts_in(path: Path) -> list[Path]:
 
 def _metadata(path: Path) -> dict[str, Any]:
     """What a bag's metadata.yaml says; nothing if it is not there or is something else."""
-    if not path.is_file() or path.stat().st_size > _LONGEST_METADATA:
+    if not path.is_file() or path.stat().st_size > LONGEST_METADATA:
         return {}
+    return bag_metadata(path.read_text(errors="replace"))
+
+
+def bag_metadata(text: str) -> dict[str, Any]:
+    """What a bag's metadata.yaml says, by its text; nothing if that is something else."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
     try:
-        content = YAML(typ="safe", pure=True).load(path.read_text(errors="replace"))
-        return dict(content["rosbag2_bagfile_information"])
+        content = YAML(typ="safe", pure=True).load(text)
+        return dict(content[BAG])
     except (YAMLError, ValueError, KeyError, TypeError, RecursionError):
         return {}
 
 
-def _listed(metadata: dict[str, Any]) -> list[str]:
+def parts_of_bag(metadata: dict[str, Any]) -> list[str]:
     """The files that it names, in their order."""
     names = metadata.get("relative_file_paths")
     return [Path(str(name)).name for name in names] if isinstance(names, list) else []
@@ -245,7 +250,7 @@ def _stored(path: Path) -> Path | None:
 
 def _part_of(paths: Sequence[Path]) -> Sequence[str]:
     """A sentence if the files are parts of a bag, and others of it lie beside them."""
-    listed = _listed(_metadata(paths[0].with_name(_METADATA)))
+    listed = parts_of_bag(_metadata(paths[0].with_name(METADATA)))
     here = [i for i, name in enumerate(listed, start=1) if name in {path.name for path in paths}]
     if not here or len(here) == len(listed):
         return ()

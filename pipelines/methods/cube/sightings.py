@@ -53,13 +53,15 @@ def _refined(camera: Camera, refined: RefinedCamera) -> Camera:
 
 
 def read_sightings(recording: Recording, data: CubeData, config: Config, dropped: dict[str, int]) -> Sightings:
-    """The cube's tags as recorded, or else found in the pictures of the device's static intervals.
+    """The cube's tags, found in the pictures of the device's static intervals, or else as recorded.
+
+    Where both are there the config may name the detections under `topics`, and no pictures.
 
     Raises InputError when a topic is unusable, with pictures when there is no static interval, or no tag of the cube.
     """
-    if IMAGE.key not in config.topics and wanted(recording, config, TAG_DETECTIONS):
-        return _detections(recording, config, data.epoch_ns, dropped)
-    return _pictures(recording, config, data, dropped)
+    if wanted(recording, config, IMAGE) and (IMAGE.key in config.topics or TAG_DETECTIONS.key not in config.topics):
+        return _pictures(recording, config, data, dropped)
+    return _detections(recording, config, data.epoch_ns, dropped)
 
 
 def _detections(recording: Recording, config: Config, epoch_ns: int, dropped: dict[str, int]) -> Sightings:
