@@ -408,6 +408,7 @@ def info(
 @app.command()
 def noise(
     session: RecordingPath,
+    config: Annotated[Path | None, typer.Option(help="YAML with `topics` and `columns` of the recording.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for noise.html and noise.json.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print noise.json and nothing else.")] = False,
     strict: _Strict = False,
@@ -419,7 +420,7 @@ def noise(
     from pipelines.reports.noise import noise_json, write_noise
 
     with progress.shown(quiet):
-        study = noise_of(session, strict)
+        study = noise_of(session, strict, config)
     written = () if out is None else write_noise(out, study)
     if as_json:
         print(noise_json(study), end="")

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines import progress
+from pipelines import methods, progress
+from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.judgement.at_rest import stretches_at_rest
 from pipelines.judgement.sensor_noise import AxisNoise, axis_noise
@@ -74,25 +75,32 @@ class _Device(NamedTuple):
     sensors: dict[str, Array]
 
 
-def noise_of(path: Path, strict: bool = False) -> NoiseStudy:
+def noise_of(path: Path, strict: bool = False, config: Path | None = None) -> NoiseStudy:
     """The noise of every gyro, accelerometer and magnetometer of a recording.
 
     Args:
         path: the recording.
         strict: refuse it if anything of it is lost.
+        config: YAML file with the columns of tables, topics made of others, and those with rates alone.
 
     Raises:
-        InputError: it cannot be read, or holds no such sensor, or nothing in it is at rest.
+        InputError: recording or config cannot be used, there is no such sensor, or nothing in it is at rest.
     """
     recording = open_recording(path, strict)
+    rates = set() if config is None else _described(recording, config)
     names = [
         name
         for name, topic in recording.topics.items()
-        if topic.type in (messages.IMU, messages.MAGNETIC_FIELD) and topic.is_readable and topic.count
+        if (topic.type in (messages.IMU, messages.MAGNETIC_FIELD) or name in rates)
+        and topic.is_readable
+        and topic.count
     ]
     if not names:
         kinds = f"{messages.IMU} or {messages.MAGNETIC_FIELD}"
-        raise InputError(f"{path}: no messages of an inertial sensor or magnetometer ({kinds}); {recording.there()}")
+        raise InputError(
+            f"{path}: no messages of an inertial sensor or magnetometer ({kinds}); {recording.there()}; tables need "
+            "--config with their `columns`, rates alone their topic under `topics` in it, as head_imu"
+        )
     found: list[SensorNoise] = []
     troubles: list[str] = []
     notes: list[str] = []
@@ -107,6 +115,15 @@ def noise_of(path: Path, strict: bool = False) -> NoiseStudy:
         )
     notes = [*recording.notes, *troubles, *notes]
     return NoiseStudy(path.name, recording.epoch_ns, recording.duration_s, tuple(found), tuple(notes))
+
+
+def _described(recording: Recording, config: Path) -> set[str]:
+    """Have a recording know what the config says of its topics; those that it names where a gyro's rates will do."""
+    settings = load_config(None, config)
+    recording.use(settings.topics.values(), settings.columns)
+    known = [topic for name in methods.names() for topic in methods.method(name).topics]
+    takes = {topic.key for topic in known if set(messages.RATES) <= set(topic.types)}
+    return {source.name for key, source in settings.topics.items() if key in takes}
 
 
 def _topic_noise(recording: Recording, name: str, notes: list[str]) -> Iterator[SensorNoise]:

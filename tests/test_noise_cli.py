@@ -105,6 +105,30 @@ def test_json_is_all_there_is_on_stdout(static: Path, alidade: Command) -> None:
             assert all(p["low"] < p["deviation"] < (p["high"] or math.inf) for p in axis["allan"])
 
 
+def test_tables_and_rates_alone_are_measured_as_the_config_describes_them(alidade: Command, tmp_path: Path) -> None:
+    t, gyro, accel = device(np.random.default_rng(3), 60.0)
+    write_session(tmp_path / "s.mcap", {"/imu": series.ImuSeries(stamps(t), gyro, accel)})
+    rows = zip(stamps(t).tolist(), *gyro.T.tolist(), *accel.T.tolist(), strict=True)
+    (tmp_path / "s.csv").write_text("\n".join(["t,gx,gy,gz,ax,ay,az", *(",".join(map(repr, row)) for row in rows)]))
+    columns = "columns: {/imu: {time: t, unit: ns, gyro: [gx, gy, gz], accel: [ax, ay, az]}}"
+    (tmp_path / "table.yaml").write_text(columns)
+    told = [json.loads(alidade("noise", tmp_path / "s.mcap", "--json").out)]
+    told.append(json.loads(alidade("noise", tmp_path / "s.csv", "--config", tmp_path / "table.yaml", "--json").out))
+    assert len(told[0]["sensors"]) == 2
+    assert told[0]["sensors"] == told[1]["sensors"]
+    refused = alidade("noise", tmp_path / "s.csv")
+    assert refused.code == 2
+    assert "columns" in refused.err
+
+    write_session(tmp_path / "rates.mcap", {"/rates": series.VectorSeries(stamps(t), gyro)})
+    (tmp_path / "rates.yaml").write_text("topics: {head_imu: /rates}")
+    run = alidade("noise", tmp_path / "rates.mcap", "--config", tmp_path / "rates.yaml", "--json")
+    assert run.code == 0, run.err
+    (found,) = json.loads(run.out)["sensors"]
+    assert (found["topic"], found["sensor"]) == ("/rates", "gyro")
+    assert alidade("noise", tmp_path / "rates.mcap").code == 2
+
+
 def moving(t: Array) -> Array:
     return np.stack([0.3 * np.sin(2.1 * t), 0.2 * np.sin(1.3 * t + 1.0), 0.25 * np.cos(1.7 * t)], axis=1)
 
