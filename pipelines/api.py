@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,7 @@ from pipelines.config import load_config
 from pipelines.config import model as _config_model
 from pipelines.errors import InputError
 from pipelines.methods import Method
+from pipelines.recording.opening import Where
 from pipelines.recording.reading import open_recording
 from pipelines.session import Arrays, Session
 from pipelines.settings import Config as _BaseConfig
@@ -33,8 +34,8 @@ if TYPE_CHECKING:
 else:
     Config = _config_model()
 
-# What can be opened: a recording, simulated data, a method's own data or its fields by name.
-Source = str | Path | Simulated | Mapping[str, Any] | Any
+# What can be opened: a recording, its files, simulated data, a method's own data or its fields by name.
+Source = str | Path | list[str | Path] | Simulated | Mapping[str, Any] | Any
 # Settings that override the recording's own: an alidade.Config or a YAML file.
 Settings = _BaseConfig | str | Path | None
 
@@ -52,9 +53,9 @@ def open(
         alidade.open({"head_t": t, "head_gyro": w, "vision_t": tv, "vision_wxyz": q}, method="head")
 
     Args:
-        source: a recording; what `simulate` returns; or arrays, either by name (those of the method's data, see
-            `alidade.Method.data`; what is not there counts as not recorded) or as an object of that class. Times are s,
-            everything else SI.
+        source: a recording, or a list of its files; what `simulate` returns; or arrays, either by name (those of the
+            method's data, see `alidade.Method.data`; what is not there counts as not recorded) or as an object of that
+            class. Times are s, everything else SI.
         method: its name; by default that of the config, or the only one the recording can serve.
         config: overrides, key by key, the config that comes with the source.
         strict: refuse a recording of which anything is lost.
@@ -69,8 +70,8 @@ def open(
 
 def _open(source: Source, method: str | None, config: Settings, strict: bool) -> Session:
     override = Path(config) if isinstance(config, str) else config
-    if isinstance(source, str | Path):
-        return Session.read(open_recording(Path(source), strict), method, override)
+    if isinstance(source, str | Path | list | tuple):
+        return Session.read(open_recording(_files(source), strict), method, override)
     if isinstance(source, Simulated):
         text = load_config(source.config.encode(), override)
         chosen = methods.method(method or text.method or "")
@@ -85,6 +86,15 @@ def _open(source: Source, method: str | None, config: Settings, strict: bool) ->
     return Session(chosen, data, settings, Arrays(chosen, data))
 
 
+def _files(source: str | Path | Sequence[Any]) -> Where:
+    """A recording's path, or the paths of its files. Raises InputError when a list has anything else."""
+    if isinstance(source, str | Path):
+        return source
+    if not all(isinstance(file, str | Path) for file in source):
+        raise InputError("open([...]) takes the files of one recording; calibrate([...]) takes several recordings")
+    return [Path(file) for file in source]
+
+
 def calibrate(
     source: Source,
     solver: str = "batch",
@@ -96,7 +106,8 @@ def calibrate(
 ) -> Calibration:
     """Open and calibrate in one go (arguments as `open` and `Session.calibrate` have them).
 
-    A list of sources is several recordings of one device, calibrated together by batch.
+    A list of sources is several recordings of one device, calibrated together by batch; the files of one recording are
+    opened first: `open([...]).calibrate()`.
 
     Raises:
         InputError: source or config cannot be used, or there is no such solver.

@@ -12,6 +12,7 @@ import pytest
 import alidade
 from pipelines.methods import simulate as write
 from pipelines.session import calibrate
+from tests.forms import split
 
 HEAD = {"duration_s": 12.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 20.0}
 
@@ -146,6 +147,20 @@ def test_arrays_do_not_say_their_method(simulated: alidade.Simulated) -> None:
         alidade.open(simulated.data)
     with pytest.raises(alidade.InputError, match="arrays: los takes LosData, not HeadData"):
         alidade.open(simulated.data, method="los")
+
+
+def test_a_list_is_the_files_of_one_recording(tmp_path: Path) -> None:
+    (tmp_path / "s.yaml").write_text("{duration_s: 5, gyro_rate_hz: 100}")
+    write("head", str(tmp_path / "s.yaml"), 1, tmp_path / "s.mcap")
+    bag = split(tmp_path / "s.mcap", tmp_path / "bag")
+    parts = sorted(bag.glob("*.mcap"))
+    whole, listed, two = (alidade.open(source).data for source in (bag, [*map(str, parts)], parts[:2]))
+    np.testing.assert_array_equal(listed.head_gyro, whole.head_gyro)
+    assert 0 < len(two.head_t) < len(whole.head_t)
+    with pytest.raises(alidade.InputError, match="takes the files of one recording"):
+        alidade.open([whole])
+    with pytest.raises(alidade.InputError, match="a recording of no files"):
+        alidade.open([])
 
 
 def test_a_misspelt_solver_is_refused_and_a_text_is_no_list(tmp_path: Path) -> None:
