@@ -62,7 +62,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # boxes around the help would take three times as long to import as all else
-    help="Calibrates how sensors are mounted and how wrong they are, from MCAP recordings, and says how sure it is.",
+    help="Calibrates how sensors are mounted and how wrong they are, from recordings, and says how sure it is.",
 )
 
 
@@ -536,7 +536,9 @@ def fleet(
 @app.command()
 def export(
     calibration: Annotated[Path, typer.Argument(metavar="CALIBRATION.yaml", help="The calibration.")],
-    form: Annotated[str, typer.Option("--format", help="px4, ardupilot, ros2, kalibr (sensors); tf, urdf (mounts).")],
+    form: Annotated[
+        str, typer.Option("--format", help="px4, ardupilot, ros2, kalibr, openvins (sensors); tf, urdf (mounts).")
+    ],
     out: Annotated[Path | None, typer.Option(help="The file to write; default: printed.")] = None,
     as_json: Json = False,
 ) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -106,6 +105,8 @@ def show_json(calibrations: Sequence[Calibration]) -> None:
 
 def facts_json(facts: SessionFacts, found: Sequence[Suggestion], unused: Sequence[str]) -> str:
     """What `info` tells, as JSON."""
+    from pipelines.reports.plain_json import plain_json
+
     suggested = {suggestion.method: suggestion for suggestion in found}
     told = dataclasses.asdict(facts)
     told["methods"] = {
@@ -120,7 +121,7 @@ def facts_json(facts: SessionFacts, found: Sequence[Suggestion], unused: Sequenc
         }
         for name, missing in told.pop("missing").items()
     }
-    return json.dumps(told | {"unused": list(unused)}, indent=1)
+    return plain_json("info", told | {"unused": list(unused)})
 
 
 def show_facts(name: str, facts: SessionFacts, found: Sequence[Suggestion] = (), unused: Sequence[str] = ()) -> None:

@@ -167,6 +167,7 @@ def test_the_commands_suggest_and_say_what_is_nearest(simulated: Path, tmp_path:
     assert shown.index("head: with these topics") < shown.index("head_imu: /xsens/data") < shown.index("los: no")
     assert "used by no method: /tracker/pose, /vehicle/imu, /xsens/data" in shown
     told = json.loads(alidade("info", path, "--json").out)
+    assert told["schema"] == "alidade.info/1"
     assert told["methods"]["head"]["suggested"]["platform_imu"] == "/vehicle/imu"
     assert told["methods"]["head"]["still_missing"] == []
     assert not told["methods"]["los"]["served"]
