@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
+from factors import so3
+from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.methods.cube.printing import print_cube, tag_size
+from pipelines.methods.cube.topics import CubeConfig
 from pipelines.reports.calibration import SavedCalibration
 from pipelines.reports.export import exported
 
@@ -226,8 +230,23 @@ def test_printed_faces_are_true_to_scale(tmp_path: Path) -> None:
     np.testing.assert_allclose(0.5 * (low + high), [0.105, 0.1485], atol=1e-6)
 
 
+def test_the_config_of_a_printed_cube_is_of_one_glued_as_the_sheets_say(tmp_path: Path) -> None:
+    print_cube(tmp_path / "cube.pdf", 0.1, 3)
+    config = load_config((tmp_path / "cube.yaml").read_bytes())
+    tags = config.section(CubeConfig).tags
+    axes = {sign + name: float(f"{sign}1") * axis for name, axis in zip("xyz", np.eye(3), strict=True) for sign in "+-"}
+    said = re.findall(rb"on side (\S\S), this way up towards side (\S\S)\)", (tmp_path / "cube.pdf").read_bytes())
+    assert list(tags) == [3, 4, 5, 6, 7, 8]
+    assert len({side for side, _ in said}) == 6
+    for tag, (side, up) in zip(tags.values(), said, strict=True):
+        assert tag.size == pytest.approx(tag_size(0.1))
+        np.testing.assert_allclose(tag.position, 0.05 * axes[side.decode()], atol=1e-9)
+        np.testing.assert_allclose(so3.matrix(tag.rotation)[:, 1], axes[up.decode()], atol=1e-8)
+        np.testing.assert_allclose(so3.matrix(tag.rotation)[:, 2], axes[side.decode()], atol=1e-8)
+
+
 @pytest.mark.parametrize(("edge", "first"), [(0.5, 16), (-1.0, 16), (0.1, 585)])
 def test_faces_that_cannot_be_printed(tmp_path: Path, edge: float, first: int) -> None:
     with pytest.raises(InputError):
         print_cube(tmp_path / "cube.pdf", edge, first)
-    assert not (tmp_path / "cube.pdf").exists()
+    assert not list(tmp_path.iterdir())

@@ -71,7 +71,7 @@ def _show(layout: "Layout") -> None:
 
 def cube_print(
     edge: Annotated[float, typer.Option(help="Of the cube, m.")],
-    out: Annotated[Path, typer.Option(help="The PDF to write.")],
+    out: Annotated[Path, typer.Option(help="The PDF to write; the tags as drawn beside it, .yaml.")],
     first_id: Annotated[int, typer.Option(help="Tag on the top face; the others follow.")] = 16,
 ) -> None:
     """Sheets with the six faces of a tag cube, true to scale."""
@@ -80,3 +80,6 @@ def cube_print(
 
     print_cube(out, edge, first_id)
     terminal.say(f"Wrote {out}: print at 100 % and check the ruler")
+    terminal.say(
+        f"Wrote {out.with_suffix('.yaml')}: ids and sizes for cube-layout --config; of a cube as drawn all tags"
+    )

@@ -1,4 +1,4 @@
-"""The simulated cube's faces with their tags, and attitudes told by them."""
+"""The faces of a cube as it is drawn, with their tags, and attitudes told by them."""
 
 from __future__ import annotations
 

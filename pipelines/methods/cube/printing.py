@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from factors import so3
 from pipelines.errors import InputError
+from pipelines.methods.cube.faces import FACES, SIDES
+from pipelines.reports.whole import write_file
 
 _POINTS_PER_M = 72.0 / 0.0254
 _PAGE = (0.210, 0.297)  # A4, m
@@ -22,24 +26,48 @@ def tag_size(edge: float) -> float:
 
 
 def print_cube(out: Path, edge: float, first_id: int = 16) -> None:
-    """Write a PDF with the six faces of a cube, one a page, each with its outline, id and a ruler to check the scale.
+    """Write a PDF with the six faces of a cube, and beside it, .yaml, the config of a cube with the tags as drawn.
+
+    Each face has a page with its outline, its id, where it goes, and a ruler to check the scale.
 
     Args:
-        out: the file.
+        out: the PDF.
         edge: of the cube, m.
         first_id: id of the tag on the top face; the others follow.
 
     Raises:
-        InputError: the face does not fit a page, or the ids leave the family.
+        InputError: the face does not fit a page, the ids leave the family, or the files cannot be written.
     """
+    if out.suffix == ".yaml":
+        raise InputError(f"--out {out}: the PDF; the tags as drawn go into a .yaml beside it")
     if not 0.02 <= edge <= _PAGE[0] - 2.0 * _MARGIN:
         raise InputError(f"--edge {edge:g} m: faces from 0.02 to {_PAGE[0] - 2.0 * _MARGIN:g} m fit an A4 page")
     if not 0 <= first_id <= 587 - 6:
         raise InputError(f"tag ids {first_id} to {first_id + 5}: the family 36h11 has 0 to 586")
-    out.write_bytes(_document([_face(edge, tag) for tag in range(first_id, first_id + 6)]))
+    faces = dict(zip(range(first_id, first_id + 6), FACES.values(), strict=True))
+    pages = [_face(edge, tag, np.array(bRt)) for tag, (bRt, _) in faces.items()]
+    try:
+        out.write_bytes(_document(pages))
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror})") from error
+    tags = [
+        f"    {tag}: {{size: {tag_size(edge):.6g}, rotation: {_numbers(bRt)}, "
+        f"position: {_numbers(0.5 * edge * np.array(normal))}}}"
+        for tag, (bRt, normal) in faces.items()
+    ]
+    write_file(out.with_suffix(".yaml"), "\n".join(["cube:", "  tag_family: 36h11", "  tags:", *tags, ""]))
 
 
-def _face(edge: float, tag: int) -> str:
+def _numbers(values: Sequence[float] | NDArray[np.float64]) -> str:
+    return f"[{', '.join(f'{value:.9g}' for value in values)}]"
+
+
+def _side(axis: NDArray[np.float64]) -> str:
+    """The side of the cube that a vector points to."""
+    return max(SIDES, key=lambda side: float(np.dot(SIDES[side], axis)))
+
+
+def _face(edge: float, tag: int, bRt: NDArray[np.float64]) -> str:
     """Drawing commands of one page."""
     from pipelines.simulation.rendering import tag_bits
 
@@ -54,11 +82,16 @@ def _face(edge: float, tag: int) -> str:
     outline = f"0.3 w {_rectangle(left, bottom, edge, edge)} S"
     ruler = f"{_rectangle(_MARGIN, _MARGIN, 0.1, 0.002)} f"
     size = 1000.0 * tag_size(edge)
-    text = (
-        f"tag {tag}, 36h11, black square {size:.2f} mm, face {1000.0 * edge:.2f} mm; the bar is 100 mm: print at 100 %"
+    _, up, out = so3.matrix(bRt).T
+    lines = (
+        f"tag {tag}, 36h11, black square {size:.2f} mm, face {1000.0 * edge:.2f} mm; the bar is 100 mm: print at 100 %",
+        f"for a cube as drawn: on side {_side(out)}, this way up towards side {_side(up)}",
     )
-    label = f"BT /F 10 Tf {_points(_MARGIN)} {_points(_MARGIN + 0.005)} Td ({text}) Tj ET"
-    return "\n".join([*squares, "f", outline, ruler, label])
+    labels = [
+        f"BT /F 10 Tf {_points(_MARGIN)} {_points(_MARGIN + 0.005 * (2 - i))} Td ({text}) Tj ET"
+        for i, text in enumerate(lines)
+    ]
+    return "\n".join([*squares, "f", outline, ruler, *labels])
 
 
 def _points(length: float) -> str:
