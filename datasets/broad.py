@@ -4,7 +4,7 @@ BROAD (Laidig, Caruso, Cereatti, Seel, Data 6(7):72, 2021) moves an IMU in front
 gyro plays the helmet IMU; its motion capture, thinned out and with noise added, plays the vision, and undisturbed it is
 the truth:
 
-    python -m datasets.broad ../shared/data/broad/01_undisturbed_slow_rotation_A.mat --out broad01.mcap
+    python -m datasets.broad 01_undisturbed_slow_rotation_A.mat --out broad01.mcap
 """
 
 from __future__ import annotations

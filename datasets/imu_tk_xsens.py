@@ -3,7 +3,7 @@
 imu_tk (D. Tedaldi, A. Pretto, E. Menegatti, ICRA 2014) comes with raw counts of a hand-held Xsens MTi: one minute at
 rest, then 37 further static poses.
 
-    python -m datasets.imu_tk_xsens ../shared/data/imu_tk_xsens --out xsens.mcap
+    python -m datasets.imu_tk_xsens imu_tk_xsens --out xsens.mcap
 """
 
 from __future__ import annotations

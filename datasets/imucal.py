@@ -4,7 +4,7 @@ imucal (MaD Lab, FAU Erlangen-Nuernberg, MIT licence) has an IMU held still in s
 about each of its axes. A turn about x or y plays a turn of the outer axis, the inner one standing at 0 or -90 degrees;
 a turn about z plays one of the inner axis:
 
-    python -m datasets.imucal ../shared/data/imucal/annotated_session.csv --out imucal.mcap
+    python -m datasets.imucal annotated_session.csv --out imucal.mcap
 
 There is no encoder. What is known of a turn is that it ends where it began, at rest: its encoder turns uniformly from
 the first sample of the part to the last. The config says so with an encoder noise of one degree, far above the scatter

@@ -2,7 +2,7 @@
 
 tagslam_test (B. Pfrommer, K. Daniilidis, arXiv 1910.00679) tumbles a block with ten tags in front of a camera.
 
-    python -m datasets.tagslam_block ../shared/data/tagslam_block
+    python -m datasets.tagslam_block tagslam_block
 """
 
 from __future__ import annotations
