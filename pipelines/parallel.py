@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from multiprocessing.util import Finalize
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from pipelines import progress
@@ -30,6 +31,8 @@ from pipelines.errors import InputError
 Thing = TypeVar("Thing")
 Answer = TypeVar("Answer")
 
+# What Linux says of the memory of the machine, and of a container (man 5 proc, cgroup-v2).
+_MEMORY, _CONTAINER = Path("/proc/meminfo"), Path("/sys/fs/cgroup")
 # One process, unless a command says that there may be more.
 _jobs = 1
 # This process's ends of the connections to others, which a fork closes: a connection ends with the last that is open.
@@ -55,6 +58,17 @@ def _cores() -> int:
 def allowed() -> int:
     """How many processes may be used."""
     return _jobs
+
+
+def room() -> float:
+    """Bytes of memory that are free for processes, on Linux: of the machine, and of a container with a limit."""
+    kilobytes = {line.partition(":")[0]: line.split()[1] for line in _MEMORY.read_text().splitlines()}
+    free = 1024.0 * float(kilobytes["MemAvailable"])
+    try:
+        limit, used = ((_CONTAINER / name).read_text().strip() for name in ("memory.max", "memory.current"))
+    except OSError:
+        return free
+    return free if limit == "max" else min(free, float(limit) - float(used))
 
 
 def done(works: Sequence[Callable[[], Answer]], what: str, most: int) -> list[Answer]:

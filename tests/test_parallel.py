@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -169,6 +170,20 @@ def _divided() -> tuple[int, list[int]]:
 def test_one_piece_of_work_at_a_time_where_no_more_are_worth_while() -> None:
     with parallel.processes(2):
         assert parallel.done([os.getpid] * 2, "asking", 1) == [os.getpid()] * 2
+
+
+@pytest.mark.parametrize(("limit", "free"), [(None, 3 << 30), ("max", 3 << 30), (str(2 << 30), 1 << 30)])
+def test_room_is_what_machine_and_container_leave(
+    limit: str | None, free: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert parallel.room() > 1 << 20
+    (tmp_path / "meminfo").write_text(f"MemTotal: {8 << 20} kB\nMemFree: 1 kB\nMemAvailable: {3 << 20} kB\n")
+    monkeypatch.setattr(parallel, "_MEMORY", tmp_path / "meminfo")
+    monkeypatch.setattr(parallel, "_CONTAINER", tmp_path)
+    if limit is not None:
+        (tmp_path / "memory.max").write_text(f"{limit}\n")
+        (tmp_path / "memory.current").write_text(f"{1 << 30}\n")
+    assert parallel.room() == free
 
 
 KILLED = """

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -192,6 +193,18 @@ def test_several_processes_find_the_same(
     assert alone.course is not None
     assert together.course is not None
     np.testing.assert_array_equal(together.course.covariance, alone.course.covariance)
+
+
+@pytest.mark.parametrize(
+    ("keep", "room", "several"), [(Keep.NOTHING, 0.0, False), (Keep.NOTHING, 1e12, True), (Keep.TREES, 0.0, True)]
+)
+def test_where_nothing_is_kept_processes_need_room(
+    keep: Keep, room: float, several: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found, _ = stretches(monkeypatch, los_problem())
+    monkeypatch.setattr(system, "_WORTH_WHILE", 1)
+    monkeypatch.setattr(system, "room", lambda: room)
+    assert (replace(found, keep=keep)._processes() > 1) is several
 
 
 def _with_processes(problem: Problem, changed: list[tuple[str, Problem]], jobs: int) -> Estimate:

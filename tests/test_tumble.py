@@ -527,7 +527,8 @@ def test_a_cube_recording_without_all_the_rest(beside: str, tmp_path: Path) -> N
         gyro = imu.gyro if "gyro" in beside else np.zeros_like(imu.gyro)
         topics["/imu"] = series.ImuSeries(imu.t_ns, gyro, imu.accel)
     write_session(tmp_path / "mag.mcap", topics, {})
-    place = Config.model_validate({"latitude_deg": 40.0, "longitude_deg": 116.3, "altitude_m": 50.0, "date": "2026-11-20"})
+    at = {"latitude_deg": 40.0, "longitude_deg": 116.3, "altitude_m": 50.0, "date": "2026-11-20"}
+    place = Config.model_validate(at)
     calibration = Session.read(open_recording(tmp_path / "mag.mcap"), None, place).calibrate()
     truth = json.loads((_shared("contract") / "cube_nominal.truth.json").read_text())
     values = dict(zip(calibration.estimate.names, calibration.estimate.values.tolist(), strict=True))

@@ -13,6 +13,7 @@ short recording is one stretch of which nothing is eliminated in advance.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 from factors.loss import TruncatedLoss
 from factors.vectorized import jacobian_factor, residuals_at
 from pipelines.graph.problem import Array, Factor, Residuals
-from pipelines.parallel import Crew
+from pipelines.parallel import Crew, room
 from pipelines.solvers.assembly import StepBoundary
 from pipelines.solvers.history import moments_of
 from pipelines.solvers.linear_system import damped, elimination_ordering, graph_of
@@ -47,8 +48,9 @@ _UNDIVIDED, _STRETCH = 15_000, 3_000
 # Up to so many variables all of the stretches is kept, 20 kB each, then what back substitution needs of them, 6 kB
 # each; of more it is found anew.
 _KEPT, _KEPT_TREES = 150_000, 400_000
-# A process is worth while for so many variables.
-_WORTH_WHILE = 5_000
+# A process is worth while for so many variables. It copies the memory of what it looks at, so many bytes of each
+# (ten hours of los): where nothing is kept for want of memory, there has to be room for that.
+_WORTH_WHILE, _COPIED = 5_000, 2_000
 # Of the information that a system with mixed second derivatives has about a number no more than this share is too much.
 _EXCESS = 0.98
 _WHAT = "stretch by stretch"
@@ -343,7 +345,14 @@ class System:
         """Several stretches about the values."""
         self._evaluated.clear()
         there = [StretchAt(stretch, values, self.loss, self.keep) for stretch in self.stretches]
-        return Crew(there, sum(len(stretch.inner) for stretch in self.stretches) // _WORTH_WHILE)
+        return Crew(there, self._processes())
+
+    def _processes(self) -> int:
+        """How many may share the stretches."""
+        own = sum(len(stretch.inner) for stretch in self.stretches)
+        if self.keep is Keep.NOTHING and sys.platform == "linux" and room() < _COPIED * own:
+            return 1
+        return own // _WORTH_WHILE
 
     def error(self, values: gtsam.Values) -> float:
         """Half the sum of squares."""
