@@ -150,6 +150,7 @@ def calibrate(
     from pipelines import parallel, progress, terminal
     from pipelines.errors import InputError
     from pipelines.recording.opening import recordings_of, told
+    from pipelines.reports.whole import require_room
     from pipelines.reports.write import adopt_parts, write_part, write_results
     from pipelines.session import calibrate as run
     from pipelines.together import calibrate_device
@@ -161,6 +162,7 @@ def calibrate(
         folder = out or _beside(sessions[0], "device")
         if not as_json:
             terminal.say(f"{len(recordings)} recordings of one device: {told(recordings)}")
+    require_room(folder)
     with progress.shown(quiet or as_json), parallel.processes(jobs), TemporaryDirectory(prefix="alidade-") as parts:
         if len(recordings) > 1:
             by_itself = partial(write_part, Path(parts))
@@ -201,9 +203,11 @@ def compare(
     """The published, batch and incremental solvers side by side, with errors where the truth is known."""
     from pipelines import parallel, progress, terminal
     from pipelines.reports.compare import write_compare
+    from pipelines.reports.whole import require_room
     from pipelines.session import calibrate as run
     from pipelines.session import self_agreement
 
+    require_room(out)
     solvers = ["published", "batch", "incremental"]
     with progress.shown(quiet or as_json), parallel.processes(jobs):
         calibrations = run(session, solvers, method, config, parse_window(window), strict, auto_topics, prior=prior)
@@ -227,7 +231,9 @@ def follow(
     method: _MethodName = None,
     config: ConfigFile = None,
     window: _Window = "1",
-    patience: Annotated[float, typer.Option(help="Seconds without anything new that end an unfinished file.")] = 30.0,
+    patience: Annotated[
+        float, typer.Option(help="Seconds without anything new that end an unfinished file.", min=0.0)
+    ] = 30.0,
     prior: _Prior = None,
     checkpoint: Annotated[Path | None, typer.Option(help="File to save the run in, and to go on from.")] = None,
     serve: Annotated[bool, typer.Option("--serve", help="Estimates live over Foxglove's WebSocket.")] = False,
@@ -249,11 +255,14 @@ def follow(
     """Calibrate a recording while it is being written, and say what is still missing. Ctrl-C ends it."""
     from pipelines.follow.follow import follow as run
     from pipelines.follow.follower import Settings
+    from pipelines.reports.whole import require_room
     from pipelines.reports.write import write_results
 
+    folder = out or _beside(Path(_file_name(source)), "incremental")
+    for place in (folder, checkpoint and checkpoint.parent):
+        require_room(place)
     settings = Settings(method, config, parse_window(window), patience, checkpoint, not no_check, prior)
     calibration = run(source, settings, port if serve else None, record, as_json, (host, page_port) if page else None)
-    folder = out or _beside(Path(_file_name(source)), "incremental")
     written = write_results(folder, calibration)
     _tell(calibration, folder, written, as_json)
 
@@ -298,7 +307,7 @@ def simulate(
     method: _OfMethod,
     out: Annotated[Path, typer.Option(help="The recording to write.")],
     scenario: _Scenario = None,
-    seed: Annotated[int, typer.Option(help="Of the noise.")] = 0,
+    seed: Annotated[int, typer.Option(help="Of the noise.", min=0)] = 0,
     images: Annotated[bool, typer.Option("--images", help="Pictures instead of what is measured in them.")] = False,
     quiet: Quiet = False,
 ) -> None:
@@ -438,9 +447,11 @@ def demo(
     """Simulate a helmet on a manoeuvring platform, calibrate it with all three solvers, say where the report is."""
     from pipelines import progress, terminal
     from pipelines.methods import simulate as simulated
+    from pipelines.reports.whole import require_room
     from pipelines.reports.write import write_results
     from pipelines.session import calibrate as run
 
+    require_room(out)
     out.mkdir(parents=True, exist_ok=True)
     session = out / "head_mounts.mcap"
     with progress.shown(quiet):
@@ -458,7 +469,7 @@ def montecarlo(
     method: _OfMethod,
     runs: Annotated[int, typer.Option(help="How many recordings to simulate, one a seed.")] = 200,
     scenario: _Scenario = None,
-    seed: Annotated[int, typer.Option(help="Of the first run; the others follow.")] = 0,
+    seed: Annotated[int, typer.Option(help="Of the first run; the others follow.", min=0)] = 0,
     solvers: Annotated[str, typer.Option(help="'all', or some of published,batch,incremental.")] = "all",
     window: _Window = "1",
     scheduler: _Scheduler = None,

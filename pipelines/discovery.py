@@ -17,7 +17,7 @@ from pipelines.recording.pairing import Pairing, pair
 from pipelines.recording.reading import Recording
 from pipelines.recording.series import ImuSeries
 from pipelines.recording.sources import TopicSource
-from pipelines.recording.topics import Setting, Topic
+from pipelines.recording.topics import Setting, Topic, wanted
 from pipelines.settings import Config
 
 # Rates and attitudes belong together above this correlation of their norms.
@@ -71,11 +71,11 @@ def with_suggested(recording: Recording, config: Config, method: str | None = No
     As it is where nothing is lacking. What is taken is remarked in the recording, which has the topics from now on.
     Raises InputError when no method could be served, or several.
     """
-    wanted = method or config.method
+    asked = method or config.method
     served = [name for name in methods.names() if not lacking(methods.method(name).needs, recording, config)]
-    if wanted in served or (wanted is None and served):
+    if asked in served or (asked is None and served):
         return config
-    found = suggestions(recording, config, [wanted] if wanted else None)
+    found = suggestions(recording, config, [asked] if asked else None)
     whole = [suggestion for suggestion in found if not suggestion.missing]
     if len(whole) != 1:
         which = " and ".join(suggestion.method for suggestion in whole)
@@ -113,7 +113,7 @@ def idle(recording: Recording, config: Config, method: str) -> tuple[str, ...]:
     read = {part for topic in chosen.topics for part in _recorded_as(config, topic)}
     sentences = []
     for topic in chosen.topics:
-        if _is_attitude(topic) or config.topic(topic) in recording.topics:
+        if _is_attitude(topic) or wanted(recording, config, topic):
             continue
         there = recording.topics.items()
         free = [n for n, t in there if t.type == topic.types[0] and t.count and t.is_readable and n not in read]
@@ -123,6 +123,13 @@ def idle(recording: Recording, config: Config, method: str) -> tuple[str, ...]:
                 f"`topics: {{{topic.key}: {free[0]}}}`"
             )
     return tuple(sentences)
+
+
+def empty(recording: Recording, config: Config, method: str) -> tuple[str, ...]:
+    """Sentences about topics of a method that are there without a message."""
+    names = dict.fromkeys(config.topic(topic) for topic in methods.method(method).topics)
+    there = [name for name in names if name in recording.topics and not recording.topics[name].count]
+    return tuple(f"topic {name} has no messages: it counts as not recorded" for name in there)
 
 
 def _recorded_as(config: Config, topic: Topic) -> tuple[str, ...]:

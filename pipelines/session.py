@@ -19,7 +19,7 @@ import numpy as np
 
 from pipelines import methods, progress
 from pipelines.config import load_config, recorded_config
-from pipelines.discovery import idle, nearest_suggestion, suggestions, with_suggested
+from pipelines.discovery import empty, idle, nearest_suggestion, suggestions, with_suggested
 from pipelines.errors import InputError
 from pipelines.graph.problem import Estimate, Problem, Step, Told
 from pipelines.judgement import noise_levels
@@ -166,7 +166,7 @@ class Session:
                 raise
             nearest = nearest_suggestion(suggestions(recording, config, [chosen.name]))
             raise InputError(f"{error}{f'; nearest is {nearest}' if nearest else ''}") from error
-        for sentence in idle(recording, config, chosen.name):
+        for sentence in (*idle(recording, config, chosen.name), *empty(recording, config, chosen.name)):
             recording.remark(sentence)
         session = cls(chosen, data, config, Recorded(recording))
         return session if prior is None else session.beginning_from(prior)

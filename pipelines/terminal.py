@@ -21,7 +21,11 @@ if TYPE_CHECKING:
     from pipelines.recording.info import SessionFacts
     from pipelines.reports.result import Calibration, ParameterResult
 
+_NARROWEST = 72
 console = Console(highlight=False)
+# In less, columns of tables would be left out, and at a width of 0 everything: lines are broken by the terminal then.
+if console.width < _NARROWEST:
+    console.width = _NARROWEST
 _LONGEST = 10_000
 
 COLOURS = {

@@ -209,6 +209,30 @@ def test_bad_options_are_refused(alidade: Command, session: Path, tmp_path: Path
     _refused(alidade("simulate", "hedd", "--out", tmp_path / "x"), tmp_path / "x", ("head",))
 
 
+def test_where_nothing_can_be_written_is_told_before_the_work(
+    alidade: Command, session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("mine")
+    out = tmp_path / "file" / "out"
+
+    def worked(*_: object, **__: object) -> None:
+        raise AssertionError("before it was told")
+
+    with monkeypatch.context() as patched:
+        for name in ("pipelines.session.calibrate", "pipelines.follow.follow.follow"):
+            patched.setattr(name, worked)
+        for command in ("calibrate", "compare", "follow"):
+            _refused(alidade(command, session, "--out", out), out, ("no folder to write results to", "file"))
+        _refused(alidade("demo", "--out", tmp_path / "file"), out, ("no folder to write results to",))
+        _refused(alidade("follow", session, "--checkpoint", out / "run.npz"), out, ("no folder to write",))
+    for path in (out, tmp_path / "none" / "s.mcap", tmp_path):
+        run = alidade("simulate", "tumble", "--out", path)
+        assert (run.code, run.err.count("\n")) == (2, 1)
+    assert (tmp_path / "file").read_text() == "mine"
+    assert alidade("simulate", "tumble", "--seed", "-1", "--out", tmp_path / "s.mcap").code == 2
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file"]
+
+
 @pytest.mark.parametrize("where", ["reading", "importing", "writing"])
 def test_ctrl_c_is_silent_and_leaves_nothing(
     alidade: Command, session: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str

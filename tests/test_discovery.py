@@ -154,6 +154,23 @@ def test_a_sensor_that_is_there_but_not_used_is_told(simulated: Path, tmp_path: 
     assert Session.read(open_recording(tmp_path / "t.mcap"), "head", None).facts.notes == ()
 
 
+def test_a_topic_without_messages_counts_as_not_recorded(simulated: Path, tmp_path: Path) -> None:
+    """A recorder makes a channel of every topic that somebody might send to. A platform's gyro has to be there."""
+    whole = open_recording(simulated)
+    imus = {name: whole.imu(name) for name in ("/head/imu", "/platform/imu")}
+    none = series.QuaternionSeries(np.empty(0, np.int64), np.empty((0, 4)))
+    there = {**imus, "/vision/attitude": whole.poses("/vision/attitude"), "/truth/attitude": none}
+    write_session(tmp_path / "s.mcap", there)
+    recording = open_recording(tmp_path / "s.mcap")
+    assert "/truth/attitude" in recording.topics
+    assert Session.read(recording, "head", None).data.truth_t is None
+    assert "topic /truth/attitude has no messages: it counts as not recorded" in recording.notes
+    of_none = series.ImuSeries(none.t_ns, *np.empty((2, 0, 3)))
+    write_session(tmp_path / "s.mcap", {**there, "/platform/imu": of_none})
+    with pytest.raises(InputError, match="topic /platform/imu has no messages"):
+        Session.read(open_recording(tmp_path / "s.mcap"), "head", None)
+
+
 def test_a_recording_that_is_served_is_left_alone(simulated: Path) -> None:
     recording = open_recording(simulated)
     assert with_suggested(recording, NONE) == NONE

@@ -371,5 +371,6 @@ def test_parts_of_one_bag_are_one_recording(tmp_path: Path) -> None:
     (tmp_path / "metadata.yaml").write_text(text)
     paths = [tmp_path / name for name in names]
     assert recordings_of(paths) == [paths[:2], paths[2]]
+    assert recordings_of([Path(), Path("/")]) == [Path(), Path("/")]
     shutil.rmtree(tmp_path)
     assert recordings_of([tmp_path / "a*.mcap", tmp_path]) == [tmp_path / "a*.mcap", tmp_path]

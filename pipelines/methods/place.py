@@ -70,4 +70,4 @@ def field_at(
     try:
         return magnetic_field(latitude, longitude, height, year)
     except ValueError as error:
-        raise InputError(f"{error}; give the date of the recording in the config as `date`") from error
+        raise InputError(f"{error}; the config has `date` and `altitude_m` for it") from error

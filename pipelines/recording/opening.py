@@ -48,7 +48,7 @@ def open_container(where: Where, strict: bool = False) -> Container:
         return _together([Path(one) for one in where], strict)
     path = Path(where)
     if path.is_dir():
-        return _folder(path, strict)
+        return _folder(path if path.name else path.resolve(), strict)
     if not path.exists() and any(letter in str(path) for letter in "*?["):
         found = [Path(name) for name in sorted(glob.glob(str(path)))]
         if not found:
@@ -65,7 +65,7 @@ def recordings_of(paths: Sequence[Path]) -> list[Where]:
     found: list[list[Path]] = []
     bags: dict[Path, list[Path]] = {}
     for path in paths:
-        metadata = path.with_name(METADATA)
+        metadata = path.parent / METADATA
         if path.is_file() and path.name in parts_of_bag(_metadata(metadata)):
             bag = metadata.resolve()
             if bag in bags:

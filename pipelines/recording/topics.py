@@ -43,5 +43,6 @@ CAMERA_INFO = Topic("camera_info", "/camera/camera_info", (messages.CAMERA_INFO,
 
 
 def wanted(recording: Recording, config: Config, topic: Topic) -> bool:
-    """Whether an optional topic is there, or the config asks for it by name."""
-    return config.topic(topic) in recording.topics or topic.key in config.topics
+    """Whether an optional topic is there with messages in it, or the config asks for it by name."""
+    found = recording.topics.get(config.topic(topic))
+    return bool(found and found.count) or topic.key in config.topics

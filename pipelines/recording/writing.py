@@ -34,6 +34,7 @@ from mcap.records import (
 from numpy.typing import NDArray
 
 from pipelines import progress
+from pipelines.errors import InputError
 from pipelines.recording import messages, series
 from pipelines.recording.mcap_records import MAGIC, MESSAGE_HEAD, windows
 from pipelines.recording.message_source import Source, message_source
@@ -60,16 +61,21 @@ def write_session(
     """Write topics, name -> series, and attachments, name -> content, as a ROS 2 recording.
 
     Messages are logged at their stamps and written in that order. The file appears under its name when it is whole, or
-    not at all.
+    not at all. Raises InputError when it cannot be written.
     """
     path = Path(path)
+    if not path.name or (path.exists() and not path.is_file()):
+        raise InputError(f"{path}: there is no file to be written, it is something else")
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        with part.open("wb") as stream:
-            _File(stream).write(topics, attachments or {})
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+        try:
+            with part.open("wb") as stream:
+                _File(stream).write(topics, attachments or {})
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 
 
 class _File:

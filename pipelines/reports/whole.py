@@ -43,6 +43,17 @@ def write_whole(out_dir: Path, names: Sequence[str], make: Callable[[Path], None
             shutil.rmtree(out_dir, ignore_errors=True)
 
 
+def require_room(out_dir: Path | None) -> None:
+    """Tell before the work that results could not be written after it. Raises InputError."""
+    if out_dir is None:
+        return
+    there = next(folder for folder in (out_dir, *out_dir.absolute().parents) if folder.exists())
+    if not there.is_dir():
+        raise InputError(f"{out_dir}: no folder to write results to ({there} is no folder)")
+    if not os.access(there, os.W_OK):
+        raise InputError(f"{out_dir}: no folder to write results to ({there} may not be written to)")
+
+
 def write_page(out_dir: Path, name: str, text: str) -> Path:
     """One page of text; returns its path. Raises InputError when it cannot be written."""
     (path,) = write_whole(out_dir, [name], lambda folder: _write_text(folder / name, text))

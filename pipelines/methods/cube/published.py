@@ -152,7 +152,10 @@ def attitudes(data: CubeData, config: Config, poses: StaticPoses) -> tuple[NDArr
         InputError: there is no camera or no reference.
     """
     if data.camera is None or data.reference_t is None or data.reference_wxyz is None:
-        raise InputError("the published solver needs a camera and a reference; without them use the graph")
+        raise InputError(
+            "the published solver needs a camera and a reference; without them take `calibrate --solver batch` or "
+            "incremental"
+        )
     BRC = config.section(CubeConfig).camera_rotation
     if BRC is None:
         raise InputError("the camera's mount on the reference is not given: cube.camera_rotation")

@@ -84,13 +84,14 @@ def read_head(recording: Recording, config: Config) -> HeadData:
 
     platform_t = platform_gyro = platform_density = None
     name = config.topic(PLATFORM_IMU)
-    if wanted(recording, config, PLATFORM_IMU):
+    # One that is there and empty is no platform at rest.
+    if name in recording.topics or wanted(recording, config, PLATFORM_IMU):
         platform_t, platform_gyro, platform_density = read_gyro(recording, name, epoch, dropped)
         spans[name] = platform_t
 
     name = config.topic(VISION_ATTITUDE)
     vision_cov: Array | None
-    if name in recording.topics or not _has_pictures(recording, config):
+    if wanted(recording, config, VISION_ATTITUDE) or not _has_pictures(recording, config):
         vision_t, vision_wxyz, vision_cov = _vision(recording, name, epoch, dropped)
     else:
         name = config.topic(IMAGE)
@@ -160,7 +161,7 @@ def write_head(
 
 
 def _has_pictures(recording: Recording, config: Config) -> bool:
-    return config.topic(IMAGE) in recording.topics and VISION_ATTITUDE.key not in config.topics
+    return wanted(recording, config, IMAGE) and VISION_ATTITUDE.key not in config.topics
 
 
 def _from_pictures(
