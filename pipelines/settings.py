@@ -50,6 +50,9 @@ def _date(value: object) -> object:
 
 Sigma = Annotated[float, Field(gt=0.0)]
 SigmaOrZero = Annotated[float, Field(ge=0.0)]
+# No sensor has more, in any of the units below; beyond it arithmetic overflows.
+NoiseSigma = Annotated[float, Field(gt=0.0, le=1e3)]
+NoiseOrZero = Annotated[float, Field(ge=0.0, le=1e3)]
 Date = Annotated[datetime.date, BeforeValidator(_date)]
 Quaternion = Annotated[tuple[float, float, float, float], Field(strict=False), AfterValidator(_unit)]
 Vector = Annotated[tuple[float, float, float], Field(strict=False)]
@@ -64,21 +67,21 @@ class Section(BaseModel):
 class Noise(Section):
     """Noise of the sensors, one sigma each; null where not given."""
 
-    gyro_density: Sigma | None = None  # rad/s/sqrt(Hz), white noise
-    gyro_bias_walk: SigmaOrZero | None = None  # rad/s/sqrt(s)
-    gyro_scale: SigmaOrZero | None = None  # fraction of the angle turned that errors not estimated add
-    platform_gyro_density: SigmaOrZero | None = None  # rad/s/sqrt(Hz)
-    accel_density: Sigma | None = None  # m/s^2/sqrt(Hz)
-    mag_density: Sigma | None = None  # T/sqrt(Hz)
-    los_error: Sigma | None = None  # rad per measurement
-    los_roll: Sigma | None = None  # rad per measurement
-    encoder: SigmaOrZero | None = None  # rad per sample
-    vision_attitude: Sigma | None = None  # rad per axis and frame
-    corner_px: Sigma | None = None  # px per axis
-    gyro_repeatability: SigmaOrZero | None = None  # rad/s, of means over a rest, beside white noise
-    turn_repeatability: SigmaOrZero | None = None  # fraction of the angle turned from rest to rest
-    accel_repeatability: SigmaOrZero | None = None  # m/s^2, of means over a rest
-    mag_repeatability: SigmaOrZero | None = None  # T, of means over a rest
+    gyro_density: NoiseSigma | None = None  # rad/s/sqrt(Hz), white noise
+    gyro_bias_walk: NoiseOrZero | None = None  # rad/s/sqrt(s)
+    gyro_scale: NoiseOrZero | None = None  # fraction of the angle turned that errors not estimated add
+    platform_gyro_density: NoiseOrZero | None = None  # rad/s/sqrt(Hz)
+    accel_density: NoiseSigma | None = None  # m/s^2/sqrt(Hz)
+    mag_density: NoiseSigma | None = None  # T/sqrt(Hz)
+    los_error: NoiseSigma | None = None  # rad per measurement
+    los_roll: NoiseSigma | None = None  # rad per measurement
+    encoder: NoiseOrZero | None = None  # rad per sample
+    vision_attitude: NoiseSigma | None = None  # rad per axis and frame
+    corner_px: NoiseSigma | None = None  # px per axis
+    gyro_repeatability: NoiseOrZero | None = None  # rad/s, of means over a rest, beside white noise
+    turn_repeatability: NoiseOrZero | None = None  # fraction of the angle turned from rest to rest
+    accel_repeatability: NoiseOrZero | None = None  # m/s^2, of means over a rest
+    mag_repeatability: NoiseOrZero | None = None  # T, of means over a rest
 
 
 # Where neither the config nor a message says anything.

@@ -173,6 +173,7 @@ def test_bad_data_is_one_line(alidade: Command, data: HeadData, tmp_path: Path, 
         ("priors: {helmet_mont_x: 0.1}", ("helmet_mont_x", "helmet_mount_x")),
         ("topics: {vision_attitude: /nowhere}", ("/nowhere",)),
         ("noise: {gyro_density: -1}", ("noise.gyro_density",)),
+        ("noise: {mag_density: 1.0e300}", ("noise.mag_density", "less than")),
         ("method: los", ("/imu", "topics:")),
     ],
 )
