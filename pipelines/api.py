@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import numbers
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import NoneType
@@ -20,6 +21,7 @@ from pipelines.errors import InputError
 from pipelines.methods import Method
 from pipelines.recording.opening import Where
 from pipelines.recording.reading import open_recording
+from pipelines.recording.shapes import Array, Rows, rows_by_name
 from pipelines.session import Arrays, Session
 from pipelines.settings import Config as _BaseConfig
 from pipelines.simulation.simulated import Simulated
@@ -39,6 +41,9 @@ Source = str | Path | list[str | Path] | Simulated | Mapping[str, Any] | Any
 # Settings that override the recording's own: an alidade.Config or a YAML file.
 Settings = _BaseConfig | str | Path | None
 
+# No session takes longer, s; stamps in ns, and in us after ten seconds, look as if one had.
+_LONGEST = 1e7
+
 
 def open(
     source: Source,
@@ -55,21 +60,21 @@ def open(
     Args:
         source: a recording, or a list of its files; what `simulate` returns; or arrays, either by name (those of the
             method's data, see `alidade.Method.data`; what is not there counts as not recorded) or as an object of that
-            class. Times are s, everything else SI.
+            class. Times are s, everything else SI; lists, integers and masked arrays become arrays of floats.
         method: its name; by default that of the config, or the only one the recording can serve.
         config: overrides, key by key, the config that comes with the source.
         strict: refuse a recording of which anything is lost.
         prior: an earlier calibration of the device to begin from: its result.json or calibration.yaml.
 
     Raises:
-        InputError: source, config or prior cannot be used.
+        InputError: source, config or prior cannot be used; of arrays, which one and why.
     """
     session = _open(source, method, config, strict)
     return session if prior is None else session.beginning_from(Path(prior))
 
 
 def _open(source: Source, method: str | None, config: Settings, strict: bool) -> Session:
-    override = Path(config) if isinstance(config, str) else config
+    override = _override(config)
     if isinstance(source, str | Path | list | tuple):
         return Session.read(open_recording(_files(source), strict), method, override)
     if isinstance(source, Simulated):
@@ -81,9 +86,18 @@ def _open(source: Source, method: str | None, config: Settings, strict: bool) ->
     if name is None:
         raise InputError("arrays do not say which method they are for: open(..., method=...)")
     chosen = methods.method(name)
-    data = source if is_dataclass(source) else _data(chosen, source)
-    _check(chosen, data)
+    data = _checked(chosen, _data(chosen, source))
     return Session(chosen, data, settings, Arrays(chosen, data))
+
+
+def _override(config: object) -> Path | _BaseConfig | None:
+    """A config, or the file of one. Raises InputError when it is neither."""
+    if config is None or isinstance(config, _BaseConfig | Path):
+        return config
+    if isinstance(config, str):
+        return Path(config)
+    kind = type(config).__name__
+    raise InputError(f"config: a file or an alidade.Config is needed, not {kind}; alidade.Config(**keys) makes one")
 
 
 def _files(source: str | Path | Sequence[Any]) -> Where:
@@ -110,7 +124,7 @@ def calibrate(
     opened first: `open([...]).calibrate()`.
 
     Raises:
-        InputError: source or config cannot be used, or there is no such solver.
+        InputError: source or config cannot be used, or there is no such solver or window.
         IndeterminateError: states other than the parameters are not determined.
     """
     if isinstance(source, list | tuple):
@@ -134,7 +148,7 @@ def load(path: str | Path, config: Settings = None) -> SavedCalibration:
     """
     from pipelines.reports.calibration import load_calibration
 
-    return load_calibration(Path(path), load_config(None, Path(config) if isinstance(config, str) else config))
+    return load_calibration(Path(path), load_config(None, _override(config)))
 
 
 def simulate(
@@ -147,12 +161,13 @@ def simulate(
     Args:
         method: its name.
         scenario: a name, a YAML file, the keys of one, or the model; None is the method's nominal scenario.
-        seed: of the noise.
+        seed: of the noise, 0 or more.
         images: draw pictures in place of what is measured in them.
 
     Raises:
-        InputError: no such method or scenario, or a scenario that cannot be drawn.
+        InputError: no such method or scenario, a scenario that cannot be drawn, or a seed below zero.
     """
+    _check_seed(seed)
     chosen = methods.method(method)
     return chosen.simulate(_scenario(chosen, scenario, images), seed, images)
 
@@ -191,7 +206,7 @@ def follow(
     input; `show` is given what is known whenever that changes; `prior` is as `open` has it.
 
     Raises:
-        InputError: the file does not appear, is no recording, or cannot be used in the end.
+        InputError: no such window, or the file does not appear, is no recording, or cannot be used in the end.
         IndeterminateError: states other than the parameters are not determined.
     """
     from pipelines.follow.follower import Follower
@@ -202,6 +217,11 @@ def follow(
     settings = Following(method, None if config is None else Path(config), window, patience, prior=earlier)
     with source_of(str(path), say=lambda _: None) as source:
         return Follower(source, settings, show or (lambda _: None), lambda _: None, lambda: False).follow()
+
+
+def _check_seed(seed: object) -> None:
+    if not isinstance(seed, numbers.Integral) or int(seed) < 0:
+        raise InputError(f"seed: {seed!r} is no whole number from zero on")
 
 
 def _scenario(method: Method, given: str | Path | Mapping[str, Any] | BaseModel | None, images: bool) -> BaseModel:
@@ -217,37 +237,61 @@ def _scenario(method: Method, given: str | Path | Mapping[str, Any] | BaseModel 
     return method.settings(None if given is None else str(given), images)
 
 
-def _data(method: Method, given: Mapping[str, Any]) -> Any:
-    """The method's data from its fields by name."""
+def _data(method: Method, given: Any) -> Any:
+    """The method's data from its fields, by name or as an object of its class; None is what was not recorded."""
     kind = method.data
+    if is_dataclass(given):
+        if not isinstance(given, kind):
+            raise InputError(f"arrays: {method.name} takes {kind.__name__}, not {type(given).__name__}")
+        given = {field.name: getattr(given, field.name) for field in fields(kind)}
+    if not isinstance(given, Mapping):
+        raise InputError(f"open(...) takes a recording, simulated data or arrays by name, not {type(given).__name__}")
     hints = typing.get_type_hints(kind)
     known = {field.name: field for field in fields(kind)}
     for name in given:
         if name not in known:
             raise InputError(f"arrays: {method.name} has no {name}; it has {', '.join(known)}")
-    values: dict[str, Any] = {"epoch_ns": 0}
+    values = {"epoch_ns": 0} | {name: value for name, value in given.items() if value is not None}
     for name, field in known.items():
-        if name in given:
-            value = given[name]
-            values[name] = np.asarray(value) if isinstance(value, list | tuple | np.ndarray) else value
-        elif field.default is MISSING and field.default_factory is MISSING and name not in values:
+        if name not in values and field.default is MISSING and field.default_factory is MISSING:
             if NoneType not in typing.get_args(hints[name]):
                 raise InputError(f"arrays: {method.name} needs {name}")
             values[name] = None
     return kind(**values)
 
 
-def _check(method: Method, data: Any) -> None:
-    """Raise InputError unless stamps increase and everything that they stamp is as long as they are."""
-    if not isinstance(data, method.data):
-        raise InputError(f"arrays: {method.name} takes {method.data.__name__}, not {type(data).__name__}")
-    for stamps, carried in method.hypotheses().streams.items():
-        t = getattr(data, stamps)
-        if t is None:
-            continue
-        if t.ndim != 1 or not np.isfinite(t).all() or not (np.diff(t) > 0.0).all():
-            raise InputError(f"arrays: {stamps} has to be one row of stamps in s, each later than the one before")
-        for name in carried:
-            values = getattr(data, name)
-            if values is not None and len(values) != len(t):
+def _checked(method: Method, data: Any) -> Any:
+    """The data with all arrays as floats.
+
+    Raises:
+        InputError: an array is none of numbers or has rows of another shape than its class says, stamps do not increase
+            or are not in s, or what they stamp is not as long as they are, or not finite.
+    """
+    streams = method.hypotheses().streams
+    # Stamps and what they stamp are arrays, whatever annotations say.
+    rows = {name: Rows() for stamps, carried in streams.items() for name in (stamps, *carried)}
+    rows |= rows_by_name(method.data)
+    given = {name: value for name in rows if (value := getattr(data, name)) is not None}
+    arrays = {name: rows[name].read(name, value) for name, value in given.items()}
+    for stamps, carried in streams.items():
+        t = arrays.get(stamps)
+        if t is not None:
+            _check_stamps(stamps, t)
+        for name in (name for name in carried if name in arrays):
+            values = arrays[name]
+            if t is None:
+                raise InputError(f"arrays: {name} needs its stamps, {stamps}")
+            if len(values) != len(t):
                 raise InputError(f"arrays: {name} has {len(values)} rows for the {len(t)} stamps of {stamps}")
+            lost = rows[name].lost(values)
+            if len(lost):
+                more = f" (and {len(lost) - 1} more)" if len(lost) > 1 else ""
+                raise InputError(f"arrays: {name} is not finite at {t[lost[0]]:.6f} s{more}; leave out such rows")
+    return replace(data, **arrays)
+
+
+def _check_stamps(name: str, t: Array) -> None:
+    if t.ndim != 1 or not np.isfinite(t).all() or not (np.diff(t) > 0.0).all():
+        raise InputError(f"arrays: {name} has to be one row of stamps in s, each later than the one before")
+    if t[-1] - t[0] > _LONGEST:
+        raise InputError(f"arrays: {name} spans {t[-1] - t[0]:.3g} s; times have to be in s, not in us or ns")

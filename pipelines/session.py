@@ -40,6 +40,7 @@ from pipelines.reports.result import Calibration
 from pipelines.settings import TRUTH, Config
 from pipelines.sharing import device_belief, walks
 from pipelines.simulation.simulated import Simulated
+from pipelines.solvers.window import check_window
 
 SOLVERS = ("batch", "incremental", "published")
 
@@ -217,7 +218,7 @@ class Session:
         measurements move a number most, what inputs taken for exact would do to it, the method's own findings.
 
         Raises:
-            InputError: no such solver, or the data cannot be used.
+            InputError: no such solver, no such window, or the data cannot be used.
             IndeterminateError: states other than the parameters are not determined.
         """
         (calibration,) = self.calibrations([solver], window, check=check, report=report)
@@ -237,6 +238,7 @@ class Session:
         for solver in solvers:
             if solver not in SOLVERS:
                 raise InputError(f"no solver {solver!r}; there are {', '.join(SOLVERS)}")
+        check_window(window)
         solved = (self._solve(solver, window, report=report) for solver in solvers)
         return self.judged(solved, seconds or {}, check, report)
 

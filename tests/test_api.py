@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import alidade
+from pipelines.methods import names
 from pipelines.methods import simulate as write
+from pipelines.recording.shapes import rows_by_name
 from pipelines.session import calibrate
 from tests.forms import split
 
@@ -138,6 +143,116 @@ def test_a_plan_needs_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 def test_arrays_that_cannot_be_used_are_refused_in_one_line(given: dict[str, object], message: str) -> None:
     with pytest.raises(alidade.InputError, match=message):
         alidade.open(given, method="head")
+
+
+# Short recordings of the methods.
+BRIEF: dict[str, dict[str, object]] = {
+    "los": {"duration_s": 3.0, "gyro_rate_hz": 50.0, "gimbal_rate_hz": 50.0, "image_rate_hz": 5.0},
+    "indexer": {"gyro_rate_hz": 5.0, "encoder_rate_hz": 5.0},
+    "head": {"duration_s": 3.0, "gyro_rate_hz": 50.0, "vision_rate_hz": 10.0},
+    "cube": {"poses": 3, "static_s": 1.0, "imu_rate_hz": 50.0},
+    "tumble": {},
+}
+
+
+@pytest.mark.parametrize("name", names())
+def test_every_methods_arrays_are_opened_by_name(name: str) -> None:
+    """Those of a cube were not: what its class was annotated with was there for type checkers alone."""
+    data = alidade.simulate(name, BRIEF.get(name)).data
+    given = {field.name: getattr(data, field.name) for field in fields(data)}
+    opened = alidade.open(given, method=name).data
+    for field in fields(data):
+        np.testing.assert_equal(getattr(opened, field.name), given[field.name])
+    arrays = rows_by_name(type(data))
+    assert {field.name for field in fields(data) if isinstance(given[field.name], np.ndarray)} <= arrays.keys()
+    assert all(rows.shape is not None for rows in arrays.values())
+
+
+def _spoilt(values: Any, *at: int) -> Any:
+    values = values.copy()
+    values[at] = np.nan
+    return values
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil", "message"),
+    [
+        ("head_gyro", lambda w: _spoilt(w, 3, 1), "head_gyro is not finite at 0.030000 s; leave out such rows"),
+        (
+            "head_gyro",
+            lambda w: np.ma.masked_less(w, 9.0),
+            r"head_gyro is not finite at 0.000000 s \(and 1199 more\)",
+        ),
+        ("head_gyro", lambda w: w[:, :2], r"head_gyro has the shape \(1200, 2\); \(N, 3\) is needed"),
+        ("head_gyro", lambda _: 1.0, r"head_gyro has the shape \(\); \(N, 3\) is needed"),
+        ("head_gyro", lambda _: [[1.0, 2.0, 3.0], [1.0]], "head_gyro is no array: its rows differ in length"),
+        ("head_gyro", lambda w: w.astype(str), "head_gyro has to be numbers, not str"),
+        ("head_gyro", lambda w: w.astype(object), "head_gyro has to be numbers, not object"),
+        ("head_gyro", lambda w: w[:0], "head_gyro has no rows; what was not recorded is left out"),
+        ("head_gyro", lambda _: None, "head needs head_gyro"),
+        ("head_t", lambda t: (1e9 * t).astype("datetime64[ns]"), "head_t has to be numbers, not datetime64"),
+        ("head_t", lambda t: 1e9 * t, r"head_t spans 1.2e\+10 s; times have to be in s, not in us or ns"),
+        ("vision_wxyz", lambda q: q[:, 1:], r"vision_wxyz has the shape \(\d+, 3\); \(N, 4\) is needed"),
+        ("platform_gyro", lambda _: np.zeros((1200, 3)), "platform_gyro needs its stamps, platform_t"),
+    ],
+)
+def test_an_array_that_is_not_what_it_has_to_be_is_named(
+    simulated: alidade.Simulated, name: str, spoil: Callable[[Any], object], message: str
+) -> None:
+    given = {field: getattr(simulated.data, field) for field in ("head_t", "head_gyro", "vision_t", "vision_wxyz")}
+    with pytest.raises(alidade.InputError, match=f"^arrays: {message}"):
+        alidade.open(given | {name: spoil(given.get(name))}, method="head")
+    with pytest.raises(alidade.InputError, match=f"^arrays: {message}"):
+        alidade.open(replace(simulated.data, **{name: spoil(given.get(name))}), method="head")
+
+
+def test_lists_integers_and_masked_arrays_become_floats(simulated: alidade.Simulated) -> None:
+    data = simulated.data
+    given = {
+        "head_t": range(len(data.head_t)),
+        "head_gyro": data.head_gyro.tolist(),
+        "vision_t": np.ma.masked_array(data.vision_t),
+        "vision_wxyz": data.vision_wxyz.astype(np.float32),
+    }
+    opened = alidade.open(given, method="head").data
+    assert {type(getattr(opened, name)) for name in given} == {np.ndarray}
+    assert {getattr(opened, name).dtype for name in given} == {np.dtype(float)}
+    np.testing.assert_array_equal(opened.head_gyro, data.head_gyro)
+
+
+def test_a_roll_may_be_missing_and_nothing_else_of_an_los_error() -> None:
+    data = alidade.simulate("los", BRIEF["los"]).data
+    covariance = np.broadcast_to(np.eye(3), (len(data.error), 3, 3)).copy()
+    covariance[:, 2] = covariance[:, :, 2] = np.nan
+    whole = replace(data, error=_spoilt(data.error, 2, 2), error_cov=covariance)
+    assert np.isnan(alidade.open(whole, method="los").data.error[2, 2])
+    at = f"{data.image_t[4]:.6f}"
+    with pytest.raises(alidade.InputError, match=f"arrays: error is not finite at {at} s"):
+        alidade.open(replace(whole, error=_spoilt(whole.error, 4, 0)), method="los")
+    with pytest.raises(alidade.InputError, match=f"arrays: error_cov is not finite at {at} s"):
+        alidade.open(replace(whole, error_cov=_spoilt(covariance, 4, 0, 1)), method="los")
+
+
+@pytest.mark.parametrize("window", [-1, 0.0, float("nan"), float("inf"), "50kf"])
+def test_a_window_that_is_none_is_refused(simulated: alidade.Simulated, window: Any, tmp_path: Path) -> None:
+    """-1 once gave a calibration, and a text a TypeError after all of the graph had been prepared."""
+    with pytest.raises(alidade.InputError, match=f"^window: {window!r}; seconds above zero are needed, or None for"):
+        alidade.open(simulated).calibrate("incremental", window=window)
+    with pytest.raises(alidade.InputError, match=f"^window: {window!r}; seconds"):
+        alidade.follow(tmp_path / "none.mcap", window=window, patience=0.0)
+
+
+def test_keys_are_no_config_and_a_seed_is_no_negative_number(simulated: alidade.Simulated) -> None:
+    config: Any = {"noise": {"gyro_density": 1e-4}}
+    with pytest.raises(alidade.InputError, match=r"^config: a file or an alidade.Config is needed, not dict; alidade"):
+        alidade.open(simulated, config=config)
+    nothing: Any = 3
+    with pytest.raises(alidade.InputError, match="takes a recording, simulated data or arrays by name, not int"):
+        alidade.open(nothing, method="head")
+    for seed in (-1, 0.5):
+        unusable: Any = seed
+        with pytest.raises(alidade.InputError, match=f"^seed: {seed} is no whole number from zero on"):
+            alidade.simulate("head", HEAD, seed=unusable)
 
 
 def test_arrays_do_not_say_their_method(simulated: alidade.Simulated) -> None:

@@ -33,6 +33,7 @@ from pipelines.reports.result import Calibration
 from pipelines.session import Session
 from pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
 from pipelines.solvers.incremental import Run
+from pipelines.solvers.window import check_window
 
 # At least so long from one look to the next, s, and so many times what it took to read: steps wait for nothing.
 _PAUSE, _REST = 0.05, 2.0
@@ -110,6 +111,7 @@ class Follower:
         self._guessed = 0.0  # from a recording of so many s
         self._held: Step | None = None  # the first step that is not settled
         self._misplaced = False  # whether it was said that pictures were taken far from their stamps
+        check_window(settings.window)
         if settings.checkpoint is not None and settings.window is None:
             raise InputError("--window all has no checkpoints: it forgets nothing; give seconds")
         if settings.prior is not None:

@@ -95,7 +95,11 @@ class Method(ABC):
     @property
     @abstractmethod
     def data(self) -> type:
-        """The class of its data: a frozen dataclass of arrays, with epoch_ns (Unix ns) the zero of all times."""
+        """The class of its data: a frozen dataclass of arrays, with epoch_ns (Unix ns) the zero of all times.
+
+        Its annotations say what arrays hold in a row (`pipelines.recording.shapes`). They are evaluated: what they name
+        is imported when the program runs, too.
+        """
 
     @abstractmethod
     def read(self, recording: Recording, config: Config) -> Any:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numbers
+
 from pipelines.errors import InputError
 
 # After a number of keyframes.
@@ -16,6 +18,12 @@ class Keyframes(int):
 
 
 Window = Keyframes | float | None
+
+
+def check_window(window: object) -> None:
+    """Raise InputError unless this is a window."""
+    if window is not None and not (isinstance(window, numbers.Real) and 0.0 < float(window) < float("inf")):
+        raise InputError(f"window: {window!r}; seconds above zero are needed, or None for the whole history")
 
 
 def parse_window(text: str) -> Window:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, wraps
-from typing import TYPE_CHECKING, TypeVar, cast
+from typing import TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +14,10 @@ from pipelines.graph.noise import Noise
 from pipelines.methods.cube.topics import CubeConfig, RawConversion, field_date
 from pipelines.methods.noise import stated
 from pipelines.methods.place import field_at
+from pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
 from pipelines.recording.temperature import Temperature
 from pipelines.settings import Config
-
-if TYPE_CHECKING:
-    from pipelines.vision.camera import Camera
+from pipelines.vision.camera import Camera
 
 Array = NDArray[np.float64]
 
@@ -61,14 +60,14 @@ class CubeData:
     """
 
     epoch_ns: int
-    imu_t: Array
-    gyro: Array
-    accel: Array
-    mag_t: Array | None = None
-    mag: Array | None = None
-    reference_t: Array | None = None
-    reference_wxyz: Array | None = None
-    reference_cov: Array | None = None
+    imu_t: Numbers
+    gyro: Vectors
+    accel: Vectors
+    mag_t: Numbers | None = None
+    mag: Vectors | None = None
+    reference_t: Numbers | None = None
+    reference_wxyz: Quaternions | None = None
+    reference_cov: Covariances | None = None
     latitude: float | None = None
     longitude: float | None = None
     height: float = 0.0

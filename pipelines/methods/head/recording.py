@@ -24,6 +24,7 @@ from pipelines.recording.checks import (
 )
 from pipelines.recording.gyro import read_gyro, read_imu
 from pipelines.recording.reading import Recording
+from pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
 from pipelines.recording.temperature import Temperature
 from pipelines.recording.topics import CAMERA_INFO, IMAGE, wanted
 from pipelines.recording.writing import attached, write_session
@@ -52,18 +53,18 @@ class HeadData:
     """
 
     epoch_ns: int
-    head_t: Array
-    head_gyro: Array
-    platform_t: Array | None
-    platform_gyro: Array | None
-    vision_t: Array
-    vision_wxyz: Array
-    vision_cov: Array | None
-    truth_t: Array | None = None
-    truth_wxyz: Array | None = None
+    head_t: Numbers
+    head_gyro: Vectors
+    platform_t: Numbers | None
+    platform_gyro: Vectors | None
+    vision_t: Numbers
+    vision_wxyz: Quaternions
+    vision_cov: Covariances | None
+    truth_t: Numbers | None = None
+    truth_wxyz: Quaternions | None = None
     gyro_density: float | None = None
     platform_gyro_density: float | None = None
-    head_force: Array | None = None
+    head_force: Vectors | None = None
     dropped: dict[str, int] = field(default_factory=dict)
     stamp_sigma: float = 0.0
     temperature: Temperature | None = None

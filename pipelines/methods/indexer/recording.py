@@ -26,6 +26,7 @@ from pipelines.recording.checks import (
 )
 from pipelines.recording.gyro import usable
 from pipelines.recording.reading import Recording
+from pipelines.recording.shapes import Numbers, Quaternions, Vectors
 from pipelines.recording.temperature import Temperature
 from pipelines.recording.topics import FIX, IMU
 from pipelines.recording.writing import attached, write_session
@@ -46,13 +47,13 @@ class IndexerData:
     """
 
     epoch_ns: int
-    gyro_t: Array
-    gyro: Array
-    encoder_t: Array
-    outer: Array
-    inner: Array
+    gyro_t: Numbers
+    gyro: Vectors
+    encoder_t: Numbers
+    outer: Numbers
+    inner: Numbers
     latitude_deg: float | None
-    attitude: Array | None = None
+    attitude: Quaternions | None = None
     gyro_density: float | None = None
     dropped: dict[str, int] = field(default_factory=dict)
     stamp_sigma: float = 0.0

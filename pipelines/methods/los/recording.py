@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise, product
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from pipelines.recording import series
 from pipelines.recording.checks import check_overlap, clean, count, nanoseconds
 from pipelines.recording.gyro import read_imu
 from pipelines.recording.reading import Recording
+from pipelines.recording.shapes import Numbers, Pairs, Rows, Vectors
 from pipelines.recording.temperature import Temperature
 from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU
 from pipelines.recording.writing import attached, write_session
@@ -36,6 +38,8 @@ _STRETCH, _MOVED = 2.0, 0.01
 _STRIDE, _FEWEST = 0.2, 20
 # Samples of the gyro looked at together.
 _BLOCK = 100_000
+# Of an LOS error, what trackers may not measure.
+_ROLL = (2,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,15 +55,15 @@ class LosData:
     """
 
     epoch_ns: int
-    gyro_t: Array
-    gyro: Array
-    gimbal_t: Array
-    gimbal: Array
-    image_t: Array
-    error: Array
-    error_cov: Array | None = None
+    gyro_t: Numbers
+    gyro: Vectors
+    gimbal_t: Numbers
+    gimbal: Pairs
+    image_t: Numbers
+    error: Annotated[Array, Rows((3,), unmeasured=_ROLL)]
+    error_cov: Annotated[Array, Rows((3, 3), unmeasured=_ROLL)] | None = None
     gyro_density: float | None = None
-    force: Array | None = None
+    force: Vectors | None = None
     dropped: dict[str, int] = field(default_factory=dict)
     stamp_sigma: float = 0.0
     temperature: Temperature | None = None

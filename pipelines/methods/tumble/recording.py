@@ -26,6 +26,7 @@ from pipelines.recording.checks import (
 )
 from pipelines.recording.faults import drop_faults
 from pipelines.recording.reading import Recording
+from pipelines.recording.shapes import Numbers, Vectors
 from pipelines.recording.temperature import Temperature
 from pipelines.recording.topics import FIX, IMU, MAG, wanted
 from pipelines.recording.writing import attached, write_session
@@ -56,18 +57,18 @@ class TumbleData:
     """
 
     epoch_ns: int
-    mag_t: Array | None = None
-    mag: Array | None = None
-    accel_t: Array | None = None
-    accel: Array | None = None
+    mag_t: Numbers | None = None
+    mag: Vectors | None = None
+    accel_t: Numbers | None = None
+    accel: Vectors | None = None
     mag_density: float | None = None
     accel_density: float | None = None
     latitude: float | None = None
     longitude: float | None = None
     height: float = 0.0
     dropped: dict[str, int] = field(default_factory=dict)
-    gyro_t: Array | None = None
-    gyro: Array | None = None
+    gyro_t: Numbers | None = None
+    gyro: Vectors | None = None
     gyro_density: float | None = None
     temperature: Temperature | None = None
 

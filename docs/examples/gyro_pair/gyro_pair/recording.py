@@ -13,6 +13,7 @@ from pipelines.recording import series
 from pipelines.recording.checks import check_overlap, nanoseconds
 from pipelines.recording.gyro import read_gyro
 from pipelines.recording.reading import Recording
+from pipelines.recording.shapes import Numbers, Vectors
 from pipelines.recording.writing import attached, write_session
 from pipelines.settings import DEFAULT_NOISE, Config, first_given
 from pipelines.simulation.simulated import Simulated
@@ -29,10 +30,10 @@ class GyroPairData:
     """
 
     epoch_ns: int
-    a_t: Array
-    a_gyro: Array
-    b_t: Array
-    b_gyro: Array
+    a_t: Numbers
+    a_gyro: Vectors
+    b_t: Numbers
+    b_gyro: Vectors
     a_density: float | None = None
     b_density: float | None = None
     dropped: dict[str, int] = field(default_factory=dict)

@@ -1,0 +1,86 @@
+"""What the arrays of a method's data hold in a row, told by the annotations of their class.
+
+    gyro_t: Numbers
+    gyro: Vectors
+    gyro_cov: Covariances | None = None
+
+A plain `Array` is one of any shape.
+"""
+
+from __future__ import annotations
+
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """An array's rows, one a stamp.
+
+    Attributes:
+        shape: of a row; None: any.
+        unmeasured: components of a row that may be NaN, where they were not measured; of a covariance its rows and
+            columns.
+    """
+
+    shape: tuple[int, ...] | None = None
+    unmeasured: tuple[int, ...] = ()
+
+    def read(self, name: str, value: Any) -> Array:
+        """What somebody gives for the array of that name, as floats; what is masked is NaN.
+
+        Raises:
+            InputError: it has anything but numbers, no rows, or rows of another shape.
+        """
+        try:
+            array = np.asanyarray(value)  # masked ones as they are
+        except (ValueError, TypeError) as error:
+            raise InputError(f"arrays: {name} is no array: its rows differ in length") from error
+        if array.dtype.kind not in "iuf":
+            raise InputError(f"arrays: {name} has to be numbers, not {array.dtype.type.__name__.rstrip('_')}")
+        if array.shape[:1] == (0,):
+            raise InputError(f"arrays: {name} has no rows; what was not recorded is left out")
+        if array.ndim == 0 or (self.shape is not None and array.shape[1:] != self.shape):
+            needed = ", ".join(["N", *map(str, self.shape or ())])
+            raise InputError(f"arrays: {name} has the shape {array.shape}; ({needed}) is needed")
+        return np.asarray(np.ma.filled(array.astype(float, copy=False), np.nan))
+
+    def lost(self, values: Array) -> NDArray[np.intp]:
+        """The rows in which anything that has to be measured is not finite."""
+        for axis in range(1, values.ndim) if self.unmeasured else ():
+            values = np.delete(values, self.unmeasured, axis)
+        return np.flatnonzero(~np.isfinite(values).all(axis=tuple(range(1, values.ndim))))
+
+
+Numbers = Annotated[Array, Rows(())]
+Pairs = Annotated[Array, Rows((2,))]
+Vectors = Annotated[Array, Rows((3,))]
+Quaternions = Annotated[Array, Rows((4,))]
+Covariances = Annotated[Array, Rows((3, 3))]
+
+
+def rows_by_name(kind: type) -> Mapping[str, Rows]:
+    """The arrays among the fields of a class of data."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    return {name: rows for name, hint in hints.items() if (rows := _rows(hint)) is not None}
+
+
+def _rows(hint: Any) -> Rows | None:
+    if hint == Array:
+        return Rows()
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Annotated:
+        return next((part for part in parts if isinstance(part, Rows)), _rows(parts[0]))
+    if origin in (typing.Union, types.UnionType):
+        return next(filter(None, map(_rows, parts)), None)
+    return None
