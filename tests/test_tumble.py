@@ -360,6 +360,33 @@ def test_an_accelerometer_alone_if_asked_for(tmp_path: Path) -> None:
             assert parameter.sigma > 1e-3 or not name.endswith(("11", "22", "33"))
 
 
+@pytest.mark.parametrize("stated", [5e-8, 5e-7, None])
+def test_a_magnetometer_that_did_not_turn_is_refused(stated: float | None) -> None:
+    data: TumbleData = _simulated(BRIEF, 0).data
+    assert data.mag is not None
+    rest = [2e-5, 0.0, -4e-5] + 1e-7 * np.random.default_rng(0).standard_normal(data.mag.shape)
+    with pytest.raises(InputError, match=r"topic /mag: the device did not turn, .*; turn it slowly through all"):
+        TUMBLE.problem(replace(data, mag=rest, mag_density=stated), Config())
+
+
+def test_turns_within_the_noise_that_is_stated_are_none() -> None:
+    """Readings of many attitudes become one where messages state ten times as much noise as these are apart."""
+    data: TumbleData = _simulated(BRIEF, 0).data
+    assert data.mag is not None
+    nearly = data.mag.mean(axis=0) + 0.05 * (data.mag - data.mag.mean(axis=0))
+    with pytest.raises(InputError, match="topic /mag: the device did not turn"):
+        TUMBLE.problem(replace(data, mag=nearly, mag_density=5e-6), Config())
+
+
+@pytest.mark.parametrize("scenario", [RESTING, TURNING])
+def test_an_accelerometer_that_did_not_turn_is_refused(scenario: TumbleScenario) -> None:
+    data: TumbleData = _simulated(scenario, 0).data
+    assert data.accel is not None
+    rest = [0.0, 0.0, 9.81] + 1e-2 * np.random.default_rng(0).standard_normal(data.accel.shape)
+    with pytest.raises(InputError, match="topic /imu: the device did not turn"):
+        TUMBLE.problem(replace(data, accel=rest), Config())
+
+
 def test_other_methods_go_first(tmp_path: Path) -> None:
     t = T0 + np.arange(0, 10**9, 10**7)
     still, zeros = np.zeros((100, 3)), np.zeros((100, 2))

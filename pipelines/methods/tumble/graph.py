@@ -27,7 +27,7 @@ from pipelines.methods.tumble.chained import FAMILIES, advice, chained
 from pipelines.methods.tumble.model import Model, Moments, Sensor, prepare
 from pipelines.methods.tumble.parameters import DIP_KEY, SLOPE_KEY, STRENGTH_KEYS, TRIAD_KEYS, Variable, variables
 from pipelines.methods.tumble.recording import TumbleData
-from pipelines.methods.tumble.unturned import unturned
+from pipelines.methods.tumble.unturned import check_turned, unturned
 from pipelines.settings import Config
 
 # What is measured within this time, s, makes one step.
@@ -38,13 +38,17 @@ def problem(data: TumbleData, config: Config) -> Problem:
     """The graph.
 
     Raises:
-        InputError: too few readings, the config names no such parameter, or the date is outside the field model.
+        InputError: too few readings or attitudes, the config names no such parameter, or the date is outside the field
+            model.
     """
     model = prepare(data, config)
     found = variables(model, config)
+    sensors = model.sensors if model.mounted is not None else tuple(map(unturned, model.sensors))
+    for sensor in sensors:
+        check_turned(sensor, config)
     if model.mounted is not None:
         return chained(data, config, model, found)
-    model = replace(model, sensors=tuple(map(unturned, model.sensors)))
+    model = replace(model, sensors=sensors)
     noises = [Level(sensor.noise) for sensor in model.sensors]
     if model.moments is not None:
         noises.append(Level(model.moments.noise))

@@ -12,13 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.ellipsoid import entries, excess, sagitta
+from pipelines.errors import InputError
 from pipelines.graph.problem import Array
 from pipelines.methods.tumble.model import Sensor
+from pipelines.methods.tumble.published import FEWEST
+from pipelines.recording.topics import IMU, MAG
+from pipelines.settings import Config
 
 # A mean may lie inside the ellipsoid, which is allowed for, by this many times its own sigma ...
 _OFF = 1.0
 # ... and those of its parts no farther apart, as a square in such units, than outliers do.
 _NEAR = 6.0
+# A device whose readings scatter by less than this share of them did not turn: a degree, which is more than noise. A
+# magnetometer in T with ten times the field for its offset scatters by more when it turns; counts may have any offset.
+_SAME = 0.02
+_TOPICS = {"accel": IMU, "mag": MAG}
 
 
 def unturned(sensor: Sensor) -> Sensor:
@@ -48,6 +56,17 @@ def unturned(sensor: Sensor) -> Sensor:
         excess=excess(means, believed / np.sqrt(number), numbers) - sagitta(means, scatter, numbers),
         warmth=None if sensor.warmth is None else mean(sensor.warmth),
     )
+
+
+def check_turned(sensor: Sensor, config: Config) -> None:
+    """Raise InputError if readings, or the means of `unturned`, show too few attitudes for any of the numbers."""
+    scatter = float(np.sqrt(sensor.raw.var(axis=0).sum()))
+    size = float(np.median(np.linalg.norm(sensor.raw, axis=1)))
+    if len(sensor.raw) < FEWEST or (sensor.is_si and scatter < _SAME * size):
+        raise InputError(
+            f"topic {config.topic(_TOPICS[sensor.name])}: the device did not turn, or hardly, beyond the noise of its "
+            f"readings; turn it slowly through all attitudes, {FEWEST} at the very least, and record again"
+        )
 
 
 def _beginnings(raw: Array, sigma: float) -> NDArray[np.intp]:
