@@ -22,6 +22,7 @@ from pipelines.methods.head.simulation import HeadScenario, head_config, simulat
 from pipelines.methods.los import graph as los
 from pipelines.methods.los.recording import read_los, write_los
 from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from pipelines.methods.tumble.scenario import TumbledAccelerometer
 from pipelines.recording.faults import drop_faults
 from pipelines.recording.reading import Recording, open_recording
 from pipelines.settings import Config
@@ -205,6 +206,7 @@ def test_a_quantised_sensor_at_rest_is_sound() -> None:
     ("spoil", "message"),
     [
         (lambda g: g * [1.0, 1.0, 0.0], "topic /imu: axis z reads 0 throughout while the others move"),
+        (lambda g: g * 0.0 + [0.0, 0.0, 9.8], r"topic /imu: all axes read the same throughout, \(0, 0, 9.8\) rad/s; "),
         (lambda g: np.clip(g, -0.05, 0.05), r"topic /imu: \d+ % of the samples cannot be used: at the end of the"),
     ],
 )
@@ -212,3 +214,38 @@ def test_a_useless_sensor_is_refused(spoil: Callable[[Array], Array], message: s
     data = cases["los"].data
     with pytest.raises(InputError, match=message):
         drop_faults("/imu", data.gyro_t, spoil(data.gyro), {}, "rad/s")
+
+
+@pytest.mark.parametrize(
+    ("name", "readings", "brief"),
+    [
+        ("los", "gyro", {"duration_s": 5.0}),
+        ("head", "head_gyro", {"duration_s": 5.0}),
+        ("indexer", "gyro", {}),
+        *(("cube", readings, {"poses": 3, "static_s": 2.0, "camera": None}) for readings in ("gyro", "accel", "mag")),
+        *(("tumble", sensor, {"attitudes": 5, "accelerometer": TumbledAccelerometer()}) for sensor in ("mag", "accel")),
+    ],
+)
+def test_a_sensor_that_measures_nothing_is_refused_by_every_method(
+    name: str, readings: str, brief: dict[str, Any], tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=r"topic /.*: all axes read the same throughout") as caught:
+        _read_standing(name, readings, brief, tmp_path / "s.mcap")
+    assert "\n" not in str(caught.value)
+
+
+def test_the_gyro_of_a_parked_platform_may_read_zero(tmp_path: Path) -> None:
+    assert not _read_standing("head", "platform_gyro", {"duration_s": 5.0}, tmp_path / "s.mcap").platform_gyro.any()
+
+
+def _read_standing(name: str, readings: str, brief: dict[str, Any], path: Path) -> Any:
+    """A simulated recording one of whose sensors reads the same throughout, as its method reads it.
+
+    That is zero, but for an accelerometer, which is none if it reads zero.
+    """
+    chosen = method(name)
+    simulated = chosen.simulate(chosen.settings().model_copy(update=brief), 3)
+    same = np.full_like(getattr(simulated.data, readings), 9.8 if readings == "accel" else 0.0)
+    chosen.write(path, replace(simulated, data=replace(simulated.data, **{readings: same})))
+    recording = open_recording(path)
+    return chosen.read(recording, load_config(recording.attachment("alidade.yaml")))

@@ -83,6 +83,28 @@ def _never_found(data: LosData) -> LosData:
     return replace(data, error=np.full_like(data.error, np.nan))
 
 
+def _no_errors(data: LosData) -> LosData:
+    return replace(data, error=np.zeros_like(data.error))
+
+
+def _nearly_one_error(data: LosData) -> LosData:
+    error = data.error.copy()
+    error[20:] = error[20]
+    return replace(data, error=error)
+
+
+def _one_axis(data: LosData) -> LosData:
+    return replace(data, error=data.error * [1.0, 0.0, 1.0])
+
+
+def _held(data: LosData, share: float) -> LosData:
+    """For such a share of every hundred messages the tracker gives the error of the first."""
+    error = data.error.copy()
+    for start in range(0, len(error), 100):
+        error[start : start + round(100 * share)] = error[start]
+    return replace(data, error=error)
+
+
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
@@ -92,12 +114,38 @@ def _never_found(data: LosData) -> LosData:
         (_other_sign, r"/imu: gimbal and pictures show that the gyro's y has the opposite sign"),
         (_pixels, r"/los/error: LOS errors of .* are they in pixels\?"),
         (_never_found, r"/los/error: the target was never found, none of the 600 messages"),
+        (
+            _no_errors,
+            r"/los/error: x and z read the same value in all 600 messages: the tracker did not measure; check",
+        ),
+        (_nearly_one_error, r"/los/error: x and z read the same value in 97 % of the 600 messages: the tracker"),
+        (_one_axis, r"/los/error: z reads the same value in all 600 messages: the tracker did not measure; check"),
+        (lambda data: _held(data, 0.8), r"/los/error: \d\d % of the samples cannot be used: frozen, .* on axis x, the"),
     ],
 )
 def test_bad_input_is_named(tmp_path: Path, spoil: Callable[[LosData], LosData], said: str) -> None:
     with pytest.raises(InputError, match=said) as caught:
         _back(tmp_path / "s.mcap", spoil(DATA))
     assert "\n" not in str(caught.value)
+
+
+def test_what_a_tracker_holds_is_left_out_and_counted(tmp_path: Path) -> None:
+    back = _back(tmp_path / "s.mcap", _held(DATA, 0.15))
+    ((what, number),) = back.dropped.items()
+    assert what == "/los/error: frozen, the same value for long"
+    # Of six stretches of fourteen one may end where the error happens to be what it was.
+    assert number in (5 * 14, 6 * 14)
+    assert len(back.image_t) == len(back.error) == len(DATA.image_t) - number
+
+
+def test_whole_pixels_are_no_frozen_tracker(tmp_path: Path) -> None:
+    pixel = 2.0 * np.nanstd(DATA.error[:, :2])
+    error = DATA.error.copy()
+    error[:, :2] = pixel * np.round(error[:, :2] / pixel)
+    assert (np.diff(error[:, :2], axis=0) == 0.0).mean() > 0.8
+    back = _back(tmp_path / "s.mcap", replace(DATA, error=error))
+    assert not back.dropped
+    assert len(back.image_t) == len(DATA.image_t)
 
 
 def test_gimbal_locked_on_purpose_is_no_frozen_encoder(tmp_path: Path) -> None:

@@ -26,21 +26,40 @@ _CLIPPED, _QUANTA = 3, 20.0
 _MOST_REPEATED = 0.5
 # What is dropped, as it is counted.
 CLIPPED = "at the end of the sensor's range"
+_STUCK = "frozen, the same value for long"
 # A recording that loses more than this is not worth solving.
 _MOST_LOST = 0.2
 
 
-def drop_faults(topic: str, t: Array, values: Array, dropped: dict[str, int], unit: str) -> NDArray[np.intp]:
+def drop_faults(
+    topic: str, t: Array, values: Array, dropped: dict[str, int], unit: str, may_stand: bool = False
+) -> NDArray[np.intp]:
     """Rows of values (N, k) at t (N,), s, that are sound; what is not is counted in `dropped`.
 
     Raises:
-        InputError: an axis never moves while the others do, or more than a fifth of the samples is lost.
+        InputError: an axis never moves while the others do, none does (unless it `may_stand`), or more than a fifth of
+            the samples is lost.
     """
-    _check_alive(topic, values)
+    _check_alive(topic, values, unit, may_stand)
     spikes = np.stack([_spikes(column) for column in values.T], axis=1)
     rest = np.where(spikes, np.nan, values)
     clipped, frozen = (np.stack([find(t, column) for column in rest.T], axis=1) for find in (_clipped, _frozen))
-    reasons = {"spike": spikes, CLIPPED: clipped, "frozen, the same value for long": frozen}
+    return _without(topic, t, values, {"spike": spikes, CLIPPED: clipped, _STUCK: frozen}, dropped, unit)
+
+
+def drop_frozen(topic: str, t: Array, values: Array, dropped: dict[str, int], unit: str, axes: str) -> NDArray[np.intp]:
+    """As `drop_faults`, of what may reach the end of its range and has outliers that the estimate is to weigh.
+
+    It is nowhere at rest: what is frozen for most of the time is so nonetheless.
+    """
+    frozen = np.stack([_frozen(t, column, most=1.0) for column in values.T], axis=1)
+    return _without(topic, t, values, {_STUCK: frozen}, dropped, unit, axes)
+
+
+def _without(
+    topic: str, t: Array, values: Array, reasons: dict[str, Mask], dropped: dict[str, int], unit: str, axes: str = "xyz"
+) -> NDArray[np.intp]:
+    """Rows that no reason, its mask (N, k), speaks against; the others are counted, and refused if too many."""
     for reason, mask in reasons.items():
         lost = mask.any(axis=1)
         if lost.mean() > _MOST_LOST:
@@ -48,21 +67,27 @@ def drop_faults(topic: str, t: Array, values: Array, dropped: dict[str, int], un
             axis = int(np.argmax(mask[first]))
             raise InputError(
                 f"topic {topic}: {100.0 * lost.mean():.0f} % of the samples cannot be used: {reason} "
-                f"({values[first, axis]:.6g} {unit} on axis {'xyz'[axis]}, the first at {t[first]:.3f} s); "
+                f"({values[first, axis]:.6g} {unit} on axis {axes[axis]}, the first at {t[first]:.3f} s); "
                 "check the sensor and its range, and record again"
             )
         count(dropped, f"{topic}: {reason}", int(lost.sum()))
     return np.flatnonzero(~np.any([mask.any(axis=1) for mask in reasons.values()], axis=0))
 
 
-def _check_alive(topic: str, values: Array) -> None:
-    """Refuse an axis that never changes beside others that always do."""
+def _check_alive(topic: str, values: Array, unit: str, may_stand: bool) -> None:
+    """Refuse axes that never change, one beside others that always do, or all of them."""
+    if len(values) <= _FROZEN_SAMPLES:
+        return
     repeated = (np.diff(values, axis=0) == 0.0).mean(axis=0)
+    what = "the sensor is dead or its driver does not fill it in: check it and record again"
+    if (repeated == 1.0).all() and not may_stand:
+        numbers = ", ".join(f"{number:.6g}" for number in values[0] + 0.0)
+        raise InputError(f"topic {topic}: all axes read the same throughout, ({numbers}) {unit}; {what}")
     for axis in np.flatnonzero(repeated == 1.0):
-        if len(values) > _FROZEN_SAMPLES and np.delete(repeated, axis).max(initial=0.0) < 0.1:
+        if np.delete(repeated, axis).max(initial=0.0) < 0.1:
             raise InputError(
                 f"topic {topic}: axis {'xyz'[axis]} reads {values[0, axis]:.6g} throughout while the others move; "
-                "the sensor is dead or its driver does not fill it in: check it and record again"
+                f"{what}"
             )
 
 
@@ -98,8 +123,8 @@ def _edge(step: Array, starts: NDArray[np.intp], stops: NDArray[np.intp]) -> Arr
     return np.fmax(np.concatenate([[0.0], step])[starts], np.concatenate([step, [0.0]])[stops])
 
 
-def _frozen(t: Array, x: Array) -> Mask:
-    """Long runs of one value that end in a jump."""
+def _frozen(t: Array, x: Array, most: float = _MOST_REPEATED) -> Mask:
+    """Long runs of one value that end in a jump; none where they are so much of the stream that this is its nature."""
     starts, stops = _runs(x)
     long = (stops - starts + 1 >= _FROZEN_SAMPLES) & (t[stops] - t[starts] >= _FROZEN)
     step = np.abs(np.diff(x))
@@ -107,7 +132,7 @@ def _frozen(t: Array, x: Array) -> Mask:
     # The first reading of a run was a good one.
     jumps = long & (_edge(step, starts, stops) > _JUMP * usual)
     out = _mask(len(x), starts[jumps] + 1, stops[jumps])
-    return out if out.mean() < _MOST_REPEATED else np.zeros(len(x), dtype=bool)
+    return out if out.mean() < most else np.zeros(len(x), dtype=bool)
 
 
 def _clipped(_: Array, x: Array) -> Mask:

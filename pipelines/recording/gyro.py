@@ -18,10 +18,11 @@ def read_gyro(
 ) -> tuple[Array, Array, float | None]:
     """Times (N,) s from the epoch, rates (N, 3) rad/s, and the density its messages state (rad/s/sqrt(Hz)) or None.
 
-    Samples that cannot be used are counted in `dropped`. Raises InputError as pipelines.recording.checks does.
+    Samples that cannot be used are counted in `dropped`. Raises InputError as pipelines.recording.checks does. For the
+    gyro of a platform: one that is parked may read zero throughout, by a simulator or a driver that cuts off noise.
     """
     imu = recording.imu(topic)
-    t, keep = usable(topic, imu, epoch_ns, dropped)
+    t, keep = usable(topic, imu, epoch_ns, dropped, may_stand=True)
     return t, taken(imu.gyro, keep), density(topic, t, taken(imu.gyro_cov, keep), LEAST_GYRO, dropped)
 
 
@@ -41,7 +42,7 @@ def read_imu(
 
 
 def usable(
-    topic: str, imu: ImuSeries, epoch_ns: int, dropped: dict[str, int], least: int = 2
+    topic: str, imu: ImuSeries, epoch_ns: int, dropped: dict[str, int], least: int = 2, may_stand: bool = False
 ) -> tuple[Array, NDArray[np.intp]]:
     """Times (N,) s from the epoch of the samples whose rates can be used, and which they are (indexes into the series).
 
@@ -49,7 +50,7 @@ def usable(
     """
     count(dropped, f"{topic}: stamped by log time (kept)", imu.stamped_by_log)
     t, keep = clean(topic, imu.t_ns, epoch_ns, imu.gyro, dropped, least)
-    sound = drop_faults(topic, t, taken(imu.gyro, keep), dropped, "rad/s")
+    sound = drop_faults(topic, t, taken(imu.gyro, keep), dropped, "rad/s", may_stand)
     t, keep = taken(t, sound), keep[sound]
     check_gyro(topic, t, taken(imu.gyro, keep))
     return t, keep

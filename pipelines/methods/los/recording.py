@@ -17,6 +17,7 @@ from pipelines.methods.los import parameters
 from pipelines.methods.los.topics import GIMBAL, JOINTS, LOS_ERROR
 from pipelines.recording import series
 from pipelines.recording.checks import check_overlap, clean, count, nanoseconds
+from pipelines.recording.faults import drop_frozen
 from pipelines.recording.gyro import read_imu
 from pipelines.recording.reading import Recording
 from pipelines.recording.shapes import Numbers, Pairs, Rows, Vectors
@@ -32,6 +33,8 @@ Array = NDArray[np.float64]
 _STEEPEST = np.deg2rad(80.0)
 # No camera that measures LOS errors looks this far off its axis, rad; in pixels most errors are larger.
 _WIDEST_ERROR = 0.5
+# A tracker that reads whole pixels repeats itself while a good gimbal holds the target, but not one value as often.
+_STUCK = 0.9
 # A gimbal is looked at in stretches this long, s, and counts as moved by the carrier beyond this, rad.
 _STRETCH, _MOVED = 2.0, 0.01
 # Pictures this far apart, s, and at least so many, tell the signs of the gyro's axes.
@@ -236,7 +239,7 @@ def _gimbal(recording: Recording, topic: str, epoch_ns: int, dropped: dict[str, 
 
 
 def _error(recording: Recording, topic: str, epoch_ns: int, dropped: dict[str, int]) -> tuple[Array, Array]:
-    """Times and phx, phz, roll; messages without phx or phz (target lost) are dropped."""
+    """Times and phx, phz, roll; messages without phx or phz (target lost), or with a frozen one, are dropped."""
     errors = recording.vector(topic)
     count(dropped, f"{topic}: stamped by log time (kept)", errors.stamped_by_log)
     offset = errors.vector[:, [0, 2]]
@@ -253,7 +256,23 @@ def _error(recording: Recording, topic: str, epoch_ns: int, dropped: dict[str, i
             f"topic {topic}: LOS errors of {np.median(size):.4g} (median, {size.max():.4g} at most), beyond "
             f"{_WIDEST_ERROR:g} rad; are they in pixels? divide by the focal length: x and z have to be in rad"
         )
-    return t, error
+    _check_tracked(topic, error[:, :2])
+    sound = drop_frozen(topic, t, error[:, :2], dropped, "rad", "xz")
+    return t[sound], error[sound]
+
+
+def _check_tracked(topic: str, offset: Array) -> None:
+    """Raise InputError if phx or phz (N, 2) are nearly always one value: errors that agree so look like small ones."""
+    share = np.array([np.unique(column, return_counts=True)[1].max() for column in offset.T]) / len(offset)
+    stuck = " and ".join(axis for axis, much in zip("xz", share, strict=True) if much >= _STUCK)
+    if stuck and len(offset) >= _FEWEST:
+        least = share[share >= _STUCK].min()
+        many = f"all {len(offset)}" if least == 1.0 else f"{100.0 * least:.0f} % of the {len(offset)}"
+        raise InputError(
+            f"topic {topic}: {stuck} {'read' if 'and' in stuck else 'reads'} the same value in {many} messages: the "
+            "tracker did not measure; check that it is locked on the target and its driver fills in x and z, and "
+            "record again"
+        )
 
 
 def _from_pictures(
