@@ -125,10 +125,11 @@ def judged(results: dict[str, Result]) -> tuple[list[Population], list[History]]
     return populations(results, found), found
 
 
-def test_a_good_fleet_raises_no_alarm() -> None:
+@pytest.mark.parametrize("fleets", [6, pytest.param(12, marks=pytest.mark.slow)])
+def test_a_good_fleet_raises_no_alarm(fleets: int) -> None:
     """One page in a hundred may, by each of the three kinds of test."""
     alarms = 0
-    for seed in range(12):
+    for seed in range(fleets):
         fleet, found = judged(a_fleet(seed))
         alarms += any(p.outlying.any() or p.drifts for p in fleet)
         alarms += any(h.found or h.together for h in found)

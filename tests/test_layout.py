@@ -153,8 +153,8 @@ def nees(tags: int, pictures: int, seeds: range, bend: float = 0.0) -> float:
 
 
 def test_sigmas_of_a_small_layout_hold() -> None:
-    # Mean of 3 * 42 squares: 1 +- 0.13.
-    assert 0.75 < nees(8, 40, range(3)) < 1.3
+    # Mean of 2 * 42 squares: 1 +- 0.15.
+    assert 0.7 < nees(8, 40, range(2)) < 1.3
 
 
 @pytest.mark.slow

@@ -68,11 +68,10 @@ CASES = {
         {"duration_s": 20.0, "vision_rate_hz": 15.0, **TURNING},
     ),
 }
+SLOW = ("indexer", "head with mounts, ideal")
 
 
-@pytest.mark.parametrize(
-    "case", [pytest.param(case, marks=[pytest.mark.slow] if case == "indexer" else []) for case in CASES]
-)
+@pytest.mark.parametrize("case", [pytest.param(case, marks=[pytest.mark.slow] * (case in SLOW)) for case in CASES])
 def test_it_is_one_big_graph(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """To 1e-6 sigmas at fixed noise levels, the device's numbers and those of the last recording, and their sigmas."""
     monkeypatch.setattr(together, "_STAYS", 1e-7)
