@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from factors import so3
 from pipelines.config import load_config
 from pipelines.errors import InputError
 from pipelines.methods.indexer.graph import problem
-from pipelines.methods.indexer.recording import IndexerData
+from pipelines.methods.indexer.recording import IndexerData, read_indexer, write_indexer
 from pipelines.methods.indexer.runs import axis_motion
 from pipelines.methods.indexer.simulation import (
     IndexerNoise,
@@ -20,6 +22,7 @@ from pipelines.methods.indexer.simulation import (
     simulate_indexer,
 )
 from pipelines.methods.indexer.validation import validate
+from pipelines.recording.reading import open_recording
 from pipelines.settings import Config
 from pipelines.solvers.batch import solve_batch
 
@@ -111,6 +114,20 @@ def test_turn_in_which_the_gyro_stuck_is_dropped(session: tuple[IndexerData, dic
     found = problem(replace(data, gyro=gyro), _config())
     assert found.dropped["turn in which gyro and encoder disagree by more than 1 %"] == 1
     assert np.abs(_errors(replace(data, gyro=gyro), truth)).max() < 4.0
+
+
+@pytest.mark.parametrize("rows", [slice(None), slice(7, 8)])
+def test_an_orientation_that_is_not_there_throughout_is_none(
+    session: tuple[IndexerData, dict[str, float]], rows: slice, tmp_path: Path
+) -> None:
+    data, _ = session
+    turning = so3.exp(np.outer(data.gyro_t, [0.0, 0.0, 0.1]))
+    lacking = turning.copy()
+    lacking[rows] = np.nan
+    for wxyz, there in ((turning, True), (lacking, False)):
+        write_indexer(tmp_path / "s.mcap", replace(data, attitude=wxyz))
+        found = read_indexer(open_recording(tmp_path / "s.mcap"), _config())
+        assert (found.attitude is not None) is there
 
 
 @pytest.mark.parametrize("wrap", [np.pi, 2.0 * np.pi])

@@ -93,9 +93,9 @@ def too_fast(topic: str, t: Array, gyro: Array) -> str:
 
 
 def unit_quaternions(topic: str, t: Array, wxyz: Array) -> Array:
-    """The quaternions, shape (N, 4), at exactly unit length. Raises InputError beyond 1e-3, and at zero norm."""
+    """The quaternions, shape (N, 4), at exactly unit length. Raises InputError beyond 1e-3, at zero norm and at NaN."""
     norm = np.linalg.norm(wxyz, axis=1)
-    bad = np.flatnonzero(np.abs(norm - 1.0) > MAX_NORM_ERROR)
+    bad = np.flatnonzero(~(np.abs(norm - 1.0) <= MAX_NORM_ERROR))
     if len(bad):
         i = bad[0]
         what = "is zero" if norm[i] == 0.0 else f"has norm {norm[i]:.6g}"

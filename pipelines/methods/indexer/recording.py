@@ -73,9 +73,10 @@ def read_indexer(recording: Recording, config: Config) -> IndexerData:
     imu = recording.imu(imu_topic)
     gyro_t, keep = usable(imu_topic, imu, epoch, dropped, least=3)
     gyro = imu.gyro[keep]
-    attitude = None
-    if (imu.wxyz_cov[keep, 0, 0] >= 0.0).all() and np.ptp(imu.wxyz[keep], axis=0).any():
-        attitude = unit_quaternions(imu_topic, gyro_t, imu.wxyz[keep])
+    attitude, wxyz = None, imu.wxyz[keep]
+    # A message that does not say it has zeros, one value, or NaN.
+    if (imu.wxyz_cov[keep, 0, 0] >= 0.0).all() and np.isfinite(wxyz).all() and np.ptp(wxyz, axis=0).any():
+        attitude = unit_quaternions(imu_topic, gyro_t, wxyz)
 
     joints = recording.joints(encoder_topic, JOINTS)
     count(dropped, f"{encoder_topic}: stamped by log time (kept)", joints.stamped_by_log)
