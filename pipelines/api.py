@@ -176,18 +176,18 @@ def plan(
     method: str,
     scenario: str | Path | None = None,
     *,
-    config: str | Path | None = None,
+    config: Settings = None,
     require: Mapping[str, float] | None = None,
 ) -> Plan:
     """How well a planned motion would determine each parameter, and a better one: `.now.sigmas`, `.steps`, `.best`.
 
     Raises:
-        InputError: no such method, scenario or parameter.
+        InputError: no such method, scenario or parameter, or the config cannot be used.
     """
     from pipelines.planning import make_plan
 
     named = None if scenario is None else str(scenario)
-    return make_plan(method, named, None if config is None else Path(config), require)
+    return make_plan(method, named, _override(config), require)
 
 
 def follow(
@@ -195,7 +195,7 @@ def follow(
     show: Callable[[View], None] | None = None,
     *,
     method: str | None = None,
-    config: str | Path | None = None,
+    config: Settings = None,
     window: float | None = 1.0,
     patience: float = 30.0,
     prior: str | Path | None = None,
@@ -206,7 +206,8 @@ def follow(
     input; `show` is given what is known whenever that changes; `prior` is as `open` has it.
 
     Raises:
-        InputError: no such window, or the file does not appear, is no recording, or cannot be used in the end.
+        InputError: no such window or config, or the file does not appear, is no recording, or cannot be used in the
+            end.
         IndeterminateError: states other than the parameters are not determined.
     """
     from pipelines.follow.follower import Follower
@@ -214,7 +215,7 @@ def follow(
     from pipelines.follow.sources import source_of
 
     earlier = None if prior is None else Path(prior)
-    settings = Following(method, None if config is None else Path(config), window, patience, prior=earlier)
+    settings = Following(method, _override(config), window, patience, prior=earlier)
     with source_of(str(path), say=lambda _: None) as source:
         return Follower(source, settings, show or (lambda _: None), lambda _: None, lambda: False).follow()
 

@@ -22,6 +22,7 @@ from pipelines.errors import InputError
 from pipelines.graph.problem import Quantity
 from pipelines.judgement.observability import Advice, Assessment, assess
 from pipelines.methods import Method, Scenario
+from pipelines.settings import Config
 
 _MOST_STEPS = 3
 # A change that brings less information than this on what is missing, nats, is not worth the trouble.
@@ -108,7 +109,7 @@ class Plan:
 def make_plan(
     method_name: str,
     scenario: str | None = None,
-    config_file: Path | None = None,
+    config_file: Path | Config | None = None,
     require: Mapping[str, float] | None = None,
     most_steps: int = _MOST_STEPS,
 ) -> Plan:
@@ -117,7 +118,7 @@ def make_plan(
     Args:
         method_name: los, indexer, ...
         scenario: YAML file or name; None is the method's nominal one.
-        config_file: overrides key by key the config that the simulated recording brings.
+        config_file: a file or a config: overrides key by key the config that the simulated recording brings.
         require: parameter -> sigma wanted, over those of the config.
         most_steps: changes at most.
 
@@ -147,7 +148,7 @@ def make_plan(
 def predict(
     method_name: str,
     scenario: Scenario,
-    config_file: Path | None,
+    config_file: Path | Config | None,
     require: Mapping[str, float],
     seeds: Sequence[int] | None = None,
     made: Made | None = None,
@@ -178,7 +179,7 @@ def predict(
 
 
 def _predicted(
-    method_name: str, scenario: Scenario, config_file: Path | None, require: Mapping[str, float], seed: int
+    method_name: str, scenario: Scenario, config_file: Path | Config | None, require: Mapping[str, float], seed: int
 ) -> Prediction:
     """Of one draw."""
     from pipelines.session import Session
@@ -237,7 +238,7 @@ def scenario_yaml(scenario: Scenario) -> str:
 
 
 def _candidates(
-    method: Method, before: Prediction, config_file: Path | None, require: Mapping[str, float], made: Made
+    method: Method, before: Prediction, config_file: Path | Config | None, require: Mapping[str, float], made: Made
 ) -> Iterator[Step]:
     """Each possible change with what it would bring to the worst draw; those that cannot be recorded are left out."""
     seeds = (before.worst,)

@@ -188,7 +188,7 @@ class Session:
         return replace(self, data=self.method.read(recording, self.config), origin=Recorded(recording))
 
     @classmethod
-    def of(cls, method: Method, simulated: Simulated, config_file: Path | None = None) -> Session:
+    def of(cls, method: Method, simulated: Simulated, config_file: Path | Config | None = None) -> Session:
         """A simulated recording that was never written."""
         config = load_config(simulated.config.encode(), config_file)
         return cls(method, simulated.data, config, Arrays(method, simulated.data, simulated.truth))

@@ -123,6 +123,8 @@ def test_a_plan_needs_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     (tmp_path / "s.yaml").write_text(f"{{duration_s: 12, {rates}, sensors: ideal}}")
     plan = alidade.plan("los", tmp_path / "s.yaml")
     assert plan.now.assessment.status == "calibrated"
+    blurred = alidade.Config.model_validate({"noise": {"los_error": 2e-2}})
+    assert alidade.plan("los", tmp_path / "s.yaml", config=blurred).now.assessment.status != "calibrated"
 
 
 @pytest.mark.parametrize(

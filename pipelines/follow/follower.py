@@ -31,6 +31,7 @@ from pipelines.recording.reading import Recording, open_recording
 from pipelines.reports.known import load_known
 from pipelines.reports.result import Calibration
 from pipelines.session import Session
+from pipelines.settings import Config
 from pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
 from pipelines.solvers.incremental import Run
 from pipelines.solvers.window import check_window
@@ -68,7 +69,7 @@ class Settings:
     """
 
     method: str | None = None
-    config: Path | None = None
+    config: Path | Config | None = None
     window: float | None = 1.0
     patience: float = 30.0
     checkpoint: Path | None = None
