@@ -56,20 +56,20 @@ def require_room(out_dir: Path | None) -> None:
 
 def write_page(out_dir: Path, name: str, text: str) -> Path:
     """One page of text; returns its path. Raises InputError when it cannot be written."""
-    (path,) = write_whole(out_dir, [name], lambda folder: _write_text(folder / name, text))
+    (path,) = write_whole(out_dir, [name], lambda folder: _write(folder / name, text))
     return path
 
 
-def write_file(path: Path, text: str) -> None:
-    """Text that belongs to nothing else. Raises InputError when it cannot be written."""
+def write_file(path: Path, content: str | bytes) -> None:
+    """A file that belongs to nothing else. Raises InputError when it cannot be written."""
     try:
-        _write_text(path, text)
+        _write(path, content)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 
 
-def _write_text(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
+def _write(path: Path, content: str | bytes) -> None:
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
 
 
 def _move(part: Path, out_dir: Path, names: Sequence[str]) -> tuple[Path, ...]:

@@ -46,10 +46,7 @@ def print_cube(out: Path, edge: float, first_id: int = 16) -> None:
         raise InputError(f"tag ids {first_id} to {first_id + 5}: the family 36h11 has 0 to 586")
     faces = dict(zip(range(first_id, first_id + 6), FACES.values(), strict=True))
     pages = [_face(edge, tag, np.array(bRt)) for tag, (bRt, _) in faces.items()]
-    try:
-        out.write_bytes(_document(pages))
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror})") from error
+    write_file(out, _document(pages))
     tags = [
         f"    {tag}: {{size: {tag_size(edge):.6g}, rotation: {_numbers(bRt)}, "
         f"position: {_numbers(0.5 * edge * np.array(normal))}}}"
