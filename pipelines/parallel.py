@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import math
 import multiprocessing
 import os
 import pickle
@@ -61,7 +62,12 @@ def allowed() -> int:
 
 
 def room() -> float:
-    """Bytes of memory that are free for processes, on Linux: of the machine, and of a container with a limit."""
+    """Bytes of memory that are free for processes: of the machine, and of a container with a limit.
+
+    Infinite where there is one process alone, which is everywhere but on Linux.
+    """
+    if sys.platform != "linux":
+        return math.inf
     kilobytes = {line.partition(":")[0]: line.split()[1] for line in _MEMORY.read_text().splitlines()}
     free = 1024.0 * float(kilobytes["MemAvailable"])
     try:

@@ -13,7 +13,6 @@ short recording is one stretch of which nothing is eliminated in advance.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
@@ -350,7 +349,7 @@ class System:
     def _processes(self) -> int:
         """How many may share the stretches."""
         own = sum(len(stretch.inner) for stretch in self.stretches)
-        if self.keep is Keep.NOTHING and sys.platform == "linux" and room() < _COPIED * own:
+        if self.keep is Keep.NOTHING and room() < _COPIED * own:
             return 1
         return own // _WORTH_WHILE
 
