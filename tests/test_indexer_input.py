@@ -21,8 +21,11 @@ from pipelines.methods.indexer.simulation import (
     indexer_config,
     simulate_indexer,
 )
+from pipelines.methods.indexer.topics import INDEXER, JOINTS
 from pipelines.methods.indexer.validation import validate
+from pipelines.recording import series
 from pipelines.recording.reading import open_recording
+from pipelines.recording.writing import write_session
 from pipelines.settings import Config
 from pipelines.solvers.batch import solve_batch
 
@@ -128,6 +131,21 @@ def test_an_orientation_that_is_not_there_throughout_is_none(
         write_indexer(tmp_path / "s.mcap", replace(data, attitude=wxyz))
         found = read_indexer(open_recording(tmp_path / "s.mcap"), _config())
         assert (found.attitude is not None) is there
+
+
+def test_fixes_that_never_came_are_none(session: tuple[IndexerData, dict[str, float]], tmp_path: Path) -> None:
+    write_indexer(tmp_path / "s.mcap", session[0])
+    whole = open_recording(tmp_path / "s.mcap")
+    none = series.FixSeries(np.empty(0, np.int64), np.empty(0), np.empty(0))
+    topics: dict[str, series.Topic] = {
+        "/imu": whole.imu("/imu"),
+        INDEXER.name: whole.joints(INDEXER.name, JOINTS),
+        "/fix": none,
+    }
+    write_session(tmp_path / "empty.mcap", topics)
+    recording = open_recording(tmp_path / "empty.mcap")
+    assert "/fix" in recording.topics
+    assert read_indexer(recording, load_config(None)).latitude_deg is None
 
 
 @pytest.mark.parametrize("wrap", [np.pi, 2.0 * np.pi])

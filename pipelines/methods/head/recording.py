@@ -92,7 +92,7 @@ def read_head(recording: Recording, config: Config) -> HeadData:
 
     name = config.topic(VISION_ATTITUDE)
     vision_cov: Array | None
-    if wanted(recording, config, VISION_ATTITUDE) or not _has_pictures(recording, config):
+    if wanted(recording, config, VISION_ATTITUDE) or not wanted(recording, config, IMAGE):
         vision_t, vision_wxyz, vision_cov = _vision(recording, name, epoch, dropped)
     else:
         name = config.topic(IMAGE)
@@ -159,10 +159,6 @@ def write_head(
         topics[TRUTH_ATTITUDE.name] = series.QuaternionSeries(t_ns, data.truth_wxyz, frame_id="platform")
     topics |= temperature.topics(data.temperature, data.epoch_ns)
     write_session(path, topics, attached(truth, config_yaml))
-
-
-def _has_pictures(recording: Recording, config: Config) -> bool:
-    return wanted(recording, config, IMAGE) and VISION_ATTITUDE.key not in config.topics
 
 
 def _from_pictures(

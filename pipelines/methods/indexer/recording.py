@@ -28,7 +28,7 @@ from pipelines.recording.gyro import usable
 from pipelines.recording.reading import Recording
 from pipelines.recording.shapes import Numbers, Quaternions, Vectors
 from pipelines.recording.temperature import Temperature
-from pipelines.recording.topics import FIX, IMU
+from pipelines.recording.topics import FIX, IMU, wanted
 from pipelines.recording.writing import attached, write_session
 from pipelines.settings import Config
 
@@ -129,7 +129,7 @@ def _latitude(recording: Recording, config: Config) -> float | None:
     topic = config.topic(FIX)
     if config.latitude_deg is not None:
         return config.latitude_deg
-    if topic not in recording.topics and FIX.key not in config.topics:
+    if not wanted(recording, config, FIX):
         return None
     fixes = recording.fixes(topic)
     good = fixes.latitude_deg[(fixes.status >= 0) & np.isfinite(fixes.latitude_deg)]

@@ -22,7 +22,7 @@ from pipelines.recording.gyro import read_imu
 from pipelines.recording.reading import Recording
 from pipelines.recording.shapes import Numbers, Pairs, Rows, Vectors
 from pipelines.recording.temperature import Temperature
-from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU
+from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, wanted
 from pipelines.recording.writing import attached, write_session
 from pipelines.settings import Config
 from pipelines.vision.recorded import camera_of
@@ -82,16 +82,15 @@ def read_los(recording: Recording, config: Config) -> LosData:
     dropped: dict[str, int] = {}
     epoch = recording.epoch_ns
     gyro_name, gimbal_name, error_name = map(config.topic, (IMU, GIMBAL, LOS_ERROR))
-    from_pictures = error_name not in recording.topics and config.topic(IMAGE) in recording.topics
     recording.read_together({gyro_name: (), gimbal_name: JOINTS, error_name: ()})
     gyro_t, gyro, density, force = read_imu(recording, gyro_name, epoch, dropped)
     gimbal_t, gimbal = _gimbal(recording, gimbal_name, epoch, dropped)
     covariance = None
-    if from_pictures and LOS_ERROR.key not in config.topics:
+    if wanted(recording, config, LOS_ERROR) or not wanted(recording, config, IMAGE):
+        image_t, error = _error(recording, error_name, epoch, dropped)
+    else:
         error_name = config.topic(IMAGE)
         image_t, error, covariance = _from_pictures(recording, config, epoch, dropped)
-    else:
-        image_t, error = _error(recording, error_name, epoch, dropped)
     check_overlap({gyro_name: gyro_t, gimbal_name: gimbal_t, error_name: image_t})
     stamp_sigma = recording.stamp_sigma_s
     warmth = temperature.read(recording, config, (parameters.TEMPERATURE,), gyro_t, dropped)
