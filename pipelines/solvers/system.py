@@ -257,7 +257,7 @@ class Linear:
         return sum(lowers for _, lowers in found)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class System:
     """A graph, its stretches, and the order in which variables are eliminated.
 
@@ -279,7 +279,7 @@ class System:
     ends: Sequence[StepBoundary] = ()
     keep: Keep = Keep.ALL
     # Who evaluated several stretches last, and has not linearised them; let go of with what comes after this system.
-    _evaluated: list[tuple[gtsam.Values, Crew[StretchAt]]] = field(default_factory=list, init=False, repr=False)
+    _evaluated: tuple[gtsam.Values, Crew[StretchAt]] | None = field(default=None, init=False, repr=False)
 
     @classmethod
     def of(
@@ -316,7 +316,7 @@ class System:
 
     def made_of(self, factors: Sequence[Factor]) -> System:
         """The same system with other noise: of factors on the same variables, one for one."""
-        self._evaluated.clear()
+        self._evaluated = None
         begin, made = 0, []
         for stretch in self.stretches:
             made.append(stretch.made_of(factors[begin : begin + len(stretch.factors)]))
@@ -325,7 +325,7 @@ class System:
 
     def under(self, loss: TruncatedLoss | None) -> System:
         """The same system with another loss."""
-        self._evaluated.clear()
+        self._evaluated = None
         return replace(self, loss=loss)
 
     @contextmanager
@@ -342,7 +342,7 @@ class System:
 
     def _about(self, values: gtsam.Values) -> Crew[StretchAt]:
         """Several stretches about the values."""
-        self._evaluated.clear()
+        self._evaluated = None
         there = [StretchAt(stretch, values, self.loss, self.keep) for stretch in self.stretches]
         return Crew(there, self._processes())
 
@@ -358,7 +358,7 @@ class System:
         if len(self.stretches) == 1:
             return self.stretches[0].error(values, self.loss)
         crew = self._about(values)
-        self._evaluated.append((values, crew))
+        self._evaluated = values, crew
         return sum(crew.ask(StretchAt.error, [()] * len(self.stretches), _WHAT))
 
     def linearized(self, values: gtsam.Values, damping: float = 0.0, mixed: bool = False) -> Linear:
@@ -378,9 +378,9 @@ class System:
 
     def _reduced(self, values: gtsam.Values, damping: float, mixed: bool) -> Linear:
         """What several stretches say of what they share."""
-        known = [crew for where, crew in self._evaluated if where is values]
-        crew = known[0] if known else self._about(values)
-        self._evaluated.clear()
+        where, known = self._evaluated or (None, None)
+        crew = known if known is not None and where is values else self._about(values)
+        self._evaluated = None
         graph, families, boundaries = gtsam.GaussianFactorGraph(), [], []
         excess: Excess = {}
         told = crew.ask(StretchAt.reduced, [(damping, mixed)] * len(self.stretches), _WHAT)
