@@ -22,7 +22,7 @@ lint: $(VENV)/dev
 	$(BIN)/lint-imports
 
 types: $(VENV)/dev
-	$(BIN)/mypy alidade factors pipelines datasets benchmarks tests docs/examples/gyro_pair docs/_site
+	$(BIN)/mypy alidade datasets benchmarks tests docs/examples/gyro_pair docs/_site
 
 bench: $(VENV)/dev
 	$(BIN)/python -m benchmarks

@@ -18,14 +18,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pipelines.api import Config, calibrate, follow, load, open, plan, simulate
-    from pipelines.errors import InputError
-    from pipelines.methods import Method
-    from pipelines.methods import names as methods
-    from pipelines.reports.result import Calibration
-    from pipelines.session import Session
-    from pipelines.simulation.simulated import Simulated
-    from pipelines.solvers.marginals import IndeterminateError
+    from alidade.pipelines.api import Config, calibrate, follow, load, open, plan, simulate
+    from alidade.pipelines.errors import InputError
+    from alidade.pipelines.methods import Method
+    from alidade.pipelines.methods import names as methods
+    from alidade.pipelines.reports.result import Calibration
+    from alidade.pipelines.session import Session
+    from alidade.pipelines.simulation.simulated import Simulated
+    from alidade.pipelines.solvers.marginals import IndeterminateError
 
 __all__ = [
     "Calibration",
@@ -46,19 +46,19 @@ __all__ = [
 ]
 
 _MODULES = {
-    "Calibration": "pipelines.reports.result",
-    "Config": "pipelines.api",
-    "IndeterminateError": "pipelines.solvers.marginals",
-    "InputError": "pipelines.errors",
-    "Method": "pipelines.methods",
-    "Session": "pipelines.session",
-    "Simulated": "pipelines.simulation.simulated",
-    "calibrate": "pipelines.api",
-    "follow": "pipelines.api",
-    "load": "pipelines.api",
-    "open": "pipelines.api",
-    "plan": "pipelines.api",
-    "simulate": "pipelines.api",
+    "Calibration": "alidade.pipelines.reports.result",
+    "Config": "alidade.pipelines.api",
+    "IndeterminateError": "alidade.pipelines.solvers.marginals",
+    "InputError": "alidade.pipelines.errors",
+    "Method": "alidade.pipelines.methods",
+    "Session": "alidade.pipelines.session",
+    "Simulated": "alidade.pipelines.simulation.simulated",
+    "calibrate": "alidade.pipelines.api",
+    "follow": "alidade.pipelines.api",
+    "load": "alidade.pipelines.api",
+    "open": "alidade.pipelines.api",
+    "plan": "alidade.pipelines.api",
+    "simulate": "alidade.pipelines.api",
 }
 
 
@@ -68,7 +68,7 @@ def __getattr__(name: str) -> Any:
 
         return version("alidade")
     if name == "methods":
-        return import_module("pipelines.methods").names
+        return import_module("alidade.pipelines.methods").names
     if name not in _MODULES:
         raise AttributeError(f"module 'alidade' has no attribute {name!r}")
     return getattr(import_module(_MODULES[name]), name)

@@ -8,23 +8,23 @@ from functools import partial
 import gtsam
 import numpy as np
 
+from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.gyro_chain import GyroChain, state
+from alidade.pipelines.graph.problem import Factor, Problem, Step
+from alidade.pipelines.graph.walking_bias import FIRST as FIRST_BIAS
+from alidade.pipelines.methods.head import graph as head
+from alidade.pipelines.methods.head.recording import HeadData
+from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from alidade.pipelines.methods.los import graph as los
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.settings import Config, Sensors
+from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.solvers.assembly import CHUNK, Assembly, StepBoundary
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.gauss_newton import Solution
+from alidade.pipelines.solvers.weighing import optimize
 from benchmarks.measure import Ratio, costs, growth
-from factors.preintegration import GyroPath
-from pipelines.config import load_config
-from pipelines.graph.gyro_chain import GyroChain, state
-from pipelines.graph.problem import Factor, Problem, Step
-from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
-from pipelines.methods.head import graph as head
-from pipelines.methods.head.recording import HeadData
-from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from pipelines.methods.los import graph as los
-from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.settings import Config, Sensors
-from pipelines.simulation.motion import EulerMotion, Swing
-from pipelines.solvers.assembly import CHUNK, Assembly, StepBoundary
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.gauss_newton import Solution
-from pipelines.solvers.weighing import optimize
 
 IDEAL = Config.model_validate({"sensors": "ideal"}).sensors
 MOUNT = int(gtsam.symbol("M", 0))

@@ -26,16 +26,16 @@ from typing import Any
 import fsspec
 import numpy as np
 
+from alidade.pipelines import methods
+from alidade.pipelines.fleet.analysis import counting, populations
+from alidade.pipelines.fleet.fleet import Outcome, Settings, calibrate_recording
+from alidade.pipelines.fleet.histories import histories, packed, unpacked
+from alidade.pipelines.fleet.recordings import Recording, find, local
+from alidade.pipelines.fleet.store import Result, Store
+from alidade.pipelines.fleet.write import write_fleet
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.session import Session
 from benchmarks.measure import peak_mib
-from pipelines import methods
-from pipelines.fleet.analysis import counting, populations
-from pipelines.fleet.fleet import Outcome, Settings, calibrate_recording
-from pipelines.fleet.histories import histories, packed, unpacked
-from pipelines.fleet.recordings import Recording, find, local
-from pipelines.fleet.store import Result, Store
-from pipelines.fleet.write import write_fleet
-from pipelines.recording.reading import open_recording
-from pipelines.session import Session
 
 # Of a unit, in the table that is compared.
 _RECORDINGS = 5

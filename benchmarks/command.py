@@ -13,16 +13,16 @@ from pathlib import Path
 
 import numpy as np
 
+from alidade.pipelines.config import load_config
+from alidade.pipelines.methods.los import graph as los
+from alidade.pipelines.methods.los.recording import write_los
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from benchmarks.batch import native, solve
 from benchmarks.measure import Cost, Ratio, costs
-from pipelines.config import load_config
-from pipelines.methods.los import graph as los
-from pipelines.methods.los.recording import write_los
-from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 
 MINUTES = LosScenario(duration_s=600.0, gyro_rate_hz=1000.0, gimbal_rate_hz=1000.0, image_rate_hz=50.0)
 Clock = Callable[[], float]
-_ALIDADE = (sys.executable, "-m", "pipelines.cli")
+_ALIDADE = (sys.executable, "-m", "alidade.pipelines.cli")
 
 
 def process(*command: str, rounds: int = 3, clock: Clock | None = None) -> Cost:

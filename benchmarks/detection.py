@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors import so3
+from alidade.pipelines.simulation.rendering import Picture, Renderer, expose, tag_quad
+from alidade.pipelines.vision.camera import Camera
+from alidade.pipelines.vision.tags import detect
 from benchmarks.measure import Ratio, costs, peak_mib
-from factors import so3
-from pipelines.simulation.rendering import Picture, Renderer, expose, tag_quad
-from pipelines.vision.camera import Camera
-from pipelines.vision.tags import detect
 
 Array = NDArray[np.float64]
 

@@ -19,10 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines import methods
-from pipelines.errors import InputError
-from pipelines.graph.assumptions import kind
-from pipelines.session import Session
+from alidade.pipelines import methods
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.assumptions import kind
+from alidade.pipelines.session import Session
 
 NOTHING = "nothing"
 SIZES = (0.3, 1.0, 3.0, 6.0, 10.0)

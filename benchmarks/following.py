@@ -18,14 +18,14 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from alidade.pipelines.follow.follower import Follower, Settings
+from alidade.pipelines.follow.guidance import View
+from alidade.pipelines.follow.sources import Source
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.methods.los.recording import write_los
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from benchmarks.measure import Ratio, resident_mib
-from pipelines.follow.follower import Follower, Settings
-from pipelines.follow.guidance import View
-from pipelines.follow.sources import Source
-from pipelines.graph.problem import Array
-from pipelines.methods.los.recording import write_los
-from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.simulation.motion import EulerMotion, Swing
 
 MINUTES = float(os.environ.get("ALIDADE_BENCH_MINUTES", "10"))
 _SPEED = 20.0

@@ -7,13 +7,13 @@ from collections.abc import Iterator
 import gtsam
 import numpy as np
 
+from alidade.factors import so3
+from alidade.factors.attitude import ahrs_factors
+from alidade.factors.gyro import GyroIncrementFactor
+from alidade.factors.preintegration import GyroPath
+from alidade.factors.vectorized import Ensemble
+from alidade.pipelines.solvers.assembly import CHUNK
 from benchmarks.measure import Ratio, costs
-from factors import so3
-from factors.attitude import ahrs_factors
-from factors.gyro import GyroIncrementFactor
-from factors.preintegration import GyroPath
-from factors.vectorized import Ensemble
-from pipelines.solvers.assembly import CHUNK
 
 SAMPLES, WINDOWS = 300_000, 36_000
 BIAS, ERRORS = (int(gtsam.symbol(c, 0)) for c in "be")

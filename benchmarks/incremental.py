@@ -14,17 +14,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.problem import Array, Problem
+from alidade.pipelines.methods.head import graph as head
+from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from alidade.pipelines.methods.los import graph as los
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.settings import Sensors
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, Run
 from benchmarks.batch import IDEAL, IMAGES_PER_S, los_problem
 from benchmarks.measure import Ratio, peak_mib, resident_mib
-from pipelines.config import load_config
-from pipelines.graph.problem import Array, Problem
-from pipelines.methods.head import graph as head
-from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from pipelines.methods.los import graph as los
-from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.settings import Sensors
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.incremental import DEFAULT_WINDOW, Run
 
 MINUTES = float(os.environ.get("ALIDADE_BENCH_MINUTES", "5"))
 # Of the recording, s, before the window has filled and the last batch re-initialisation is behind.

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
+from alidade.pipelines import methods
+from alidade.pipelines.fleet.montecarlo import simulate_and_solve
+from alidade.pipelines.session import calibrate
 from benchmarks.measure import Ratio, costs
-from pipelines import methods
-from pipelines.fleet.montecarlo import simulate_and_solve
-from pipelines.session import calibrate
 
 
 def run() -> Iterator[Ratio]:

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
+from alidade.pipelines.methods import simulate
+from alidade.pipelines.reports.html import report_html
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.session import calibrate
 from benchmarks.measure import Cost, Ratio, costs
-from pipelines.methods import simulate
-from pipelines.reports.html import report_html
-from pipelines.reports.result import Calibration
-from pipelines.session import calibrate
 from tests.browser import CHROMIUM
 
 _METHODS = ("los", "indexer", "head", "cube")

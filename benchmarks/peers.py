@@ -15,19 +15,19 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 
+from alidade.factors import so3
+from alidade.factors.gyro import GyroIncrementFactor
+from alidade.factors.model import Model
+from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.problem import Problem
+from alidade.pipelines.methods.los import graph as los
+from alidade.pipelines.methods.los.recording import LosData
+from alidade.pipelines.methods.los.simulation import LosNoise, LosScenario, los_config, simulate_los
+from alidade.pipelines.solvers.assembly import CHUNK
 from benchmarks import static
 from benchmarks.batch import IDEAL, build, solve
 from benchmarks.measure import Ratio, costs
-from factors import so3
-from factors.gyro import GyroIncrementFactor
-from factors.model import Model
-from factors.preintegration import GyroPath
-from pipelines.config import load_config
-from pipelines.graph.problem import Problem
-from pipelines.methods.los import graph as los
-from pipelines.methods.los.recording import LosData
-from pipelines.methods.los.simulation import LosNoise, LosScenario, los_config, simulate_los
-from pipelines.solvers.assembly import CHUNK
 
 Array = NDArray[np.float64]
 

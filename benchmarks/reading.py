@@ -12,11 +12,11 @@ import numpy as np
 from mcap_ros2.reader import read_ros2_messages
 from rosbags.highlevel import AnyReader
 
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.mcap_file import McapFile
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.writing import write_session
 from benchmarks.measure import Ratio, costs
-from pipelines.recording import series
-from pipelines.recording.mcap_file import McapFile
-from pipelines.recording.reading import open_recording
-from pipelines.recording.writing import write_session
 
 TOPIC = "/imu"
 HOUR = 3_600_000  # messages of an hour at 1 kHz

@@ -12,13 +12,13 @@ from functools import partial
 import gtsam
 import numpy as np
 
+from alidade.factors import so3
+from alidade.factors.los import LosRateFactor, rate_matrix
+from alidade.factors.model import Array, Model, Residuals
+from alidade.factors.triad import AccelFactor
+from alidade.pipelines.graph.problem import Factor
+from alidade.pipelines.solvers.weighing import optimize
 from benchmarks.measure import Ratio, costs
-from factors import so3
-from factors.los import LosRateFactor, rate_matrix
-from factors.model import Array, Model, Residuals
-from factors.triad import AccelFactor
-from pipelines.graph.problem import Factor
-from pipelines.solvers.weighing import optimize
 
 ROWS = 2_000_000
 SAME = 1e-9  # relative

@@ -19,20 +19,20 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from factors import so3
-from factors.indexer import mounting_angles
-from pipelines import methods
-from pipelines.graph.problem import Array, Problem, rotation_vector_coordinates
-from pipelines.methods.cube.scenario import CubeScenario
-from pipelines.methods.head.simulation import HeadScenario
-from pipelines.methods.indexer.simulation import IndexerScenario, Position
-from pipelines.methods.los.simulation import LosAngles, LosScenario
-from pipelines.methods.triads import triad_names
-from pipelines.methods.tumble.scenario import TumbleScenario
-from pipelines.session import Session
-from pipelines.settings import Sensors
-from pipelines.simulation.motion import EulerMotion, Swing
-from pipelines.solvers.incremental import DEFAULT_WINDOW, Run
+from alidade.factors import so3
+from alidade.factors.indexer import mounting_angles
+from alidade.pipelines import methods
+from alidade.pipelines.graph.problem import Array, Problem, rotation_vector_coordinates
+from alidade.pipelines.methods.cube.scenario import CubeScenario
+from alidade.pipelines.methods.head.simulation import HeadScenario
+from alidade.pipelines.methods.indexer.simulation import IndexerScenario, Position
+from alidade.pipelines.methods.los.simulation import LosAngles, LosScenario
+from alidade.pipelines.methods.triads import triad_names
+from alidade.pipelines.methods.tumble.scenario import TumbleScenario
+from alidade.pipelines.session import Session
+from alidade.pipelines.settings import Sensors
+from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, Run
 
 HEAD = HeadScenario(
     duration_s=30.0,

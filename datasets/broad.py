@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from pipelines.errors import InputError
-from pipelines.methods.head.recording import HeadData, write_head
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.head.recording import HeadData, write_head
 
 Array = NDArray[np.float64]
 

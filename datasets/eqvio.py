@@ -21,14 +21,22 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from factors.attitude import ahrs_factors
-from factors.chi_square import gate
-from factors.loss import TruncatedLoss
-from factors.model import ROT3, Array, Model, Residuals
-from factors.preintegration import GyroPath
-from pipelines.graph.problem import Estimate, Factor, Parameter, Problem, Quantity, Step, rotation_vector_coordinates
-from pipelines.solvers.batch import solve_batch
+from alidade.factors import so3
+from alidade.factors.attitude import ahrs_factors
+from alidade.factors.chi_square import gate
+from alidade.factors.loss import TruncatedLoss
+from alidade.factors.model import ROT3, Array, Model, Residuals
+from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.graph.problem import (
+    Estimate,
+    Factor,
+    Parameter,
+    Problem,
+    Quantity,
+    Step,
+    rotation_vector_coordinates,
+)
+from alidade.pipelines.solvers.batch import solve_batch
 
 Index = NDArray[np.intp]
 

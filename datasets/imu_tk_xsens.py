@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from pipelines.errors import InputError
-from pipelines.methods.cube.data import CubeData
-from pipelines.methods.cube.writing import write_cube
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.cube.data import CubeData
+from alidade.pipelines.methods.cube.writing import write_cube
 
 Array = NDArray[np.float64]
 

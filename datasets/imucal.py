@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
-from pipelines.methods.indexer.recording import IndexerData, write_indexer
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.indexer.recording import IndexerData, write_indexer
 
 Array = NDArray[np.float64]
 

@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from pipelines.errors import InputError
-from pipelines.vision.camera import Camera
-from pipelines.vision.layout import Layout, Shots, estimate_layout
-from pipelines.vision.pose import TagBody, estimate_pose
-from pipelines.vision.tags import Detections
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.vision.camera import Camera
+from alidade.pipelines.vision.layout import Layout, Shots, estimate_layout
+from alidade.pipelines.vision.pose import TagBody, estimate_pose
+from alidade.pipelines.vision.tags import Detections
 
 Array = NDArray[np.float64]
 

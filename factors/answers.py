@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.loss import TruncatedLoss
-from factors.model import Array
+from alidade.factors.loss import TruncatedLoss
+from alidade.factors.model import Array
 
 if TYPE_CHECKING:
-    from factors.vectorized import VectorizedFactor
+    from alidade.factors.vectorized import VectorizedFactor
 
 # Linear systems of so many factors are laid out at once: few enough to stay in the cache.
 _AT_A_TIME = 16

@@ -14,10 +14,10 @@ from typing import ClassVar
 import gtsam
 import numpy as np
 
-from factors import so3
-from factors.gyro import PLATFORM, Derivatives, by_platform_errors, carried, needed, parted, platform_errors
-from factors.model import ROT3, Array, Block, Model, Residuals
-from factors.preintegration import GyroPath, Increments
+from alidade.factors import so3
+from alidade.factors.gyro import PLATFORM, Derivatives, by_platform_errors, carried, needed, parted, platform_errors
+from alidade.factors.model import ROT3, Array, Block, Model, Residuals
+from alidade.factors.preintegration import GyroPath, Increments
 
 
 def ahrs_factors(
@@ -60,7 +60,7 @@ class VisionAttitudeFactor(Model):
     Predicted: cRh = cRb bRv(at) vRh with bRv(at) = dB(anchor, at)^T bRv(anchor) dV(anchor, at), the gyros' own samples
     carrying the attitude from the time of the variable to that of the picture. Blocks: bRv at the anchors (rotations),
     gyro bias (3), cRb, vRh (rotations), the pictures' errors (1 or 3) and, unless the gyros are perfect, the helmet
-    gyro's errors (6 to 18) and those of the platform's gyro (9), see factors.gyro. The pictures' errors are
+    gyro's errors (6 to 18) and those of the platform's gyro (9), see alidade.factors.gyro. The pictures' errors are
     time offset, s, positive when a picture was taken later than its stamp says; clock skew, at = stamp + time offset -
     skew * elapsed; angle scale, Log(first^T cRh) is measured 1 + scale times as large.
 

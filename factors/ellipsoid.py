@@ -17,7 +17,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from factors.model import Array, Block, Model, Residuals
+from alidade.factors.model import Array, Block, Model, Residuals
 
 # Of a symmetric K: which of the nine entries by rows each of the six numbers is.
 _UPPER = np.zeros((9, 6))

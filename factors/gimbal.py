@@ -9,7 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
-from factors.model import Array
+from alidade.factors.model import Array
 
 # Motion around a picture is smoothed over this time to either side, s: long against noise, short against sway.
 SMOOTHING = 0.2
@@ -67,7 +67,7 @@ class LocalMotion:
     Attributes:
         rate, acceleration: (n, 3) of the gyro, rad/s and rad/s^2.
         gimbal, gimbal_rate, gimbal_acceleration: (n, 2) of azimuth and elevation, rad, rad/s and rad/s^2.
-        drivers: (n, d) of the gyro, see factors.gyro; None where it has none.
+        drivers: (n, d) of the gyro, see alidade.factors.gyro; None where it has none.
     """
 
     rate: Array

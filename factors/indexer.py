@@ -22,9 +22,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors import so3
-from factors.gyro import by_symmetric, needed, symmetric
-from factors.model import Array, Block, Model, Residuals
+from alidade.factors import so3
+from alidade.factors.gyro import by_symmetric, needed, symmetric
+from alidade.factors.model import Array, Block, Model, Residuals
 
 Option = Literal["errors", "temperature", "encoder", "epsilon", "tilt"]
 # What the encoders' errors are, in the order of their block.
@@ -248,10 +248,10 @@ class IndexerAverageFactor(Model):
         gyro = (I + S) mRt w + bias + c warmth,    w = fixed + cos(epsilon) cosine + sin(epsilon) sine
 
     compared in frame t, where encoder noise has fixed directions. Blocks: theta (3), gyro bias (3, rad/s), then
-    the options: "errors" (6), the numbers of S as factors.gyro has them; "temperature" (3, rad/s/K), which is c;
-    "encoder" (5), the encoders' errors, on which w depends linearly; "epsilon" (1, rad); "tilt" (3, rad), a small
-    rotation of the true platform rate against the encoders' account of it, w -> Exp(tilt) w, for errors that come
-    again with every turn.
+    the options: "errors" (6), the numbers of S as alidade.factors.gyro has them; "temperature" (3, rad/s/K), which is
+    c; "encoder" (5), the encoders' errors, on which w depends linearly; "epsilon" (1, rad); "tilt" (3, rad), a small
+    rotation of the true platform rate against the encoders' account of it, w -> Exp(tilt) w, for errors that come again
+    with every turn.
 
     Attributes:
         gyro: (n, 3) mean rates, rad/s.

@@ -21,10 +21,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from factors import so3
-from factors.gimbal import GimbalPath, LocalMotion
-from factors.gyro import rate_error
-from factors.model import ROT3, Array, Block, Model, Residuals
+from alidade.factors import so3
+from alidade.factors.gimbal import GimbalPath, LocalMotion
+from alidade.factors.gyro import rate_error
+from alidade.factors.model import ROT3, Array, Block, Model, Residuals
 
 # What else than the mounting spoils LOS errors, in the order of their block: s and rad/s, s and c of encoders rad.
 SIGHT_ERRORS = (
@@ -90,7 +90,7 @@ class LosDirectionFactor(Model):
     about its line of sight, the twist about y that takes the target's texture to its picture: the rotation part of the
     picture's local similarity. Blocks: tRm at the stamps (rotations), the mounting angles `names` (rad), and with
     `around` the gyro bias (3, rad/s), SIGHT_ERRORS and, unless the gyro is perfect, its errors (6 to 18), see
-    factors.gyro. With those errors
+    alidade.factors.gyro. With those errors
 
     - a picture was taken at stamp + time_offset - clock_skew * elapsed, and an encoder read its axis encoder_delay
       later than it is stamped; gyro and gimbal carry attitude and angles there from where the stamp was moved to;

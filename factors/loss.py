@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factors.model import Array
+from alidade.factors.model import Array
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
+from alidade.factors import so3
 
 if TYPE_CHECKING:
     import gtsam
 
-    from factors.loss import TruncatedLoss
-    from factors.vectorized import VectorizedFactor
+    from alidade.factors.loss import TruncatedLoss
+    from alidade.factors.vectorized import VectorizedFactor
 
 Array = NDArray[np.float64]
 # Whitened residuals (n, m) and, on demand, their Jacobians by the blocks, (n, m, d) each.
@@ -102,7 +102,7 @@ class Model:
         Raises:
             ValueError: keys, noise or the model's own blocks do not fit.
         """
-        from factors.vectorized import VectorizedFactor
+        from alidade.factors.vectorized import VectorizedFactor
 
         return VectorizedFactor(self, keys, loss, compress, noise)
 

@@ -19,7 +19,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors import so3
+from alidade.factors import so3
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from factors.model import Array, Model, check, dimension, retract
+from alidade.factors.model import Array, Model, check, dimension, retract
 
 
 def assert_jacobians(

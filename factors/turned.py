@@ -1,9 +1,9 @@
 """Constant vectors of the level frame as a triad measures them at attitudes that a gyro carries.
 
 Frames: a inertial, n level (x to the east of the field, y along its horizontal part, z up), which turns with the earth,
-b the body. A triad has nominal = K raw + b, by rows of K and b (12 numbers), as in factors.ellipsoid; what is predicted
-is raw, whose noise is white. The gyro's own samples carry the attitude from the time of its variable to that of the
-measurement.
+b the body. A triad has nominal = K raw + b, by rows of K and b (12 numbers), as in alidade.factors.ellipsoid; what is
+predicted is raw, whose noise is white. The gyro's own samples carry the attitude from the time of its variable to that
+of the measurement.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from factors import so3
-from factors.ellipsoid import by_slope, drifted
-from factors.gyro import SCALE, Derivatives, carried, rate_error
-from factors.model import ROT3, Array, Block, Model, Residuals
-from factors.preintegration import GyroPath
+from alidade.factors import so3
+from alidade.factors.ellipsoid import by_slope, drifted
+from alidade.factors.gyro import SCALE, Derivatives, carried, rate_error
+from alidade.factors.model import ROT3, Array, Block, Model, Residuals
+from alidade.factors.preintegration import GyroPath
 
 # The rate's change is the difference of what it is so much before and after, s.
 _SHORT = 0.01
@@ -31,7 +31,7 @@ class FieldFactor(Model):
 
     Blocks: attitude aRb at the anchor (rotations), gyro bias (3), triad (12), strength s (1), dip (1; rad, the field's
     inclination, positive down), delay (1; s by which a reading was taken later than its stamp says) and, unless the
-    gyro is perfect, its errors (6 to 18), see factors.gyro.
+    gyro is perfect, its errors (6 to 18), see alidade.factors.gyro.
 
     Attributes:
         time: (n,) stamps, s.

@@ -13,10 +13,10 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from factors.model import ROT3, Array, Block, Model, Residuals
-from factors.preintegration import running_product, trapezoid_excess
-from factors.triad import parts
+from alidade.factors import so3
+from alidade.factors.model import ROT3, Array, Block, Model, Residuals
+from alidade.factors.preintegration import running_product, trapezoid_excess
+from alidade.factors.triad import parts
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class GyroRotationFactor(Model):
     in the unit of raw: their mean adds to c). Of a gyro that feels specific force also G by rows (9, rad/s per m/s^2)
     and the accelerometer's triad (12): raw = A w + c + d + G f, with the f of that accelerometer, its curvature left
     out. Where the temperature is known also s (3, in the unit of raw per K), and that of an accelerometer that drifts
-    too (3): s warmth adds to c. Samples are mean rates centred on their stamps, integrated as factors.preintegration
-    does: the arc between point rates w0 and w1 is T (w0 + w1) / 2 + T^2 (w0 x w1) / 12.
+    too (3): s warmth adds to c. Samples are mean rates centred on their stamps, integrated as
+    alidade.factors.preintegration does: the arc between point rates w0 and w1 is T (w0 + w1) / 2 + T^2 (w0 x w1) / 12.
 
     Attributes:
         time: (n,) ends of the turns, s.

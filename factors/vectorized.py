@@ -1,7 +1,7 @@
 """The bridge from vectorised models to gtsam: many measurements in one CustomFactor.
 
-The bridge gathers the blocks from gtsam's Values and calls the model; `factors.answers` weighs outliers down and lays
-the Jacobians out. One Python call for 20 measurements costs little more than for one.
+The bridge gathers the blocks from gtsam's Values and calls the model; `alidade.factors.answers` weighs outliers down
+and lays the Jacobians out. One Python call for 20 measurements costs little more than for one.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from factors.answers import Answers, Evaluation, Places, counting, laid_out, places_of, squares_of
-from factors.loss import TruncatedLoss
-from factors.model import POSE3, ROT3, Array, Block, Keys, Model, Residuals, check, dimension, width
+from alidade.factors import so3
+from alidade.factors.answers import Answers, Evaluation, Places, counting, laid_out, places_of, squares_of
+from alidade.factors.loss import TruncatedLoss
+from alidade.factors.model import POSE3, ROT3, Array, Block, Keys, Model, Residuals, check, dimension, width
 
 # Models of these types, rows and blocks were seen to give what they declare.
 _CHECKED: set[Hashable] = set()

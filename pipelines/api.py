@@ -14,23 +14,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from pipelines import methods
-from pipelines.config import load_config
-from pipelines.config import model as _config_model
-from pipelines.errors import InputError
-from pipelines.methods import Method
-from pipelines.recording.opening import Where
-from pipelines.recording.reading import open_recording
-from pipelines.recording.shapes import Array, Rows, rows_by_name
-from pipelines.session import Arrays, Session
-from pipelines.settings import Config as _BaseConfig
-from pipelines.simulation.simulated import Simulated
+from alidade.pipelines import methods
+from alidade.pipelines.config import load_config
+from alidade.pipelines.config import model as _config_model
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import Method
+from alidade.pipelines.recording.opening import Where
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.shapes import Array, Rows, rows_by_name
+from alidade.pipelines.session import Arrays, Session
+from alidade.pipelines.settings import Config as _BaseConfig
+from alidade.pipelines.simulation.simulated import Simulated
 
 if TYPE_CHECKING:
-    from pipelines.follow.guidance import View
-    from pipelines.planning import Plan
-    from pipelines.reports.calibration import SavedCalibration
-    from pipelines.reports.result import Calibration
+    from alidade.pipelines.follow.guidance import View
+    from alidade.pipelines.planning import Plan
+    from alidade.pipelines.reports.calibration import SavedCalibration
+    from alidade.pipelines.reports.result import Calibration
 
     Config = _BaseConfig
 else:
@@ -130,7 +130,7 @@ def calibrate(
     if isinstance(source, list | tuple):
         if solver != "batch":
             raise InputError(f"solver {solver!r}: several recordings are calibrated together by batch alone")
-        from pipelines.together import calibrate_together
+        from alidade.pipelines.together import calibrate_together
 
         return calibrate_together([partial(open, each, method, config, prior=prior) for each in source])
     return open(source, method, config, prior=prior).calibrate(solver, window)
@@ -146,7 +146,7 @@ def load(path: str | Path, config: Settings = None) -> SavedCalibration:
     Raises:
         InputError: file or config cannot be used.
     """
-    from pipelines.reports.calibration import load_calibration
+    from alidade.pipelines.reports.calibration import load_calibration
 
     return load_calibration(Path(path), load_config(None, _override(config)))
 
@@ -184,7 +184,7 @@ def plan(
     Raises:
         InputError: no such method, scenario or parameter, or the config cannot be used.
     """
-    from pipelines.planning import make_plan
+    from alidade.pipelines.planning import make_plan
 
     named = None if scenario is None else str(scenario)
     return make_plan(method, named, _override(config), require)
@@ -210,9 +210,9 @@ def follow(
             end.
         IndeterminateError: states other than the parameters are not determined.
     """
-    from pipelines.follow.follower import Follower
-    from pipelines.follow.follower import Settings as Following
-    from pipelines.follow.sources import source_of
+    from alidade.pipelines.follow.follower import Follower
+    from alidade.pipelines.follow.follower import Settings as Following
+    from alidade.pipelines.follow.sources import source_of
 
     earlier = None if prior is None else Path(prior)
     settings = Following(method, _override(config), window, patience, prior=earlier)
@@ -226,7 +226,7 @@ def _check_seed(seed: object) -> None:
 
 
 def _scenario(method: Method, given: str | Path | Mapping[str, Any] | BaseModel | None, images: bool) -> BaseModel:
-    from pipelines.simulation.scenario import explain
+    from alidade.pipelines.simulation.scenario import explain
 
     if isinstance(given, BaseModel):
         return given

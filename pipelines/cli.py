@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from pipelines import exit_codes
-from pipelines.options import ConfigFile, Json, Quiet, RecordingPath, RecordingPaths
-from pipelines.solvers.window import parse_window
+from alidade.pipelines import exit_codes
+from alidade.pipelines.options import ConfigFile, Json, Quiet, RecordingPath, RecordingPaths
+from alidade.pipelines.solvers.window import parse_window
 
 if TYPE_CHECKING:
-    from pipelines.reports.result import Calibration
+    from alidade.pipelines.reports.result import Calibration
 
 # Errors that are told in one line, by name: to import the second takes gtsam's quarter of a second.
 _TROUBLE = {"InputError": exit_codes.BAD_INPUT, "IndeterminateError": exit_codes.UNDETERMINED}
@@ -46,7 +46,7 @@ class _WithMethods(TyperGroup):
 
 @cache
 def _of_methods() -> Mapping[str, Any]:
-    from pipelines import methods
+    from alidade.pipelines import methods
 
     own = typer.Typer(rich_markup_mode=None)
     own.callback()(lambda: None)
@@ -67,13 +67,13 @@ app = typer.Typer(
 
 
 def _complete_method(incomplete: str) -> list[str]:
-    from pipelines import methods
+    from alidade.pipelines import methods
 
     return [name for name in methods.names() if name.startswith(incomplete)]
 
 
 def _complete_scenario(incomplete: str) -> list[str]:
-    from pipelines import methods
+    from alidade.pipelines import methods
 
     return [name for known in methods.scenarios().values() for name in known if name.startswith(incomplete)]
 
@@ -112,7 +112,7 @@ _Window = Annotated[str, typer.Option(help="Of the incremental solver: seconds k
 
 def _version(wanted: bool) -> None:
     if wanted:
-        from pipelines.reports.result import software_versions
+        from alidade.pipelines.reports.result import software_versions
 
         typer.echo(software_versions()["alidade"])
         raise typer.Exit
@@ -147,13 +147,13 @@ def calibrate(
     """
     from tempfile import TemporaryDirectory
 
-    from pipelines import parallel, progress, terminal
-    from pipelines.errors import InputError
-    from pipelines.recording.opening import recordings_of, told
-    from pipelines.reports.whole import require_room
-    from pipelines.reports.write import adopt_parts, write_part, write_results
-    from pipelines.session import calibrate as run
-    from pipelines.together import calibrate_device
+    from alidade.pipelines import parallel, progress, terminal
+    from alidade.pipelines.errors import InputError
+    from alidade.pipelines.recording.opening import recordings_of, told
+    from alidade.pipelines.reports.whole import require_room
+    from alidade.pipelines.reports.write import adopt_parts, write_part, write_results
+    from alidade.pipelines.session import calibrate as run
+    from alidade.pipelines.together import calibrate_device
 
     recordings, folder = recordings_of(sessions), out or _beside(sessions[0], solver.value)
     if len(recordings) > 1:
@@ -201,11 +201,11 @@ def compare(
     quiet: Quiet = False,
 ) -> None:
     """The published, batch and incremental solvers side by side, with errors where the truth is known."""
-    from pipelines import parallel, progress, terminal
-    from pipelines.reports.compare import write_compare
-    from pipelines.reports.whole import require_room
-    from pipelines.session import calibrate as run
-    from pipelines.session import self_agreement
+    from alidade.pipelines import parallel, progress, terminal
+    from alidade.pipelines.reports.compare import write_compare
+    from alidade.pipelines.reports.whole import require_room
+    from alidade.pipelines.session import calibrate as run
+    from alidade.pipelines.session import self_agreement
 
     require_room(out)
     solvers = ["published", "batch", "incremental"]
@@ -253,10 +253,10 @@ def follow(
     as_json: Json = False,
 ) -> None:
     """Calibrate a recording while it is being written, and say what is still missing. Ctrl-C ends it."""
-    from pipelines.follow.follow import follow as run
-    from pipelines.follow.follower import Settings
-    from pipelines.reports.whole import require_room
-    from pipelines.reports.write import write_results
+    from alidade.pipelines.follow.follow import follow as run
+    from alidade.pipelines.follow.follower import Settings
+    from alidade.pipelines.reports.whole import require_room
+    from alidade.pipelines.reports.write import write_results
 
     folder = out or _beside(Path(_file_name(source)), "incremental")
     for place in (folder, checkpoint and checkpoint.parent):
@@ -283,10 +283,10 @@ def validate(
 
     Exit code 0 it holds, 2 unusable input, 3 the recording cannot say, 4 it does not hold.
     """
-    from pipelines import parallel, progress, terminal
-    from pipelines.reports.plain_json import validation_json
-    from pipelines.validate import table, write_validation
-    from pipelines.validate import validate as run
+    from alidade.pipelines import parallel, progress, terminal
+    from alidade.pipelines.reports.plain_json import validation_json
+    from alidade.pipelines.validate import table, write_validation
+    from alidade.pipelines.validate import validate as run
 
     with progress.shown(quiet or as_json), parallel.processes(jobs), progress.doing("validating"):
         validated = run(session, calibration, method, config, strict)
@@ -312,8 +312,8 @@ def simulate(
     quiet: Quiet = False,
 ) -> None:
     """Simulate a recording with its truth."""
-    from pipelines import progress, terminal
-    from pipelines.methods import simulate as run
+    from alidade.pipelines import progress, terminal
+    from alidade.pipelines.methods import simulate as run
 
     with progress.shown(quiet), progress.doing("simulating"):
         run(method, scenario, seed, out, images)
@@ -329,10 +329,10 @@ def scenarios(
     as_json: Json = False,
 ) -> None:
     """The scenarios that `simulate`, `plan` and `montecarlo` find by name, or the YAML of one, to be changed."""
-    from pipelines import methods, terminal
-    from pipelines.errors import InputError, nearest_three
-    from pipelines.reports.plain_json import plain_json
-    from pipelines.simulation.scenario import summary
+    from alidade.pipelines import methods, terminal
+    from alidade.pipelines.errors import InputError, nearest_three
+    from alidade.pipelines.reports.plain_json import plain_json
+    from alidade.pipelines.simulation.scenario import summary
 
     known = methods.scenarios()
     files = {scenario: path for found in known.values() for scenario, path in found.items()}
@@ -365,11 +365,11 @@ def plan(
     quiet: Quiet = False,
 ) -> None:
     """How well a planned motion would determine each parameter, and a better one. Exit code 3 if less than required."""
-    from pipelines import progress, terminal
-    from pipelines.planning import make_plan, requirements, write_scenario
-    from pipelines.reports.plain_json import plan_json
-    from pipelines.reports.plan import plan_html
-    from pipelines.reports.whole import write_file
+    from alidade.pipelines import progress, terminal
+    from alidade.pipelines.planning import make_plan, requirements, write_scenario
+    from alidade.pipelines.reports.plain_json import plan_json
+    from alidade.pipelines.reports.plan import plan_html
+    from alidade.pipelines.reports.whole import write_file
 
     with progress.shown(quiet or as_json):
         planned = make_plan(method, scenario, config, requirements(require or []))
@@ -397,11 +397,11 @@ def info(
     quiet: Quiet = False,
 ) -> None:
     """What can be calibrated from a recording, with which topics, what is missing, and what is in it."""
-    from pipelines import progress, terminal
-    from pipelines.config import recorded_config
-    from pipelines.discovery import suggestions, unused
-    from pipelines.recording.reading import open_recording
-    from pipelines.session import session_facts
+    from alidade.pipelines import progress, terminal
+    from alidade.pipelines.config import recorded_config
+    from alidade.pipelines.discovery import suggestions, unused
+    from alidade.pipelines.recording.reading import open_recording
+    from alidade.pipelines.session import session_facts
 
     with progress.shown(quiet), progress.doing("reading"):
         recording = open_recording(session, strict)
@@ -424,9 +424,9 @@ def noise(
     quiet: Quiet = False,
 ) -> None:
     """The noise of gyros, accelerometers and magnetometers from their time at rest, and the config's section for it."""
-    from pipelines import progress, terminal
-    from pipelines.noise import noise_of
-    from pipelines.reports.noise import noise_json, write_noise
+    from alidade.pipelines import progress, terminal
+    from alidade.pipelines.noise import noise_of
+    from alidade.pipelines.reports.noise import noise_json, write_noise
 
     with progress.shown(quiet):
         study = noise_of(session, strict, config)
@@ -445,11 +445,11 @@ def demo(
     quiet: Quiet = False,
 ) -> None:
     """Simulate a helmet on a manoeuvring platform, calibrate it with all three solvers, say where the report is."""
-    from pipelines import progress, terminal
-    from pipelines.methods import simulate as simulated
-    from pipelines.reports.whole import require_room
-    from pipelines.reports.write import write_results
-    from pipelines.session import calibrate as run
+    from alidade.pipelines import progress, terminal
+    from alidade.pipelines.methods import simulate as simulated
+    from alidade.pipelines.reports.whole import require_room
+    from alidade.pipelines.reports.write import write_results
+    from alidade.pipelines.session import calibrate as run
 
     require_room(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -479,10 +479,10 @@ def montecarlo(
     quiet: Quiet = False,
 ) -> None:
     """Simulate and solve many recordings: are the sigmas true? The same command goes on after an interruption."""
-    from pipelines import progress, terminal
-    from pipelines.fleet.montecarlo import SOLVERS, run_study
-    from pipelines.fleet.write import write_study
-    from pipelines.reports.plain_json import study_json
+    from alidade.pipelines import progress, terminal
+    from alidade.pipelines.fleet.montecarlo import SOLVERS, run_study
+    from alidade.pipelines.fleet.write import write_study
+    from alidade.pipelines.reports.plain_json import study_json
 
     folder = out or Path(f"{method}-montecarlo")
     chosen = SOLVERS if solvers == "all" else tuple(solvers.split(","))
@@ -518,14 +518,14 @@ def fleet(
     quiet: Quiet = False,
 ) -> None:
     """Calibrate many recordings and compare units and dates. The same command goes on after an interruption."""
-    from pipelines import progress, terminal
-    from pipelines.fleet.analysis import counting, populations
-    from pipelines.fleet.attention import sentence, units_of_interest
-    from pipelines.fleet.fleet import Settings, calibrate_fleet
-    from pipelines.fleet.histories import histories
-    from pipelines.fleet.recordings import find
-    from pipelines.fleet.write import write_fleet
-    from pipelines.reports.plain_json import fleet_json
+    from alidade.pipelines import progress, terminal
+    from alidade.pipelines.fleet.analysis import counting, populations
+    from alidade.pipelines.fleet.attention import sentence, units_of_interest
+    from alidade.pipelines.fleet.fleet import Settings, calibrate_fleet
+    from alidade.pipelines.fleet.histories import histories
+    from alidade.pipelines.fleet.recordings import find
+    from alidade.pipelines.fleet.write import write_fleet
+    from alidade.pipelines.reports.plain_json import fleet_json
 
     settings = Settings.of(method, config, solver.value, parse_window(window), prior)
     with progress.shown(quiet or as_json):
@@ -554,11 +554,11 @@ def export(
     as_json: Json = False,
 ) -> None:
     """A calibration as the parameters of another program, in its own conventions."""
-    from pipelines import terminal
-    from pipelines.reports.calibration import load_calibration
-    from pipelines.reports.export import exported
-    from pipelines.reports.plain_json import plain_json
-    from pipelines.reports.whole import write_file
+    from alidade.pipelines import terminal
+    from alidade.pipelines.reports.calibration import load_calibration
+    from alidade.pipelines.reports.export import exported
+    from alidade.pipelines.reports.plain_json import plain_json
+    from alidade.pipelines.reports.whole import write_file
 
     saved = load_calibration(calibration)
     text = exported(saved, form)
@@ -581,8 +581,8 @@ def certificate(
     pdf: Annotated[bool, typer.Option("--pdf", help="Print it too, certificate.pdf.")] = False,
 ) -> None:
     """A calibration certificate, certificate.html to be printed and certificate.json."""
-    from pipelines import terminal
-    from pipelines.reports.certificate import write_certificate
+    from alidade.pipelines import terminal
+    from alidade.pipelines.reports.certificate import write_certificate
 
     written, missing = write_certificate(results, fields, before, out, pdf)
     terminal.say(f"Wrote {', '.join(map(str, written))}")
@@ -606,7 +606,7 @@ def _file_name(source: str) -> str:
 
 def _tell(calibration: "Calibration", folder: Path, written: Sequence[Path], as_json: bool = False) -> NoReturn:
     """Show a calibration and where its results are; its status is the exit code."""
-    from pipelines import terminal
+    from alidade.pipelines import terminal
 
     if as_json:
         terminal.show_json([calibration])

@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ValidationError, create_model
 
-from pipelines import methods
-from pipelines.errors import InputError, nearest
-from pipelines.settings import ATTACHMENT, Config
+from alidade.pipelines import methods
+from alidade.pipelines.errors import InputError, nearest
+from alidade.pipelines.settings import ATTACHMENT, Config
 
 if TYPE_CHECKING:
-    from pipelines.recording.reading import Recording
+    from alidade.pipelines.recording.reading import Recording
 
 _LONGEST = 1 << 20
 

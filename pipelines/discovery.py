@@ -9,16 +9,16 @@ import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pipelines import methods
-from pipelines.errors import InputError
-from pipelines.recording import messages
-from pipelines.recording.info import lacking
-from pipelines.recording.pairing import Pairing, pair
-from pipelines.recording.reading import Recording
-from pipelines.recording.series import ImuSeries
-from pipelines.recording.sources import TopicSource
-from pipelines.recording.topics import Setting, Topic, wanted
-from pipelines.settings import Config
+from alidade.pipelines import methods
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording import messages
+from alidade.pipelines.recording.info import lacking
+from alidade.pipelines.recording.pairing import Pairing, pair
+from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.series import ImuSeries
+from alidade.pipelines.recording.sources import TopicSource
+from alidade.pipelines.recording.topics import Setting, Topic, wanted
+from alidade.pipelines.settings import Config
 
 # Rates and attitudes belong together above this correlation of their norms.
 _BELONGS = 0.7

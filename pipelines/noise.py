@@ -10,16 +10,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines import methods, progress
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.judgement.at_rest import stretches_at_rest
-from pipelines.judgement.sensor_noise import AxisNoise, axis_noise
-from pipelines.recording import messages
-from pipelines.recording.checks import clean
-from pipelines.recording.even import even_pieces
-from pipelines.recording.faults import drop_faults
-from pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines import methods, progress
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.judgement.at_rest import stretches_at_rest
+from alidade.pipelines.judgement.sensor_noise import AxisNoise, axis_noise
+from alidade.pipelines.recording import messages
+from alidade.pipelines.recording.checks import clean
+from alidade.pipelines.recording.even import even_pieces
+from alidade.pipelines.recording.faults import drop_faults
+from alidade.pipelines.recording.reading import Recording, open_recording
 
 Array = NDArray[np.float64]
 

@@ -26,8 +26,8 @@ from multiprocessing.util import Finalize
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from pipelines import progress
-from pipelines.errors import InputError
+from alidade.pipelines import progress
+from alidade.pipelines.errors import InputError
 
 Thing = TypeVar("Thing")
 Answer = TypeVar("Answer")

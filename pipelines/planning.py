@@ -17,12 +17,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines import methods, progress
-from pipelines.errors import InputError
-from pipelines.graph.problem import Quantity
-from pipelines.judgement.observability import Advice, Assessment, assess
-from pipelines.methods import Method, Scenario
-from pipelines.settings import Config
+from alidade.pipelines import methods, progress
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Quantity
+from alidade.pipelines.judgement.observability import Advice, Assessment, assess
+from alidade.pipelines.methods import Method, Scenario
+from alidade.pipelines.settings import Config
 
 _MOST_STEPS = 3
 # A change that brings less information than this on what is missing, nats, is not worth the trouble.
@@ -182,9 +182,9 @@ def _predicted(
     method_name: str, scenario: Scenario, config_file: Path | Config | None, require: Mapping[str, float], seed: int
 ) -> Prediction:
     """Of one draw."""
-    from pipelines.session import Session
-    from pipelines.solvers.batch import solve_batch
-    from pipelines.solvers.marginals import IndeterminateError
+    from alidade.pipelines.session import Session
+    from alidade.pipelines.solvers.batch import solve_batch
+    from alidade.pipelines.solvers.marginals import IndeterminateError
 
     method = methods.method(method_name)
     session = Session.of(method, method.simulate(method.scenario.model_validate(scenario), seed), config_file)

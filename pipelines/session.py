@@ -17,30 +17,30 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from pipelines import methods, progress
-from pipelines.config import load_config, recorded_config
-from pipelines.discovery import empty, idle, nearest_suggestion, suggestions, with_suggested
-from pipelines.errors import InputError
-from pipelines.graph.problem import Estimate, Problem, Step, Told
-from pipelines.judgement import noise_levels
-from pipelines.judgement.causes import find_causes
-from pipelines.judgement.explanation import Causes, explained, told_steps
-from pipelines.judgement.halves import Halves, held_out, span, split_at, split_halves
-from pipelines.judgement.observability import assess
-from pipelines.judgement.second import other_solution
-from pipelines.judgement.self_check import SelfCheck
-from pipelines.judgement.stability import Moved, Stability, stability
-from pipelines.methods import Method
-from pipelines.recording.info import SessionFacts, facts_of, lacking
-from pipelines.recording.message_reader import ENCODING
-from pipelines.recording.opening import Where
-from pipelines.recording.reading import Recording, open_recording
-from pipelines.reports.known import load_known
-from pipelines.reports.result import Calibration
-from pipelines.settings import TRUTH, Config
-from pipelines.sharing import device_belief, walks
-from pipelines.simulation.simulated import Simulated
-from pipelines.solvers.window import check_window
+from alidade.pipelines import methods, progress
+from alidade.pipelines.config import load_config, recorded_config
+from alidade.pipelines.discovery import empty, idle, nearest_suggestion, suggestions, with_suggested
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Estimate, Problem, Step, Told
+from alidade.pipelines.judgement import noise_levels
+from alidade.pipelines.judgement.causes import find_causes
+from alidade.pipelines.judgement.explanation import Causes, explained, told_steps
+from alidade.pipelines.judgement.halves import Halves, held_out, span, split_at, split_halves
+from alidade.pipelines.judgement.observability import assess
+from alidade.pipelines.judgement.second import other_solution
+from alidade.pipelines.judgement.self_check import SelfCheck
+from alidade.pipelines.judgement.stability import Moved, Stability, stability
+from alidade.pipelines.methods import Method
+from alidade.pipelines.recording.info import SessionFacts, facts_of, lacking
+from alidade.pipelines.recording.message_reader import ENCODING
+from alidade.pipelines.recording.opening import Where
+from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.reports.known import load_known
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.settings import TRUTH, Config
+from alidade.pipelines.sharing import device_belief, walks
+from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.solvers.window import check_window
 
 SOLVERS = ("batch", "incremental", "published")
 
@@ -334,11 +334,11 @@ class Session:
         if solver == "published":
             return self.method.published(self.data, self.config, problem), problem
         if solver == "incremental":
-            from pipelines.solvers.incremental import solve_incremental
+            from alidade.pipelines.solvers.incremental import solve_incremental
 
             shown = replace(problem, steps=partial(_shown, problem, self.facts.duration_s))
             return solve_incremental(shown, window), problem
-        from pipelines.solvers.batch import solve_batch
+        from alidade.pipelines.solvers.batch import solve_batch
 
         device = walks(self.method, self.config, [q.name for q in problem.quantities])
         with progress.doing("solving"):
@@ -359,7 +359,7 @@ class Session:
 
     def _batch_beside(self) -> Estimate:
         """Batch's estimate to compare with: without what its own report would tell of it."""
-        from pipelines.solvers.batch import solve_batch
+        from alidade.pipelines.solvers.batch import solve_batch
 
         with progress.doing("solving"):
             return solve_batch(self.problem())

@@ -1,4 +1,4 @@
-"""What the config of a session may say. Reading and checking one is pipelines.config's work.
+"""What the config of a session may say. Reading and checking one is alidade.pipelines.config's work.
 
 config.noise.gyro_density           # None where the config does not say
 config.topic(IMU)                   # the topic's name, renamed or default
@@ -24,11 +24,11 @@ from pydantic import (
 )
 from pydantic import Tag as Case
 
-from pipelines.belief import Belief, independent
-from pipelines.errors import InputError, nearest
-from pipelines.recording.sources import TopicSource
-from pipelines.recording.table_topics import TableTopic
-from pipelines.recording.topics import Topic
+from alidade.pipelines.belief import Belief, independent
+from alidade.pipelines.errors import InputError, nearest
+from alidade.pipelines.recording.sources import TopicSource
+from alidade.pipelines.recording.table_topics import TableTopic
+from alidade.pipelines.recording.topics import Topic
 
 # Names of the attachments that hold a recording's config and, if simulated, its truth.
 ATTACHMENT = "alidade.yaml"

@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.belief import Belief
-from pipelines.errors import InputError, nearest
-from pipelines.methods import Method
-from pipelines.reports.known import Known
-from pipelines.settings import Config
+from alidade.pipelines.belief import Belief
+from alidade.pipelines.errors import InputError, nearest
+from alidade.pipelines.methods import Method
+from alidade.pipelines.reports.known import Known
+from alidade.pipelines.settings import Config
 
 DAY_S = 86_400.0
 

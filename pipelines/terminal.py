@@ -12,14 +12,14 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from pipelines.errors import printable
+from alidade.pipelines.errors import printable
 
 if TYPE_CHECKING:
-    from pipelines.discovery import Suggestion
-    from pipelines.noise import NoiseStudy
-    from pipelines.planning import Plan
-    from pipelines.recording.info import SessionFacts
-    from pipelines.reports.result import Calibration, ParameterResult
+    from alidade.pipelines.discovery import Suggestion
+    from alidade.pipelines.noise import NoiseStudy
+    from alidade.pipelines.planning import Plan
+    from alidade.pipelines.recording.info import SessionFacts
+    from alidade.pipelines.reports.result import Calibration, ParameterResult
 
 _NARROWEST = 72
 console = Console(highlight=False)
@@ -56,8 +56,8 @@ def show_scenarios(scenarios: Sequence[Mapping[str, str]]) -> None:
 
 def show(calibrations: Sequence[Calibration]) -> None:
     """One table, a row a parameter: the truth where known, then value, sigma and error (in sigmas) of each solver."""
-    from pipelines.reports.result import truth_errors
-    from pipelines.reports.units import human_unit, to_digits_of
+    from alidade.pipelines.reports.result import truth_errors
+    from alidade.pipelines.reports.units import human_unit, to_digits_of
 
     alone = len(calibrations) == 1
     errors = [truth_errors(c) for c in calibrations]
@@ -101,7 +101,7 @@ def as_text(calibrations: Sequence[Calibration]) -> str:
 
 def show_json(calibrations: Sequence[Calibration]) -> None:
     """The result of a calibration as result.json has it; of several a list of them."""
-    from pipelines.reports.result import result_json
+    from alidade.pipelines.reports.result import result_json
 
     texts = [result_json(calibration).rstrip() for calibration in calibrations]
     print(texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]")
@@ -109,7 +109,7 @@ def show_json(calibrations: Sequence[Calibration]) -> None:
 
 def facts_json(facts: SessionFacts, found: Sequence[Suggestion], unused: Sequence[str]) -> str:
     """What `info` tells, as JSON."""
-    from pipelines.reports.plain_json import plain_json
+    from alidade.pipelines.reports.plain_json import plain_json
 
     suggested = {suggestion.method: suggestion for suggestion in found}
     told = dataclasses.asdict(facts)
@@ -178,8 +178,8 @@ def _show_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:
 
 def show_plan(plan: Plan) -> None:
     """Predicted sigmas of a motion and of the better one, what falls short, and what to change."""
-    from pipelines.reports.budget import limits
-    from pipelines.reports.units import human_unit, rounded
+    from alidade.pipelines.reports.budget import limits
+    from alidade.pipelines.reports.units import human_unit, rounded
 
     limited = {limit.name: limit for limit in limits(plan.best.budget, plan.best.quantities)}
     table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
@@ -214,7 +214,7 @@ def show_plan(plan: Plan) -> None:
 
 def show_noise(study: NoiseStudy) -> None:
     """A table a sensor, what to know beside it, and the section to paste."""
-    from pipelines.reports.noise import remarks, rows, section, title
+    from alidade.pipelines.reports.noise import remarks, rows, section, title
 
     for sensor in study.sensors:
         say(title(sensor))
@@ -237,7 +237,7 @@ def show_noise(study: NoiseStudy) -> None:
 
 
 def _cell(parameter: ParameterResult, factor: float, error_sigmas: float | None, alone: bool) -> str:
-    from pipelines.reports.units import rounded, signed, to_digits_of
+    from alidade.pipelines.reports.units import rounded, signed, to_digits_of
 
     value = to_digits_of(parameter.value * factor, parameter.sigma * factor)
     if parameter.sigma == 0.0:

@@ -22,24 +22,24 @@ from typing import Any
 
 import numpy as np
 
-from pipelines import progress
-from pipelines.belief import Belief
-from pipelines.errors import InputError
-from pipelines.graph.assumptions import kind
-from pipelines.graph.believing import believing
-from pipelines.graph.problem import Array, ChiSquare, Estimate, Parameter, Problem, Quantity, Step, Told
-from pipelines.judgement import noise_levels
-from pipelines.judgement.changes import Changes, Rate, changes
-from pipelines.judgement.observability import Assessment, Fit, assess
-from pipelines.methods import Method
-from pipelines.recording.info import SessionFacts
-from pipelines.recording.opening import Where
-from pipelines.recording.reading import open_recording
-from pipelines.reports.over_time import recordings_shown, sentences
-from pipelines.reports.result import Calibration, PartParameter, PartResult
-from pipelines.session import Session
-from pipelines.sharing import DAY_S, walk_as_told, walks
-from pipelines.solvers.joint import Joined, grown, join, tell
+from alidade.pipelines import progress
+from alidade.pipelines.belief import Belief
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.assumptions import kind
+from alidade.pipelines.graph.believing import believing
+from alidade.pipelines.graph.problem import Array, ChiSquare, Estimate, Parameter, Problem, Quantity, Step, Told
+from alidade.pipelines.judgement import noise_levels
+from alidade.pipelines.judgement.changes import Changes, Rate, changes
+from alidade.pipelines.judgement.observability import Assessment, Fit, assess
+from alidade.pipelines.methods import Method
+from alidade.pipelines.recording.info import SessionFacts
+from alidade.pipelines.recording.opening import Where
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.reports.over_time import recordings_shown, sentences
+from alidade.pipelines.reports.result import Calibration, PartParameter, PartResult
+from alidade.pipelines.session import Session
+from alidade.pipelines.sharing import DAY_S, walk_as_told, walks
+from alidade.pipelines.solvers.joint import Joined, grown, join, tell
 
 # The joint estimate stays when other linearisations move it by less than this, in sigmas (what is left is about the
 # square), and those that were not tried are foreseen to; so many times they are tried.

@@ -6,20 +6,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipelines import progress
-from pipelines.config import recorded_config
-from pipelines.judgement.changes import Change
-from pipelines.judgement.holding import Holding, Verdict, holding
-from pipelines.judgement.validation import Validation
-from pipelines.methods import method
-from pipelines.recording.reading import open_recording
-from pipelines.reports.calibration import SavedCalibration
-from pipelines.reports.known import Known, load_known, saved_of, with_covariance
-from pipelines.reports.units import human_unit, to_digits_of
-from pipelines.reports.validation import validation_html, validation_rows
-from pipelines.reports.whole import write_page
-from pipelines.session import Recorded, Session, resolve_method
-from pipelines.sharing import device_belief, walks
+from alidade.pipelines import progress
+from alidade.pipelines.config import recorded_config
+from alidade.pipelines.judgement.changes import Change
+from alidade.pipelines.judgement.holding import Holding, Verdict, holding
+from alidade.pipelines.judgement.validation import Validation
+from alidade.pipelines.methods import method
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.reports.calibration import SavedCalibration
+from alidade.pipelines.reports.known import Known, load_known, saved_of, with_covariance
+from alidade.pipelines.reports.units import human_unit, to_digits_of
+from alidade.pipelines.reports.validation import validation_html, validation_rows
+from alidade.pipelines.reports.whole import write_page
+from alidade.pipelines.session import Recorded, Session, resolve_method
+from alidade.pipelines.sharing import device_belief, walks
 
 FILE = "validation.html"
 
@@ -123,8 +123,8 @@ def validate(
 
 def _held(session: Session, known: Known) -> tuple[Holding | None, dict[str, float]]:
     """What the recording says of the calibration, and its own parameters; neither where it cannot be solved."""
-    from pipelines.solvers.batch import solve_batch
-    from pipelines.solvers.marginals import IndeterminateError
+    from alidade.pipelines.solvers.batch import solve_batch
+    from alidade.pipelines.solvers.marginals import IndeterminateError
 
     if known.solver == "published":
         return None, {}

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from factors import so3
-from pipelines.graph.problem import (
+from alidade.factors import so3
+from alidade.pipelines.graph.problem import (
     Attitudes,
     ChiSquare,
     Estimate,
@@ -20,11 +20,11 @@ from pipelines.graph.problem import (
     Step,
     rotation_vector_coordinates,
 )
-from pipelines.judgement.observability import assess
-from pipelines.methods import method
-from pipelines.recording.info import SessionFacts, TopicFacts
-from pipelines.reports.result import Calibration, quantities_of
-from pipelines.settings import Config
+from alidade.pipelines.judgement.observability import assess
+from alidade.pipelines.methods import method
+from alidade.pipelines.recording.info import SessionFacts, TopicFacts
+from alidade.pipelines.reports.result import Calibration, quantities_of
+from alidade.pipelines.settings import Config
 
 # Data sheets of sensors without errors.
 IDEAL = Config.model_validate({"sensors": "ideal"}).sensors

@@ -9,10 +9,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.loss import TruncatedLoss
-from factors.model import Block, Model, Residuals
-from pipelines.graph.priors import vector_prior
-from pipelines.graph.problem import Array, Factor, Parameter, Problem, Quantity, Step
+from alidade.factors.loss import TruncatedLoss
+from alidade.factors.model import Block, Model, Residuals
+from alidade.pipelines.graph.priors import vector_prior
+from alidade.pipelines.graph.problem import Array, Factor, Parameter, Problem, Quantity, Step
 
 PARAMETER = int(gtsam.symbol("p", 0))
 WALK, START, NOISE, PRIOR = 0.3, 0.5, 0.2, 2.0

@@ -16,7 +16,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
 
-from pipelines import cli
+from alidade.pipelines import cli
 from tests.command import Command, Run
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"

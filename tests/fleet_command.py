@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from pipelines import cli
+from alidade.pipelines import cli
 
 
 def alidade(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:

@@ -20,7 +20,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pipelines.recording.messages import TAG_DETECTIONS, definition_text
+from alidade.pipelines.recording.messages import TAG_DETECTIONS, definition_text
 
 # Topic, type, log time in ns, CDR.
 Message = tuple[str, str, int, bytes]

@@ -8,11 +8,11 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from factors.vectorized import VectorizedFactor
-from pipelines.graph.problem import Factor, Parameter, Problem, Step
-from pipelines.solvers.assembly import CHUNK, Assembly
-from pipelines.solvers.marginals import joint_covariance, reported
-from pipelines.solvers.weighing import optimize
+from alidade.factors.vectorized import VectorizedFactor
+from alidade.pipelines.graph.problem import Factor, Parameter, Problem, Step
+from alidade.pipelines.solvers.assembly import CHUNK, Assembly
+from alidade.pipelines.solvers.marginals import joint_covariance, reported
+from alidade.pipelines.solvers.weighing import optimize
 
 # Indices of one recording's variables stay below this.
 _APART = 10_000_000

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.recording import series
+from alidade.pipelines.recording import series
 
 T0 = 1_700_000_000_123_456_789
 

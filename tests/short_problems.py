@@ -5,13 +5,13 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-from pipelines.config import load_config
-from pipelines.graph.problem import Problem
-from pipelines.methods.head import graph as head
-from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from pipelines.methods.los import graph as los
-from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.problem import Problem
+from alidade.pipelines.methods.head import graph as head
+from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from alidade.pipelines.methods.los import graph as los
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.simulation.motion import EulerMotion, Swing
 
 LOS = LosScenario(duration_s=15.0, image_rate_hz=20.0, gyro_rate_hz=200.0, gimbal_rate_hz=100.0)
 SWAY = EulerMotion(

@@ -24,7 +24,7 @@ def main() -> None:
         assert (out / "report.html").stat().st_size > 100_000
         calibration = alidade.calibrate(session)
         assert calibration.status == "calibrated", calibration.headline
-    import factors
+    from alidade import factors
 
     assert all(getattr(factors, name) is not None for name in factors.__all__)
     print("the installed distribution works")

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 import alidade
-from pipelines.methods import names
-from pipelines.methods import simulate as write
-from pipelines.recording.shapes import rows_by_name
-from pipelines.session import calibrate
+from alidade.pipelines.methods import names
+from alidade.pipelines.methods import simulate as write
+from alidade.pipelines.recording.shapes import rows_by_name
+from alidade.pipelines.session import calibrate
 from tests.forms import split
 
 HEAD = {"duration_s": 12.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 20.0}
@@ -51,8 +51,7 @@ def test_python_dash_m_is_the_command() -> None:
 
 def test_typing_is_announced() -> None:
     """`Typing :: Typed` once stood in the classifiers without py.typed."""
-    import factors
-    import pipelines
+    from alidade import factors, pipelines
 
     for package in (alidade, factors, pipelines):
         assert (Path(str(package.__file__)).parent / "py.typed").is_file()
@@ -61,7 +60,7 @@ def test_typing_is_announced() -> None:
 def test_a_file_its_data_and_its_arrays_give_the_same_calibration(
     simulated: alidade.Simulated, calibration: alidade.Calibration, tmp_path: Path
 ) -> None:
-    from pipelines.methods import method
+    from alidade.pipelines.methods import method
 
     method("head").write(tmp_path / "s.mcap", simulated)
     data = simulated.data

@@ -7,10 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-from pipelines.methods import names
+from alidade.pipelines.methods import names
 
 ROOT = Path(__file__).parents[1]
-ROOMS = [ROOT / "alidade", ROOT / "factors", ROOT / "pipelines"]
+ROOMS = [ROOT / "factors", ROOT / "pipelines"]
 _DOCSTRING = re.compile(r'"""(?:.|\n)*?"""')
 _COMMENT = re.compile(r"#[^\n]*")
 

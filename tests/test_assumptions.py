@@ -12,20 +12,20 @@ import numpy as np
 import pytest
 
 import alidade
-from pipelines import methods
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.graph.assumptions import Assumption, pull, quantities
-from pipelines.graph.problem import Estimate, Quantity
-from pipelines.judgement.observability import assess
-from pipelines.methods.head.findings import findings
-from pipelines.methods.head.graph import problem
-from pipelines.methods.head.recording import HeadData, read_head, write_head
-from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from pipelines.recording.reading import open_recording
-from pipelines.session import Session
-from pipelines.simulation.scenario import load_scenario
-from pipelines.solvers.batch import solve_batch
+from alidade.pipelines import methods
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.assumptions import Assumption, pull, quantities
+from alidade.pipelines.graph.problem import Estimate, Quantity
+from alidade.pipelines.judgement.observability import assess
+from alidade.pipelines.methods.head.findings import findings
+from alidade.pipelines.methods.head.graph import problem
+from alidade.pipelines.methods.head.recording import HeadData, read_head, write_head
+from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.session import Session
+from alidade.pipelines.simulation.scenario import load_scenario
+from alidade.pipelines.solvers.batch import solve_batch
 from tests.command import Command
 
 SCALE = Assumption(("gyro_scale_x", "gyro_scale_y"), "", "gyro", "scale", 1e-2)

@@ -7,16 +7,16 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pipelines.config import load_config
-from pipelines.graph.problem import Problem
-from pipelines.judgement.observability import assess
-from pipelines.methods.head import graph as head
-from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from pipelines.methods.los import graph as los
-from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.settings import Sensors
-from pipelines.simulation.motion import EulerMotion
-from pipelines.solvers.batch import solve_batch
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.problem import Problem
+from alidade.pipelines.judgement.observability import assess
+from alidade.pipelines.methods.head import graph as head
+from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from alidade.pipelines.methods.los import graph as los
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.settings import Sensors
+from alidade.pipelines.simulation.motion import EulerMotion
+from alidade.pipelines.solvers.batch import solve_batch
 
 STILL = EulerMotion()
 HEAD = HeadScenario(duration_s=12.0, head=STILL, vision_rate_hz=20.0, gyro_rate_hz=100.0, sensors=Sensors())

@@ -6,12 +6,12 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import so3
-from factors.attitude import VisionAttitudeFactor, ahrs_factors
-from factors.gyro import GyroIncrementFactor, symmetric
-from factors.model import Array
-from factors.preintegration import GyroPath
-from factors.testing import assert_jacobians
+from alidade.factors import so3
+from alidade.factors.attitude import VisionAttitudeFactor, ahrs_factors
+from alidade.factors.gyro import GyroIncrementFactor, symmetric
+from alidade.factors.model import Array
+from alidade.factors.preintegration import GyroPath
+from alidade.factors.testing import assert_jacobians
 from tests.numerics import assert_rows_are_independent
 
 RNG = np.random.default_rng(1)

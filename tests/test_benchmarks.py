@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alidade.pipelines.solvers.assembly import CHUNK
 from benchmarks import __main__ as runner
 from benchmarks.batch import build
 from benchmarks.measure import Ratio, costs, growth, worse
-from pipelines.solvers.assembly import CHUNK
 
 SLOW = """
 from benchmarks.measure import Ratio, costs

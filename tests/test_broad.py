@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
+from alidade.factors import so3
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
 from datasets.broad import CONFIG, VISION_SIGMA, Trial, gyro_bias_at_rest, read_trial, to_session
-from factors import so3
-from pipelines.config import load_config
-from pipelines.errors import InputError
 from tests.broad_trials import BIAS, LOST, RATE_HZ, TRIALS, converted
 
 

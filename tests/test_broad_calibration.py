@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.reports.write import write_results
+from alidade.pipelines.session import calibrate
 from datasets.broad import Score, read_trial, score_results
-from pipelines.reports.result import Calibration
-from pipelines.reports.write import write_results
-from pipelines.session import calibrate
 from tests.broad_trials import TRIALS, converted
 
 

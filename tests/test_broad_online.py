@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.judgement.halves import cut
-from pipelines.recording.reading import open_recording
-from pipelines.session import Session
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.incremental import solve_incremental
+from alidade.pipelines.judgement.halves import cut
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.session import Session
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import solve_incremental
 from tests.broad_trials import TRIALS, converted
 
 # The first half of this is rest.

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 import alidade
-from pipelines.graph.problem import Quantity
-from pipelines.planning import predict
-from pipelines.reports.budget import REST, limits
-from pipelines.reports.html import report_html
-from pipelines.reports.result import Calibration, result
+from alidade.pipelines.graph.problem import Quantity
+from alidade.pipelines.planning import predict
+from alidade.pipelines.reports.budget import REST, limits
+from alidade.pipelines.reports.html import report_html
+from alidade.pipelines.reports.result import Calibration, result
 from tests.pages import Page
 
 SHORT = {"duration_s": 15.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 15.0}

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from alidade import calibrate, simulate
-from factors.chi_square import student
-from pipelines.errors import InputError
-from pipelines.reports.certificate import write_certificate
+from alidade.factors.chi_square import student
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.reports.certificate import write_certificate
 from tests.browser import fits
 from tests.command import Command
 

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 import alidade
-from pipelines.config import load_config
-from pipelines.graph.problem import Array, Told
-from pipelines.judgement.changes import LEVEL, Changes, changes
-from pipelines.reports.over_time import forecasts
-from pipelines.reports.result import Calibration
-from pipelines.session import Session
-from pipelines.solvers.joint import join
-from pipelines.together import calibrate_together
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.problem import Array, Told
+from alidade.pipelines.judgement.changes import LEVEL, Changes, changes
+from alidade.pipelines.reports.over_time import forecasts
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.session import Session
+from alidade.pipelines.solvers.joint import join
+from alidade.pipelines.together import calibrate_together
 from tests.short_problems import COARSE
 
 NAMES = ("arm_mount_x", "arm_mount_y", "arm_mount_z", "own")

@@ -12,18 +12,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.graph.problem import Attitudes, Estimate, Problem
-from pipelines.methods.los.graph import problem
-from pipelines.methods.los.recording import read_los, write_los
-from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.recording.reading import open_recording
-from pipelines.simulation.motion import EulerMotion, Swing
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
-from pipelines.solvers.incremental import Run, solve_incremental
-from pipelines.solvers.smoother import FixedLag
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Attitudes, Estimate, Problem
+from alidade.pipelines.methods.los.graph import problem
+from alidade.pipelines.methods.los.recording import read_los, write_los
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
+from alidade.pipelines.solvers.incremental import Run, solve_incremental
+from alidade.pipelines.solvers.smoother import FixedLag
 from tests.builders import IDEAL
 
 BRISK = EulerMotion(
@@ -39,11 +39,11 @@ IDENTITY = {"recording": "first", "config": "{}"}
 RESUME = """
 import json, sys
 from pathlib import Path
-from pipelines.methods.los.graph import problem
-from pipelines.config import load_config
-from pipelines.methods.los.recording import read_los
-from pipelines.recording.reading import open_recording
-from pipelines.solvers.checkpoint import load_checkpoint
+from alidade.pipelines.methods.los.graph import problem
+from alidade.pipelines.config import load_config
+from alidade.pipelines.methods.los.recording import read_los
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.solvers.checkpoint import load_checkpoint
 recording = open_recording(Path(sys.argv[1]))
 config = load_config(recording.attachment("alidade.yaml"))
 made = problem(read_los(recording, config), config)

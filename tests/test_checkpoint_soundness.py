@@ -9,11 +9,11 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors.model import Model, Residuals
-from factors.vectorized import VectorizedFactor
-from pipelines.errors import InputError
-from pipelines.graph.problem import Array, Factor, Problem, Step
-from pipelines.solvers.incremental import solve_incremental
+from alidade.factors.model import Model, Residuals
+from alidade.factors.vectorized import VectorizedFactor
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Array, Factor, Problem, Step
+from alidade.pipelines.solvers.incremental import solve_incremental
 from tests.chain import PARAMETER, Walk, state
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from scipy.stats import chi2
 
-from factors.chi_square import gate, interval, quantile
+from alidade.factors.chi_square import gate, interval, quantile
 
 
 @pytest.mark.parametrize("dof", [2, 3, 10, 100, 5000, 1e6])

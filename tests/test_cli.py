@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.methods.head.recording import HeadData, write_head
-from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from pipelines.simulation.scenario import load_scenario
+from alidade.pipelines.methods.head.recording import HeadData, write_head
+from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from alidade.pipelines.simulation.scenario import load_scenario
 from tests.builders import IDEAL
 from tests.command import Command, Run
 
@@ -220,7 +220,7 @@ def test_where_nothing_can_be_written_is_told_before_the_work(
         raise AssertionError("before it was told")
 
     with monkeypatch.context() as patched:
-        for name in ("pipelines.session.calibrate", "pipelines.follow.follow.follow"):
+        for name in ("alidade.pipelines.session.calibrate", "alidade.pipelines.follow.follow.follow"):
             patched.setattr(name, worked)
         for command in ("calibrate", "compare", "follow"):
             _refused(alidade(command, session, "--out", out), out, ("no folder to write results to", "file"))
@@ -243,7 +243,11 @@ def test_ctrl_c_is_silent_and_leaves_nothing(
             raise ImportError("initialization failed") from KeyboardInterrupt()  # as gtsam's module does
         raise KeyboardInterrupt
 
-    target = "pipelines.reports.write.report_html" if where == "writing" else "pipelines.session.open_recording"
+    target = (
+        "alidade.pipelines.reports.write.report_html"
+        if where == "writing"
+        else "alidade.pipelines.session.open_recording"
+    )
     monkeypatch.setattr(target, interrupted)
     run = alidade("calibrate", session, "--out", tmp_path / "out")
     assert (run.code, run.out, run.err) == (130, "", "")
@@ -306,7 +310,7 @@ import atexit, sys
 heavy = ("numpy", "pydantic", "gtsam", "cv2", "bokeh", "rich")
 atexit.register(lambda: print([name for name in heavy if name in sys.modules], file=sys.stderr))
 sys.argv = ["alidade", *{typed.split()}]
-from pipelines.cli import main
+from alidade.pipelines.cli import main
 main()
 """
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[1])

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
-from pipelines.recording import messages
-from pipelines.recording.clocks import find_step
-from pipelines.recording.reading import open_recording
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording import messages
+from alidade.pipelines.recording.clocks import find_step
+from alidade.pipelines.recording.reading import open_recording
 from tests.raw_messages import STORE, T0, random_message, write_raw
 
 Stamps = NDArray[np.int64]

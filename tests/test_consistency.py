@@ -11,26 +11,26 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from factors import so3
-from pipelines.cli import app
-from pipelines.config import load_config
-from pipelines.graph.problem import Estimate, Residuals
-from pipelines.judgement import causes as causes_
-from pipelines.judgement.causes import find_causes
-from pipelines.judgement.halves import cut, held_out, split_halves
-from pipelines.judgement.rejection import rejection_sentence, too_many_rejected
-from pipelines.judgement.trials import trials
-from pipelines.methods import Method, method
-from pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
-from pipelines.methods.cube.simulation import simulate_cube
-from pipelines.methods.cube.topics import CubeConfig
-from pipelines.methods.head.recording import write_head
-from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
-from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.session import Arrays, Session
-from pipelines.settings import Config, Sensors
-from pipelines.simulation.motion import EulerMotion, Swing
+from alidade.factors import so3
+from alidade.pipelines.cli import app
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.problem import Estimate, Residuals
+from alidade.pipelines.judgement import causes as causes_
+from alidade.pipelines.judgement.causes import find_causes
+from alidade.pipelines.judgement.halves import cut, held_out, split_halves
+from alidade.pipelines.judgement.rejection import rejection_sentence, too_many_rejected
+from alidade.pipelines.judgement.trials import trials
+from alidade.pipelines.methods import Method, method
+from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
+from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.methods.head.recording import write_head
+from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from alidade.pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.session import Arrays, Session
+from alidade.pipelines.settings import Config, Sensors
+from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from tests.builders import IDEAL
 
 Case = tuple[Method, Any, Config]

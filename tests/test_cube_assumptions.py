@@ -10,17 +10,17 @@ import pytest
 from scipy.stats import chi2
 
 import alidade
-from factors import so3
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.graph.problem import Estimate
-from pipelines.methods.cube.data import CubeData
-from pipelines.methods.cube.graph import problem
-from pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
-from pipelines.methods.cube.simulation import simulate_cube
-from pipelines.settings import Config
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.incremental import solve_incremental
+from alidade.factors import so3
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Estimate
+from alidade.pipelines.methods.cube.data import CubeData
+from alidade.pipelines.methods.cube.graph import problem
+from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
+from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.settings import Config
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import solve_incremental
 
 SHORT: dict[str, Any] = {"poses": 16, "static_s": 2.0, "turn_rad_s": 1.6, "camera": {"rate_hz": 5.0}}
 # One of everything, beyond or within its prior.

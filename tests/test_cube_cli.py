@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from factors import so3
-from pipelines import cli
-from pipelines.methods import simulate
-from pipelines.methods.cube.data import CubeData, Sightings
-from pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
-from pipelines.methods.cube.simulation import simulate_cube
-from pipelines.methods.cube.writing import write_cube
-from pipelines.vision.camera import Camera
+from alidade.factors import so3
+from alidade.pipelines import cli
+from alidade.pipelines.methods import simulate
+from alidade.pipelines.methods.cube.data import CubeData, Sightings
+from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
+from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.cube.writing import write_cube
+from alidade.pipelines.vision.camera import Camera
 
 SCENARIO = CubeScenario(poses=8, static_s=1.5, turn_rad_s=1.5, camera=CubeCamera(rate_hz=5.0))
 CONFIG = cube_config(SCENARIO)

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from factors import so3
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.methods.cube.printing import print_cube, tag_size
-from pipelines.methods.cube.topics import CubeConfig
-from pipelines.reports.calibration import SavedCalibration
-from pipelines.reports.export import exported
+from alidade.factors import so3
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.cube.printing import print_cube, tag_size
+from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.reports.calibration import SavedCalibration
+from alidade.pipelines.reports.export import exported
 
 RNG = np.random.default_rng(1)
 BIAS = {"accel": 0.3, "gyro": 0.02, "mag": 2e-5}

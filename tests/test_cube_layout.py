@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factors import so3
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.methods.cube.layout import cube_layout, layout_yaml
-from pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Errors, TagCube, cube_config
-from pipelines.methods.cube.simulation import simulate_cube
-from pipelines.methods.cube.topics import CubeConfig
-from pipelines.methods.cube.writing import write_cube
-from pipelines.recording.reading import open_recording
-from pipelines.vision.layout import Layout
+from alidade.factors import so3
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.cube.layout import cube_layout, layout_yaml
+from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Errors, TagCube, cube_config
+from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.methods.cube.writing import write_cube
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.vision.layout import Layout
 from tests.browser import fits
 from tests.command import Command
 from tests.pages import Page

@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factors import so3
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.graph.problem import Estimate
-from pipelines.methods.cube.data import CubeData
-from pipelines.methods.cube.graph import problem
-from pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Errors, TagCube, cube_config
-from pipelines.methods.cube.simulation import simulate_cube
-from pipelines.methods.cube.topics import CubeConfig, LayoutCovariance
-from pipelines.methods.cube.writing import write_cube
-from pipelines.settings import Config
-from pipelines.solvers.batch import solve_batch
+from alidade.factors import so3
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Estimate
+from alidade.pipelines.methods.cube.data import CubeData
+from alidade.pipelines.methods.cube.graph import problem
+from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Errors, TagCube, cube_config
+from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.cube.topics import CubeConfig, LayoutCovariance
+from alidade.pipelines.methods.cube.writing import write_cube
+from alidade.pipelines.settings import Config
+from alidade.pipelines.solvers.batch import solve_batch
 from tests.command import Command
 
 TAGS = [17, 18, 19, 20, 21]

@@ -11,22 +11,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datasets import imu_tk_xsens
-from factors import so3
-from factors.turns import GyroRotationFactor
-from factors.vectorized import Ensemble
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.graph.problem import Estimate, Problem
-from pipelines.judgement.observability import Assessment, assess
-from pipelines.judgement.validation import rms
-from pipelines.methods import simulate
-from pipelines.methods.cube.data import CubeData
-from pipelines.methods.cube.findings import findings
-from pipelines.methods.cube.graph import problem
-from pipelines.methods.cube.published import published_estimate
-from pipelines.methods.cube.recording import read_cube
-from pipelines.methods.cube.scenario import (
+from alidade.factors import so3
+from alidade.factors.turns import GyroRotationFactor
+from alidade.factors.vectorized import Ensemble
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Estimate, Problem
+from alidade.pipelines.judgement.observability import Assessment, assess
+from alidade.pipelines.judgement.validation import rms
+from alidade.pipelines.methods import simulate
+from alidade.pipelines.methods.cube.data import CubeData
+from alidade.pipelines.methods.cube.findings import findings
+from alidade.pipelines.methods.cube.graph import problem
+from alidade.pipelines.methods.cube.published import published_estimate
+from alidade.pipelines.methods.cube.recording import read_cube
+from alidade.pipelines.methods.cube.scenario import (
     CubeCamera,
     CubeScenario,
     Errors,
@@ -36,17 +35,18 @@ from pipelines.methods.cube.scenario import (
     TagCube,
     cube_config,
 )
-from pipelines.methods.cube.simulation import simulate_cube
-from pipelines.methods.cube.static_intervals import static_intervals
-from pipelines.methods.cube.topics import CubeConfig, Raw, RawConversion
-from pipelines.methods.cube.validation import validate
-from pipelines.methods.static_intervals import find_static_intervals
-from pipelines.recording.reading import open_recording
-from pipelines.settings import Config
-from pipelines.simulation.temperature import Warming
-from pipelines.solvers.assembly import CHUNK, Assembly
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.incremental import solve_incremental
+from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.cube.static_intervals import static_intervals
+from alidade.pipelines.methods.cube.topics import CubeConfig, Raw, RawConversion
+from alidade.pipelines.methods.cube.validation import validate
+from alidade.pipelines.methods.static_intervals import find_static_intervals
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.settings import Config
+from alidade.pipelines.simulation.temperature import Warming
+from alidade.pipelines.solvers.assembly import CHUNK, Assembly
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import solve_incremental
+from datasets import imu_tk_xsens
 
 # The default field prior leaves the magnetometer's scale at one per cent; here the field is known better, and is so.
 FIELD = {"field_e": 1e-8, "field_n": 1e-8, "field_u": 1e-8}

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from pipelines.methods import simulate
-from pipelines.methods.cube import static_intervals
-from pipelines.reports.html import report_html
-from pipelines.session import calibrate
-from pipelines.vision import pose
+from alidade.pipelines.methods import simulate
+from alidade.pipelines.methods.cube import static_intervals
+from alidade.pipelines.reports.html import report_html
+from alidade.pipelines.session import calibrate
+from alidade.pipelines.vision import pose
 
 POSES = 6
 SCENARIO = f"{{poses: {POSES}, static_s: 2.0, turn_rad_s: 4.0, camera: {{rate_hz: 1.0, pictures: {{rate_hz: 1.0}}}}}}"

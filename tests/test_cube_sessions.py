@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factors import so3
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.methods import method
-from pipelines.methods.cube.data import CubeData, Sightings, local_field
-from pipelines.methods.cube.poses import static_poses
-from pipelines.methods.cube.recording import read_cube
-from pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
-from pipelines.methods.cube.simulation import simulate_cube
-from pipelines.methods.cube.static_intervals import static_intervals
-from pipelines.methods.cube.topics import CubeConfig
-from pipelines.methods.cube.writing import write_cube
-from pipelines.recording.reading import open_recording
-from pipelines.settings import Config
-from pipelines.vision.camera import Camera
+from alidade.factors import so3
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.cube.data import CubeData, Sightings, local_field
+from alidade.pipelines.methods.cube.poses import static_poses
+from alidade.pipelines.methods.cube.recording import read_cube
+from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
+from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.cube.static_intervals import static_intervals
+from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.methods.cube.writing import write_cube
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.settings import Config
+from alidade.pipelines.vision.camera import Camera
 
 SCENARIO = CubeScenario(poses=4, static_s=2.0, camera=CubeCamera(rate_hz=5.0))
 
@@ -197,7 +197,7 @@ def test_date_outside_the_field_model(session: CubeData) -> None:
 
 
 def test_blurred_pictures_only(tmp_path: Path, session: CubeData) -> None:
-    from pipelines.simulation.rendering import encode
+    from alidade.pipelines.simulation.rendering import encode
 
     t = static_intervals(session, _config()).mean(axis=1)
     nothing = Sightings(t, *(np.zeros(0, dtype=np.int64),) * 2, np.zeros((0, 4, 2)), None)

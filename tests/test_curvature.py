@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from alidade.pipelines.graph.problem import Array, Estimate, Problem
+from alidade.pipelines.settings import Sensors
+from alidade.pipelines.solvers import batch, curvature
+from alidade.pipelines.solvers.batch import solve_batch
 from benchmarks.young import CASES, LOS, beginning, drawn_los, followed, made, nees
-from pipelines.graph.problem import Array, Estimate, Problem
-from pipelines.settings import Sensors
-from pipelines.solvers import batch, curvature
-from pipelines.solvers.batch import solve_batch
 from tests.builders import IDEAL
 
 

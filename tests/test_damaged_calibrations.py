@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from mcap.opcode import Opcode
 
-from pipelines.errors import InputError
-from pipelines.methods.los.recording import write_los
-from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.recording import writing
-from pipelines.reports.result import truth_errors
-from pipelines.session import calibrate
-from pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.los.recording import write_los
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.recording import writing
+from alidade.pipelines.reports.result import truth_errors
+from alidade.pipelines.session import calibrate
+from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from tests.builders import IDEAL
 from tests.command import Command
 from tests.damage import boundaries, cuts, flips, rewrite, spoilt

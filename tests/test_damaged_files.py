@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from mcap.opcode import Opcode
 
-from pipelines.errors import InputError
-from pipelines.recording import writing
-from pipelines.recording.reading import open_recording
-from pipelines.session import session_facts
-from pipelines.settings import Config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording import writing
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.session import session_facts
+from alidade.pipelines.settings import Config
 from tests.damage import (
     CONFIG,
     FORMS,

@@ -18,12 +18,12 @@ import zstandard
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.recording import messages, video
-from pipelines.recording.reading import open_recording
-from pipelines.recording.ros1_bag import MAGIC
-from pipelines.recording.writing import write_session
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording import messages, video
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.ros1_bag import MAGIC
+from alidade.pipelines.recording.writing import write_session
 from tests import forms
 from tests.damage import CONFIG, Whole, flips, read, spoilt, topics
 from tests.turning import turning, write_csv

@@ -8,17 +8,17 @@ from pathlib import Path
 
 import pytest
 
-from pipelines import methods
-from pipelines.config import load_config
-from pipelines.graph.assumptions import Assumption
-from pipelines.methods.cube.parameters import ASSUMPTIONS as CUBE
-from pipelines.methods.head.parameters import ASSUMPTIONS as HEAD
-from pipelines.methods.indexer.parameters import ASSUMPTIONS as INDEXER
-from pipelines.methods.los.parameters import ASSUMPTIONS as LOS
-from pipelines.methods.place import FIELD
-from pipelines.methods.tumble import turning
-from pipelines.methods.tumble.recording import SLOPES
-from pipelines.settings import Sensors
+from alidade.pipelines import methods
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.assumptions import Assumption
+from alidade.pipelines.methods.cube.parameters import ASSUMPTIONS as CUBE
+from alidade.pipelines.methods.head.parameters import ASSUMPTIONS as HEAD
+from alidade.pipelines.methods.indexer.parameters import ASSUMPTIONS as INDEXER
+from alidade.pipelines.methods.los.parameters import ASSUMPTIONS as LOS
+from alidade.pipelines.methods.place import FIELD
+from alidade.pipelines.methods.tumble import turning
+from alidade.pipelines.methods.tumble.recording import SLOPES
+from alidade.pipelines.settings import Sensors
 from tests.walk import steps
 
 PAGE = Path(__file__).parents[1] / "docs" / "data-sheets.md"

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.config import load_config
-from pipelines.discovery import suggestions, unused, with_suggested
-from pipelines.errors import InputError
-from pipelines.methods import simulate
-from pipelines.methods.head.recording import read_head
-from pipelines.recording import series
-from pipelines.recording.pairing import pair
-from pipelines.recording.reading import Recording, open_recording
-from pipelines.recording.sources import inverted
-from pipelines.recording.writing import write_session
-from pipelines.session import Session
+from alidade.pipelines.config import load_config
+from alidade.pipelines.discovery import suggestions, unused, with_suggested
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import simulate
+from alidade.pipelines.methods.head.recording import read_head
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.pairing import pair
+from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.recording.sources import inverted
+from alidade.pipelines.recording.writing import write_session
+from alidade.pipelines.session import Session
 from tests import forms
 from tests.command import Command
 

@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 import alidade as door
-from pipelines.config import load_config
-from pipelines.settings import DEFAULT_NOISE
+from alidade.pipelines.config import load_config
+from alidade.pipelines.settings import DEFAULT_NOISE
 from tests.browser import DESKTOP, PHONE, look, needs_browser, running
 from tests.command import Command, Run
 from tests.walk import Step, difference, steps
@@ -76,7 +76,7 @@ def test_page_works(
 
 def _apart(step: Step, path: list[str]) -> Run:
     words = step.words
-    command = [sys.executable, "-m", "pipelines.cli", *words[1:]] if words[0] == "alidade" else words
+    command = [sys.executable, "-m", "alidade.pipelines.cli", *words[1:]] if words[0] == "alidade" else words
     environment = {"PYTHONPATH": os.pathsep.join(path), "PATH": "/usr/bin:/bin", "COLUMNS": "100"}
     run = subprocess.run(command, env=environment, capture_output=True, text=True)
     return Run(run.returncode, run.stdout, run.stderr)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factors.earth import EARTH_RATE, earth_rate, gravity, magnetic_field
+from alidade.factors.earth import EARTH_RATE, earth_rate, gravity, magnetic_field
 
 
 def test_earth_rate_points_north_at_the_equator_and_up_at_the_pole() -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from alidade.factors import so3
+from alidade.factors.model import Array
+from alidade.factors.testing import assert_jacobians
+from alidade.pipelines.graph.problem import Estimate
+from alidade.pipelines.solvers.batch import solve_batch
 from datasets import eqvio
-from factors import so3
-from factors.model import Array
-from factors.testing import assert_jacobians
-from pipelines.graph.problem import Estimate
-from pipelines.solvers.batch import solve_batch
 
 
 @pytest.fixture(scope="module")

@@ -11,23 +11,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.graph.problem import Array, Estimate, Problem
-from pipelines.judgement.observability import assess
-from pipelines.methods import method
-from pipelines.methods.head import graph as head
-from pipelines.methods.head.recording import read_head, write_head
-from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from pipelines.methods.los import graph as los
-from pipelines.methods.los.recording import read_los, write_los
-from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.methods.tumble.scenario import TumbledAccelerometer
-from pipelines.recording.faults import drop_faults
-from pipelines.recording.reading import Recording, open_recording
-from pipelines.settings import Config
-from pipelines.simulation.motion import EulerMotion, Swing
-from pipelines.solvers.batch import solve_batch
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Array, Estimate, Problem
+from alidade.pipelines.judgement.observability import assess
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.head import graph as head
+from alidade.pipelines.methods.head.recording import read_head, write_head
+from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from alidade.pipelines.methods.los import graph as los
+from alidade.pipelines.methods.los.recording import read_los, write_los
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.methods.tumble.scenario import TumbledAccelerometer
+from alidade.pipelines.recording.faults import drop_faults
+from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.settings import Config
+from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.solvers.batch import solve_batch
 from tests.builders import make_calibration
 
 SWAY = EulerMotion(

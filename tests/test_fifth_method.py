@@ -26,7 +26,7 @@ COMMANDS = """
 import json, os, sys
 from contextlib import redirect_stderr, redirect_stdout
 from io import StringIO
-from pipelines import cli
+from alidade.pipelines import cli
 
 for line in sys.stdin:
     folder, words = json.loads(line)

@@ -19,15 +19,15 @@ from typing import Any
 
 import pytest
 
-from pipelines.errors import InputError
-from pipelines.fleet import engine, fleet
-from pipelines.fleet.engine import cluster, completed, source_version
-from pipelines.fleet.fleet import Settings, calibrate_fleet, calibrate_recording
-from pipelines.fleet.montecarlo import simulate_and_solve
-from pipelines.fleet.recordings import find
-from pipelines.methods import method
-from pipelines.methods.head.recording import write_head
-from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.fleet import engine, fleet
+from alidade.pipelines.fleet.engine import cluster, completed, source_version
+from alidade.pipelines.fleet.fleet import Settings, calibrate_fleet, calibrate_recording
+from alidade.pipelines.fleet.montecarlo import simulate_and_solve
+from alidade.pipelines.fleet.recordings import find
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.head.recording import write_head
+from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from tests.builders import IDEAL
 from tests.fleet_command import alidade
 
@@ -128,7 +128,7 @@ def rows_of(out: Path) -> list[dict[str, str]]:
 def test_a_worker_killed_midway_costs_nothing(start: Start, scheduler: str, recordings: Path, tmp_path: Path) -> None:
     first, second = worker(start, scheduler), worker(start, scheduler)
     out = tmp_path / "out"
-    command = start("pipelines.cli", "fleet", recordings / "*.mcap", "--scheduler", scheduler, "--out", out)
+    command = start("alidade.pipelines.cli", "fleet", recordings / "*.mcap", "--scheduler", scheduler, "--out", out)
     until(lambda: len(finished(out)) >= 4)
     first.send_signal(signal.SIGKILL)
     assert len(finished(out)) < COUNT - 2, "too fast to be midway"
@@ -159,7 +159,7 @@ def test_workers_killed_at_random_cost_nothing(start: Start, tmp_path: Path, wha
         "fleet": (tmp_path / "*.mcap",),
         "montecarlo": ("head", "--scenario", scenario, "--runs", COUNT, "--solvers", "batch"),
     }
-    command = start("pipelines.cli", what, *words[what], "--jobs", 3, "--out", out)
+    command = start("alidade.pipelines.cli", what, *words[what], "--jobs", 3, "--out", out)
     killed = 0
     # Each after one more result: workers take seconds to start, and some work must end.
     while len(finished(out)) < COUNT - 4:
@@ -218,7 +218,7 @@ def test_ctrl_c_keeps_what_is_finished(
 ) -> None:
     out = tmp_path / "out"
     words = ("fleet", recordings / "U0*.mcap", "--out", out)
-    command = start("pipelines.cli", *words, "--jobs", 1)
+    command = start("alidade.pipelines.cli", *words, "--jobs", 1)
     until(lambda: len(finished(out)) >= 2)
     # As a terminal does: to every process of the group.
     os.killpg(command.pid, signal.SIGINT)
@@ -259,13 +259,12 @@ def test_a_recording_that_kills_workers_is_set_aside(
 
 def test_workers_of_another_version_are_refused(start: Start, scheduler: str, recordings: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
-    for package in ("factors", "pipelines"):
-        shutil.copytree(ROOT / package, other / package, ignore=shutil.ignore_patterns("__pycache__"))
-    with (other / "factors" / "so3.py").open("a") as stream:
+    shutil.copytree(ROOT / "alidade", other / "alidade", ignore=shutil.ignore_patterns("__pycache__"))
+    with (other / "alidade" / "factors" / "so3.py").open("a") as stream:
         stream.write("# another\n")
     process = worker(start, scheduler, root=other)
     out = tmp_path / "out"
-    command = start("pipelines.cli", "fleet", recordings / "*.mcap", "--scheduler", scheduler, "--out", out)
+    command = start("alidade.pipelines.cli", "fleet", recordings / "*.mcap", "--scheduler", scheduler, "--out", out)
     output, error = command.communicate(timeout=60)
     assert process.poll() is None
     assert (command.returncode, output) == (2, "")
@@ -308,7 +307,7 @@ def test_a_scheduler_that_dies_midway_is_told(start: Start, recordings: Path, tm
     out = tmp_path / "out"
     process, address = scheduling(start, tmp_path)
     worker(start, address)
-    command = start("pipelines.cli", "fleet", recordings / "*.mcap", "--scheduler", address, "--out", out)
+    command = start("alidade.pipelines.cli", "fleet", recordings / "*.mcap", "--scheduler", address, "--out", out)
     until(lambda: len(finished(out)) >= 2)
     process.kill()
     _, error = command.communicate(timeout=60)

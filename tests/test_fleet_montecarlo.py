@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.fleet import consistency
-from pipelines.fleet.montecarlo import SOLVERS, _first, run_study, simulate_and_solve
-from pipelines.methods import method, names
-from pipelines.reports.result import truth_errors
-from pipelines.session import Session, calibrate
+from alidade.pipelines.fleet import consistency
+from alidade.pipelines.fleet.montecarlo import SOLVERS, _first, run_study, simulate_and_solve
+from alidade.pipelines.methods import method, names
+from alidade.pipelines.reports.result import truth_errors
+from alidade.pipelines.session import Session, calibrate
 from tests.browser import fits
 from tests.fleet_command import alidade
 
@@ -170,7 +170,7 @@ def test_a_missing_extra_is_told(
     words: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("pipelines.fleet.find_spec", lambda name: None if name == "arro3" else True)
+    monkeypatch.setattr("alidade.pipelines.fleet.find_spec", lambda name: None if name == "arro3" else True)
     assert alidade(monkeypatch, *words) == 2
     assert capsys.readouterr().err == "alidade: this command needs arro3: pip install 'alidade[fleet]'\n"
 
@@ -182,7 +182,7 @@ def test_the_consistency_page_lists_every_solver(local_cluster: str, tmp_path: P
     assert rows == [["| tumble", solver, "2"] for solver in SOLVERS]
 
 
-# Shorter than the nominal recordings: `python -m pipelines.fleet.consistency` has the whole study.
+# Shorter than the nominal recordings: `python -m alidade.pipelines.fleet.consistency` has the whole study.
 BRIEF = {
     "los": "{duration_s: 30.0, sensors: {}}",
     "head": "{duration_s: 30.0, vision_rate_hz: 15.0, sensors: {}}",

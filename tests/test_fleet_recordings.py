@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.fleet import engine
-from pipelines.fleet.fleet import Settings, calibrate_recording
-from pipelines.fleet.recordings import find
-from pipelines.methods.head.recording import write_head
-from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from alidade.pipelines.fleet import engine
+from alidade.pipelines.fleet.fleet import Settings, calibrate_recording
+from alidade.pipelines.fleet.recordings import find
+from alidade.pipelines.methods.head.recording import write_head
+from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from tests.browser import fits
 from tests.fleet_command import alidade
 from tests.forms import split

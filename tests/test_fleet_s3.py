@@ -14,10 +14,10 @@ from urllib.request import Request, urlopen
 
 import pytest
 
-from pipelines.fleet.fleet import Settings, calibrate_recording
-from pipelines.fleet.recordings import find
-from pipelines.methods.head.recording import write_head
-from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from alidade.pipelines.fleet.fleet import Settings, calibrate_recording
+from alidade.pipelines.fleet.recordings import find
+from alidade.pipelines.methods.head.recording import write_head
+from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from tests.builders import IDEAL
 from tests.command import Command
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pipelines.belief import independent
-from pipelines.fleet import statistics
-from pipelines.fleet.analysis import Population, counting, populations
-from pipelines.fleet.attention import units_of_interest
-from pipelines.fleet.histories import History, change_table, histories, packed
-from pipelines.fleet.store import Result
-from pipelines.solvers.told import told_of
+from alidade.pipelines.belief import independent
+from alidade.pipelines.fleet import statistics
+from alidade.pipelines.fleet.analysis import Population, counting, populations
+from alidade.pipelines.fleet.attention import units_of_interest
+from alidade.pipelines.fleet.histories import History, change_table, histories, packed
+from alidade.pipelines.fleet.store import Result
+from alidade.pipelines.solvers.told import told_of
 
 
 @pytest.mark.parametrize("dof", [3, 6, 36])

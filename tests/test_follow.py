@@ -20,18 +20,18 @@ import pytest
 from scipy.stats import chi2
 from tornado.websocket import websocket_connect
 
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.follow.follower import Follower, Settings
+from alidade.pipelines.follow.guidance import View
+from alidade.pipelines.follow.serve import LiveServer
+from alidade.pipelines.follow.sources import Source
+from alidade.pipelines.methods.los.recording import write_los
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.session import calibrate
+from alidade.pipelines.settings import ClockSheet
+from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from benchmarks.young import nees
-from pipelines.errors import InputError
-from pipelines.follow.follower import Follower, Settings
-from pipelines.follow.guidance import View
-from pipelines.follow.serve import LiveServer
-from pipelines.follow.sources import Source
-from pipelines.methods.los.recording import write_los
-from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.reports.result import Calibration
-from pipelines.session import calibrate
-from pipelines.settings import ClockSheet
-from pipelines.simulation.motion import EulerMotion, Swing
 from tests.builders import IDEAL
 from tests.command import Command
 
@@ -97,7 +97,7 @@ def _recorder(
 
 
 def _alidade(*arguments: str) -> list[str]:
-    return [sys.executable, "-m", "pipelines.cli", *arguments]
+    return [sys.executable, "-m", "alidade.pipelines.cli", *arguments]
 
 
 async def _received(url: str, topic: str, seconds: float) -> dict[str, Any]:

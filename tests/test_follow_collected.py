@@ -8,23 +8,23 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from pipelines.config import load_config
-from pipelines.follow.guidance import View
-from pipelines.follow.screen import Screen
-from pipelines.graph.motion import Motion
-from pipelines.graph.problem import Quantity
-from pipelines.judgement.checklist import ChecklistItem
-from pipelines.judgement.observability import assess
-from pipelines.methods import method
-from pipelines.methods.cube.guidance import next_pose
-from pipelines.methods.cube.scenario import CubeScenario, cube_config
-from pipelines.methods.cube.simulation import simulate_cube
-from pipelines.methods.head.simulation import HeadScenario, simulate_head
-from pipelines.methods.indexer.simulation import IndexerScenario, simulate_indexer
-from pipelines.methods.los.simulation import LosScenario, simulate_los
-from pipelines.settings import Config
-from pipelines.simulation.motion import EulerMotion, Swing
-from pipelines.simulation.scenario import load_scenario
+from alidade.pipelines.config import load_config
+from alidade.pipelines.follow.guidance import View
+from alidade.pipelines.follow.screen import Screen
+from alidade.pipelines.graph.motion import Motion
+from alidade.pipelines.graph.problem import Quantity
+from alidade.pipelines.judgement.checklist import ChecklistItem
+from alidade.pipelines.judgement.observability import assess
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.cube.guidance import next_pose
+from alidade.pipelines.methods.cube.scenario import CubeScenario, cube_config
+from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.head.simulation import HeadScenario, simulate_head
+from alidade.pipelines.methods.indexer.simulation import IndexerScenario, simulate_indexer
+from alidade.pipelines.methods.los.simulation import LosScenario, simulate_los
+from alidade.pipelines.settings import Config
+from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.simulation.scenario import load_scenario
 
 
 def _wanted(found: object) -> dict[str, str]:

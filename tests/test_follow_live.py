@@ -14,16 +14,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.follow.follower import Follower, Settings
-from pipelines.follow.guidance import View
-from pipelines.follow.sources import Source, StandardInput, source_of
-from pipelines.methods.los.recording import write_los
-from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.recording.growing import Growing
-from pipelines.reports.result import Calibration
-from pipelines.session import calibrate
-from pipelines.settings import Sensors
-from pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.follow.follower import Follower, Settings
+from alidade.pipelines.follow.guidance import View
+from alidade.pipelines.follow.sources import Source, StandardInput, source_of
+from alidade.pipelines.methods.los.recording import write_los
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.recording.growing import Growing
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.session import calibrate
+from alidade.pipelines.settings import Sensors
+from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from tests.builders import IDEAL
 from tests.live import Bridge, Message, messages, paced, write
 

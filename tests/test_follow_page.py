@@ -22,19 +22,19 @@ import pytest
 from mcap.reader import make_reader
 from rich.console import Console
 
-from pipelines.errors import InputError
-from pipelines.follow.follower import Follower, Settings
-from pipelines.follow.guidance import View
-from pipelines.follow.page import LivePage
-from pipelines.follow.screen import Screen
-from pipelines.follow.sources import Source
-from pipelines.graph.motion import Motion
-from pipelines.graph.problem import Quantity
-from pipelines.judgement.checklist import ChecklistItem
-from pipelines.judgement.observability import assess
-from pipelines.judgement.pictures import covered, swaying
-from pipelines.judgement.stability import Stability
-from pipelines.methods import simulate
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.follow.follower import Follower, Settings
+from alidade.pipelines.follow.guidance import View
+from alidade.pipelines.follow.page import LivePage
+from alidade.pipelines.follow.screen import Screen
+from alidade.pipelines.follow.sources import Source
+from alidade.pipelines.graph.motion import Motion
+from alidade.pipelines.graph.problem import Quantity
+from alidade.pipelines.judgement.checklist import ChecklistItem
+from alidade.pipelines.judgement.observability import assess
+from alidade.pipelines.judgement.pictures import covered, swaying
+from alidade.pipelines.judgement.stability import Stability
+from alidade.pipelines.methods import simulate
 from tests.browser import DESKTOP, PHONE, needs_browser
 from tests.devtools import Tab
 from tests.live import messages, paced, write

@@ -16,19 +16,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.errors import InputError
-from pipelines.follow.follower import Follower, Settings
-from pipelines.follow.guidance import View
-from pipelines.follow.protocol import SUBPROTOCOLS, websockets
-from pipelines.follow.serve import LiveServer
-from pipelines.follow.sources import Source, StandardInput, source_of
-from pipelines.graph.problem import Quantity
-from pipelines.judgement.observability import assess
-from pipelines.methods.los.recording import write_los
-from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.reports.result import Calibration
-from pipelines.session import calibrate
-from pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.follow.follower import Follower, Settings
+from alidade.pipelines.follow.guidance import View
+from alidade.pipelines.follow.protocol import SUBPROTOCOLS, websockets
+from alidade.pipelines.follow.serve import LiveServer
+from alidade.pipelines.follow.sources import Source, StandardInput, source_of
+from alidade.pipelines.graph.problem import Quantity
+from alidade.pipelines.judgement.observability import assess
+from alidade.pipelines.methods.los.recording import write_los
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.session import calibrate
+from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from tests import forms
 from tests.builders import IDEAL
 from tests.live import Bridge, messages, write

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from alidade.pipelines.config import load_config
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.indexer.simulation import Position
+from alidade.pipelines.recording import messages
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.session import calibrate
+from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from datasets.broad import CONFIG as BROAD_CONFIG
-from pipelines.config import load_config
-from pipelines.methods import method
-from pipelines.methods.indexer.simulation import Position
-from pipelines.recording import messages
-from pipelines.recording.reading import open_recording
-from pipelines.session import calibrate
-from pipelines.simulation.motion import EulerMotion, Swing
 from tests import forms
 from tests.broad_trials import TRIALS, converted
 from tests.turning import write_csv

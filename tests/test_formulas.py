@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 import alidade
-from factors import so3
-from factors.indexer import base_from_platform, mounting
-from factors.los import LosDirectionFactor
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.methods import method
-from pipelines.methods.formula import apply
-from pipelines.reports.calibration import calibration_yaml
-from pipelines.settings import Config
+from alidade.factors import so3
+from alidade.factors.indexer import base_from_platform, mounting
+from alidade.factors.los import LosDirectionFactor
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.formula import apply
+from alidade.pipelines.reports.calibration import calibration_yaml
+from alidade.pipelines.settings import Config
 from tests.formulas import CASES
 
 Array = so3.Array

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.recording import messages, video
-from pipelines.recording.reading import open_recording
-from pipelines.settings import Config
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording import messages, video
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.settings import Config
 from tests import forms
 from tests.damage import Whole, check_sound, read, write_small
 from tests.raw_messages import T0, read_any, write_raw

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.errors import InputError
-from pipelines.recording.growing import Growing
-from pipelines.recording.reading import Recording, open_recording
-from pipelines.recording.writing import write_session
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording.growing import Growing
+from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.recording.writing import write_session
 from tests.live import messages, write
 from tests.recorded import session
 

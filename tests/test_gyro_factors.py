@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from factors import so3
-from factors.attitude import ahrs_factors
-from factors.gyro import GyroIncrementFactor, carried, corrected, symmetric
-from factors.model import Array
-from factors.preintegration import GyroPath, Increments
-from factors.testing import assert_jacobians
-from factors.vectorized import Ensemble
+from alidade.factors import so3
+from alidade.factors.attitude import ahrs_factors
+from alidade.factors.gyro import GyroIncrementFactor, carried, corrected, symmetric
+from alidade.factors.model import Array
+from alidade.factors.preintegration import GyroPath, Increments
+from alidade.factors.testing import assert_jacobians
+from alidade.factors.vectorized import Ensemble
 from tests.numerics import assert_rows_are_independent
 
 N = 15

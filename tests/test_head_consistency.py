@@ -12,18 +12,18 @@ import pytest
 from scipy.stats import chi2
 from typer.testing import CliRunner
 
-from factors import so3
-from pipelines.cli import app
-from pipelines.config import load_config
-from pipelines.graph.problem import Array, Estimate, Problem
-from pipelines.judgement import noise_levels
-from pipelines.judgement.observability import Assessment, assess
-from pipelines.methods.head.graph import problem
-from pipelines.methods.head.recording import write_head
-from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from pipelines.simulation.scenario import load_scenario
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.incremental import solve_incremental
+from alidade.factors import so3
+from alidade.pipelines.cli import app
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.problem import Array, Estimate, Problem
+from alidade.pipelines.judgement import noise_levels
+from alidade.pipelines.judgement.observability import Assessment, assess
+from alidade.pipelines.methods.head.graph import problem
+from alidade.pipelines.methods.head.recording import write_head
+from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from alidade.pipelines.simulation.scenario import load_scenario
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import solve_incremental
 
 Solve = Callable[[Problem], Estimate]
 SOLVERS = pytest.mark.parametrize("solve", [solve_batch, solve_incremental])

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from factors import so3
-from pipelines.cli import app
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.judgement.validation import peak, rms
-from pipelines.methods.head.graph import problem
-from pipelines.methods.head.recording import HeadData, write_head
-from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from pipelines.methods.head.validation import validate
-from pipelines.session import calibrate
-from pipelines.settings import Config
-from pipelines.simulation.scenario import load_scenario
+from alidade.factors import so3
+from alidade.pipelines.cli import app
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.judgement.validation import peak, rms
+from alidade.pipelines.methods.head.graph import problem
+from alidade.pipelines.methods.head.recording import HeadData, write_head
+from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from alidade.pipelines.methods.head.validation import validate
+from alidade.pipelines.session import calibrate
+from alidade.pipelines.settings import Config
+from alidade.pipelines.simulation.scenario import load_scenario
 
 QUIET = {"gyro_density": 0.0, "gyro_bias_walk": 0.0, "platform_gyro_density": 0.0, "vision_attitude": 0.0}
 

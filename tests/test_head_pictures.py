@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factors import so3
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.methods.head.recording import HeadData, read_head, write_head
-from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head, simulate_pictures
-from pipelines.recording.reading import open_recording
-from pipelines.session import calibrate
-from pipelines.simulation.scenario import load_scenario
+from alidade.factors import so3
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.head.recording import HeadData, read_head, write_head
+from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head, simulate_pictures
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.session import calibrate
+from alidade.pipelines.simulation.scenario import load_scenario
 
 
 def scenario(**changes: object) -> HeadScenario:

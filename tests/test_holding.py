@@ -10,17 +10,17 @@ import pytest
 
 from alidade import calibrate, simulate
 from alidade import open as opened
-from pipelines.belief import Belief
-from pipelines.config import load_config
-from pipelines.graph.problem import Quantity, Told
-from pipelines.judgement.changes import LEVEL
-from pipelines.judgement.holding import Holding, holding
-from pipelines.methods import method
-from pipelines.methods.indexer.recording import write_indexer
-from pipelines.reports.known import load_known
-from pipelines.sharing import device_belief, walks
-from pipelines.simulation.simulated import Simulated
-from pipelines.solvers.batch import solve_batch
+from alidade.pipelines.belief import Belief
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.problem import Quantity, Told
+from alidade.pipelines.judgement.changes import LEVEL
+from alidade.pipelines.judgement.holding import Holding, holding
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.indexer.recording import write_indexer
+from alidade.pipelines.reports.known import load_known
+from alidade.pipelines.sharing import device_belief, walks
+from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.solvers.batch import solve_batch
 from tests.browser import fits
 from tests.command import Command
 from tests.short_problems import COARSE

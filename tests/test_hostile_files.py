@@ -17,12 +17,12 @@ import pytest
 import zstandard
 from mcap.opcode import Opcode
 
-from pipelines.config import load_config
-from pipelines.errors import InputError, printable
-from pipelines.recording import messages
-from pipelines.recording.mcap_records import HEAD, MAGIC
-from pipelines.recording.reading import open_recording
-from pipelines.session import resolve_method, session_facts
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError, printable
+from alidade.pipelines.recording import messages
+from alidade.pipelines.recording.mcap_records import HEAD, MAGIC
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.session import resolve_method, session_facts
 from tests.raw_messages import STORE, T0, random_message
 
 MIB = 1 << 20

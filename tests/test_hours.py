@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import alidade
-from factors import preintegration
-from pipelines.errors import InputError
-from pipelines.methods.los import recording as los
-from pipelines.recording.checks import density, taken
-from pipelines.recording.reading import open_recording
-from pipelines.session import Session
+from alidade.factors import preintegration
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.los import recording as los
+from alidade.pipelines.recording.checks import density, taken
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.session import Session
 
 # Of los at 1 kHz and 50 pictures a second, bytes a sample of the gyro: with ten hours, 36 million, in 8 GiB.
 READING, READ, PREPARING, PREPARED = 165.0, 73.0, 145.0, 110.0

@@ -8,9 +8,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from factors import so3
-from factors.earth import earth_rate
-from factors.indexer import (
+from alidade.factors import so3
+from alidade.factors.earth import earth_rate
+from alidade.factors.indexer import (
     AxisPath,
     IndexerAverageFactor,
     Option,
@@ -21,8 +21,8 @@ from factors.indexer import (
     mounting,
     mounting_angles,
 )
-from factors.model import Array
-from factors.testing import assert_jacobians
+from alidade.factors.model import Array
+from alidade.factors.testing import assert_jacobians
 from tests.numerics import assert_rows_are_independent
 
 RNG = np.random.default_rng(3)

@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.config import load_config
-from pipelines.graph.problem import Estimate, Problem
-from pipelines.methods.indexer.graph import problem
-from pipelines.methods.indexer.recording import read_indexer
-from pipelines.methods.indexer.simulation import ARCSEC, IndexerScenario, indexer_config, simulate_indexer
-from pipelines.recording.reading import open_recording
-from pipelines.settings import Sensors
-from pipelines.simulation.scenario import load_scenario
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.incremental import solve_incremental
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.problem import Estimate, Problem
+from alidade.pipelines.methods.indexer.graph import problem
+from alidade.pipelines.methods.indexer.recording import read_indexer
+from alidade.pipelines.methods.indexer.simulation import ARCSEC, IndexerScenario, indexer_config, simulate_indexer
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.settings import Sensors
+from alidade.pipelines.simulation.scenario import load_scenario
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import solve_incremental
 from tests.builders import IDEAL
 
 

@@ -8,26 +8,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factors import so3
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.methods.indexer.graph import problem
-from pipelines.methods.indexer.recording import IndexerData, read_indexer, write_indexer
-from pipelines.methods.indexer.runs import axis_motion
-from pipelines.methods.indexer.simulation import (
+from alidade.factors import so3
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.indexer.graph import problem
+from alidade.pipelines.methods.indexer.recording import IndexerData, read_indexer, write_indexer
+from alidade.pipelines.methods.indexer.runs import axis_motion
+from alidade.pipelines.methods.indexer.simulation import (
     IndexerNoise,
     IndexerScenario,
     Position,
     indexer_config,
     simulate_indexer,
 )
-from pipelines.methods.indexer.topics import INDEXER, JOINTS
-from pipelines.methods.indexer.validation import validate
-from pipelines.recording import series
-from pipelines.recording.reading import open_recording
-from pipelines.recording.writing import write_session
-from pipelines.settings import Config
-from pipelines.solvers.batch import solve_batch
+from alidade.pipelines.methods.indexer.topics import INDEXER, JOINTS
+from alidade.pipelines.methods.indexer.validation import validate
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.writing import write_session
+from alidade.pipelines.settings import Config
+from alidade.pipelines.solvers.batch import solve_batch
 
 SCENARIO = IndexerScenario(
     positions=[

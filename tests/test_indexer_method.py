@@ -8,24 +8,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alidade.factors import so3
+from alidade.factors.chi_square import quantile
+from alidade.factors.indexer import mounting
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.assumptions import pull
+from alidade.pipelines.graph.problem import Estimate, Quantity
+from alidade.pipelines.judgement.validation import rms
+from alidade.pipelines.methods.indexer.graph import problem
+from alidade.pipelines.methods.indexer.parameters import indexer_parameters
+from alidade.pipelines.methods.indexer.published import published_estimate, thin_shell
+from alidade.pipelines.methods.indexer.recording import read_indexer
+from alidade.pipelines.methods.indexer.simulation import ARCSEC, IndexerScenario, indexer_config, simulate_indexer
+from alidade.pipelines.methods.indexer.validation import validate
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.settings import Config, Sensors
+from alidade.pipelines.simulation.scenario import load_scenario
+from alidade.pipelines.solvers.batch import solve_batch
 from datasets.imucal import CONFIG, COUNTS, read_parts, to_session
-from factors import so3
-from factors.chi_square import quantile
-from factors.indexer import mounting
-from pipelines.config import load_config
-from pipelines.graph.assumptions import pull
-from pipelines.graph.problem import Estimate, Quantity
-from pipelines.judgement.validation import rms
-from pipelines.methods.indexer.graph import problem
-from pipelines.methods.indexer.parameters import indexer_parameters
-from pipelines.methods.indexer.published import published_estimate, thin_shell
-from pipelines.methods.indexer.recording import read_indexer
-from pipelines.methods.indexer.simulation import ARCSEC, IndexerScenario, indexer_config, simulate_indexer
-from pipelines.methods.indexer.validation import validate
-from pipelines.recording.reading import open_recording
-from pipelines.settings import Config, Sensors
-from pipelines.simulation.scenario import load_scenario
-from pipelines.solvers.batch import solve_batch
 from tests.builders import IDEAL
 
 # The whole claim of the publication, and the tenth part of it that the graph must hold.

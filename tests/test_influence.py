@@ -9,12 +9,12 @@ import gtsam
 import numpy as np
 import pytest
 
-from pipelines.graph.problem import Array, Factor, Parameter, Problem, Quantity
-from pipelines.solvers.assembly import Assembly
-from pipelines.solvers.influence import FactorRows, Influence, influence, uncertainty_budget
-from pipelines.solvers.marginals import IndeterminateError, joint_information, ordering_of, reported_covariance
-from pipelines.solvers.system import System
-from pipelines.solvers.weighing import optimize
+from alidade.pipelines.graph.problem import Array, Factor, Parameter, Problem, Quantity
+from alidade.pipelines.solvers.assembly import Assembly
+from alidade.pipelines.solvers.influence import FactorRows, Influence, influence, uncertainty_budget
+from alidade.pipelines.solvers.marginals import IndeterminateError, joint_information, ordering_of, reported_covariance
+from alidade.pipelines.solvers.system import System
+from alidade.pipelines.solvers.weighing import optimize
 from tests.short_problems import head_problem, los_problem
 
 A, B, S = gtsam.symbol("a", 0), gtsam.symbol("b", 0), gtsam.symbol("s", 0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipelines.graph.clock import Clock, Keyframes
+from alidade.pipelines.graph.clock import Clock, Keyframes
 
 KEYFRAMES = Keyframes(Clock(10.0, 0.01), 0.02)
 

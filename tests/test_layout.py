@@ -9,21 +9,21 @@ import cv2
 import numpy as np
 import pytest
 
+from alidade.factors import so3
+from alidade.pipelines.config import recorded_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.cube.layout import cube_layout
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.vision.camera import Camera
+from alidade.pipelines.vision.layout import Layout, Shots, estimate_layout
+from alidade.pipelines.vision.layout.additional import nothing, with_intrinsics
+from alidade.pipelines.vision.layout.bundle import moved
+from alidade.pipelines.vision.layout.normal import shared_rows
+from alidade.pipelines.vision.layout.placing import mirrored
+from alidade.pipelines.vision.layout.sights import Bundle, Sights, linearized
+from alidade.pipelines.vision.pose import TagBody, estimate_pose
+from alidade.pipelines.vision.tags import Detections
 from datasets import tagslam_block
-from factors import so3
-from pipelines.config import recorded_config
-from pipelines.errors import InputError
-from pipelines.methods.cube.layout import cube_layout
-from pipelines.recording.reading import open_recording
-from pipelines.vision.camera import Camera
-from pipelines.vision.layout import Layout, Shots, estimate_layout
-from pipelines.vision.layout.additional import nothing, with_intrinsics
-from pipelines.vision.layout.bundle import moved
-from pipelines.vision.layout.normal import shared_rows
-from pipelines.vision.layout.placing import mirrored
-from pipelines.vision.layout.sights import Bundle, Sights, linearized
-from pipelines.vision.pose import TagBody, estimate_pose
-from pipelines.vision.tags import Detections
 
 K = np.array([[1150.0, 0, 641.3], [0, 1155.0, 477.8], [0, 0, 1]])
 CAMERA = Camera(1280, 960, K, "plumb_bob", np.array([-0.25, 0.1, 1e-3, -5e-4, 0.02]))
@@ -426,8 +426,8 @@ def test_a_real_cube_of_18_tags(shared_data) -> None:  # type: ignore[no-untyped
     assert layout.rms_px < 0.35
     # Its shutter does not roll.
     assert abs(layout.line_time[0]) < 3.0 * layout.line_time_sigma[0]
-    from pipelines.methods.cube.layout import _shots
-    from pipelines.methods.cube.topics import CubeConfig
+    from alidade.pipelines.methods.cube.layout import _shots
+    from alidade.pipelines.methods.cube.topics import CubeConfig
 
     shots, given = _shots(recording, config), TagBody.from_board(config.section(CubeConfig))
     assert shots.time is not None

@@ -7,16 +7,16 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from alidade.pipelines.graph.problem import Problem
+from alidade.pipelines.methods.los.simulation import LosScenario
+from alidade.pipelines.solvers.assembly import CHUNK, Assembly
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.gauss_newton import Solution
+from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, Run, in_use
+from alidade.pipelines.solvers.linearity import is_linear
+from alidade.pipelines.solvers.noise_levels import weigh
+from alidade.pipelines.solvers.weighing import optimize
 from benchmarks.young import LOS, beginning, drawn_los, made, nees
-from pipelines.graph.problem import Problem
-from pipelines.methods.los.simulation import LosScenario
-from pipelines.solvers.assembly import CHUNK, Assembly
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.gauss_newton import Solution
-from pipelines.solvers.incremental import DEFAULT_WINDOW, Run, in_use
-from pipelines.solvers.linearity import is_linear
-from pipelines.solvers.noise_levels import weigh
-from pipelines.solvers.weighing import optimize
 
 
 def _solved(scenario: LosScenario) -> tuple[Problem, Solution, Sequence[int], Sequence[int]]:

@@ -6,12 +6,12 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import so3
-from factors.gimbal import GimbalPath, LocalMotion, command
-from factors.los import SIGHT_ERRORS, LosDirectionFactor, LosRateFactor, Surroundings, rate_matrix, roll_rate
-from factors.model import Array
-from factors.testing import assert_jacobians
-from factors.vectorized import Ensemble
+from alidade.factors import so3
+from alidade.factors.gimbal import GimbalPath, LocalMotion, command
+from alidade.factors.los import SIGHT_ERRORS, LosDirectionFactor, LosRateFactor, Surroundings, rate_matrix, roll_rate
+from alidade.factors.model import Array
+from alidade.factors.testing import assert_jacobians
+from alidade.factors.vectorized import Ensemble
 from tests.numerics import assert_rows_are_independent
 
 N = 12

@@ -10,21 +10,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factors.chi_square import quantile
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.graph.problem import Array, Estimate, Problem
-from pipelines.judgement.observability import Assessment, assess
-from pipelines.methods.los.graph import problem
-from pipelines.methods.los.published import recursive_least_squares
-from pipelines.methods.los.recording import LosData, read_los
-from pipelines.methods.los.simulation import LosAngles, LosScenario, los_config, simulate_los
-from pipelines.recording.reading import open_recording
-from pipelines.settings import Config, Noise, Sensors
-from pipelines.simulation.motion import EulerMotion, Swing
-from pipelines.simulation.scenario import load_scenario
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.incremental import solve_incremental
+from alidade.factors.chi_square import quantile
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Array, Estimate, Problem
+from alidade.pipelines.judgement.observability import Assessment, assess
+from alidade.pipelines.methods.los.graph import problem
+from alidade.pipelines.methods.los.published import recursive_least_squares
+from alidade.pipelines.methods.los.recording import LosData, read_los
+from alidade.pipelines.methods.los.simulation import LosAngles, LosScenario, los_config, simulate_los
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.settings import Config, Noise, Sensors
+from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.simulation.scenario import load_scenario
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import solve_incremental
 from tests.builders import IDEAL
 
 # Sway swift enough for a short recording.

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.methods import simulate
-from pipelines.methods.los.recording import LosData, read_los, write_los
-from pipelines.methods.los.simulation import LosCamera, LosScenario, los_config, simulate_los, simulate_pictures
-from pipelines.recording.reading import open_recording
-from pipelines.recording.sources import TopicSource
-from pipelines.settings import Config
-from pipelines.simulation.scenario import load_scenario
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import simulate
+from alidade.pipelines.methods.los.recording import LosData, read_los, write_los
+from alidade.pipelines.methods.los.simulation import LosCamera, LosScenario, los_config, simulate_los, simulate_pictures
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.sources import TopicSource
+from alidade.pipelines.settings import Config
+from alidade.pipelines.simulation.scenario import load_scenario
 
 DATA, TRUTH = simulate_los(LosScenario(duration_s=12.0, measures_roll=True), 1)
 

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.config import load_config
-from pipelines.judgement.validation import peak, rms
-from pipelines.methods.los.graph import problem
-from pipelines.methods.los.simulation import LosNoise, LosScenario, los_config, simulate_los
-from pipelines.methods.los.validation import validate
-from pipelines.settings import Config
-from pipelines.simulation.scenario import load_scenario
-from pipelines.solvers.batch import solve_batch
+from alidade.pipelines.config import load_config
+from alidade.pipelines.judgement.validation import peak, rms
+from alidade.pipelines.methods.los.graph import problem
+from alidade.pipelines.methods.los.simulation import LosNoise, LosScenario, los_config, simulate_los
+from alidade.pipelines.methods.los.validation import validate
+from alidade.pipelines.settings import Config
+from alidade.pipelines.simulation.scenario import load_scenario
+from alidade.pipelines.solvers.batch import solve_batch
 from tests.builders import IDEAL
 
 SILENT = LosNoise(gyro_density=0.0, gyro_bias_walk=0.0, encoder=0.0, los_error=0.0, los_roll=0.0)

@@ -6,9 +6,9 @@ import xml.etree.ElementTree as ET
 
 import pytest
 
-from pipelines.methods import method
-from pipelines.methods.meanings import meaning
-from pipelines.settings import Config
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.meanings import meaning
+from alidade.pipelines.settings import Config
 from tests.formulas import CASES
 
 NAMES = {

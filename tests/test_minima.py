@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines import methods
-from pipelines.graph.problem import Problem, Step
-from pipelines.methods.tumble.scenario import TumbledAccelerometer, TumbledMagnetometer, TumbleScenario
-from pipelines.session import Session
-from pipelines.solvers.assembly import CHUNK, Assembly
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.minima import CLOSE
-from pipelines.solvers.system import System
+from alidade.pipelines import methods
+from alidade.pipelines.graph.problem import Problem, Step
+from alidade.pipelines.methods.tumble.scenario import TumbledAccelerometer, TumbledMagnetometer, TumbleScenario
+from alidade.pipelines.session import Session
+from alidade.pipelines.solvers.assembly import CHUNK, Assembly
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.minima import CLOSE
+from alidade.pipelines.solvers.system import System
 
 # Iron by which one axis of the magnetometer says little.
 STRONG = TumbleScenario(magnetometer=TumbledMagnetometer(soft_iron=0.2))

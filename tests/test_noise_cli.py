@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from alidade.pipelines.config import load_config
+from alidade.pipelines.judgement.at_rest import stretches_at_rest
+from alidade.pipelines.noise import noise_of
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.even import even_pieces
+from alidade.pipelines.recording.writing import write_session
+from alidade.pipelines.reports.noise import length
 from datasets.broad import read_trial
-from pipelines.config import load_config
-from pipelines.judgement.at_rest import stretches_at_rest
-from pipelines.noise import noise_of
-from pipelines.recording import series
-from pipelines.recording.even import even_pieces
-from pipelines.recording.writing import write_session
-from pipelines.reports.noise import length
 from tests import noises
 from tests.broad_trials import TRIALS
 from tests.browser import fits

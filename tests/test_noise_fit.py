@@ -10,10 +10,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.fft import dct
 
-from pipelines.judgement.allan import NOISES, allan_curve, allan_variance, confidence
-from pipelines.judgement.noise_fit import Coefficient, cosine_transform, fit_noise
-from pipelines.judgement.sensor_noise import axis_noise
-from pipelines.judgement.spectral_lines import find_lines
+from alidade.pipelines.judgement.allan import NOISES, allan_curve, allan_variance, confidence
+from alidade.pipelines.judgement.noise_fit import Coefficient, cosine_transform, fit_noise
+from alidade.pipelines.judgement.sensor_noise import axis_noise
+from alidade.pipelines.judgement.spectral_lines import find_lines
 from tests import noises
 
 Array = NDArray[np.float64]

@@ -12,16 +12,16 @@ import pytest
 from scipy.signal import lfilter
 
 from alidade import simulate
-from factors import so3
-from pipelines import methods
-from pipelines.config import load_config
-from pipelines.graph.problem import Array, Estimate, Problem
-from pipelines.methods.cube.static_intervals import static_intervals
-from pipelines.methods.noise import white_density
-from pipelines.settings import DEFAULT_NOISE, Config
-from pipelines.settings import Noise as NoiseSettings
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.incremental import solve_incremental
+from alidade.factors import so3
+from alidade.pipelines import methods
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.problem import Array, Estimate, Problem
+from alidade.pipelines.methods.cube.static_intervals import static_intervals
+from alidade.pipelines.methods.noise import white_density
+from alidade.pipelines.settings import DEFAULT_NOISE, Config
+from alidade.pipelines.settings import Noise as NoiseSettings
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import solve_incremental
 
 # Method -> scenario, and the noises that its recording is made of.
 CASES: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pipelines.graph.motion import Motion
-from pipelines.graph.problem import ChiSquare, History, Quantity, Residuals
-from pipelines.judgement.observability import Assessment, Cause, Innovations, assess, learning
+from alidade.pipelines.graph.motion import Motion
+from alidade.pipelines.graph.problem import ChiSquare, History, Quantity, Residuals
+from alidade.pipelines.judgement.observability import Assessment, Cause, Innovations, assess, learning
 
 GOOD_FIT = ChiSquare(1000.0, 1000.0, {"vision": (1000.0, 1000.0)})
 

@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-from pipelines.methods.cube.scenario import CubeScenario
-from pipelines.methods.head.simulation import HeadScenario
-from pipelines.methods.indexer.simulation import IndexerScenario, Position
-from pipelines.methods.los.simulation import LosScenario
-from pipelines.planning import Prediction, predict
-from pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.methods.cube.scenario import CubeScenario
+from alidade.pipelines.methods.head.simulation import HeadScenario
+from alidade.pipelines.methods.indexer.simulation import IndexerScenario, Position
+from alidade.pipelines.methods.los.simulation import LosScenario
+from alidade.pipelines.planning import Prediction, predict
+from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from tests.builders import IDEAL
 
 _Scenario = LosScenario | HeadScenario | IndexerScenario | CubeScenario

@@ -9,11 +9,11 @@ import gtsam
 import numpy as np
 import pytest
 
-from pipelines.graph.problem import Problem, Step
-from pipelines.methods import method
-from pipelines.recording.temperature import Temperature
-from pipelines.settings import Config
-from pipelines.simulation.temperature import Warming
+from alidade.pipelines.graph.problem import Problem, Step
+from alidade.pipelines.methods import method
+from alidade.pipelines.recording.temperature import Temperature
+from alidade.pipelines.settings import Config
+from alidade.pipelines.simulation.temperature import Warming
 
 # Between two temperatures, s: until the next one is there it is not known what it is.
 WARMED = 0.5

@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from pipelines import parallel, progress
-from pipelines.errors import InputError
-from pipelines.parallel import Crew, LostError
+from alidade.pipelines import parallel, progress
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.parallel import Crew, LostError
 
 pytestmark = pytest.mark.skipif(
     sys.platform != "linux", reason="elsewhere there is one process, as here without --jobs"
@@ -188,7 +188,7 @@ def test_room_is_what_machine_and_container_leave(
 
 KILLED = """
 import os, signal
-from pipelines import parallel
+from alidade.pipelines import parallel
 from tests.test_parallel import Counter, crew, processes
 with parallel.processes(3):
     first, second = crew(), crew()

@@ -9,10 +9,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from pipelines.judgement.pictures import along, covered, swaying
-from pipelines.methods.cube.faces import SIDES, Side
-from pipelines.methods.cube.picture import rested
-from pipelines.methods.indexer.picture import turning
+from alidade.pipelines.judgement.pictures import along, covered, swaying
+from alidade.pipelines.methods.cube.faces import SIDES, Side
+from alidade.pipelines.methods.cube.picture import rested
+from alidade.pipelines.methods.indexer.picture import turning
 
 
 def _words(picture: str) -> list[str]:

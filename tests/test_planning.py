@@ -10,21 +10,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.methods import method
-from pipelines.methods.cube.faces import Resting, Side
-from pipelines.methods.cube.next_poses import next_poses
-from pipelines.methods.cube.scenario import CubeScenario
-from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.planning import Prediction, make_plan, predict, requirements, write_scenario
-from pipelines.reports.plain_json import plan_json
-from pipelines.reports.plan import plan_html
-from pipelines.settings import Sensors
-from pipelines.simulation.motion import EulerMotion, Swing
-from pipelines.simulation.scenario import load_scenario
-from pipelines.solvers.batch import solve_batch
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.cube.faces import Resting, Side
+from alidade.pipelines.methods.cube.next_poses import next_poses
+from alidade.pipelines.methods.cube.scenario import CubeScenario
+from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.planning import Prediction, make_plan, predict, requirements, write_scenario
+from alidade.pipelines.reports.plain_json import plan_json
+from alidade.pipelines.reports.plan import plan_html
+from alidade.pipelines.settings import Sensors
+from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.simulation.scenario import load_scenario
+from alidade.pipelines.solvers.batch import solve_batch
 from tests.browser import fits
 from tests.pages import Page
 

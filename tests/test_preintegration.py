@@ -6,8 +6,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import preintegration, so3
-from factors.preintegration import GyroPath
+from alidade.factors import preintegration, so3
+from alidade.factors.preintegration import GyroPath
 
 
 def _stream(n: int = 400, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

@@ -13,17 +13,17 @@ from typer.testing import CliRunner
 
 import alidade
 from alidade import Config
-from pipelines.belief import Belief, independent
-from pipelines.cli import app
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.graph.believing import believing
-from pipelines.graph.problem import Problem
-from pipelines.methods import method
-from pipelines.reports.result import Calibration
-from pipelines.sharing import walks
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.incremental import solve_incremental
+from alidade.pipelines.belief import Belief, independent
+from alidade.pipelines.cli import app
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.believing import believing
+from alidade.pipelines.graph.problem import Problem
+from alidade.pipelines.methods import method
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.sharing import walks
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import solve_incremental
 from tests.one_graph import one_graph
 from tests.short_problems import COARSE, FOUR_POSITIONS, head_problem
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 from rich.console import Console
 
+from alidade.pipelines import progress
+from alidade.pipelines.parallel import processes
+from alidade.pipelines.vision import parallel
 from benchmarks.detection import cube_picture
-from pipelines import progress
-from pipelines.parallel import processes
-from pipelines.vision import parallel
 
 
 def test_silent_when_not_a_terminal(capfd: pytest.CaptureFixture[str]) -> None:

@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factors import so3
-from factors.earth import EARTH_RATE, earth_rate, gravity
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.methods.cube.data import CubeData, local_field
-from pipelines.methods.cube.graph import problem
-from pipelines.methods.cube.published import nominal_vectors, published_estimate, regression
-from pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Errors, cube_config
-from pipelines.methods.cube.simulation import simulate_cube
+from alidade.factors import so3
+from alidade.factors.earth import EARTH_RATE, earth_rate, gravity
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.cube.data import CubeData, local_field
+from alidade.pipelines.methods.cube.graph import problem
+from alidade.pipelines.methods.cube.published import nominal_vectors, published_estimate, regression
+from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, Errors, cube_config
+from alidade.pipelines.methods.cube.simulation import simulate_cube
 
 RNG = np.random.default_rng(1)
 K = np.eye(3) + 0.05 * RNG.normal(size=(3, 3))

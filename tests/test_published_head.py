@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factors import so3
-from pipelines.errors import InputError
-from pipelines.methods.head import published
-from pipelines.methods.head.published import HeadFilterResult, euler_kalman_filter
-from pipelines.methods.head.recording import HeadData
-from pipelines.methods.head.simulation import HeadScenario, simulate_head
-from pipelines.simulation.scenario import load_scenario
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.head import published
+from alidade.pipelines.methods.head.published import HeadFilterResult, euler_kalman_filter
+from alidade.pipelines.methods.head.recording import HeadData
+from alidade.pipelines.methods.head.simulation import HeadScenario, simulate_head
+from alidade.pipelines.simulation.scenario import load_scenario
 
 
 def run(scenario: HeadScenario, data: HeadData) -> HeadFilterResult:

@@ -5,11 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from factors import so3
-from pipelines.errors import InputError
-from pipelines.methods.indexer.published import HalfDifference, cost, half_differences, search, thin_shell
-from pipelines.methods.indexer.simulation import ARCSEC, IndexerNoise, IndexerScenario, Position, simulate_indexer
-from pipelines.simulation.scenario import load_scenario
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.indexer.published import HalfDifference, cost, half_differences, search, thin_shell
+from alidade.pipelines.methods.indexer.simulation import (
+    ARCSEC,
+    IndexerNoise,
+    IndexerScenario,
+    Position,
+    simulate_indexer,
+)
+from alidade.pipelines.simulation.scenario import load_scenario
 
 RATE = np.deg2rad(10.0)
 TWO_DEG = np.deg2rad(2.0)

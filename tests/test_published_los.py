@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factors.gimbal import GimbalPath
-from factors.los import LosRateFactor
-from pipelines.errors import InputError
-from pipelines.methods.los.graph import problem
-from pipelines.methods.los.published import NAMES, published_estimate, rates, recursive_least_squares
-from pipelines.methods.los.recording import LosData
-from pipelines.methods.los.simulation import LosAngles, LosScenario, simulate_los
-from pipelines.settings import Config
-from pipelines.simulation.scenario import load_scenario
+from alidade.factors.gimbal import GimbalPath
+from alidade.factors.los import LosRateFactor
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.los.graph import problem
+from alidade.pipelines.methods.los.published import NAMES, published_estimate, rates, recursive_least_squares
+from alidade.pipelines.methods.los.recording import LosData
+from alidade.pipelines.methods.los.simulation import LosAngles, LosScenario, simulate_los
+from alidade.pipelines.settings import Config
+from alidade.pipelines.simulation.scenario import load_scenario
 
 
 def _noise_free(elevation: float, size: float = 1.0) -> tuple[LosData, np.ndarray]:

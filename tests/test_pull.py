@@ -7,20 +7,20 @@ from functools import cache
 import numpy as np
 import pytest
 
+from alidade.pipelines.graph.problem import Array, Problem
+from alidade.pipelines.simulation.motion import EulerMotion
+from alidade.pipelines.solvers import batch
+from alidade.pipelines.solvers.assembly import CHUNK, Assembly
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.gauss_newton import Solution
+from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, solve_incremental
+from alidade.pipelines.solvers.marginals import joint_covariance, joint_information
+from alidade.pipelines.solvers.noise_levels import weigh
+from alidade.pipelines.solvers.pull import without_pull
+from alidade.pipelines.solvers.spurious import information_of_noise
+from alidade.pipelines.solvers.weighing import optimize, with_levels
+from alidade.pipelines.solvers.window import Window
 from benchmarks.young import drawn_los, made
-from pipelines.graph.problem import Array, Problem
-from pipelines.simulation.motion import EulerMotion
-from pipelines.solvers import batch
-from pipelines.solvers.assembly import CHUNK, Assembly
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.gauss_newton import Solution
-from pipelines.solvers.incremental import DEFAULT_WINDOW, solve_incremental
-from pipelines.solvers.marginals import joint_covariance, joint_information
-from pipelines.solvers.noise_levels import weigh
-from pipelines.solvers.pull import without_pull
-from pipelines.solvers.spurious import information_of_noise
-from pipelines.solvers.weighing import optimize, with_levels
-from pipelines.solvers.window import Window
 
 MOUNTS, PRIOR = slice(0, 4), 0.1
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alidade.pipelines.reports.write import write_results
+from alidade.pipelines.session import calibrate
 from datasets.broad import read_trial, score_results
-from pipelines.reports.write import write_results
-from pipelines.session import calibrate
 from tests.broad_trials import TRIALS, converted
 
 # An accelerometer turned by hand, as its authors published it (OpenAXES imu9), scaled to gravity as it is here.

@@ -15,21 +15,21 @@ from gtsam import Rot3
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.methods import method, simulate
-from pipelines.methods.head.topics import VISION_ATTITUDE
-from pipelines.methods.indexer.simulation import Position
-from pipelines.recording import messages, series
-from pipelines.recording.checks import density
-from pipelines.recording.gyro import read_gyro
-from pipelines.recording.reading import Recording, open_recording
-from pipelines.recording.sources import TopicSource, inverted
-from pipelines.recording.topics import IMU
-from pipelines.recording.writing import write_session
-from pipelines.session import calibrate, session_facts
-from pipelines.settings import Config
-from pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import method, simulate
+from alidade.pipelines.methods.head.topics import VISION_ATTITUDE
+from alidade.pipelines.methods.indexer.simulation import Position
+from alidade.pipelines.recording import messages, series
+from alidade.pipelines.recording.checks import density
+from alidade.pipelines.recording.gyro import read_gyro
+from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.recording.sources import TopicSource, inverted
+from alidade.pipelines.recording.topics import IMU
+from alidade.pipelines.recording.writing import write_session
+from alidade.pipelines.session import calibrate, session_facts
+from alidade.pipelines.settings import Config
+from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from tests import forms, live
 from tests.forms import header, ros2_recording
 from tests.recorded import T0, assert_same, session

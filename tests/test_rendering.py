@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from factors import so3
-from pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_bits, tag_quad
-from pipelines.vision.camera import Camera
+from alidade.factors import so3
+from alidade.pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_bits, tag_quad
+from alidade.pipelines.vision.camera import Camera
 
 K = np.array([[300.0, 0.0, 81.3], [0.0, 305.0, 58.6], [0.0, 0.0, 1.0]])
 CAMERAS = {

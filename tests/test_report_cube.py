@@ -8,20 +8,20 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from factors import so3
-from pipelines.config import load_config
-from pipelines.graph.problem import Estimate, Findings
-from pipelines.methods.cube.data import CubeData
-from pipelines.methods.cube.figures import cube_plots
-from pipelines.methods.cube.findings import findings, white_noise
-from pipelines.methods.cube.graph import problem
-from pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
-from pipelines.methods.cube.simulation import simulate_cube
-from pipelines.methods.triads import parts_of
-from pipelines.reports.result import Calibration, Plot, Table
-from pipelines.reports.sphere_map import described
-from pipelines.settings import Config
-from pipelines.solvers.batch import solve_batch
+from alidade.factors import so3
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.problem import Estimate, Findings
+from alidade.pipelines.methods.cube.data import CubeData
+from alidade.pipelines.methods.cube.figures import cube_plots
+from alidade.pipelines.methods.cube.findings import findings, white_noise
+from alidade.pipelines.methods.cube.graph import problem
+from alidade.pipelines.methods.cube.scenario import CubeCamera, CubeScenario, cube_config
+from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.triads import parts_of
+from alidade.pipelines.reports.result import Calibration, Plot, Table
+from alidade.pipelines.reports.sphere_map import described
+from alidade.pipelines.settings import Config
+from alidade.pipelines.solvers.batch import solve_batch
 
 SCENARIO = CubeScenario(poses=10, static_s=3.0, turn_rad_s=1.2, camera=CubeCamera(rate_hz=5.0))
 Solved = tuple[CubeData, Config, Estimate, Findings, dict[str, float]]

@@ -7,12 +7,12 @@ from typing import cast
 
 import numpy as np
 
-from pipelines.config import load_config
-from pipelines.methods.indexer.figures import indexer_plots
-from pipelines.methods.indexer.graph import problem
-from pipelines.methods.indexer.simulation import IndexerScenario, Position, indexer_config, simulate_indexer
-from pipelines.reports.result import Calibration, Plot
-from pipelines.solvers.batch import solve_batch
+from alidade.pipelines.config import load_config
+from alidade.pipelines.methods.indexer.figures import indexer_plots
+from alidade.pipelines.methods.indexer.graph import problem
+from alidade.pipelines.methods.indexer.simulation import IndexerScenario, Position, indexer_config, simulate_indexer
+from alidade.pipelines.reports.result import Calibration, Plot
+from alidade.pipelines.solvers.batch import solve_batch
 
 
 def _plots(scenario: IndexerScenario) -> dict[str, Plot]:

@@ -8,12 +8,12 @@ from typing import cast
 import numpy as np
 import pytest
 
-from pipelines.config import load_config
-from pipelines.methods.los.figures import los_plots
-from pipelines.methods.los.graph import problem
-from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.reports.result import Calibration, Plot
-from pipelines.solvers.batch import solve_batch
+from alidade.pipelines.config import load_config
+from alidade.pipelines.methods.los.figures import los_plots
+from alidade.pipelines.methods.los.graph import problem
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.reports.result import Calibration, Plot
+from alidade.pipelines.solvers.batch import solve_batch
 
 SCENARIO = LosScenario(duration_s=20.0, image_rate_hz=20.0, gyro_rate_hz=200.0, gimbal_rate_hz=100.0)
 

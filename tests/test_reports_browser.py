@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.methods import simulate
-from pipelines.reports.html import report_html
-from pipelines.session import calibrate
+from alidade.pipelines.methods import simulate
+from alidade.pipelines.reports.html import report_html
+from alidade.pipelines.session import calibrate
 from tests.browser import drawn, needs_browser, sheets
 
 SCENARIOS = {

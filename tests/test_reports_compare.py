@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.errors import InputError
-from pipelines.judgement.halves import Halves
-from pipelines.reports.compare import compare_html, write_compare
-from pipelines.reports.plots import common_plots
-from pipelines.reports.result import Calibration
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.judgement.halves import Halves
+from alidade.pipelines.reports.compare import compare_html, write_compare
+from alidade.pipelines.reports.plots import common_plots
+from alidade.pipelines.reports.result import Calibration
 from tests.browser import drawn, needs_browser
 from tests.builders import make_calibration
 from tests.pages import Page

@@ -13,20 +13,20 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from factors import so3
-from pipelines.errors import InputError
-from pipelines.graph.problem import (
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import (
     Attitudes,
     ChiSquare,
     History,
     Residuals,
 )
-from pipelines.recording.messages import definition
-from pipelines.reports import write
-from pipelines.reports.calibration import SavedCalibration, calibration_yaml, load_calibration
-from pipelines.reports.result import Calibration, result_json
-from pipelines.reports.trajectory import tum
-from pipelines.reports.write import write_results
+from alidade.pipelines.recording.messages import definition
+from alidade.pipelines.reports import write
+from alidade.pipelines.reports.calibration import SavedCalibration, calibration_yaml, load_calibration
+from alidade.pipelines.reports.result import Calibration, result_json
+from alidade.pipelines.reports.trajectory import tum
+from alidade.pipelines.reports.write import write_results
 from tests.builders import EPOCH_NS, MOUNT, NAMES, make_calibration
 
 

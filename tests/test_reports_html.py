@@ -9,19 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factors import so3
-from pipelines.graph.motion import Motion
-from pipelines.graph.problem import Attitudes, Quantity, Residuals
-from pipelines.graph.robust import robust_sigma
-from pipelines.judgement.observability import assess
-from pipelines.methods.head.figures import head_plots
-from pipelines.methods.head.recording import HeadData
-from pipelines.recording.sources import TopicSource
-from pipelines.reports.html import report_html
-from pipelines.reports.plots import common_plots
-from pipelines.reports.result import Calibration, quantities_of
-from pipelines.reports.units import human_unit, to_digits_of
-from pipelines.settings import Config
+from alidade.factors import so3
+from alidade.pipelines.graph.motion import Motion
+from alidade.pipelines.graph.problem import Attitudes, Quantity, Residuals
+from alidade.pipelines.graph.robust import robust_sigma
+from alidade.pipelines.judgement.observability import assess
+from alidade.pipelines.methods.head.figures import head_plots
+from alidade.pipelines.methods.head.recording import HeadData
+from alidade.pipelines.recording.sources import TopicSource
+from alidade.pipelines.reports.html import report_html
+from alidade.pipelines.reports.plots import common_plots
+from alidade.pipelines.reports.result import Calibration, quantities_of
+from alidade.pipelines.reports.units import human_unit, to_digits_of
+from alidade.pipelines.settings import Config
 from tests.browser import drawn, needs_browser
 from tests.builders import make_calibration
 from tests.pages import Page

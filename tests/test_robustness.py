@@ -10,25 +10,25 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from factors import so3
-from pipelines import session
-from pipelines.config import load_config
-from pipelines.graph.problem import Estimate, Problem
-from pipelines.judgement.observability import assess
-from pipelines.methods.cube import graph as cube
-from pipelines.methods.cube.scenario import CubeScenario, cube_config
-from pipelines.methods.cube.simulation import simulate_cube
-from pipelines.methods.indexer import graph as indexer
-from pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
-from pipelines.methods.los import graph as los
-from pipelines.methods.los.recording import write_los
-from pipelines.methods.los.simulation import LosAngles, LosScenario, los_config, simulate_los
-from pipelines.methods.triads import triad_names
-from pipelines.session import calibrate
-from pipelines.simulation.motion import EulerMotion, Swing
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.incremental import solve_incremental
-from pipelines.solvers.system import System
+from alidade.factors import so3
+from alidade.pipelines import session
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.problem import Estimate, Problem
+from alidade.pipelines.judgement.observability import assess
+from alidade.pipelines.methods.cube import graph as cube
+from alidade.pipelines.methods.cube.scenario import CubeScenario, cube_config
+from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.indexer import graph as indexer
+from alidade.pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
+from alidade.pipelines.methods.los import graph as los
+from alidade.pipelines.methods.los.recording import write_los
+from alidade.pipelines.methods.los.simulation import LosAngles, LosScenario, los_config, simulate_los
+from alidade.pipelines.methods.triads import triad_names
+from alidade.pipelines.session import calibrate
+from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import solve_incremental
+from alidade.pipelines.solvers.system import System
 
 SWAY = EulerMotion(
     yaw=[Swing(amplitude_deg=20, frequency_hz=0.15)],

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.reports.result import Calibration
-from pipelines.session import calibrate
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.session import calibrate
 
 # Found by an independent fit with the scales free, repeatable to 0.05 deg on another recording of the device.
 MOUNT_DEG = (-0.32, -0.38, -0.10)

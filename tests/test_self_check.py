@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pipelines.cli import app
-from pipelines.graph.problem import Estimate
-from pipelines.judgement.self_check import SelfCheck
-from pipelines.methods.los.recording import write_los
-from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.cli import app
+from alidade.pipelines.graph.problem import Estimate
+from alidade.pipelines.judgement.self_check import SelfCheck
+from alidade.pipelines.methods.los.recording import write_los
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from tests.builders import IDEAL
 
 SCENARIO = LosScenario(duration_s=6.0, image_rate_hz=6.0, gyro_rate_hz=50.0, gimbal_rate_hz=50.0, sensors=IDEAL)

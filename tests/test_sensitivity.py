@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factors import so3
-from pipelines.graph.problem import Array, Estimate, Factor, Step
-from pipelines.judgement.hypotheses import ExactInput
-from pipelines.methods import method
-from pipelines.methods.cube.scenario import CubeScenario
-from pipelines.reports.html import report_html
-from pipelines.reports.result import Calibration, result
-from pipelines.session import Session
-from pipelines.settings import Config
-from pipelines.solvers.batch import solve_batch
+from alidade.factors import so3
+from alidade.pipelines.graph.problem import Array, Estimate, Factor, Step
+from alidade.pipelines.judgement.hypotheses import ExactInput
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.cube.scenario import CubeScenario
+from alidade.pipelines.reports.html import report_html
+from alidade.pipelines.reports.result import Calibration, result
+from alidade.pipelines.session import Session
+from alidade.pipelines.settings import Config
+from alidade.pipelines.solvers.batch import solve_batch
 from tests.pages import Page
 
 SCENARIOS: dict[str, dict[str, Any]] = {

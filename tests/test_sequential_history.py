@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.config import load_config
-from pipelines.graph.problem import Problem
-from pipelines.methods.indexer import graph as indexer
-from pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
-from pipelines.simulation.scenario import load_scenario
-from pipelines.solvers.batch import solve_batch
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.problem import Problem
+from alidade.pipelines.methods.indexer import graph as indexer
+from alidade.pipelines.methods.indexer.simulation import IndexerScenario, indexer_config, simulate_indexer
+from alidade.pipelines.simulation.scenario import load_scenario
+from alidade.pipelines.solvers.batch import solve_batch
 from tests.builders import IDEAL
 from tests.short_problems import head_problem, los_problem
 

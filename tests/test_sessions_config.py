@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.methods.cube.topics import CubeConfig, field_date
-from pipelines.methods.head.topics import HEAD_IMU, HeadConfig
-from pipelines.methods.los.topics import GIMBAL
-from pipelines.settings import Tag, check_names, first_given
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.cube.topics import CubeConfig, field_date
+from alidade.pipelines.methods.head.topics import HEAD_IMU, HeadConfig
+from alidade.pipelines.methods.los.topics import GIMBAL
+from alidade.pipelines.settings import Tag, check_names, first_given
 
 # The example of the file format, with every key.
 FULL = b"""
@@ -151,7 +151,7 @@ def test_config_wins_over_message_over_default() -> None:
 
 
 def test_configs_of_the_independent_recordings(shared_data: Path) -> None:
-    from pipelines.recording.reading import open_recording
+    from alidade.pipelines.recording.reading import open_recording
 
     methods = {}
     for path in (shared_data / "contract").glob("*.mcap"):

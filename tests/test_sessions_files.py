@@ -12,12 +12,12 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.highlevel import AnyReader
 
-from pipelines.errors import InputError
-from pipelines.recording import mcap_records as records
-from pipelines.recording import messages, series
-from pipelines.recording.mcap_file import McapFile
-from pipelines.recording.reading import open_recording
-from pipelines.recording.writing import write_session
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording import mcap_records as records
+from alidade.pipelines.recording import messages, series
+from alidade.pipelines.recording.mcap_file import McapFile
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.writing import write_session
 from tests.recorded import T0, assert_same, session
 
 

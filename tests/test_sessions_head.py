@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factors import so3
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.methods.head.recording import HeadData, read_head, write_head
-from pipelines.recording import checks, series
-from pipelines.recording.reading import open_recording
-from pipelines.recording.writing import write_session
+from alidade.factors import so3
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.head.recording import HeadData, read_head, write_head
+from alidade.pipelines.recording import checks, series
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.writing import write_session
 
 T0 = 1_800_000_000_000_000_000
 NONE = load_config(None)

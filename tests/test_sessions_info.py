@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.methods import method, names
-from pipelines.recording import series
-from pipelines.recording.reading import open_recording
-from pipelines.recording.topics import Setting, Topic
-from pipelines.recording.writing import write_session
-from pipelines.session import missing_for, resolve_method, session_facts
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import method, names
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.topics import Setting, Topic
+from alidade.pipelines.recording.writing import write_session
+from alidade.pipelines.session import missing_for, resolve_method, session_facts
 
 T0 = 1_800_000_000_000_000_000
 NONE = load_config(None)

@@ -11,11 +11,11 @@ import pytest
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pipelines.errors import InputError
-from pipelines.recording import messages
-from pipelines.recording.reading import open_recording
-from pipelines.session import resolve_method, session_facts
-from pipelines.settings import Config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording import messages
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.session import resolve_method, session_facts
+from alidade.pipelines.settings import Config
 from tests.raw_messages import FLAT, OLD_TAGS, POINT_TAGS, STORE, T0, random_message, read_any, write_raw
 
 

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factors import so3
-from factors.earth import earth_rate, gravity, magnetic_field
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.methods import simulate
-from pipelines.methods.cube.faces import Resting
-from pipelines.methods.cube.poses import static_poses
-from pipelines.methods.cube.recording import read_cube
-from pipelines.methods.cube.scenario import (
+from alidade.factors import so3
+from alidade.factors.earth import earth_rate, gravity, magnetic_field
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import simulate
+from alidade.pipelines.methods.cube.faces import Resting
+from alidade.pipelines.methods.cube.poses import static_poses
+from alidade.pipelines.methods.cube.recording import read_cube
+from alidade.pipelines.methods.cube.scenario import (
     YEAR,
     CubeCamera,
     CubeNoise,
@@ -25,11 +25,11 @@ from pipelines.methods.cube.scenario import (
     ReferenceAttitude,
     cube_config,
 )
-from pipelines.methods.cube.simulation import simulate_cube
-from pipelines.methods.cube.static_intervals import static_intervals
-from pipelines.methods.cube.topics import CubeConfig
-from pipelines.recording.reading import open_recording
-from pipelines.simulation.scenario import load_scenario
+from alidade.pipelines.methods.cube.simulation import simulate_cube
+from alidade.pipelines.methods.cube.static_intervals import static_intervals
+from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.simulation.scenario import load_scenario
 
 QUIET = CubeNoise(gyro_density=1e-12, gyro_bias_walk=0.0, accel_density=1e-12, mag_density=1e-18, corner_px=1e-6)
 EXACT = CubeScenario(

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factors import so3
-from factors.earth import earth_rate
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.methods.head.recording import read_head, write_head
-from pipelines.methods.head.simulation import HeadNoise, HeadScenario, head_config, simulate_head
-from pipelines.recording.reading import open_recording
-from pipelines.simulation.scenario import load_scenario
+from alidade.factors import so3
+from alidade.factors.earth import earth_rate
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.head.recording import read_head, write_head
+from alidade.pipelines.methods.head.simulation import HeadNoise, HeadScenario, head_config, simulate_head
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.simulation.scenario import load_scenario
 
 SCENARIOS = ["head_nominal", "head_mounts", "head_outages", "head_turntable"]
 QUIET = {

@@ -7,15 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factors import so3
-from factors.earth import EARTH_RATE
-from pipelines.config import load_config
-from pipelines.methods import simulate
-from pipelines.methods.indexer.recording import read_indexer
-from pipelines.methods.indexer.runs import axis_motion
-from pipelines.methods.indexer.simulation import ARCSEC, IndexerNoise, IndexerScenario, Position, simulate_indexer
-from pipelines.recording.reading import open_recording
-from pipelines.simulation.scenario import load_scenario
+from alidade.factors import so3
+from alidade.factors.earth import EARTH_RATE
+from alidade.pipelines.config import load_config
+from alidade.pipelines.methods import simulate
+from alidade.pipelines.methods.indexer.recording import read_indexer
+from alidade.pipelines.methods.indexer.runs import axis_motion
+from alidade.pipelines.methods.indexer.simulation import (
+    ARCSEC,
+    IndexerNoise,
+    IndexerScenario,
+    Position,
+    simulate_indexer,
+)
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.simulation.scenario import load_scenario
 
 QUIET = IndexerNoise(gyro_density=0.0)
 SHORT = [Position(axis="outer", other_deg=0, turns=1), Position(axis="inner", other_deg=180, turns=1)]

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from factors import so3
-from pipelines.methods.los import simulation
-from pipelines.methods.los.parameters import ASSUMPTIONS
-from pipelines.methods.los.simulation import (
+from alidade.factors import so3
+from alidade.pipelines.methods.los import simulation
+from alidade.pipelines.methods.los.parameters import ASSUMPTIONS
+from alidade.pipelines.methods.los.simulation import (
     LosAngles,
     LosNoise,
     Loss,
@@ -22,7 +22,7 @@ from pipelines.methods.los.simulation import (
     simulate_los,
     simulate_motion,
 )
-from pipelines.simulation.motion import EulerMotion
+from alidade.pipelines.simulation.motion import EulerMotion
 
 SILENT = LosNoise(gyro_density=0.0, gyro_bias_walk=0.0, encoder=0.0, los_error=0.0, los_roll=0.0)
 STRAIGHT = LosAngles(delta_px=0, delta_pz=0, delta_gx=0, delta_gy=0, delta_gz=0)

@@ -7,10 +7,10 @@ import re
 
 import pytest
 
-from factors import so3
-from pipelines.methods import method
-from pipelines.reports.calibration import SavedTransform
-from pipelines.reports.sketch import enlarged, sketch_with, told
+from alidade.factors import so3
+from alidade.pipelines.methods import method
+from alidade.pipelines.reports.calibration import SavedTransform
+from alidade.pipelines.reports.sketch import enlarged, sketch_with, told
 
 
 def turned(*degrees: float) -> SavedTransform:

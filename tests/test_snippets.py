@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factors import so3
-from pipelines.graph.problem import Array
-from pipelines.methods import method
-from pipelines.methods.formula import Formula, apply
-from pipelines.reports.snippets import c_code, python_code
-from pipelines.settings import Config
+from alidade.factors import so3
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.formula import Formula, apply
+from alidade.pipelines.reports.snippets import c_code, python_code
+from alidade.pipelines.settings import Config
 from tests.formulas import CASES
 
 COMPILER = shutil.which("cc")

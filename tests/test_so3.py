@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import so3
+from alidade.factors import so3
 
 RNG = np.random.default_rng(0)
 

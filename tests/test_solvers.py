@@ -9,22 +9,22 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors.loss import TruncatedLoss
-from factors.model import Model, Residuals
-from pipelines.config import load_config
-from pipelines.graph.problem import Array, Estimate, Factor, Parameter, Problem, Quantity, Step
-from pipelines.judgement.observability import assess
-from pipelines.methods.los import graph as los
-from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.solvers import gauss_newton
-from pipelines.solvers.assembly import CHUNK, Assembly
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.gauss_newton import minimize
-from pipelines.solvers.incremental import solve_incremental
-from pipelines.solvers.marginals import IndeterminateError, joint_information, reported_covariance
-from pipelines.solvers.system import System
-from pipelines.solvers.weighing import optimize
-from pipelines.solvers.window import Keyframes
+from alidade.factors.loss import TruncatedLoss
+from alidade.factors.model import Model, Residuals
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.problem import Array, Estimate, Factor, Parameter, Problem, Quantity, Step
+from alidade.pipelines.judgement.observability import assess
+from alidade.pipelines.methods.los import graph as los
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.solvers import gauss_newton
+from alidade.pipelines.solvers.assembly import CHUNK, Assembly
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.gauss_newton import minimize
+from alidade.pipelines.solvers.incremental import solve_incremental
+from alidade.pipelines.solvers.marginals import IndeterminateError, joint_information, reported_covariance
+from alidade.pipelines.solvers.system import System
+from alidade.pipelines.solvers.weighing import optimize
+from alidade.pipelines.solvers.window import Keyframes
 from tests import chain
 from tests.chain import INTERVAL, PARAMETER, PRIOR, Walk
 from tests.short_problems import los_problem

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from alidade import simulate
-from pipelines import methods
-from pipelines.config import load_config
-from pipelines.graph.problem import Estimate, Problem
-from pipelines.solvers import batch
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.incremental import solve_incremental
+from alidade.pipelines import methods
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.problem import Estimate, Problem
+from alidade.pipelines.solvers import batch
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import solve_incremental
 
 PRIOR = 0.35
 YAW = {"yaw": [{"amplitude_deg": 40.0, "frequency_hz": 0.13}, {"amplitude_deg": 10.0, "frequency_hz": 0.47}]}
@@ -60,7 +60,7 @@ def test_what_motion_tells_stays(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_what_is_known_well_is_not_asked() -> None:
     problem = made(duration_s=5.0, head=dict.fromkeys(("yaw", "pitch", "roll"), YAW["yaw"]))
-    from pipelines.solvers import spurious
+    from alidade.pipelines.solvers import spurious
 
     covariance = solve_batch(problem).covariance
     keys = [p.key for p in problem.parameters]

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 
 import alidade
-from factors import so3
-from pipelines.follow.guidance import View, Watch
-from pipelines.graph.motion import Motion
-from pipelines.graph.problem import Course, Estimate, Quantity
-from pipelines.judgement.halves import Halves
-from pipelines.judgement.observability import assess
-from pipelines.judgement.stability import Moved, Stability, stability
-from pipelines.settings import Config
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.incremental import DEFAULT_WINDOW, Run
+from alidade.factors import so3
+from alidade.pipelines.follow.guidance import View, Watch
+from alidade.pipelines.graph.motion import Motion
+from alidade.pipelines.graph.problem import Course, Estimate, Quantity
+from alidade.pipelines.judgement.halves import Halves
+from alidade.pipelines.judgement.observability import assess
+from alidade.pipelines.judgement.stability import Moved, Stability, stability
+from alidade.pipelines.settings import Config
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, Run
 
 IDEAL = Config.model_validate({"sensors": "ideal"})
 HEAD = {"duration_s": 60.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 20.0}

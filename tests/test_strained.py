@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 import alidade
-from pipelines.graph.problem import Estimate, Quantity
-from pipelines.judgement.assumptions import strained
+from alidade.pipelines.graph.problem import Estimate, Quantity
+from alidade.pipelines.judgement.assumptions import strained
 
 HEAD = {"duration_s": 40.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 20.0}
 

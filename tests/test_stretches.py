@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from pipelines import parallel, progress
-from pipelines.graph.problem import Array, Estimate, Factor, Problem
-from pipelines.solvers import system
-from pipelines.solvers.assembly import CHUNK, Assembly
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.coloured import added_variance
-from pipelines.solvers.influence import influence
-from pipelines.solvers.marginals import IndeterminateError, joint_information
-from pipelines.solvers.stretch import Keep
+from alidade.pipelines import parallel, progress
+from alidade.pipelines.graph.problem import Array, Estimate, Factor, Problem
+from alidade.pipelines.solvers import system
+from alidade.pipelines.solvers.assembly import CHUNK, Assembly
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.coloured import added_variance
+from alidade.pipelines.solvers.influence import influence
+from alidade.pipelines.solvers.marginals import IndeterminateError, joint_information
+from alidade.pipelines.solvers.stretch import Keep
 from tests.short_problems import head_problem, los_problem
 
 
@@ -265,9 +265,9 @@ from pathlib import Path
 
 import alidade
 from benchmarks.measure import peak_mib, resident_mib
-from pipelines.solvers import system
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.marginals import joint_information
+from alidade.pipelines.solvers import system
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.marginals import joint_information
 
 system._UNDIVIDED, system._STRETCH, system._KEPT, system._KEPT_TREES = 10_000, 600, 0, 0
 scenario = {"duration_s": float(sys.argv[1]), "gyro_rate_hz": 100.0, "gimbal_rate_hz": 100.0}

@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.graph.problem import Estimate
-from pipelines.methods import method
-from pipelines.recording import series
-from pipelines.recording.reading import open_recording
-from pipelines.recording.temperature import Temperature, read_temperature
-from pipelines.recording.writing import write_session
-from pipelines.reports.calibration import load_calibration
-from pipelines.session import Session
-from pipelines.simulation.simulated import Simulated
-from pipelines.solvers.batch import solve_batch
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Estimate
+from alidade.pipelines.methods import method
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.temperature import Temperature, read_temperature
+from alidade.pipelines.recording.writing import write_session
+from alidade.pipelines.reports.calibration import load_calibration
+from alidade.pipelines.session import Session
+from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.solvers.batch import solve_batch
 from tests.command import Command
 
 T0 = 1_800_000_000_000_000_000

@@ -17,19 +17,19 @@ from typer.testing import CliRunner
 
 import alidade
 from alidade import Config
-from pipelines import together
-from pipelines.cli import app
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.fleet.statistics import mean_nees
-from pipelines.graph.problem import Array, Told
-from pipelines.recording.opening import recordings_of
-from pipelines.reports.over_time import forecasts, recordings_shown
-from pipelines.reports.result import Calibration, Plot
-from pipelines.session import Session
-from pipelines.sharing import walks
-from pipelines.solvers.joint import join
-from pipelines.together import calibrate_together
+from alidade.pipelines import together
+from alidade.pipelines.cli import app
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.fleet.statistics import mean_nees
+from alidade.pipelines.graph.problem import Array, Told
+from alidade.pipelines.recording.opening import recordings_of
+from alidade.pipelines.reports.over_time import forecasts, recordings_shown
+from alidade.pipelines.reports.result import Calibration, Plot
+from alidade.pipelines.session import Session
+from alidade.pipelines.sharing import walks
+from alidade.pipelines.solvers.joint import join
+from alidade.pipelines.together import calibrate_together
 from tests.broad_trials import TRIALS, converted
 from tests.one_graph import one_graph, solved
 from tests.short_problems import COARSE
@@ -225,7 +225,7 @@ MANY = """
 import resource, sys
 from unittest.mock import patch
 import alidade
-from pipelines import together
+from alidade.pipelines import together
 
 how, count = sys.argv[1], int(sys.argv[2])
 made = [alidade.simulate("indexer", None, seed=seed) for seed in range(count)]

@@ -9,14 +9,14 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from factors import so3
-from pipelines.methods import method
-from pipelines.methods.formula import apply
-from pipelines.reports.calibration import SavedCalibration, calibration_yaml, load_calibration, saved
-from pipelines.reports.export import exported
-from pipelines.reports.result import Calibration
-from pipelines.reports.transforms import roll_pitch_yaw
-from pipelines.session import Session
+from alidade.factors import so3
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.formula import apply
+from alidade.pipelines.reports.calibration import SavedCalibration, calibration_yaml, load_calibration, saved
+from alidade.pipelines.reports.export import exported
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.reports.transforms import roll_pitch_yaw
+from alidade.pipelines.session import Session
 
 FRAMES = {
     "indexer": {"mRt": ("imu", "platform")},

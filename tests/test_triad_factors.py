@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from factors import so3
-from factors.earth import earth_rate
-from factors.model import Array, Block, Model, dimension, retract
-from factors.tags import TagAttitudeFactor
-from factors.testing import assert_jacobians
-from factors.triad import (
+from alidade.factors import so3
+from alidade.factors.earth import earth_rate
+from alidade.factors.model import Array, Block, Model, dimension, retract
+from alidade.factors.tags import TagAttitudeFactor
+from alidade.factors.testing import assert_jacobians
+from alidade.factors.triad import (
     AccelFactor,
     GyroStaticFactor,
     MagFactor,
@@ -22,7 +22,7 @@ from factors.triad import (
     parts,
     triad,
 )
-from factors.turns import GyroRotationFactor
+from alidade.factors.turns import GyroRotationFactor
 from tests.numerics import assert_rows_are_independent
 
 N = 7

@@ -12,32 +12,37 @@ from typing import Any
 import numpy as np
 import pytest
 
-from factors import so3
-from factors.chi_square import quantile
-from factors.ellipsoid import DipFactor, StrengthFactor, sagitta
-from factors.preintegration import GyroPath
-from factors.testing import assert_jacobians
-from factors.turned import FieldFactor, UpFactor
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.graph.problem import Estimate
-from pipelines.methods import method
-from pipelines.methods.triads import triad_names, triad_of
-from pipelines.methods.tumble.model import prepare
-from pipelines.methods.tumble.recording import TumbleData, read_tumble, write_tumble
-from pipelines.methods.tumble.scenario import TumbledAccelerometer, TumbledGyro, TumbledMagnetometer, TumbleScenario
-from pipelines.methods.tumble.unturned import unturned
-from pipelines.planning import make_plan
-from pipelines.recording import series
-from pipelines.recording.checks import nanoseconds
-from pipelines.recording.reading import open_recording
-from pipelines.recording.writing import write_session
-from pipelines.session import Session, resolve_method
-from pipelines.settings import Config
-from pipelines.simulation.simulated import Simulated
-from pipelines.simulation.temperature import Warming
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.incremental import solve_incremental
+from alidade.factors import so3
+from alidade.factors.chi_square import quantile
+from alidade.factors.ellipsoid import DipFactor, StrengthFactor, sagitta
+from alidade.factors.preintegration import GyroPath
+from alidade.factors.testing import assert_jacobians
+from alidade.factors.turned import FieldFactor, UpFactor
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Estimate
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.triads import triad_names, triad_of
+from alidade.pipelines.methods.tumble.model import prepare
+from alidade.pipelines.methods.tumble.recording import TumbleData, read_tumble, write_tumble
+from alidade.pipelines.methods.tumble.scenario import (
+    TumbledAccelerometer,
+    TumbledGyro,
+    TumbledMagnetometer,
+    TumbleScenario,
+)
+from alidade.pipelines.methods.tumble.unturned import unturned
+from alidade.pipelines.planning import make_plan
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.checks import nanoseconds
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.writing import write_session
+from alidade.pipelines.session import Session, resolve_method
+from alidade.pipelines.settings import Config
+from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.temperature import Warming
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import solve_incremental
 from tests.command import Command
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"

@@ -11,13 +11,13 @@ import gtsam
 import numpy as np
 import pytest
 
-import factors
-from factors import so3
-from factors.answers import square_root
-from factors.loss import TruncatedLoss
-from factors.model import POSE3, Array, Keys, Model, Residuals
-from factors.testing import assert_jacobians
-from factors.vectorized import Ensemble, VectorizedFactor
+from alidade import factors
+from alidade.factors import so3
+from alidade.factors.answers import square_root
+from alidade.factors.loss import TruncatedLoss
+from alidade.factors.model import POSE3, Array, Keys, Model, Residuals
+from alidade.factors.testing import assert_jacobians
+from alidade.factors.vectorized import Ensemble, VectorizedFactor
 
 
 @dataclass(frozen=True)

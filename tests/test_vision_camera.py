@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.errors import InputError
-from pipelines.vision.camera import Camera
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.vision.camera import Camera
 
 K = np.array([[620.0, 0.0, 322.7], [0.0, 615.0, 236.4], [0.0, 0.0, 1.0]])
 RNG = np.random.default_rng(0)

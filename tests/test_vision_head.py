@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from factors import so3
-from pipelines.errors import InputError
-from pipelines.simulation.rendering import Renderer, encode, expose, tag_quad
-from pipelines.vision import board as vision
-from pipelines.vision.board import Sight, board_attitudes, body_poses
-from pipelines.vision.camera import Camera
-from pipelines.vision.parallel import UNREADABLE
-from pipelines.vision.pose import TagBody
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.simulation.rendering import Renderer, encode, expose, tag_quad
+from alidade.pipelines.vision import board as vision
+from alidade.pipelines.vision.board import Sight, board_attitudes, body_poses
+from alidade.pipelines.vision.camera import Camera
+from alidade.pipelines.vision.parallel import UNREADABLE
+from alidade.pipelines.vision.pose import TagBody
 
 CAMERA = Camera(
     640,

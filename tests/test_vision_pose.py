@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from factors import so3
-from pipelines.errors import InputError
-from pipelines.vision.camera import Camera
-from pipelines.vision.pose import BodyPose, TagBody, estimate_pose
-from pipelines.vision.tags import Detections
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.vision.camera import Camera
+from alidade.pipelines.vision.pose import BodyPose, TagBody, estimate_pose
+from alidade.pipelines.vision.tags import Detections
 
 K = np.array([[1150.0, 0, 641.3], [0, 1155.0, 477.8], [0, 0, 1]])
 PINHOLE = Camera(1280, 960, K, "plumb_bob", np.array([-0.25, 0.1, 1e-3, -5e-4, 0.02]))

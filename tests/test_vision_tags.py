@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from factors import so3
-from pipelines.errors import InputError
-from pipelines.simulation.rendering import Renderer, expose, tag_quad
-from pipelines.vision.camera import Camera
-from pipelines.vision.tags import Detections, detect
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.simulation.rendering import Renderer, expose, tag_quad
+from alidade.pipelines.vision.camera import Camera
+from alidade.pipelines.vision.tags import Detections, detect
 
 SIZE = 0.1
 # Official order: bottom left, bottom right, top right, top left; x right, y up.

@@ -6,12 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from factors import so3
-from pipelines.errors import InputError
-from pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
-from pipelines.vision.camera import Camera
-from pipelines.vision.parallel import UNREADABLE
-from pipelines.vision.target import LOST, los_errors
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
+from alidade.pipelines.vision.camera import Camera
+from alidade.pipelines.vision.parallel import UNREADABLE
+from alidade.pipelines.vision.target import LOST, los_errors
 
 FOCAL = 2000.0
 CAMERA = Camera(

@@ -7,16 +7,16 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pipelines.config import load_config
-from pipelines.graph.problem import Array, Estimate, Problem
-from pipelines.graph.walking_bias import WalkingBias
-from pipelines.methods.head.graph import problem as head_problem
-from pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
-from pipelines.methods.los.graph import problem as los_problem
-from pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from pipelines.settings import Config
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.incremental import solve_incremental
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.problem import Array, Estimate, Problem
+from alidade.pipelines.graph.walking_bias import WalkingBias
+from alidade.pipelines.methods.head.graph import problem as head_problem
+from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from alidade.pipelines.methods.los.graph import problem as los_problem
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.settings import Config
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import solve_incremental
 from tests.builders import IDEAL
 
 Made = tuple[Problem, dict[str, float]]

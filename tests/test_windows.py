@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from alidade import simulate
-from pipelines import methods
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.graph.problem import Estimate, Problem
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.incremental import Run, solve_incremental
-from pipelines.solvers.window import Keyframes, parse_window
+from alidade.pipelines import methods
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Estimate, Problem
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import Run, solve_incremental
+from alidade.pipelines.solvers.window import Keyframes, parse_window
 
 # More than twice as many keyframes as a window of ten holds.
 SMALL: dict[str, dict[str, Any]] = {

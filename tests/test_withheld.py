@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from alidade.pipelines.graph.problem import Array, Problem
+from alidade.pipelines.judgement.observability import assess
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, Run
+from alidade.pipelines.solvers.innovations import Innovations
+from alidade.pipelines.solvers.rows import Rows
+from alidade.pipelines.solvers.withheld import covariance_without, values_without, with_prior
 from benchmarks.young import CASES, made, nees
-from pipelines.graph.problem import Array, Problem
-from pipelines.judgement.observability import assess
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.incremental import DEFAULT_WINDOW, Run
-from pipelines.solvers.innovations import Innovations
-from pipelines.solvers.rows import Rows
-from pipelines.solvers.withheld import covariance_without, values_without, with_prior
 
 FEW, SHARE = 20, 0.25
 

@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from alidade.pipelines.config import load_config
+from alidade.pipelines.graph.problem import Array, Estimate, Problem
+from alidade.pipelines.methods.head.simulation import HeadScenario
+from alidade.pipelines.methods.los import graph as los
+from alidade.pipelines.methods.los.simulation import los_config, simulate_los
+from alidade.pipelines.settings import Sensors
+from alidade.pipelines.simulation.motion import EulerMotion
+from alidade.pipelines.solvers import incremental
+from alidade.pipelines.solvers.assembly import CHUNK, Assembly
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import Run, solve_incremental
+from alidade.pipelines.solvers.noise_levels import weigh
+from alidade.pipelines.solvers.weighing import optimize
 from benchmarks.batch import IDEAL
 from benchmarks.young import CASES, LOS, beginning, followed, made, nees, report, run
-from pipelines.config import load_config
-from pipelines.graph.problem import Array, Estimate, Problem
-from pipelines.methods.head.simulation import HeadScenario
-from pipelines.methods.los import graph as los
-from pipelines.methods.los.simulation import los_config, simulate_los
-from pipelines.settings import Sensors
-from pipelines.simulation.motion import EulerMotion
-from pipelines.solvers import incremental
-from pipelines.solvers.assembly import CHUNK, Assembly
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.incremental import Run, solve_incremental
-from pipelines.solvers.noise_levels import weigh
-from pipelines.solvers.weighing import optimize
 
 MOUNT = slice(3, 6)
 PRIOR = 0.35

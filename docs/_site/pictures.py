@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from PIL import Image
 
-from pipelines import cli
+from alidade.pipelines import cli
 
 if TYPE_CHECKING:
     from tests.devtools import Tab

@@ -26,10 +26,10 @@ from pydantic import BaseModel
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-from pipelines import cli, methods
-from pipelines.config import model
-from pipelines.reports.result import Result
-from pipelines.simulation.scenario import summary
+from alidade.pipelines import cli, methods
+from alidade.pipelines.config import model
+from alidade.pipelines.reports.result import Result
+from alidade.pipelines.simulation.scenario import summary
 
 _ATTRIBUTES = re.compile(r"\n\s*Attributes:\n(.*?)(\n\n|\Z)", re.DOTALL)
 

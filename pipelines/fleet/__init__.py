@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
-from pipelines.errors import InputError
+from alidade.pipelines.errors import InputError
 
 
 def require_extra() -> None:

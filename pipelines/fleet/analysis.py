@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.fleet import statistics
-from pipelines.fleet.histories import History
-from pipelines.fleet.statistics import Array, Component, Spread, Trend
-from pipelines.fleet.store import Result
-from pipelines.fleet.tables import Cell, Row
+from alidade.pipelines.fleet import statistics
+from alidade.pipelines.fleet.histories import History
+from alidade.pipelines.fleet.statistics import Array, Component, Spread, Trend
+from alidade.pipelines.fleet.store import Result
+from alidade.pipelines.fleet.tables import Cell, Row
 
 DAY = 86400.0
 _COUNTED = {"calibrated", "weak"}

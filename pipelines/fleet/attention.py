@@ -10,14 +10,14 @@ from typing import Literal
 
 import numpy as np
 
-from pipelines import exit_codes
-from pipelines.fleet.analysis import Population, iso
-from pipelines.fleet.histories import History
-from pipelines.fleet.store import Result
-from pipelines.graph.problem import Quantity
-from pipelines.judgement.changes import Change
-from pipelines.reports.over_time import what
-from pipelines.reports.units import human_unit, to_digits_of
+from alidade.pipelines import exit_codes
+from alidade.pipelines.fleet.analysis import Population, iso
+from alidade.pipelines.fleet.histories import History
+from alidade.pipelines.fleet.store import Result
+from alidade.pipelines.graph.problem import Quantity
+from alidade.pipelines.judgement.changes import Change
+from alidade.pipelines.reports.over_time import what
+from alidade.pipelines.reports.units import human_unit, to_digits_of
 
 Kind = Literal["changed", "outlying", "failed", "inconsistent", "unobservable", "weak"]
 # In the order of how much they matter.

@@ -25,8 +25,8 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipelines.errors import InputError
-from pipelines.fleet import require_extra
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.fleet import require_extra
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -221,8 +221,11 @@ def _source_version() -> Callable[[], str]:
     def version() -> str:
         digest = hashlib.sha256()
         brought = {entry.module.partition(".")[0] for entry in metadata.entry_points(group="alidade.methods")}
-        for package in ("factors", "pipelines", *sorted(brought)):
-            spec = importlib.util.find_spec(package)
+        for package in ("alidade.factors", "alidade.pipelines", *sorted(brought)):
+            try:
+                spec = importlib.util.find_spec(package)
+            except ModuleNotFoundError:
+                return ""
             if spec is None or not spec.submodule_search_locations:
                 return ""
             root = Path(next(iter(spec.submodule_search_locations)))

@@ -14,23 +14,23 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from pipelines import exit_codes, methods, progress
-from pipelines.belief import Belief
-from pipelines.config import load_config
-from pipelines.errors import InputError
-from pipelines.fleet import require_extra
-from pipelines.fleet.engine import Killed, cluster, completed, source_version
-from pipelines.fleet.histories import packed
-from pipelines.fleet.isolated import failure, quarantined, run_isolated
-from pipelines.fleet.recordings import Recording, as_date, from_metadata, from_name, local
-from pipelines.fleet.store import Result, Store, settings_key
-from pipelines.recording.container import sha256_of, sha256_together
-from pipelines.reports.known import load_known
-from pipelines.sharing import walks
+from alidade.pipelines import exit_codes, methods, progress
+from alidade.pipelines.belief import Belief
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.fleet import require_extra
+from alidade.pipelines.fleet.engine import Killed, cluster, completed, source_version
+from alidade.pipelines.fleet.histories import packed
+from alidade.pipelines.fleet.isolated import failure, quarantined, run_isolated
+from alidade.pipelines.fleet.recordings import Recording, as_date, from_metadata, from_name, local
+from alidade.pipelines.fleet.store import Result, Store, settings_key
+from alidade.pipelines.recording.container import sha256_of, sha256_together
+from alidade.pipelines.reports.known import load_known
+from alidade.pipelines.sharing import walks
 
 if TYPE_CHECKING:
-    from pipelines.graph.problem import Told
-    from pipelines.reports.result import Calibration
+    from alidade.pipelines.graph.problem import Told
+    from alidade.pipelines.reports.result import Calibration
 
 
 # In the path of earlier calibrations.
@@ -230,7 +230,7 @@ def _calibrated(path: Path, settings: Settings, prior: Path | None) -> Result:
 
 
 def _calibration(path: Path, settings: Settings, config: Path | None, prior: Path | None) -> Calibration:
-    from pipelines.session import calibrate
+    from alidade.pipelines.session import calibrate
 
     (calibration,) = calibrate(
         path, [settings.solver], settings.method, config, settings.window, prior=prior, report=False
@@ -263,7 +263,7 @@ def _summary(calibration: Calibration) -> Result:
 
 def _says(calibration: Calibration) -> Told:
     """What a calibration says of its numbers; of solvers that do not tell it, by their covariance."""
-    from pipelines.solvers.told import told_of
+    from alidade.pipelines.solvers.told import told_of
 
     estimate = calibration.estimate
     if estimate.told is not None:

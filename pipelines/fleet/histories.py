@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipelines.fleet import statistics
-from pipelines.fleet.store import Result
-from pipelines.fleet.tables import Row
-from pipelines.graph.problem import Told
-from pipelines.judgement.changes import Change, Changes, changes
-from pipelines.sharing import DAY_S
-from pipelines.solvers.joint import grown, join
+from alidade.pipelines.fleet import statistics
+from alidade.pipelines.fleet.store import Result
+from alidade.pipelines.fleet.tables import Row
+from alidade.pipelines.graph.problem import Told
+from alidade.pipelines.judgement.changes import Change, Changes, changes
+from alidade.pipelines.sharing import DAY_S
+from alidade.pipelines.solvers.joint import grown, join
 
 
 @dataclass(frozen=True)

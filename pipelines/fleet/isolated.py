@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from pipelines import exit_codes
-from pipelines.errors import InputError
-from pipelines.fleet.store import Result
+from alidade.pipelines import exit_codes
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.fleet.store import Result
 
 if TYPE_CHECKING:
-    from pipelines.reports.result import Calibration
+    from alidade.pipelines.reports.result import Calibration
 
 
 def run_isolated(summarise: Callable[[Calibration], Result], calibrate: Callable[[], Calibration]) -> Result:
     """Status, exit code, reason, seconds of wall time, and what `summarise` takes of the calibration. Never raises."""
-    from pipelines.solvers.marginals import IndeterminateError
+    from alidade.pipelines.solvers.marginals import IndeterminateError
 
     try:
         calibration = calibrate()

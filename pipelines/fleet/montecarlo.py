@@ -18,19 +18,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines import methods, progress
-from pipelines.errors import InputError
-from pipelines.fleet import require_extra, statistics
-from pipelines.fleet.engine import Killed, cluster, completed, source_version
-from pipelines.fleet.isolated import quarantined, run_isolated
-from pipelines.fleet.store import Result, Store, settings_key
-from pipelines.fleet.tables import Cell, Row
+from alidade.pipelines import methods, progress
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.fleet import require_extra, statistics
+from alidade.pipelines.fleet.engine import Killed, cluster, completed, source_version
+from alidade.pipelines.fleet.isolated import quarantined, run_isolated
+from alidade.pipelines.fleet.store import Result, Store, settings_key
+from alidade.pipelines.fleet.tables import Cell, Row
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from pipelines.methods import Method
-    from pipelines.reports.result import Calibration
+    from alidade.pipelines.methods import Method
+    from alidade.pipelines.reports.result import Calibration
 
 SOLVERS = ("published", "batch", "incremental")
 
@@ -176,7 +176,7 @@ def simulate_and_solve(
     method: str, scenario: BaseModel, seed: int, solvers: Sequence[str], window: float | None
 ) -> dict[str, Result]:
     """On the worker: solver -> numbers of one seed of a scenario."""
-    from pipelines.session import Session
+    from alidade.pipelines.session import Session
 
     chosen = methods.method(method)
     session = Session.of(chosen, chosen.simulate(scenario, seed))
@@ -230,7 +230,7 @@ def _coverage_cells(shares: tuple[float, float, float]) -> dict[str, Cell]:
 
 def _first(method: Method, scenario: BaseModel, seed: int) -> tuple[str, str, str, dict[str, float]]:
     """What tells a study's recordings from others: method, data of one, their config and truth."""
-    from pipelines.session import Arrays
+    from alidade.pipelines.session import Arrays
 
     simulated = method.simulate(scenario, seed)
     return method.name, Arrays(method, simulated.data).sha256(), simulated.config, dict(simulated.truth)
@@ -238,7 +238,7 @@ def _first(method: Method, scenario: BaseModel, seed: int) -> tuple[str, str, st
 
 def _numbers(calibration: Calibration) -> Result:
     """Errors against sigmas, of what was estimated and whose truth is known."""
-    from pipelines.reports.result import truth_errors
+    from alidade.pipelines.reports.result import truth_errors
 
     errors = truth_errors(calibration)
     judged = [p for p in calibration.parameters.values() if p.name in errors and p.sigma > 0.0]

@@ -10,24 +10,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.fleet import statistics
-from pipelines.fleet.analysis import Population, iso
-from pipelines.fleet.attention import Unit, readable, sentence, units_of_interest
-from pipelines.fleet.histories import History
-from pipelines.fleet.statistics import Component
-from pipelines.graph.problem import Array, Quantity
-from pipelines.methods import method
-from pipelines.methods.meanings import meaning
-from pipelines.reports.answer import Answer
-from pipelines.reports.figure import COLORS, REJECTED, Figure, Shape, milliseconds, thin
-from pipelines.reports.result import Plot
-from pipelines.reports.templating import page
-from pipelines.reports.units import human_unit, rounded, to_digits_of
+from alidade.pipelines.fleet import statistics
+from alidade.pipelines.fleet.analysis import Population, iso
+from alidade.pipelines.fleet.attention import Unit, readable, sentence, units_of_interest
+from alidade.pipelines.fleet.histories import History
+from alidade.pipelines.fleet.statistics import Component
+from alidade.pipelines.graph.problem import Array, Quantity
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.meanings import meaning
+from alidade.pipelines.reports.answer import Answer
+from alidade.pipelines.reports.figure import COLORS, REJECTED, Figure, Shape, milliseconds, thin
+from alidade.pipelines.reports.result import Plot
+from alidade.pipelines.reports.templating import page
+from alidade.pipelines.reports.units import human_unit, rounded, to_digits_of
 
 if TYPE_CHECKING:
-    from pipelines.fleet.fleet import Outcome
-    from pipelines.fleet.montecarlo import Study
-    from pipelines.fleet.store import Result
+    from alidade.pipelines.fleet.fleet import Outcome
+    from alidade.pipelines.fleet.montecarlo import Study
+    from alidade.pipelines.fleet.store import Result
 
 # Rows of a list on the page; the CSV has all.
 _MOST_LISTED = 200
@@ -42,7 +42,7 @@ def fleet_html(outcome: Outcome, fleet: Sequence[Population], found: Sequence[Hi
     statuses = [r["status"] for r in results.values()]
     dates = [r["date"] for r in results.values() if r["date"] is not None]
     return page(
-        "pipelines.fleet",
+        "alidade.pipelines.fleet",
         "fleet.html",
         [_population_plot(p) for p in fleet],
         outcome=outcome,
@@ -78,7 +78,7 @@ def study_html(study: Study) -> str:
     """The page of a Monte Carlo study."""
     solvers = [solver for solver in study.solvers if study.estimates(solver)]
     return page(
-        "pipelines.fleet",
+        "alidade.pipelines.fleet",
         "montecarlo.html",
         [plot for solver in solvers for plot in (_nees_plot(study, solver), _errors_plot(study, solver))],
         study=study,

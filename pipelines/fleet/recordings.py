@@ -17,9 +17,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from pipelines.errors import InputError
-from pipelines.fleet import require_extra
-from pipelines.recording.opening import BAG, LONGEST_METADATA, METADATA, bag_metadata, parts_of_bag
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.fleet import require_extra
+from alidade.pipelines.recording.opening import BAG, LONGEST_METADATA, METADATA, bag_metadata, parts_of_bag
 
 if TYPE_CHECKING:
     from fsspec.core import OpenFile

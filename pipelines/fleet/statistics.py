@@ -14,8 +14,8 @@ from statistics import NormalDist
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.chi_square import quantile, student
-from pipelines.judgement.likelihood import likeliest
+from alidade.factors.chi_square import quantile, student
+from alidade.pipelines.judgement.likelihood import likeliest
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from pipelines.errors import InputError
+from alidade.pipelines.errors import InputError
 
 FILE = "results.jsonl"
 

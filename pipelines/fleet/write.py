@@ -6,13 +6,13 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from pipelines.errors import InputError
-from pipelines.fleet.analysis import Population, table
-from pipelines.fleet.fleet import Outcome
-from pipelines.fleet.histories import History, change_table
-from pipelines.fleet.montecarlo import Study, run_table, summary_table
-from pipelines.fleet.pages import fleet_html, study_html
-from pipelines.fleet.tables import write_csv, write_parquet
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.fleet.analysis import Population, table
+from alidade.pipelines.fleet.fleet import Outcome
+from alidade.pipelines.fleet.histories import History, change_table
+from alidade.pipelines.fleet.montecarlo import Study, run_table, summary_table
+from alidade.pipelines.fleet.pages import fleet_html, study_html
+from alidade.pipelines.fleet.tables import write_csv, write_parquet
 
 
 def write_fleet(out: Path, outcome: Outcome, fleet: Sequence[Population], found: Sequence[History]) -> tuple[Path, ...]:

@@ -15,11 +15,11 @@ from typing import Any, BinaryIO
 
 from mcap.writer import Writer
 
-from pipelines.follow.protocol import MESSAGE_DATA, MESSAGE_HEAD, SUBPROTOCOLS, websockets
-from pipelines.follow.sources import Stream
-from pipelines.recording.channel_format import ChannelFormat
-from pipelines.recording.container import Channel, Schema
-from pipelines.recording.messages import SENSORS
+from alidade.pipelines.follow.protocol import MESSAGE_DATA, MESSAGE_HEAD, SUBPROTOCOLS, websockets
+from alidade.pipelines.follow.sources import Stream
+from alidade.pipelines.recording.channel_format import ChannelFormat
+from alidade.pipelines.recording.container import Channel, Schema
+from alidade.pipelines.recording.messages import SENSORS
 
 # Encoding of messages -> that of their schema, where a bridge does not say it.
 _SCHEMAS = {

@@ -11,14 +11,14 @@ from types import FrameType
 
 from rich.console import Console
 
-from pipelines.follow.follower import Follower, Settings
-from pipelines.follow.guidance import View
-from pipelines.follow.page import LivePage
-from pipelines.follow.screen import Screen
-from pipelines.follow.serve import LiveServer
-from pipelines.follow.sources import source_of
-from pipelines.reports.result import Calibration
-from pipelines.terminal import console
+from alidade.pipelines.follow.follower import Follower, Settings
+from alidade.pipelines.follow.guidance import View
+from alidade.pipelines.follow.page import LivePage
+from alidade.pipelines.follow.screen import Screen
+from alidade.pipelines.follow.serve import LiveServer
+from alidade.pipelines.follow.sources import source_of
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.terminal import console
 
 
 def follow(

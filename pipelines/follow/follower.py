@@ -18,23 +18,23 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.errors import InputError
-from pipelines.follow.guidance import View, Watch, view_of
-from pipelines.follow.sources import Source
-from pipelines.graph.clock import Clock
-from pipelines.graph.problem import Problem, Step
-from pipelines.judgement.checklist import ChecklistItem
-from pipelines.recording.container import sha256_of
-from pipelines.recording.growing import Growing
-from pipelines.recording.opening import identity
-from pipelines.recording.reading import Recording, open_recording
-from pipelines.reports.known import load_known
-from pipelines.reports.result import Calibration
-from pipelines.session import Session
-from pipelines.settings import Config
-from pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
-from pipelines.solvers.incremental import Run
-from pipelines.solvers.window import check_window
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.follow.guidance import View, Watch, view_of
+from alidade.pipelines.follow.sources import Source
+from alidade.pipelines.graph.clock import Clock
+from alidade.pipelines.graph.problem import Problem, Step
+from alidade.pipelines.judgement.checklist import ChecklistItem
+from alidade.pipelines.recording.container import sha256_of
+from alidade.pipelines.recording.growing import Growing
+from alidade.pipelines.recording.opening import identity
+from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.reports.known import load_known
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.session import Session
+from alidade.pipelines.settings import Config
+from alidade.pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
+from alidade.pipelines.solvers.incremental import Run
+from alidade.pipelines.solvers.window import check_window
 
 # At least so long from one look to the next, s, and so many times what it took to read: steps wait for nothing.
 _PAUSE, _REST = 0.05, 2.0

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.graph.motion import Motion
-from pipelines.graph.problem import Array, Quantity
-from pipelines.judgement import noise_levels
-from pipelines.judgement.checklist import ChecklistItem
-from pipelines.judgement.observability import Assessment, assess
-from pipelines.judgement.stability import Stability, stability
-from pipelines.solvers.incremental import Run
+from alidade.pipelines.graph.motion import Motion
+from alidade.pipelines.graph.problem import Array, Quantity
+from alidade.pipelines.judgement import noise_levels
+from alidade.pipelines.judgement.checklist import ChecklistItem
+from alidade.pipelines.judgement.observability import Assessment, assess
+from alidade.pipelines.judgement.stability import Stability, stability
+from alidade.pipelines.solvers.incremental import Run
 
 # Parameters a sentence names.
 _MOST_NAMED = 6

@@ -24,10 +24,10 @@ from importlib.resources import files
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from pipelines.errors import InputError
-from pipelines.follow.guidance import View
-from pipelines.reports.result import Calibration
-from pipelines.reports.units import human_unit, to_digits_of
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.follow.guidance import View
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.reports.units import human_unit, to_digits_of
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -264,7 +264,7 @@ _REFUSED = (
 
 
 def _html() -> str:
-    return files("pipelines.follow").joinpath("templates/live.html").read_text(encoding="utf-8")
+    return files("alidade.pipelines.follow").joinpath("templates/live.html").read_text(encoding="utf-8")
 
 
 def _listening(host: str, port: int) -> socket.socket:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from typing import Any
 
-from pipelines.errors import InputError
+from alidade.pipelines.errors import InputError
 
 SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 # Binary: opcode, subscription, time in ns, then the message.

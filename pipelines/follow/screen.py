@@ -12,10 +12,10 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from pipelines.follow.guidance import View
-from pipelines.follow.qr import qr
-from pipelines.reports.units import human_unit, rounded, to_digits_of
-from pipelines.terminal import COLOURS
+from alidade.pipelines.follow.guidance import View
+from alidade.pipelines.follow.qr import qr
+from alidade.pipelines.reports.units import human_unit, rounded, to_digits_of
+from alidade.pipelines.terminal import COLOURS
 
 # A line at most this often where there is no terminal, s.
 _LINE = 5.0

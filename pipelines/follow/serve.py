@@ -14,9 +14,9 @@ from contextlib import suppress
 from types import TracebackType
 from typing import Any, NamedTuple
 
-from pipelines.errors import InputError
-from pipelines.follow.guidance import View
-from pipelines.follow.protocol import MESSAGE_DATA, MESSAGE_HEAD, SUBPROTOCOLS, websockets
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.follow.guidance import View
+from alidade.pipelines.follow.protocol import MESSAGE_DATA, MESSAGE_HEAD, SUBPROTOCOLS, websockets
 
 # Others on the network have no business with a calibration bench.
 HOST = "127.0.0.1"

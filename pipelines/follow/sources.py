@@ -14,9 +14,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
 
-from pipelines.errors import InputError
-from pipelines.recording.mcap_records import MAGIC
-from pipelines.recording.opening import Where, is_closed, parts_in
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording.mcap_records import MAGIC
+from alidade.pipelines.recording.opening import Where, is_closed, parts_in
 
 _PIECE = 1 << 16
 # Names of the files in which a stream is written down.
@@ -147,7 +147,7 @@ def source_of(what: str, folder: Path | None = None, say: Callable[[str], None] 
     if what == "-":
         return StandardInput(folder)
     if what.startswith(("ws://", "wss://")):
-        from pipelines.follow.bridge import Bridge
+        from alidade.pipelines.follow.bridge import Bridge
 
         return Bridge(what, folder, say)
     return Source(Path(what))

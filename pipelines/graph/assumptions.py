@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipelines.graph.problem import Array, Findings, Parameter, Quantity
-from pipelines.settings import Config
+from alidade.pipelines.graph.problem import Array, Findings, Parameter, Quantity
+from alidade.pipelines.settings import Config
 
 # What is left free has a prior so many times the one in force.
 _FREE = 10.0

@@ -13,10 +13,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.belief import Belief, root_of_information
-from pipelines.errors import InputError
-from pipelines.graph.priors import pinned
-from pipelines.graph.problem import Array, Factor, Parameter, Problem, Quantity, Step
+from alidade.pipelines.belief import Belief, root_of_information
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.priors import pinned
+from alidade.pipelines.graph.problem import Array, Factor, Parameter, Problem, Quantity, Step
 
 # Elements of a prior's row below this share of its largest are rounding.
 _ROUNDING = 1e-9

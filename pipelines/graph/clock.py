@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factors import so3
-from factors.preintegration import GyroPath, Increments
-from pipelines.graph.problem import Array
-from pipelines.graph.robust import fitted
+from alidade.factors import so3
+from alidade.factors.preintegration import GyroPath, Increments
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.graph.robust import fitted
 
 # A clock is guessed first from as much of a recording as takes it to go wrong by so much, s (sigma), far less than a
 # swing takes, then from so many times as much each time.

@@ -11,12 +11,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from factors.attitude import ahrs_factors
-from factors.gyro import GyroIncrementFactor, carried, corrected, platform_errors
-from factors.preintegration import GyroPath, Increments
-from pipelines.graph.problem import Array, Factor, Parameter, Step
-from pipelines.graph.walking_bias import WalkingBias
+from alidade.factors import so3
+from alidade.factors.attitude import ahrs_factors
+from alidade.factors.gyro import GyroIncrementFactor, carried, corrected, platform_errors
+from alidade.factors.preintegration import GyroPath, Increments
+from alidade.pipelines.graph.problem import Array, Factor, Parameter, Step
+from alidade.pipelines.graph.walking_bias import WalkingBias
 
 
 @lru_cache(maxsize=1000)
@@ -81,7 +81,7 @@ class GyroChain:
         variance: (K - 1,) of each, rad^2 per axis.
         bias: its nodes over the keyframes.
         nodes: (K,) whole numbers: the node in force up to each keyframe.
-        errors: of the gyro, as factors.gyro has them; None: perfect.
+        errors: of the gyro, as alidade.factors.gyro has them; None: perfect.
         platform, platform_turns: the platform's gyro and its increments; None in an inertial frame.
         platform_errors: of that gyro, its bias first; None: perfect.
         first: number of the first keyframe in the recording, where the chain is over its end alone.

@@ -8,7 +8,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from pipelines.graph.problem import Array
+from alidade.pipelines.graph.problem import Array
 
 
 def linear_factor(

@@ -11,7 +11,7 @@ class Motion:
 
     Attributes:
         words: a sentence, without its capital and its full stop.
-        picture: of it, SVG as `pipelines.judgement.pictures` draws it; empty: none.
+        picture: of it, SVG as `alidade.pipelines.judgement.pictures` draws it; empty: none.
         why: what it is for; empty: that goes without saying.
     """
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from factors import so3
-from pipelines.graph.problem import Array, Factor, Parameter, Quantity
+from alidade.factors import so3
+from alidade.pipelines.graph.problem import Array, Factor, Parameter, Quantity
 
 # A fixed quantity is held by a prior this much tighter than the accuracy wanted of it.
 _PINNED = 1e-6

@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from factors.loss import TruncatedLoss
-from factors.vectorized import VectorizedFactor
-from pipelines.graph.motion import Motion
-from pipelines.graph.noise import Level
+from alidade.factors import so3
+from alidade.factors.loss import TruncatedLoss
+from alidade.factors.vectorized import VectorizedFactor
+from alidade.pipelines.graph.motion import Motion
+from alidade.pipelines.graph.noise import Level
 
 if TYPE_CHECKING:
     import gtsam
 
-    from pipelines.graph.clock import Keyframes
+    from alidade.pipelines.graph.clock import Keyframes
 
 Array = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.graph.linear import linear_factor
-from pipelines.graph.problem import Array, Factor, Step
+from alidade.pipelines.graph.linear import linear_factor
+from alidade.pipelines.graph.problem import Array, Factor, Step
 
 # A stretch may bend the angle by this fraction of what gyro noise does over it ...
 _FRACTION = 0.2

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.chi_square import interval
+from alidade.factors.chi_square import interval
 
 Array = NDArray[np.float64]
 

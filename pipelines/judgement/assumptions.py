@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.graph.assumptions import pull
-from pipelines.graph.problem import Array, Estimate, Quantity
+from alidade.pipelines.graph.assumptions import pull
+from alidade.pipelines.graph.problem import Array, Estimate, Quantity
 
 # A pull beyond this is no chance ...
 _FAR = 4.0

@@ -15,17 +15,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines import parallel
-from pipelines.graph.problem import Estimate, Residuals
-from pipelines.judgement.halves import cut
-from pipelines.judgement.observability import Cause
-from pipelines.judgement.outcome import Outcome, at_once, outcome, quick_score
-from pipelines.judgement.rejection import too_many_rejected
-from pipelines.judgement.trials import Trial, faults, trials
-from pipelines.settings import Config
+from alidade.pipelines import parallel
+from alidade.pipelines.graph.problem import Estimate, Residuals
+from alidade.pipelines.judgement.halves import cut
+from alidade.pipelines.judgement.observability import Cause
+from alidade.pipelines.judgement.outcome import Outcome, at_once, outcome, quick_score
+from alidade.pipelines.judgement.rejection import too_many_rejected
+from alidade.pipelines.judgement.trials import Trial, faults, trials
+from alidade.pipelines.settings import Config
 
 if TYPE_CHECKING:
-    from pipelines.methods import Method
+    from alidade.pipelines.methods import Method
 
 # Trials are made on this much of a recording, s, where it fits worst, and looked at on less.
 _STRETCH, _SHORT = 30.0, 8.0

@@ -19,11 +19,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from factors.chi_square import quantile
-from pipelines.graph.assumptions import kind
-from pipelines.graph.problem import Array
-from pipelines.judgement.likelihood import likeliest
-from pipelines.solvers.joint import Joined
+from alidade.factors.chi_square import quantile
+from alidade.pipelines.graph.assumptions import kind
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.judgement.likelihood import likeliest
+from alidade.pipelines.solvers.joint import Joined
 
 # How often a history in which nothing changed is taken for one in which something did: by a number, by all at once.
 LEVEL, _JOINTLY = 0.05, 0.2

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.graph.motion import Motion
-from pipelines.graph.problem import Array
-from pipelines.judgement.pictures import swaying
+from alidade.pipelines.graph.motion import Motion
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.judgement.pictures import swaying
 
 # A turn within this time, s, counts as motion about an axis.
 _STRETCH = 5.0
@@ -28,7 +28,7 @@ class ChecklistItem:
         wanted: what is still to be done, empty when it is enough.
         share: how much there is of what is enough, 0 to 1; None where that is no matter of more or less.
         motion: that gives what is wanted, for who holds the device; None where no single motion does.
-        chart: of what there is, SVG as `pipelines.judgement.pictures` draws it; empty: none.
+        chart: of what there is, SVG as `alidade.pipelines.judgement.pictures` draws it; empty: none.
     """
 
     what: str

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from pipelines import progress
-from pipelines.graph.problem import Estimate, Quantity
-from pipelines.judgement import noise_levels
-from pipelines.judgement.assumptions import Strained, strained
-from pipelines.judgement.observability import Assessment, Cause
-from pipelines.judgement.rejection import rejection_sentence, too_many_rejected
-from pipelines.judgement.stability import Moved
-from pipelines.reports.units import human_unit, to_digits_of
+from alidade.pipelines import progress
+from alidade.pipelines.graph.problem import Estimate, Quantity
+from alidade.pipelines.judgement import noise_levels
+from alidade.pipelines.judgement.assumptions import Strained, strained
+from alidade.pipelines.judgement.observability import Assessment, Cause
+from alidade.pipelines.judgement.rejection import rejection_sentence, too_many_rejected
+from alidade.pipelines.judgement.stability import Moved
+from alidade.pipelines.reports.units import human_unit, to_digits_of
 
 # Assumptions that do not hold, and steps between the two sides of a change, that are told.
 _MOST_NAMED = 3

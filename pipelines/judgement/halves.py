@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines import parallel
-from pipelines.graph.problem import Array, Problem, Quantity
-from pipelines.graph.robust import robust_sigma
-from pipelines.judgement.outcome import at_once, outcome, times_of
-from pipelines.settings import Config
+from alidade.pipelines import parallel
+from alidade.pipelines.graph.problem import Array, Problem, Quantity
+from alidade.pipelines.graph.robust import robust_sigma
+from alidade.pipelines.judgement.outcome import at_once, outcome, times_of
+from alidade.pipelines.settings import Config
 
 if TYPE_CHECKING:
-    from pipelines.judgement.hypotheses import Hypotheses
-    from pipelines.methods import Method
+    from alidade.pipelines.judgement.hypotheses import Hypotheses
+    from alidade.pipelines.methods import Method
 
 # One chunk in so many is held out.
 _HELD_OUT = 5
@@ -100,9 +100,9 @@ def held_out(problem: Problem) -> dict[str, float]:
 
     One chunk in five is held out. 1 is as good as the noise; a little more is the uncertainty of the prediction.
     """
-    from pipelines.solvers.assembly import CHUNK, Assembly
-    from pipelines.solvers.system import residuals_of
-    from pipelines.solvers.weighing import optimize
+    from alidade.pipelines.solvers.assembly import CHUNK, Assembly
+    from alidade.pipelines.solvers.system import residuals_of
+    from alidade.pipelines.solvers.weighing import optimize
 
     steps = list(problem.steps(CHUNK))
     whole = Assembly.of(steps)

@@ -11,11 +11,11 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from pipelines.belief import Belief
-from pipelines.graph.problem import Quantity, Told
-from pipelines.judgement.changes import Change, Changes, changes
-from pipelines.solvers.joint import join
-from pipelines.solvers.told import told_of
+from alidade.pipelines.belief import Belief
+from alidade.pipelines.graph.problem import Quantity, Told
+from alidade.pipelines.judgement.changes import Change, Changes, changes
+from alidade.pipelines.solvers.joint import join
+from alidade.pipelines.solvers.told import told_of
 
 Verdict = Literal["holds", "changed", "unknown", "same"]
 

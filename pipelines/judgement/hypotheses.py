@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pipelines.settings import Config
+    from alidade.pipelines.settings import Config
 
 AXES = ("x", "y", "z")
 

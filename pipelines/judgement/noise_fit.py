@@ -20,8 +20,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.chi_square import interval, quantile
-from pipelines.judgement.allan import NOISES
+from alidade.factors.chi_square import interval, quantile
+from alidade.pipelines.judgement.allan import NOISES
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from pipelines.graph.noise import Level
-from pipelines.judgement.observability import Consistency
+from alidade.pipelines.graph.noise import Level
+from alidade.pipelines.judgement.observability import Consistency
 
 # A noise found to be more than so many times the one stated, by so many sigmas, is no noise: the model lacks something.
 # One that is far smaller spoils nothing once it is known.

@@ -16,10 +16,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.chi_square import quantile
-from pipelines.graph.motion import Motion
-from pipelines.graph.problem import Array, ChiSquare, History, Quantity, Residuals
-from pipelines.judgement.assumptions import costs
+from alidade.factors.chi_square import quantile
+from alidade.pipelines.graph.motion import Motion
+from alidade.pipelines.graph.problem import Array, ChiSquare, History, Quantity, Residuals
+from alidade.pipelines.judgement.assumptions import costs
 
 Verdict = Literal["fixed", "observable", "prior", "weak", "unobservable"]
 Status = Literal["calibrated", "weak", "inconsistent", "unobservable"]
@@ -253,7 +253,7 @@ class Assessment:
         covariance: (n, n), the one judged: symmetric and finite whatever was given.
         consistency: None when the solver has no chi-square.
         headline: the verdict in one sentence.
-        causes: of residuals that do not fit, the likeliest first; see pipelines.judgement.causes.
+        causes: of residuals that do not fit, the likeliest first; see alidade.pipelines.judgement.causes.
     """
 
     status: Status

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.graph.problem import Array, ChiSquare, Estimate, Problem, Quantity
-from pipelines.judgement.observability import Fit
-from pipelines.parallel import LostError
-from pipelines.settings import Config
+from alidade.pipelines.graph.problem import Array, ChiSquare, Estimate, Problem, Quantity
+from alidade.pipelines.judgement.observability import Fit
+from alidade.pipelines.parallel import LostError
+from alidade.pipelines.settings import Config
 
 if TYPE_CHECKING:
-    from pipelines.methods import Method
+    from alidade.pipelines.methods import Method
 
 # A recording with more than this share rejected does not fit.
 _OUTLIERS = 0.1
@@ -79,7 +79,7 @@ def outcome(method: Method, data: Any, config: Config) -> Outcome | None:
     A trial is made with data and noise that nobody recorded: whatever it raises ends the trial, and nothing else,
     but for a process that is lost, which says nothing of the trial.
     """
-    from pipelines.solvers.batch import solve_batch
+    from alidade.pipelines.solvers.batch import solve_batch
 
     try:
         problem = method.graph(data, config)
@@ -114,9 +114,9 @@ def times_of(method: Method, data: Any) -> list[Array]:
 
 
 def _score(problem: Problem) -> float:
-    from pipelines.solvers.assembly import CHUNK, Assembly
-    from pipelines.solvers.system import residuals_of
-    from pipelines.solvers.weighing import optimize
+    from alidade.pipelines.solvers.assembly import CHUNK, Assembly
+    from alidade.pipelines.solvers.system import residuals_of
+    from alidade.pipelines.solvers.weighing import optimize
 
     whole = Assembly.of(problem.steps(CHUNK))
     factors = whole.factors

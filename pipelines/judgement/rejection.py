@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from pipelines.graph.problem import Residuals
-from pipelines.graph.robust import robust_sigma
+from alidade.pipelines.graph.problem import Residuals
+from alidade.pipelines.graph.robust import robust_sigma
 
 # Shares of a family from which on the headline tells of the rejected, and from which on the model is wrong.
 _TOLD, _TOO_MANY = 0.1, 0.25

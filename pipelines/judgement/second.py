@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipelines.graph.problem import Estimate, Quantity
-from pipelines.reports.units import human_unit
+from alidade.pipelines.graph.problem import Estimate, Quantity
+from alidade.pipelines.reports.units import human_unit
 
 # So many of the numbers that differ most are named.
 _NAMED = 3

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.graph.problem import Estimate
+from alidade.pipelines.graph.problem import Estimate
 
 # A difference that is told, in sigmas.
 _TOLD = 1.0

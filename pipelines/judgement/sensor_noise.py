@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.judgement.allan import AllanCurve, allan_curve, confidence
-from pipelines.judgement.noise_fit import NoiseFit, fit_noise
-from pipelines.judgement.spectral_lines import Line, find_lines, without_lines
+from alidade.pipelines.judgement.allan import AllanCurve, allan_curve, confidence
+from alidade.pipelines.judgement.noise_fit import NoiseFit, fit_noise
+from alidade.pipelines.judgement.spectral_lines import Line, find_lines, without_lines
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.chi_square import quantile
+from alidade.factors.chi_square import quantile
 
 Array = NDArray[np.float64]
 

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.graph.assumptions import pull
-from pipelines.graph.problem import Array, Estimate, Quantity
-from pipelines.judgement.halves import Halves
+from alidade.pipelines.graph.assumptions import pull
+from alidade.pipelines.graph.problem import Array, Estimate, Quantity
+from alidade.pipelines.judgement.halves import Halves
 
 # A recording in which nothing changed is taken for one in which something did so often.
 LEVEL = 1e-3

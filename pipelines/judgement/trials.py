@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.judgement.hypotheses import Hypotheses, Scaling
-from pipelines.judgement.outcome import outcome, quick_score
-from pipelines.settings import Config
+from alidade.pipelines.judgement.hypotheses import Hypotheses, Scaling
+from alidade.pipelines.judgement.outcome import outcome, quick_score
+from alidade.pipelines.settings import Config
 
 if TYPE_CHECKING:
-    from pipelines.methods import Method
+    from alidade.pipelines.methods import Method
 
 _OFFSET = "time_offset"
 _DELAY_PRIOR = 0.05

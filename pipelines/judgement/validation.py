@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.graph.problem import Array
+from alidade.pipelines.graph.problem import Array
 
 
 @dataclass(frozen=True, eq=False)

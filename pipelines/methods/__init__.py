@@ -17,22 +17,22 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from pipelines.errors import InputError, nearest_three
+from alidade.pipelines.errors import InputError, nearest_three
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from pipelines.graph.problem import Array, Estimate, Findings, Problem
-    from pipelines.judgement.checklist import ChecklistItem
-    from pipelines.judgement.hypotheses import Hypotheses
-    from pipelines.judgement.validation import Validation
-    from pipelines.methods.formula import Formula
-    from pipelines.recording.reading import Recording
-    from pipelines.recording.topics import Need, Topic
-    from pipelines.reports.calibration import SavedCalibration
-    from pipelines.reports.result import Calibration, Plot, Table
-    from pipelines.settings import Config, MethodSection
-    from pipelines.simulation.simulated import Simulated
+    from alidade.pipelines.graph.problem import Array, Estimate, Findings, Problem
+    from alidade.pipelines.judgement.checklist import ChecklistItem
+    from alidade.pipelines.judgement.hypotheses import Hypotheses
+    from alidade.pipelines.judgement.validation import Validation
+    from alidade.pipelines.methods.formula import Formula
+    from alidade.pipelines.recording.reading import Recording
+    from alidade.pipelines.recording.topics import Need, Topic
+    from alidade.pipelines.reports.calibration import SavedCalibration
+    from alidade.pipelines.reports.result import Calibration, Plot, Table
+    from alidade.pipelines.settings import Config, MethodSection
+    from alidade.pipelines.simulation.simulated import Simulated
 
 GROUP = "alidade.methods"
 
@@ -53,9 +53,9 @@ class Method(ABC):
         of_recording: patterns of the parameters that belong to a recording; the others are the device's.
         rotations: parameters that are rotation vectors, without their _x, _y, _z -> the rotation each is.
         meanings: pattern of parameters' names -> what they are, a sentence with {0}, {1} for the pattern's groups; what
-            `pipelines.methods.meanings` says of all methods need not stand there.
+            `alidade.pipelines.methods.meanings` says of all methods need not stand there.
         components: family of measurements -> what its residuals are, one by one, where they are not x, y and z.
-        sketch: picture of the frames, SVG, if there is one; `pipelines.reports.sketch` says what it may have.
+        sketch: picture of the frames, SVG, if there is one; `alidade.pipelines.reports.sketch` says what it may have.
         scenarios: folder with scenarios that come with the method, if it brings its own.
         drawn: whether its simulator draws motions, or sensors far from nominal, from the seed, so that one recording of
             a scenario determines more than another.
@@ -97,8 +97,8 @@ class Method(ABC):
     def data(self) -> type:
         """The class of its data: a frozen dataclass of arrays, with epoch_ns (Unix ns) the zero of all times.
 
-        Its annotations say what arrays hold in a row (`pipelines.recording.shapes`). They are evaluated: what they name
-        is imported when the program runs, too.
+        Its annotations say what arrays hold in a row (`alidade.pipelines.recording.shapes`). They are evaluated: what
+        they name is imported when the program runs, too.
         """
 
     @abstractmethod
@@ -111,7 +111,7 @@ class Method(ABC):
 
     def graph(self, data: Any, config: Config) -> Problem:
         """The graph with what the config knows of parameters in place of their priors. Raises as `problem` does."""
-        from pipelines.graph.believing import believing
+        from alidade.pipelines.graph.believing import believing
 
         return believing(self.problem(data, config), config.beliefs)
 
@@ -142,7 +142,7 @@ class Method(ABC):
 
         Raises InputError when there is no such scenario, or it does not fit the model.
         """
-        from pipelines.simulation.scenario import load_scenario
+        from alidade.pipelines.simulation.scenario import load_scenario
 
         return load_scenario(self.scenario, scenario or self.nominal(images), self.scenarios)
 
@@ -214,7 +214,7 @@ def names() -> tuple[str, ...]:
 def method(name: str) -> Method:
     """The method of that name. Raises InputError when there is none, or when its distribution is broken."""
     if name in _BUILT_IN:
-        found = import_module(f"pipelines.methods.{name}").METHOD
+        found = import_module(f"alidade.pipelines.methods.{name}").METHOD
         assert isinstance(found, Method)
         return found
     entry = _brought().get(name)
@@ -248,7 +248,7 @@ def scenarios() -> dict[str, dict[str, Path]]:
 
     Raises InputError when a method's distribution is broken.
     """
-    from pipelines.simulation.scenario import shipped
+    from alidade.pipelines.simulation.scenario import shipped
 
     return {
         name: {stem: path for stem, path in shipped(method(name).scenarios).items() if stem.startswith(f"{name}_")}

@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from factors import so3
-from factors.gyro import symmetric
-from pipelines.errors import InputError
-from pipelines.graph.problem import Array
+from alidade.factors import so3
+from alidade.factors.gyro import symmetric
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Array
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pipelines.methods import Method
+    from alidade.pipelines.methods import Method
 
 _SENSORS = {"accel": "accelerometer", "gyro": "gyro", "mag": "magnetometer"}
 _AXES = dict(zip("123", "xyz", strict=True))

@@ -9,9 +9,9 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.graph.noise import ROUGHLY, Level, Noise, Source
-from pipelines.graph.robust import robust_sigma
-from pipelines.settings import DEFAULT_NOISE, Config
+from alidade.pipelines.graph.noise import ROUGHLY, Level, Noise, Source
+from alidade.pipelines.graph.robust import robust_sigma
+from alidade.pipelines.settings import DEFAULT_NOISE, Config
 
 Array = NDArray[np.float64]
 

@@ -7,12 +7,12 @@ import datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.earth import magnetic_field
-from pipelines.errors import InputError
-from pipelines.graph.assumptions import Assumption
-from pipelines.recording.reading import Recording
-from pipelines.recording.topics import Topic, wanted
-from pipelines.settings import Config, first_given
+from alidade.factors.earth import magnetic_field
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.assumptions import Assumption
+from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.topics import Topic, wanted
+from alidade.pipelines.settings import Config, first_given
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
+from alidade.pipelines.errors import InputError
 
 Array = NDArray[np.float64]
 

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipelines.graph.assumptions import Assumption, parameter
-from pipelines.graph.problem import Array
-from pipelines.recording import series
-from pipelines.recording.checks import nanoseconds
-from pipelines.recording.reading import Recording
-from pipelines.recording.temperature import Temperature, read_temperature
-from pipelines.recording.topics import TEMPERATURE, wanted
-from pipelines.settings import Config
+from alidade.pipelines.graph.assumptions import Assumption, parameter
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.checks import nanoseconds
+from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.temperature import Temperature, read_temperature
+from alidade.pipelines.recording.topics import TEMPERATURE, wanted
+from alidade.pipelines.settings import Config
 
 # What formulas call the temperature at which a bias is the bias, degrees Celsius.
 FIRST = "first_temperature"
@@ -24,7 +24,7 @@ def read(
 ) -> Temperature | None:
     """That of a recording; None without the topic, and where the config fixes all slopes over it.
 
-    Raises InputError as pipelines.recording.temperature does.
+    Raises InputError as alidade.pipelines.recording.temperature does.
     """
     if not wanted(recording, config, TEMPERATURE) or parameter(0, slopes, config) is None:
         return None

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
-from pipelines.methods.triads import TRIADS, triad_of
-from pipelines.reports.calibration import SavedCalibration
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.triads import TRIADS, triad_of
+from alidade.pipelines.reports.calibration import SavedCalibration
 
 Array = NDArray[np.float64]
 

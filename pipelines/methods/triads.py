@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from factors import so3
-from pipelines.graph.problem import Array
-from pipelines.methods.formula import Formula
+from alidade.factors import so3
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.methods.formula import Formula
 
 TRIADS = ("accel", "gyro", "mag")
 # Sensor -> what comes out, and what formulas call it.

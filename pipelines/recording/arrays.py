@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.recording import series
-from pipelines.recording.container import Channel, Container, Rows, Schema, rows_of
-from pipelines.recording.data_loss import DataLoss
-from pipelines.recording.mcap_records import MESSAGE_HEAD
-from pipelines.recording.message_source import message_source
-from pipelines.recording.messages import definition_text
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.container import Channel, Container, Rows, Schema, rows_of
+from alidade.pipelines.recording.data_loss import DataLoss
+from alidade.pipelines.recording.mcap_records import MESSAGE_HEAD
+from alidade.pipelines.recording.message_source import message_source
+from alidade.pipelines.recording.messages import definition_text
 
 # Messages at a time; those of any size may be pictures.
 _ALIKE, _VARIED = 1 << 14, 4

@@ -7,11 +7,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.recording import messages
-from pipelines.recording.container import Channel, Rows, Schema, rows_of
-from pipelines.recording.decoding import header_stamps, logged_at
-from pipelines.recording.messages import Definition, Language, MessageError, Wire
-from pipelines.recording.translation import Translation, is_foxglove, ros_type
+from alidade.pipelines.recording import messages
+from alidade.pipelines.recording.container import Channel, Rows, Schema, rows_of
+from alidade.pipelines.recording.decoding import header_stamps, logged_at
+from alidade.pipelines.recording.messages import Definition, Language, MessageError, Wire
+from alidade.pipelines.recording.translation import Translation, is_foxglove, ros_type
 
 # Encoding of the messages and of what defines them -> layout, and what the definition is written in.
 _ROS: dict[str, tuple[Wire, Language]] = {

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
+from alidade.pipelines.errors import InputError
 
 Stamps = NDArray[np.int64]
 

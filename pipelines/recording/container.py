@@ -1,6 +1,6 @@
 """What holds messages: a file, or several. Whatever the form, messages come as bytes, channel by channel.
 
-A container knows no message type; pipelines.recording.message_reader makes numbers of the bytes.
+A container knows no message type; alidade.pipelines.recording.message_reader makes numbers of the bytes.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipelines.recording.data_loss import DataLoss
+from alidade.pipelines.recording.data_loss import DataLoss
 
 
 class Schema(NamedTuple):

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.recording.container import Rows
-from pipelines.recording.mcap_records import windows
-from pipelines.recording.messages import Array, Definition, Layout, Leaf, MessageError, Wire, at
+from alidade.pipelines.recording.container import Rows
+from alidade.pipelines.recording.mcap_records import windows
+from alidade.pipelines.recording.messages import Array, Definition, Layout, Leaf, MessageError, Wire, at
 
 # Which numbers of a field, as indexes, given the message; None if the message has not got them.
 Order = Callable[[Any], Sequence[int] | None]

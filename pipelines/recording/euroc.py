@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
-from pipelines.recording import series
-from pipelines.recording.arrays import ArrayContainer
-from pipelines.recording.container import sha256_of, sha256_together
-from pipelines.recording.tables import column_names, nanoseconds, numbers, read_columns
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.arrays import ArrayContainer
+from alidade.pipelines.recording.container import sha256_of, sha256_together
+from alidade.pipelines.recording.tables import column_names, nanoseconds, numbers, read_columns
 
 _DISTORTION = {"radial-tangential": "plumb_bob", "equidistant": "equidistant"}
 _LONGEST_YAML = 1 << 20

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
-from pipelines.recording.checks import count
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording.checks import count
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from pipelines.errors import InputError
-from pipelines.recording.container import Container, Rows, rows_of
-from pipelines.recording.data_loss import DataLoss
-from pipelines.recording.mcap_file import McapFile
-from pipelines.recording.mcap_index import Block, McapIndex
-from pipelines.recording.mcap_records import MAGIC, windows
-from pipelines.recording.opening import open_container
-from pipelines.recording.parts import Parts
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording.container import Container, Rows, rows_of
+from alidade.pipelines.recording.data_loss import DataLoss
+from alidade.pipelines.recording.mcap_file import McapFile
+from alidade.pipelines.recording.mcap_index import Block, McapIndex
+from alidade.pipelines.recording.mcap_records import MAGIC, windows
+from alidade.pipelines.recording.opening import open_container
+from alidade.pipelines.recording.parts import Parts
 
 # Messages of numbers are shorter, bytes; longer ones are not kept from look to look.
 _LARGE = 1 << 14

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.recording.checks import LEAST_GYRO, check_gyro, clean, count, density, taken
-from pipelines.recording.faults import drop_faults
-from pipelines.recording.reading import Recording
-from pipelines.recording.series import ImuSeries
+from alidade.pipelines.recording.checks import LEAST_GYRO, check_gyro, clean, count, density, taken
+from alidade.pipelines.recording.faults import drop_faults
+from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.series import ImuSeries
 
 Array = NDArray[np.float64]
 
@@ -18,8 +18,9 @@ def read_gyro(
 ) -> tuple[Array, Array, float | None]:
     """Times (N,) s from the epoch, rates (N, 3) rad/s, and the density its messages state (rad/s/sqrt(Hz)) or None.
 
-    Samples that cannot be used are counted in `dropped`. Raises InputError as pipelines.recording.checks does. For the
-    gyro of a platform: one that is parked may read zero throughout, by a simulator or a driver that cuts off noise.
+    Samples that cannot be used are counted in `dropped`. Raises InputError as alidade.pipelines.recording.checks does.
+    For the gyro of a platform: one that is parked may read zero throughout, by a simulator or a driver that cuts off
+    noise.
     """
     imu = recording.imu(topic)
     t, keep = usable(topic, imu, epoch_ns, dropped, may_stand=True)
@@ -46,7 +47,7 @@ def usable(
 ) -> tuple[Array, NDArray[np.intp]]:
     """Times (N,) s from the epoch of the samples whose rates can be used, and which they are (indexes into the series).
 
-    Raises InputError as pipelines.recording.checks and pipelines.recording.faults do.
+    Raises InputError as alidade.pipelines.recording.checks and alidade.pipelines.recording.faults do.
     """
     count(dropped, f"{topic}: stamped by log time (kept)", imu.stamped_by_log)
     t, keep = clean(topic, imu.t_ns, epoch_ns, imu.gyro, dropped, least)

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.recording.message_reader import Topic as RecordedTopic
-from pipelines.recording.reading import Recording
-from pipelines.recording.topics import Need, Setting, Topic
-from pipelines.settings import Config
+from alidade.pipelines.recording.message_reader import Topic as RecordedTopic
+from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.topics import Need, Setting, Topic
+from alidade.pipelines.settings import Config
 
 
 @dataclass(frozen=True)

@@ -16,12 +16,12 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
-from pipelines.recording import mcap_records as records
-from pipelines.recording.container import Container, Rows
-from pipelines.recording.data_loss import DataLoss, described
-from pipelines.recording.mcap_index import Block, McapIndex
-from pipelines.recording.mcap_records import (
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording import mcap_records as records
+from alidade.pipelines.recording.container import Container, Rows
+from alidade.pipelines.recording.data_loss import DataLoss, described
+from alidade.pipelines.recording.mcap_index import Block, McapIndex
+from alidade.pipelines.recording.mcap_records import (
     AFTER_LENGTH,
     HEAD,
     MAGIC,

@@ -15,11 +15,11 @@ from typing import BinaryIO
 import numpy as np
 from mcap.opcode import Opcode
 
-from pipelines.errors import InputError
-from pipelines.recording import mcap_records as records
-from pipelines.recording.container import Channel, Schema
-from pipelines.recording.data_loss import DataLoss
-from pipelines.recording.mcap_records import HEAD, MAGIC, MESSAGE_HEAD, DamagedError, Fields
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording import mcap_records as records
+from alidade.pipelines.recording.container import Channel, Schema
+from alidade.pipelines.recording.data_loss import DataLoss
+from alidade.pipelines.recording.mcap_records import HEAD, MAGIC, MESSAGE_HEAD, DamagedError, Fields
 
 _RAW_BLOCK = 1 << 20
 _FOOTER = struct.Struct("<BQQQI")

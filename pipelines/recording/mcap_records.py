@@ -16,7 +16,7 @@ import zstandard
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from pipelines.recording.container import Channel, Schema
+from alidade.pipelines.recording.container import Channel, Schema
 
 MAGIC = b"\x89MCAP0\r\n"
 HEAD = struct.Struct("<BQ")

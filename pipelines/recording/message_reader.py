@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.errors import InputError
-from pipelines.recording import messages
-from pipelines.recording.channel_format import READABLE, ChannelFormat, converted
-from pipelines.recording.clocks import check_clock
-from pipelines.recording.container import Container, Rows
-from pipelines.recording.decoding import Decoder, Times, header_stamps, logged_at
-from pipelines.recording.messages import Definition, MessageError
-from pipelines.recording.stamps import stamp_notes
-from pipelines.recording.topic_columns import NUMBERS, TopicColumns
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording import messages
+from alidade.pipelines.recording.channel_format import READABLE, ChannelFormat, converted
+from alidade.pipelines.recording.clocks import check_clock
+from alidade.pipelines.recording.container import Container, Rows
+from alidade.pipelines.recording.decoding import Decoder, Times, header_stamps, logged_at
+from alidade.pipelines.recording.messages import Definition, MessageError
+from alidade.pipelines.recording.stamps import stamp_notes
+from alidade.pipelines.recording.topic_columns import NUMBERS, TopicColumns
 
 # Topics whose first stamp may start a session. Positions and intrinsics may be stamped long before it.
 TIMED = {

@@ -11,9 +11,9 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from pipelines.recording import messages, series
-from pipelines.recording.mcap_records import MESSAGE_HEAD
-from pipelines.recording.messages import Array, Definition, known
+from alidade.pipelines.recording import messages, series
+from alidade.pipelines.recording.mcap_records import MESSAGE_HEAD
+from alidade.pipelines.recording.messages import Array, Definition, known
 
 _PICTURE = 1 << 16  # expected size of a message of no fixed size; only chunk sizes depend on it
 _SEC_NS = 1_000_000_000

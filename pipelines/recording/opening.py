@@ -12,14 +12,14 @@ from typing import Any
 
 import zstandard
 
-from pipelines.errors import InputError
-from pipelines.recording import ros1_bag
-from pipelines.recording.arrays import ArrayContainer
-from pipelines.recording.container import Container
-from pipelines.recording.mcap_file import McapFile
-from pipelines.recording.mcap_records import MAGIC
-from pipelines.recording.parts import Parts
-from pipelines.recording.video import is_video
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording import ros1_bag
+from alidade.pipelines.recording.arrays import ArrayContainer
+from alidade.pipelines.recording.container import Container
+from alidade.pipelines.recording.mcap_file import McapFile
+from alidade.pipelines.recording.mcap_records import MAGIC
+from alidade.pipelines.recording.parts import Parts
+from alidade.pipelines.recording.video import is_video
 
 _ZSTD, _SQLITE, _ULOG, _ARDUPILOT = b"\x28\xb5\x2f\xfd", b"SQLite format 3\0", b"ULog\x01\x12\x35", b"\xa3\x95"
 _TABLES = {".csv", ".tum", ".txt"}
@@ -114,11 +114,11 @@ def _by_content(path: Path, data: Path, strict: bool) -> Container:
     if start.startswith(ros1_bag.MAGIC):
         return ros1_bag.Ros1Bag(path, strict, data)
     if start.startswith(_SQLITE):
-        from pipelines.recording.sqlite_file import SqliteFile
+        from alidade.pipelines.recording.sqlite_file import SqliteFile
 
         return SqliteFile(path, strict, data)
     if start.startswith(_ULOG):
-        from pipelines.recording.ulog import read_ulog
+        from alidade.pipelines.recording.ulog import read_ulog
 
         return read_ulog(path, strict, data)
     if start.startswith(_ARDUPILOT):
@@ -131,7 +131,7 @@ def _by_content(path: Path, data: Path, strict: bool) -> Container:
     if is_video(start):
         return ArrayContainer(path, {}, ["a video; `columns:` in the config says which table has its pictures' stamps"])
     if _TABLES & set(path.suffixes) and start:
-        from pipelines.recording.tables import read_table
+        from alidade.pipelines.recording.tables import read_table
 
         return read_table(path, data)
     return McapFile(path, strict, data)
@@ -176,10 +176,10 @@ def _folder(path: Path, strict: bool) -> Container:
         whole = _together(there, strict, path, remarks)
         if str(metadata.get("compression_mode")).lower() != "message":
             return whole
-        from pipelines.recording.packed import PackedMessages
+        from alidade.pipelines.recording.packed import PackedMessages
 
         return PackedMessages(whole)
-    from pipelines.recording.euroc import find_euroc, read_euroc
+    from alidade.pipelines.recording.euroc import find_euroc, read_euroc
 
     root = find_euroc(path)
     if root is not None:

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 
 import zstandard
 
-from pipelines.errors import InputError
-from pipelines.recording.container import Container, Rows, rows_of
-from pipelines.recording.data_loss import DataLoss
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording.container import Container, Rows, rows_of
+from alidade.pipelines.recording.data_loss import DataLoss
 
 # No message of a sensor is larger.
 _LARGEST = 1 << 26

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.recording.sources import matrices
+from alidade.pipelines.recording.sources import matrices
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from pipelines.recording.container import Channel, Container, Rows, Schema, sha256_together
-from pipelines.recording.data_loss import DataLoss
+from alidade.pipelines.recording.container import Channel, Container, Rows, Schema, sha256_together
+from alidade.pipelines.recording.data_loss import DataLoss
 
 # Ids of channels and schemas in a part; each part has its own range of them.
 _IDS = 1 << 32

@@ -5,8 +5,8 @@
 
 Time is header.stamp; log time stands in only where the stamp is zero, and the series counts those. Messages come in
 the order of their log times. Every method raises InputError, naming what is there, when the topic is missing or empty,
-holds another type, cannot be decoded, or its clock was set in between (pipelines.recording.clocks). A chunk that is
-damaged is left out, see `Recording.notes`.
+holds another type, cannot be decoded, or its clock was set in between (alidade.pipelines.recording.clocks). A chunk
+that is damaged is left out, see `Recording.notes`.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines import progress
-from pipelines.errors import InputError
-from pipelines.recording import messages, series, video
-from pipelines.recording.clocks import check_clock
-from pipelines.recording.container import Container
-from pipelines.recording.data_loss import DataLoss
-from pipelines.recording.decoding import Times
-from pipelines.recording.message_reader import TIMED, MessageReader, Topic
-from pipelines.recording.netpbm import netpbm
-from pipelines.recording.opening import Where, open_container
-from pipelines.recording.sources import TopicSource, inverted, joined
-from pipelines.recording.stamps import jitter_ns
-from pipelines.recording.table_topics import TableTopic, described
+from alidade.pipelines import progress
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording import messages, series, video
+from alidade.pipelines.recording.clocks import check_clock
+from alidade.pipelines.recording.container import Container
+from alidade.pipelines.recording.data_loss import DataLoss
+from alidade.pipelines.recording.decoding import Times
+from alidade.pipelines.recording.message_reader import TIMED, MessageReader, Topic
+from alidade.pipelines.recording.netpbm import netpbm
+from alidade.pipelines.recording.opening import Where, open_container
+from alidade.pipelines.recording.sources import TopicSource, inverted, joined
+from alidade.pipelines.recording.stamps import jitter_ns
+from alidade.pipelines.recording.table_topics import TableTopic, described
 
 # Pairs of frames an error lists.
 _MOST_PAIRS = 30

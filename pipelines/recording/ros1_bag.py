@@ -16,10 +16,10 @@ from typing import BinaryIO
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 
-from pipelines.errors import InputError
-from pipelines.recording.container import Channel, Container, Rows, Schema
-from pipelines.recording.data_loss import DataLoss, described
-from pipelines.recording.mcap_records import DamagedError
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording.container import Channel, Container, Rows, Schema
+from alidade.pipelines.recording.data_loss import DataLoss, described
+from alidade.pipelines.recording.mcap_records import DamagedError
 
 MAGIC = b"#ROSBAG V2.0\n"
 

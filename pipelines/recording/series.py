@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipelines.recording import messages
+from alidade.pipelines.recording import messages
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]

@@ -18,7 +18,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
+from alidade.pipelines.errors import InputError
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_serializer, model_validator
 
-from pipelines.recording import series
+from alidade.pipelines.recording import series
 
 Array = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from pipelines.errors import InputError
-from pipelines.recording.container import Channel, Container, Rows, Schema, rows_of
-from pipelines.recording.data_loss import DataLoss
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording.container import Channel, Container, Rows, Schema, rows_of
+from alidade.pipelines.recording.data_loss import DataLoss
 
 # No message, definition or number of topics of a recording comes near these.
 _LARGEST, _MOST_TOPICS = 1 << 28, 10_000

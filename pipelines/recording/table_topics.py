@@ -17,13 +17,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from pipelines.errors import InputError, nearest
-from pipelines.recording import series
-from pipelines.recording.arrays import ArrayContainer
-from pipelines.recording.container import Container, sha256_of, sha256_together
-from pipelines.recording.parts import Parts
-from pipelines.recording.tables import CsvFile, nanoseconds, numbers, read_columns
-from pipelines.recording.video import VideoFile
+from alidade.pipelines.errors import InputError, nearest
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.arrays import ArrayContainer
+from alidade.pipelines.recording.container import Container, sha256_of, sha256_together
+from alidade.pipelines.recording.parts import Parts
+from alidade.pipelines.recording.tables import CsvFile, nanoseconds, numbers, read_columns
+from alidade.pipelines.recording.video import VideoFile
 
 _Three = Annotated[tuple[str, str, str], Field(strict=False)]
 _Four = Annotated[tuple[str, str, str, str], Field(strict=False)]

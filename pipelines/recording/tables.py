@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
-from pipelines.recording import series
-from pipelines.recording.arrays import ArrayContainer
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.arrays import ArrayContainer
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipelines.errors import InputError
-from pipelines.recording.checks import clean, count
-from pipelines.recording.reading import Recording
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording.checks import clean, count
+from alidade.pipelines.recording.reading import Recording
 
 Array = NDArray[np.float64]
 
@@ -39,8 +39,9 @@ class Temperature:
 def read_temperature(recording: Recording, topic: str, sensor_t: Array, dropped: dict[str, int]) -> Temperature:
     """The temperature of a sensor that has samples at sensor_t (N,), s from the session's start.
 
-    Messages that cannot be used are counted in `dropped`. Raises InputError as pipelines.recording.checks does, when a
-    temperature is none of a sensor in degrees Celsius, and when there is none for long while the sensor has samples.
+    Messages that cannot be used are counted in `dropped`. Raises InputError as alidade.pipelines.recording.checks does,
+    when a temperature is none of a sensor in degrees Celsius, and when there is none for long while the sensor has
+    samples.
     """
     found = recording.temperature(topic)
     count(dropped, f"{topic}: stamped by log time (kept)", found.stamped_by_log)

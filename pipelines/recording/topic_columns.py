@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from pipelines.recording import messages, series
-from pipelines.recording.decoding import Order, Table
+from alidade.pipelines.recording import messages, series
+from alidade.pipelines.recording.decoding import Order, Table
 
 _COLUMNS: Mapping[str, Mapping[str, series.Column]] = {
     name: columns

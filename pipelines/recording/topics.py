@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from pipelines.recording import messages
+from alidade.pipelines.recording import messages
 
 if TYPE_CHECKING:
-    from pipelines.recording.reading import Recording
-    from pipelines.settings import Config
+    from alidade.pipelines.recording.reading import Recording
+    from alidade.pipelines.settings import Config
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from pipelines.recording import messages
-from pipelines.recording.container import Schema
-from pipelines.recording.messages import Definition, MessageError
+from alidade.pipelines.recording import messages
+from alidade.pipelines.recording.container import Schema
+from alidade.pipelines.recording.messages import Definition, MessageError
 
 _HEADER, _TIME = "std_msgs/msg/Header", "builtin_interfaces/msg/Time"
 # Last part of a type's name -> ROS 2 type.

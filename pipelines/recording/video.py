@@ -7,8 +7,8 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from pipelines.errors import InputError
-from pipelines.recording.netpbm import colour_file
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording.netpbm import colour_file
 
 # How the formats of messages are called; what is read, and what else a video may be.
 H264 = ("h264", "avc", "x264", "libx264")

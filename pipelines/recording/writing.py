@@ -33,12 +33,12 @@ from mcap.records import (
 )
 from numpy.typing import NDArray
 
-from pipelines import progress
-from pipelines.errors import InputError
-from pipelines.recording import messages, series
-from pipelines.recording.mcap_records import MAGIC, MESSAGE_HEAD, windows
-from pipelines.recording.message_source import Source, message_source
-from pipelines.settings import ATTACHMENT, TRUTH
+from alidade.pipelines import progress
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording import messages, series
+from alidade.pipelines.recording.mcap_records import MAGIC, MESSAGE_HEAD, windows
+from alidade.pipelines.recording.message_source import Source, message_source
+from alidade.pipelines.settings import ATTACHMENT, TRUTH
 
 _CHUNK = 1 << 20
 _LEVEL = 1  # noise does not compress better at higher ones

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from pipelines.graph.assumptions import kind
-from pipelines.graph.problem import Quantity
-from pipelines.solvers.joint import RECORDING, WALK
+from alidade.pipelines.graph.assumptions import kind
+from alidade.pipelines.graph.problem import Quantity
+from alidade.pipelines.solvers.joint import RECORDING, WALK
 
 _PRIOR = "prior of "
 # Smaller shares are told together, and so are those after so many.

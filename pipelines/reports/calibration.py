@@ -15,13 +15,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
 
-from factors import so3
-from pipelines.errors import InputError
-from pipelines.graph.problem import Array, rotation_vector_coordinates
-from pipelines.judgement.observability import Status, Verdict
-from pipelines.methods.formula import Formula, apply
-from pipelines.reports.result import Calibration
-from pipelines.settings import Config
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Array, rotation_vector_coordinates
+from alidade.pipelines.judgement.observability import Status, Verdict
+from alidade.pipelines.methods.formula import Formula, apply
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.settings import Config
 
 _HEAD = """\
 # Calibration by alidade. Units are SI and radians, quaternions w x y z. aRb maps coordinates in b to coordinates in a,
@@ -116,7 +116,7 @@ class SavedCalibration(_Record):
                 parameters and config: it was made with another config, or by the published solver, which does not know
                 all of them.
         """
-        from pipelines.methods import method
+        from alidade.pipelines.methods import method
 
         told = "\n".join(self.formulas)
         # A formula names a parameter, or the vector that it is a component of.

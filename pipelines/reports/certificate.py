@@ -19,17 +19,17 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
-from factors.chi_square import student
-from pipelines.errors import InputError, nearest
-from pipelines.graph.problem import Quantity
-from pipelines.methods import method
-from pipelines.methods.meanings import meaning
-from pipelines.reports.answer import Answer, Tone
-from pipelines.reports.known import load_known
-from pipelines.reports.templating import environment
-from pipelines.reports.units import human_unit, to_digits_of
-from pipelines.reports.whole import write_whole
-from pipelines.solvers.joint import RECORDING
+from alidade.factors.chi_square import student
+from alidade.pipelines.errors import InputError, nearest
+from alidade.pipelines.graph.problem import Quantity
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.meanings import meaning
+from alidade.pipelines.reports.answer import Answer, Tone
+from alidade.pipelines.reports.known import load_known
+from alidade.pipelines.reports.templating import environment
+from alidade.pipelines.reports.units import human_unit, to_digits_of
+from alidade.pipelines.reports.whole import write_whole
+from alidade.pipelines.solvers.joint import RECORDING
 
 FILES = ("certificate.html", "certificate.pdf", "certificate.json")
 # Of effective degrees of freedom more than this are as good as infinitely many.
@@ -283,7 +283,7 @@ def _html(result: _Result, stated: Fields, rows: Sequence[Row], before: Path | N
     quantities = {p.name: Quantity(p.name, p.unit, None, 1.0, p.require or math.inf) for p in result.parameters}
     said = {name: "not stated" if value is None else value for name, value in stated.model_dump().items()}
     return (
-        environment("pipelines.reports")
+        environment("alidade.pipelines.reports")
         .get_template("certificate.html")
         .render(
             f=said,

@@ -8,15 +8,15 @@ from statistics import NormalDist
 
 import numpy as np
 
-from pipelines.graph.problem import Quantity
-from pipelines.judgement.halves import Halves
-from pipelines.methods.meanings import meaning
-from pipelines.reports.answer import Answer
-from pipelines.reports.figure import COLORS, Dash, Figure
-from pipelines.reports.result import Calibration, Plot, truth_errors
-from pipelines.reports.templating import page
-from pipelines.reports.units import human_unit, signed, to_digits_of
-from pipelines.reports.whole import write_page
+from alidade.pipelines.graph.problem import Quantity
+from alidade.pipelines.judgement.halves import Halves
+from alidade.pipelines.methods.meanings import meaning
+from alidade.pipelines.reports.answer import Answer
+from alidade.pipelines.reports.figure import COLORS, Dash, Figure
+from alidade.pipelines.reports.result import Calibration, Plot, truth_errors
+from alidade.pipelines.reports.templating import page
+from alidade.pipelines.reports.units import human_unit, signed, to_digits_of
+from alidade.pipelines.reports.whole import write_page
 
 FILE = "compare.html"
 # How often chance alone may take any parameter of the halves apart.
@@ -36,14 +36,14 @@ def compare_html(
 
     Args:
         calibrations: of one recording, by different solvers.
-        halves: of the recording, see pipelines.judgement.halves.
+        halves: of the recording, see alidade.pipelines.judgement.halves.
         predicted: family -> size of the errors of held-out measurements, sigmas.
     """
     quantities = [q for q in calibrations[0].problem.quantities if q.prior_sigma != 0.0]
     known = calibrations[0].truth is not None
     plots = [*_differences(calibrations, quantities), *_convergence(calibrations, quantities)]
     return page(
-        "pipelines.reports",
+        "alidade.pipelines.reports",
         "compare.html",
         plots,
         calibrations=calibrations,

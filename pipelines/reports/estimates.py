@@ -19,13 +19,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.graph.problem import Array, History
-from pipelines.recording.mcap_records import MESSAGE_HEAD
-from pipelines.recording.message_source import message_source
-from pipelines.recording.messages import JOINT_STATE, definition_text
-from pipelines.recording.series import JointSeries
-from pipelines.reports.plots import variables
-from pipelines.reports.result import Calibration
+from alidade.pipelines.graph.problem import Array, History
+from alidade.pipelines.recording.mcap_records import MESSAGE_HEAD
+from alidade.pipelines.recording.message_source import message_source
+from alidade.pipelines.recording.messages import JOINT_STATE, definition_text
+from alidade.pipelines.recording.series import JointSeries
+from alidade.pipelines.reports.plots import variables
+from alidade.pipelines.reports.result import Calibration
 
 MESSAGE = "alidade_msgs/msg/Estimate"
 DEFINITION = """\

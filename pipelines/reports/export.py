@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from pipelines import methods
-from pipelines.errors import InputError
-from pipelines.reports.calibration import SavedCalibration
-from pipelines.reports.transforms import FORMATS
+from alidade.pipelines import methods
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.reports.calibration import SavedCalibration
+from alidade.pipelines.reports.transforms import FORMATS
 
 
 def exported(saved: SavedCalibration, form: str) -> str:

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipelines.graph.problem import Array
+from alidade.pipelines.graph.problem import Array
 
 # The first three are Paul Tol's high-contrast scheme: told apart by the colour-blind, and in grey. On dark ground their
 # lighter forms. "rejected" is kept for what was rejected, the last ones for what stands behind.

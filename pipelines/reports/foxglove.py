@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from itertools import cycle
 from typing import Any
 
-from pipelines.reports.figure import COLORS, PALETTE
-from pipelines.reports.plots import variables
-from pipelines.reports.result import Calibration
+from alidade.pipelines.reports.figure import COLORS, PALETTE
+from alidade.pipelines.reports.plots import variables
+from alidade.pipelines.reports.result import Calibration
 
 _PLOT = {
     "showXAxisLabels": True,

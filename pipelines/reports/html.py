@@ -10,19 +10,19 @@ import datetime
 from contextlib import suppress
 from dataclasses import dataclass
 
-from pipelines.graph.problem import Quantity
-from pipelines.judgement.observability import by_advice
-from pipelines.methods.meanings import NOISES, meaning
-from pipelines.reports.answer import Answer, Tone
-from pipelines.reports.budget import Limit, limits
-from pipelines.reports.calibration import SavedCalibration, saved
-from pipelines.reports.plots import common_plots
-from pipelines.reports.result import Calibration, NoiseResult, Plot, Table, quantities_of, truth_errors
-from pipelines.reports.ros import ros_parameters
-from pipelines.reports.sketch import enlarged, sketch_with, told
-from pipelines.reports.snippets import c_code, python_code
-from pipelines.reports.templating import environment, page
-from pipelines.reports.units import human_unit, noise_unit, rounded, signed, to_digits_of
+from alidade.pipelines.graph.problem import Quantity
+from alidade.pipelines.judgement.observability import by_advice
+from alidade.pipelines.methods.meanings import NOISES, meaning
+from alidade.pipelines.reports.answer import Answer, Tone
+from alidade.pipelines.reports.budget import Limit, limits
+from alidade.pipelines.reports.calibration import SavedCalibration, saved
+from alidade.pipelines.reports.plots import common_plots
+from alidade.pipelines.reports.result import Calibration, NoiseResult, Plot, Table, quantities_of, truth_errors
+from alidade.pipelines.reports.ros import ros_parameters
+from alidade.pipelines.reports.sketch import enlarged, sketch_with, told
+from alidade.pipelines.reports.snippets import c_code, python_code
+from alidade.pipelines.reports.templating import environment, page
+from alidade.pipelines.reports.units import human_unit, noise_unit, rounded, signed, to_digits_of
 
 # Beyond so many sigmas of its prior a number says nothing.
 _MEANINGLESS = 10.0
@@ -85,7 +85,7 @@ def report_html(calibration: Calibration) -> str:
     sketch = sketch_with(svg, shown)
     found = limits(calibration.budget or {}, calibration.problem.quantities)
     return page(
-        "pipelines.reports",
+        "alidade.pipelines.reports",
         "report.html",
         plots,
         c=calibration,
@@ -224,7 +224,7 @@ def _moved(quantity: Quantity, move: float, sigma: float) -> str:
 
 def notebook_html(calibration: Calibration) -> str:
     """The parameters and the verdict as a fragment of HTML, for notebooks."""
-    template = environment("pipelines.reports").get_template("notebook.html")
+    template = environment("alidade.pipelines.reports").get_template("notebook.html")
     return template.render(c=calibration, rows=_rows(calibration))
 
 

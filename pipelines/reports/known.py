@@ -13,10 +13,10 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from pipelines.belief import Belief, independent
-from pipelines.errors import InputError
-from pipelines.judgement.observability import Status
-from pipelines.reports.calibration import SavedCalibration, SavedParameter, SavedRecording, load_calibration
+from alidade.pipelines.belief import Belief, independent
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.judgement.observability import Status
+from alidade.pipelines.reports.calibration import SavedCalibration, SavedParameter, SavedRecording, load_calibration
 
 # A covariance is symmetric, and none of its eigenvalues negative, to this share.
 _ROUNDING = 1e-6

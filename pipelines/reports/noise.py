@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.judgement.allan import allan_variance
-from pipelines.judgement.noise_fit import Coefficient
-from pipelines.noise import NoiseStudy, SensorNoise
-from pipelines.reports.answer import Answer
-from pipelines.reports.figure import COLORS, Figure
-from pipelines.reports.result import Plot, software_versions
-from pipelines.reports.templating import page
-from pipelines.reports.whole import write_whole
+from alidade.pipelines.judgement.allan import allan_variance
+from alidade.pipelines.judgement.noise_fit import Coefficient
+from alidade.pipelines.noise import NoiseStudy, SensorNoise
+from alidade.pipelines.reports.answer import Answer
+from alidade.pipelines.reports.figure import COLORS, Figure
+from alidade.pipelines.reports.result import Plot, software_versions
+from alidade.pipelines.reports.templating import page
+from alidade.pipelines.reports.whole import write_whole
 
 FILES = ("noise.html", "noise.json")
 
@@ -161,7 +161,7 @@ def noise_json(study: NoiseStudy) -> str:
 def noise_html(study: NoiseStudy) -> str:
     """The page as one HTML text that opens offline."""
     return page(
-        "pipelines.reports",
+        "alidade.pipelines.reports",
         "noise.html",
         [_plot(sensor) for sensor in study.sensors],
         answer=_answer(study),

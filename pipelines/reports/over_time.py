@@ -9,12 +9,12 @@ from itertools import cycle
 
 import numpy as np
 
-from pipelines.graph.assumptions import kind
-from pipelines.graph.problem import Quantity
-from pipelines.judgement.changes import Change, Changes
-from pipelines.reports.figure import COLORS, Figure, milliseconds
-from pipelines.reports.result import Calibration, PartResult, Plot, Table
-from pipelines.reports.units import human_unit, rounded, to_digits_of
+from alidade.pipelines.graph.assumptions import kind
+from alidade.pipelines.graph.problem import Quantity
+from alidade.pipelines.judgement.changes import Change, Changes
+from alidade.pipelines.reports.figure import COLORS, Figure, milliseconds
+from alidade.pipelines.reports.result import Calibration, PartResult, Plot, Table
+from alidade.pipelines.reports.units import human_unit, rounded, to_digits_of
 
 # Beyond so many days a forecast says nothing.
 _FAR_DAYS = 36_525.0

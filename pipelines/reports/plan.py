@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from pipelines import methods
-from pipelines.methods.meanings import meaning
-from pipelines.planning import Plan
-from pipelines.reports.answer import Answer
-from pipelines.reports.budget import limits
-from pipelines.reports.figure import BEFORE, COLORS, Figure
-from pipelines.reports.result import Plot
-from pipelines.reports.templating import page
-from pipelines.reports.units import human_unit, rounded
+from alidade.pipelines import methods
+from alidade.pipelines.methods.meanings import meaning
+from alidade.pipelines.planning import Plan
+from alidade.pipelines.reports.answer import Answer
+from alidade.pipelines.reports.budget import limits
+from alidade.pipelines.reports.figure import BEFORE, COLORS, Figure
+from alidade.pipelines.reports.result import Plot
+from alidade.pipelines.reports.templating import page
+from alidade.pipelines.reports.units import human_unit, rounded
 
 
 def plan_html(plan: Plan) -> str:
@@ -27,7 +27,7 @@ def plan_html(plan: Plan) -> str:
         verdict = plan.now.assessment.verdicts[q.name]
         rows.append((q.name, meaning(method, q.name), unit, *sigmas, verdict, limit))
     return page(
-        "pipelines.reports",
+        "alidade.pipelines.reports",
         "plan.html",
         [_plot(plan)],
         method=method.title,

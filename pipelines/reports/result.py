@@ -18,22 +18,22 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
-from pipelines.graph.assumptions import pull
-from pipelines.graph.noise import Level, Source
-from pipelines.graph.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
-from pipelines.judgement.changes import Changes
-from pipelines.judgement.observability import Assessment, Fit, Innovations, Learning, Status, Verdict, learning
-from pipelines.judgement.rejection import rejection_sentence
-from pipelines.judgement.self_check import SelfCheck
-from pipelines.judgement.stability import Stability
-from pipelines.recording.faults import CLIPPED
-from pipelines.recording.info import SessionFacts
-from pipelines.reports.figure import Figure
-from pipelines.settings import Config
+from alidade.pipelines.graph.assumptions import pull
+from alidade.pipelines.graph.noise import Level, Source
+from alidade.pipelines.graph.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
+from alidade.pipelines.judgement.changes import Changes
+from alidade.pipelines.judgement.observability import Assessment, Fit, Innovations, Learning, Status, Verdict, learning
+from alidade.pipelines.judgement.rejection import rejection_sentence
+from alidade.pipelines.judgement.self_check import SelfCheck
+from alidade.pipelines.judgement.stability import Stability
+from alidade.pipelines.recording.faults import CLIPPED
+from alidade.pipelines.recording.info import SessionFacts
+from alidade.pipelines.reports.figure import Figure
+from alidade.pipelines.settings import Config
 
 if TYPE_CHECKING:
-    from pipelines.methods import Method
-    from pipelines.methods.formula import Formula
+    from alidade.pipelines.methods import Method
+    from alidade.pipelines.methods.formula import Formula
 
 # Beyond so many of its prior's sigmas a parameter is not where it was said to be.
 _FAR_FROM_PRIOR = 5.0
@@ -229,7 +229,7 @@ class Calibration:
         Raises:
             InputError: the folder cannot be written to.
         """
-        from pipelines.reports.write import write_results
+        from alidade.pipelines.reports.write import write_results
 
         return write_results(Path(folder), self)
 
@@ -247,7 +247,7 @@ class Calibration:
         Raises:
             InputError: something is given that no formula measures.
         """
-        from pipelines.methods.formula import apply
+        from alidade.pipelines.methods.formula import apply
 
         values = {name: parameter.value for name, parameter in self.parameters.items() if name in self.applied}
         unknown = dict.fromkeys((q.name for q in self.problem.quantities), 0.0)
@@ -264,13 +264,13 @@ class Calibration:
 
     def __str__(self) -> str:
         """The table and the verdict, as the command prints them."""
-        from pipelines.terminal import as_text
+        from alidade.pipelines.terminal import as_text
 
         return as_text([self])
 
     def _repr_html_(self) -> str:
         """The table for notebooks."""
-        from pipelines.reports.html import notebook_html
+        from alidade.pipelines.reports.html import notebook_html
 
         return notebook_html(self)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import Any
 
-from pipelines.reports.calibration import SavedCalibration
+from alidade.pipelines.reports.calibration import SavedCalibration
 
 
 def ros_parameters(saved: SavedCalibration, names: Collection[str]) -> str:

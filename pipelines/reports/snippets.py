@@ -1,7 +1,7 @@
 """Formulas with a calibration's numbers in them, as Python and as C, to be copied.
 
-The expressions of `pipelines.methods.formula` are read with Python's own `ast`; whatever depends on nothing measured is
-computed here, so that the code holds numbers. Rotations are matrices, 3x3, in the code.
+The expressions of `alidade.pipelines.methods.formula` are read with Python's own `ast`; whatever depends on nothing
+measured is computed here, so that the code holds numbers. Rotations are matrices, 3x3, in the code.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from typing import Literal
 
 import numpy as np
 
-from factors import so3
-from pipelines.graph.problem import Array
-from pipelines.methods.formula import Formula
+from alidade.factors import so3
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.methods.formula import Formula
 
 Kind = Literal["scalar", "vector", "matrix"]
 _RANKS: tuple[Kind, ...] = ("scalar", "vector", "matrix")

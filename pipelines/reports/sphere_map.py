@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.graph.problem import Array
-from pipelines.reports.figure import COLORS, FAINT, Figure
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.reports.figure import COLORS, FAINT, Figure
 
 # Directions farther than this from all there are, rad, are gaps; the second ones wide.
 _GAPS = np.deg2rad([30.0, 45.0])

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.graph.problem import Array
-from pipelines.reports.figure import PALETTE, Figure, Mark
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.reports.figure import PALETTE, Figure, Mark
 
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-    from pipelines.reports.result import Plot
+    from alidade.pipelines.reports.result import Plot
 
 # A figure of more px than this is as broad as the page.
 _TALL = 380
@@ -62,7 +62,7 @@ def environment(package: str) -> Environment:
     from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
     made = Environment(
-        loader=ChoiceLoader([PackageLoader(package), PackageLoader("pipelines.reports")]),
+        loader=ChoiceLoader([PackageLoader(package), PackageLoader("alidade.pipelines.reports")]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

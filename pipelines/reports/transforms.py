@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from factors import so3
-from pipelines.reports.calibration import SavedCalibration, SavedTransform
+from alidade.factors import so3
+from alidade.pipelines.reports.calibration import SavedCalibration, SavedTransform
 
 _SAID = "covariance of small rotations about the parent's axes, rad^2, by rows"
 _PLACE = "only the rotation is calibrated: put the translation in"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from pipelines.graph.problem import Quantity
+from alidade.pipelines.graph.problem import Quantity
 
 _G = 9.80665  # standard gravity, m/s^2
 

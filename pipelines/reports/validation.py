@@ -7,14 +7,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipelines.judgement.validation import Validation, peak, rms
-from pipelines.methods import method
-from pipelines.methods.meanings import meaning
-from pipelines.reports.answer import Answer, Tone
-from pipelines.reports.calibration import SavedCalibration
-from pipelines.reports.figure import BEFORE, COLORS, Figure
-from pipelines.reports.result import Plot
-from pipelines.reports.templating import page
+from alidade.pipelines.judgement.validation import Validation, peak, rms
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.meanings import meaning
+from alidade.pipelines.reports.answer import Answer, Tone
+from alidade.pipelines.reports.calibration import SavedCalibration
+from alidade.pipelines.reports.figure import BEFORE, COLORS, Figure
+from alidade.pipelines.reports.result import Plot
+from alidade.pipelines.reports.templating import page
 
 # Angles of less than this, rad, are read in arc seconds.
 _FINE = 2e-4
@@ -67,7 +67,7 @@ def validation_html(
     """
     made_by = method(calibration.method)
     return page(
-        "pipelines.reports",
+        "alidade.pipelines.reports",
         "validation.html",
         [_plot(v) for v in validations],
         c=calibration,

@@ -6,14 +6,14 @@ import shutil
 from functools import partial
 from pathlib import Path
 
-from pipelines.errors import InputError
-from pipelines.reports.calibration import calibration_yaml
-from pipelines.reports.estimates import write_estimates
-from pipelines.reports.foxglove import foxglove_layout
-from pipelines.reports.html import report_html
-from pipelines.reports.result import Calibration, result_json
-from pipelines.reports.trajectory import tum
-from pipelines.reports.whole import write_whole
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.reports.calibration import calibration_yaml
+from alidade.pipelines.reports.estimates import write_estimates
+from alidade.pipelines.reports.foxglove import foxglove_layout
+from alidade.pipelines.reports.html import report_html
+from alidade.pipelines.reports.result import Calibration, result_json
+from alidade.pipelines.reports.trajectory import tum
+from alidade.pipelines.reports.whole import write_whole
 
 # In the order in which they take their places: result.json, gone first and back last, says that the others are its own.
 FILES = ("calibration.yaml", "attitude.tum", "estimates.mcap", "foxglove.json", "report.html", "result.json")

@@ -13,8 +13,8 @@ from functools import cache, reduce
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors import so3
-from pipelines.vision.camera import Camera
+from alidade.factors import so3
+from alidade.pipelines.vision.camera import Camera
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]

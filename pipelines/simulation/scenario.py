@@ -10,12 +10,12 @@ from typing import TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from pipelines.errors import InputError, nearest, nearest_three
+from alidade.pipelines.errors import InputError, nearest, nearest_three
 
 Model = TypeVar("Model", bound=BaseModel)
 
 # Installed beside this file; in a source tree among the data sets.
-_FOLDERS = (Path(__file__).parent / "scenarios", Path(__file__).parents[2] / "datasets" / "scenarios")
+_FOLDERS = (Path(__file__).parent / "scenarios", Path(__file__).resolve().parents[2] / "datasets" / "scenarios")
 
 
 def load_scenario(model: type[Model], name_or_path: str | Path, folder: Path | None = None) -> Model:

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError, nearest
-from pipelines.graph.assumptions import Assumption, quantities
-from pipelines.settings import Config, Sensors
+from alidade.pipelines.errors import InputError, nearest
+from alidade.pipelines.graph.assumptions import Assumption, quantities
+from alidade.pipelines.settings import Config, Sensors
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from pipelines.graph.assumptions import Assumption
-from pipelines.recording.temperature import Temperature
+from alidade.pipelines.graph.assumptions import Assumption
+from alidade.pipelines.recording.temperature import Temperature
 
 Array = NDArray[np.float64]
 Positive = Annotated[float, Field(gt=0.0)]

@@ -9,22 +9,22 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from pipelines.graph.noise import Level
-from pipelines.graph.problem import Array, Course, Estimate, Factor, History, Minimum, Problem, Pull, Told
-from pipelines.solvers.assembly import CHUNK, Assembly, StepBoundary
-from pipelines.solvers.coloured import added_variance, coloured, inflations
-from pipelines.solvers.curvature import second_order
-from pipelines.solvers.gauss_newton import MOST_ITERATIONS, Solution, minimize
-from pipelines.solvers.history import sequential_history
-from pipelines.solvers.influence import Influence, influence, strongest, uncertainty_budget
-from pipelines.solvers.marginals import chi_square, joint_covariance, reported, smoothed
-from pipelines.solvers.minima import likeliest
-from pipelines.solvers.noise_levels import weigh
-from pipelines.solvers.pull import without_pull
-from pipelines.solvers.spurious import Spurious, information_of_noise
-from pipelines.solvers.system import Linear, without_rejected
-from pipelines.solvers.told import told
-from pipelines.solvers.weighing import linearized, optimize, with_levels
+from alidade.pipelines.graph.noise import Level
+from alidade.pipelines.graph.problem import Array, Course, Estimate, Factor, History, Minimum, Problem, Pull, Told
+from alidade.pipelines.solvers.assembly import CHUNK, Assembly, StepBoundary
+from alidade.pipelines.solvers.coloured import added_variance, coloured, inflations
+from alidade.pipelines.solvers.curvature import second_order
+from alidade.pipelines.solvers.gauss_newton import MOST_ITERATIONS, Solution, minimize
+from alidade.pipelines.solvers.history import sequential_history
+from alidade.pipelines.solvers.influence import Influence, influence, strongest, uncertainty_budget
+from alidade.pipelines.solvers.marginals import chi_square, joint_covariance, reported, smoothed
+from alidade.pipelines.solvers.minima import likeliest
+from alidade.pipelines.solvers.noise_levels import weigh
+from alidade.pipelines.solvers.pull import without_pull
+from alidade.pipelines.solvers.spurious import Spurious, information_of_noise
+from alidade.pipelines.solvers.system import Linear, without_rejected
+from alidade.pipelines.solvers.told import told
+from alidade.pipelines.solvers.weighing import linearized, optimize, with_levels
 
 # The measurements that matter most are so many.
 _STRONGEST = 20

@@ -17,14 +17,14 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from pipelines.errors import InputError
-from pipelines.graph.problem import Problem
-from pipelines.solvers.course import Way
-from pipelines.solvers.incremental import Run
-from pipelines.solvers.innovations import Innovations
-from pipelines.solvers.rows import Rows
-from pipelines.solvers.state import State
-from pipelines.solvers.window import Keyframes
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Problem
+from alidade.pipelines.solvers.course import Way
+from alidade.pipelines.solvers.incremental import Run
+from alidade.pipelines.solvers.innovations import Innovations
+from alidade.pipelines.solvers.rows import Rows
+from alidade.pipelines.solvers.state import State
+from alidade.pipelines.solvers.window import Keyframes
 
 _SCHEMA = "alidade.checkpoint/4"
 _INNOVATIONS = "innovations/"

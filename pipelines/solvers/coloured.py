@@ -17,8 +17,8 @@ from collections.abc import Mapping, Sequence
 import gtsam
 import numpy as np
 
-from pipelines.graph.problem import Array, Factor, Problem, Residuals
-from pipelines.solvers.influence import FactorRows, Influence
+from alidade.pipelines.graph.problem import Array, Factor, Problem, Residuals
+from alidade.pipelines.solvers.influence import FactorRows, Influence
 
 # Families of fewer measurements are too short to tell their colour.
 _FEWEST = 100

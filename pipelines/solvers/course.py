@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.graph.problem import Array, Course
-from pipelines.solvers.rows import Rows
+from alidade.pipelines.graph.problem import Array, Course
+from alidade.pipelines.solvers.rows import Rows
 
 # From one moment to the next, as a share of the time since the first.
 _APART = 0.02

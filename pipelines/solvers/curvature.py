@@ -28,8 +28,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.graph.problem import Array, Problem
-from pipelines.solvers.marginals import (
+from alidade.pipelines.graph.problem import Array, Problem
+from alidade.pipelines.solvers.marginals import (
     IndeterminateError,
     marginal,
     ordering_of,
@@ -38,7 +38,7 @@ from pipelines.solvers.marginals import (
 )
 
 if TYPE_CHECKING:
-    from pipelines.solvers.system import Linear, System
+    from alidade.pipelines.solvers.system import Linear, System
 
 # A direction with a sigma within this share of the prior follows those of which its sigma is within this share.
 _WEAK, _LESS = 0.1, 0.5

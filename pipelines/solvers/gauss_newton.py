@@ -26,8 +26,8 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from pipelines.solvers.marginals import IndeterminateError
-from pipelines.solvers.system import Linear, System
+from alidade.pipelines.solvers.marginals import IndeterminateError
+from alidade.pipelines.solvers.system import Linear, System
 
 MOST_ITERATIONS = 60
 # Damping in units of an unknown's own information, beyond which no step is left to be made.

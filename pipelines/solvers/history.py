@@ -11,9 +11,9 @@ from collections.abc import Mapping, Sequence
 import gtsam
 import numpy as np
 
-from pipelines.graph.problem import Array, Course, Problem
-from pipelines.solvers.assembly import StepBoundary
-from pipelines.solvers.marginals import coordinate_inverse, ordering_of, reported, reported_covariance
+from alidade.pipelines.graph.problem import Array, Course, Problem
+from alidade.pipelines.solvers.assembly import StepBoundary
+from alidade.pipelines.solvers.marginals import coordinate_inverse, ordering_of, reported, reported_covariance
 
 # The recording is looked back upon at so many moments.
 _MOMENTS = 50

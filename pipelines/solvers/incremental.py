@@ -5,7 +5,7 @@ minute one; the calibration variables stay. With window None it is iSAM2 over th
 
 Now and then everything but the variables in use is marginalised out of the smoother: what it knows of them becomes one
 Gaussian, and a new smoother goes on from that alone. A run can be saved there and taken up again in another process,
-see pipelines.solvers.checkpoint: both go on from the same numbers.
+see alidade.pipelines.solvers.checkpoint: both go on from the same numbers.
 """
 
 from __future__ import annotations
@@ -19,16 +19,26 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.graph.problem import Array, Attitudes, ChiSquare, Course, Estimate, Factor, History, Problem, Step
-from pipelines.solvers.assembly import CHUNK, Assembly
-from pipelines.solvers.coloured import growth, inflated_by_innovations
-from pipelines.solvers.course import Way
-from pipelines.solvers.curvature import second_order
-from pipelines.solvers.gauss_newton import Solution
-from pipelines.solvers.history import sequential_history
-from pipelines.solvers.innovations import Innovations, Prediction
-from pipelines.solvers.linearity import BENT, is_linear
-from pipelines.solvers.marginals import (
+from alidade.pipelines.graph.problem import (
+    Array,
+    Attitudes,
+    ChiSquare,
+    Course,
+    Estimate,
+    Factor,
+    History,
+    Problem,
+    Step,
+)
+from alidade.pipelines.solvers.assembly import CHUNK, Assembly
+from alidade.pipelines.solvers.coloured import growth, inflated_by_innovations
+from alidade.pipelines.solvers.course import Way
+from alidade.pipelines.solvers.curvature import second_order
+from alidade.pipelines.solvers.gauss_newton import Solution
+from alidade.pipelines.solvers.history import sequential_history
+from alidade.pipelines.solvers.innovations import Innovations, Prediction
+from alidade.pipelines.solvers.linearity import BENT, is_linear
+from alidade.pipelines.solvers.marginals import (
     HELD,
     IndeterminateError,
     information_of,
@@ -36,16 +46,16 @@ from pipelines.solvers.marginals import (
     reported,
     reported_covariance,
 )
-from pipelines.solvers.noise_levels import weigh
-from pipelines.solvers.pull import without_pull
-from pipelines.solvers.rows import Rows
-from pipelines.solvers.smoother import FixedLag, Smoother, Unlimited, linearized, unweighed, used_part
-from pipelines.solvers.spurious import Spurious, information_of_noise
-from pipelines.solvers.state import State, explained, require_known, require_sound
-from pipelines.solvers.system import Linear
-from pipelines.solvers.weighing import optimize, with_levels
-from pipelines.solvers.window import Keyframes, Window
-from pipelines.solvers.withheld import covariance_without, values_without, with_prior
+from alidade.pipelines.solvers.noise_levels import weigh
+from alidade.pipelines.solvers.pull import without_pull
+from alidade.pipelines.solvers.rows import Rows
+from alidade.pipelines.solvers.smoother import FixedLag, Smoother, Unlimited, linearized, unweighed, used_part
+from alidade.pipelines.solvers.spurious import Spurious, information_of_noise
+from alidade.pipelines.solvers.state import State, explained, require_known, require_sound
+from alidade.pipelines.solvers.system import Linear
+from alidade.pipelines.solvers.weighing import optimize, with_levels
+from alidade.pipelines.solvers.window import Keyframes, Window
+from alidade.pipelines.solvers.withheld import covariance_without, values_without, with_prior
 
 DEFAULT_WINDOW = 1.0
 

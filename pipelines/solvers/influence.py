@@ -23,10 +23,10 @@ from typing import Any, TypeVar
 import gtsam
 import numpy as np
 
-from pipelines.graph.problem import Array, Factor, Problem, Pull
-from pipelines.solvers.marginals import HELD
-from pipelines.solvers.stretch import Part
-from pipelines.solvers.system import Linear
+from alidade.pipelines.graph.problem import Array, Factor, Problem, Pull
+from alidade.pipelines.solvers.marginals import HELD
+from alidade.pipelines.solvers.stretch import Part
+from alidade.pipelines.solvers.system import Linear
 
 Answer = TypeVar("Answer")
 

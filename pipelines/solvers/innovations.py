@@ -10,13 +10,13 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.chi_square import gate
-from pipelines.graph.problem import Array, ChiSquare, Factor, Residuals
-from pipelines.solvers.linear_system import linear_graph_of
-from pipelines.solvers.marginals import ordering_of
-from pipelines.solvers.rows import Rows
-from pipelines.solvers.smoother import Smoother, slices
-from pipelines.solvers.system import residuals_of
+from alidade.factors.chi_square import gate
+from alidade.pipelines.graph.problem import Array, ChiSquare, Factor, Residuals
+from alidade.pipelines.solvers.linear_system import linear_graph_of
+from alidade.pipelines.solvers.marginals import ordering_of
+from alidade.pipelines.solvers.rows import Rows
+from alidade.pipelines.solvers.smoother import Smoother, slices
+from alidade.pipelines.solvers.system import residuals_of
 
 # After so many rejections in a row it is the prediction that is wrong: take the measurement.
 _MOST_REJECTED = 10

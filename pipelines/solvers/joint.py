@@ -16,13 +16,13 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipelines.belief import Belief
-from pipelines.graph.noise import Level
-from pipelines.graph.problem import Array, Problem, Told
-from pipelines.solvers.assembly import CHUNK, Assembly
-from pipelines.solvers.noise_levels import weigh
-from pipelines.solvers.told import fewest, told
-from pipelines.solvers.weighing import optimize
+from alidade.pipelines.belief import Belief
+from alidade.pipelines.graph.noise import Level
+from alidade.pipelines.graph.problem import Array, Problem, Told
+from alidade.pipelines.solvers.assembly import CHUNK, Assembly
+from alidade.pipelines.solvers.noise_levels import weigh
+from alidade.pipelines.solvers.told import fewest, told
+from alidade.pipelines.solvers.weighing import optimize
 
 # Two dates are never nearer than this, days.
 _LEAST_DAYS = 1e-6

@@ -7,8 +7,8 @@ from collections.abc import Collection, Sequence
 import gtsam
 import numpy as np
 
-from pipelines.graph.problem import Factor
-from pipelines.solvers.marginals import ordering_of
+from alidade.pipelines.graph.problem import Factor
+from alidade.pipelines.solvers.marginals import ordering_of
 
 
 def graph_of(factors: Sequence[Factor]) -> gtsam.NonlinearFactorGraph:

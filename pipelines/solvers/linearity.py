@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipelines.graph.problem import Problem
-from pipelines.solvers.gauss_newton import Solution
-from pipelines.solvers.marginals import IndeterminateError, coordinate_inverse
+from alidade.pipelines.graph.problem import Problem
+from alidade.pipelines.solvers.gauss_newton import Solution
+from alidade.pipelines.solvers.marginals import IndeterminateError, coordinate_inverse
 
 # So many points about the estimate are tried, in pairs.
 _PAIRS = 4

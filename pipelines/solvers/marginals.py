@@ -10,15 +10,15 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.graph.problem import Array, ChiSquare, Factor, History, Parameter, Problem
+from alidade.pipelines.graph.problem import Array, ChiSquare, Factor, History, Parameter, Problem
 
 if TYPE_CHECKING:
-    from pipelines.solvers.system import Linear
+    from alidade.pipelines.solvers.system import Linear
 
 # A direction the data and priors say nothing about gets this many times its prior scale as sigma, so that it can be
 # named with the others instead of making the system unsolvable.
 _UNKNOWN = 1e4
-# What balances the pull of noise, see pipelines.solvers.pull: neither measured nor believed.
+# What balances the pull of noise, see alidade.pipelines.solvers.pull: neither measured nor believed.
 HELD = "held"
 # Families whose residuals say nothing about the noise of the recording.
 _NO_MEASUREMENTS = ("prior", "definition", HELD)
@@ -46,7 +46,7 @@ def joint_covariance(
 ) -> Array:
     """Covariance (n, n) of the reported numbers, everything else marginalised out; works for singular systems.
 
-    `noise` is information that counts for nothing, see pipelines.solvers.spurious.
+    `noise` is information that counts for nothing, see alidade.pipelines.solvers.spurious.
 
     Raises:
         IndeterminateError: another variable is undetermined.

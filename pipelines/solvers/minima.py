@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING
 import gtsam
 import numpy as np
 
-from pipelines.graph.problem import Minimum, Problem
-from pipelines.solvers.marginals import reported
+from alidade.pipelines.graph.problem import Minimum, Problem
+from alidade.pipelines.solvers.marginals import reported
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from pipelines.solvers.gauss_newton import Solution
-    from pipelines.solvers.system import System
+    from alidade.pipelines.solvers.gauss_newton import Solution
+    from alidade.pipelines.solvers.system import System
 
 # By so much less than this, in chi-square, another minimum is told: the 99 % quantile for one degree of freedom.
 CLOSE = 6.635

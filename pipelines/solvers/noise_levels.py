@@ -20,12 +20,12 @@ from typing import cast
 import gtsam
 import numpy as np
 
-from factors.vectorized import VectorizedFactor
-from pipelines.graph.linear import rescaled
-from pipelines.graph.noise import Level, Noise
-from pipelines.graph.problem import Array, Factor
-from pipelines.graph.robust import robust_sigma
-from pipelines.solvers.marginals import sum_of_squares
+from alidade.factors.vectorized import VectorizedFactor
+from alidade.pipelines.graph.linear import rescaled
+from alidade.pipelines.graph.noise import Level, Noise
+from alidade.pipelines.graph.problem import Array, Factor
+from alidade.pipelines.graph.robust import robust_sigma
+from alidade.pipelines.solvers.marginals import sum_of_squares
 
 # Levels stay as they are while what would change is less than this, in the logarithm.
 _NEGLIGIBLE = 0.01

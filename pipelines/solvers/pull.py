@@ -13,11 +13,11 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from pipelines.graph.problem import Array, Factor, Problem
-from pipelines.solvers.gauss_newton import MOST_ITERATIONS, Solution, minimize
-from pipelines.solvers.marginals import HELD, joint_covariance
-from pipelines.solvers.spurious import Spurious, information_of_noise
-from pipelines.solvers.system import System
+from alidade.pipelines.graph.problem import Array, Factor, Problem
+from alidade.pipelines.solvers.gauss_newton import MOST_ITERATIONS, Solution, minimize
+from alidade.pipelines.solvers.marginals import HELD, joint_covariance
+from alidade.pipelines.solvers.spurious import Spurious, information_of_noise
+from alidade.pipelines.solvers.system import System
 
 # Combinations nearer than this to their priors' means, in sigmas of these, stay where they are. Where some are held, it
 # may show of others that they have been pulled, or that all is told: so often there are more. One that is less than

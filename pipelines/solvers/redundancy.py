@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.graph.problem import Array, Factor
-from pipelines.solvers.stretch import Part
-from pipelines.solvers.system import Linear
+from alidade.pipelines.graph.problem import Array, Factor
+from alidade.pipelines.solvers.stretch import Part
+from alidade.pipelines.solvers.system import Linear
 
 # Elements of a row of a rejected measurement or a free prior.
 _EMPTY = 1e-12

@@ -8,10 +8,10 @@ from typing import Protocol
 import gtsam
 import numpy as np
 
-from factors.loss import TruncatedLoss
-from pipelines.graph.problem import Array, Factor
-from pipelines.solvers.linear_system import graph_of, linear_graph_of
-from pipelines.solvers.marginals import ordering_of
+from alidade.factors.loss import TruncatedLoss
+from alidade.pipelines.graph.problem import Array, Factor
+from alidade.pipelines.solvers.linear_system import graph_of, linear_graph_of
+from alidade.pipelines.solvers.marginals import ordering_of
 
 # Move of a variable, in its own units (rad, rad/s, s), that makes iSAM2 linearise its factors anew.
 _RELINEARIZE = 1e-2

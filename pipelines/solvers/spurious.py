@@ -21,9 +21,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.graph.problem import Array, Problem
-from pipelines.solvers.marginals import IndeterminateError, joint_information, prior_units
-from pipelines.solvers.system import Linear
+from alidade.pipelines.graph.problem import Array, Problem
+from alidade.pipelines.solvers.marginals import IndeterminateError, joint_information, prior_units
+from alidade.pipelines.solvers.system import Linear
 
 # Directions in which sigma is beyond this share of the prior are looked at; in others noise adds next to nothing.
 _WEAK = 0.3

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from pipelines.errors import InputError
-from pipelines.graph.problem import Factor
-from pipelines.solvers.marginals import IndeterminateError, explain, ordering_of
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Factor
+from alidade.pipelines.solvers.marginals import IndeterminateError, explain, ordering_of
 
 
 @dataclass(frozen=True)

@@ -17,12 +17,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.loss import TruncatedLoss
-from factors.vectorized import Ensemble, VectorizedFactor
-from pipelines.graph.problem import Array, Factor
-from pipelines.solvers.linear_system import damped, elimination_ordering, graph_of, linear_graph_of
-from pipelines.solvers.marginals import IndeterminateError, eliminated, explain, ordering_of
-from pipelines.solvers.triangular import Triangular, conditionals_of, rows_of
+from alidade.factors.loss import TruncatedLoss
+from alidade.factors.vectorized import Ensemble, VectorizedFactor
+from alidade.pipelines.graph.problem import Array, Factor
+from alidade.pipelines.solvers.linear_system import damped, elimination_ordering, graph_of, linear_graph_of
+from alidade.pipelines.solvers.marginals import IndeterminateError, eliminated, explain, ordering_of
+from alidade.pipelines.solvers.triangular import Triangular, conditionals_of, rows_of
 
 # Variable and which of its numbers -> information about it that a linear system has too much.
 Excess = dict[tuple[int, int], Array]
@@ -164,7 +164,7 @@ class Part:
 
 
 class Dense(NamedTuple):
-    """A linear factor as arrays, as factors.vectorized.jacobian_factor has them."""
+    """A linear factor as arrays, as alidade.factors.vectorized.jacobian_factor has them."""
 
     keys: list[int]
     widths: list[int]

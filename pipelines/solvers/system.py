@@ -4,7 +4,7 @@ A long recording is divided into stretches of time. The variables that only one 
 which leaves, as square root of information, what the stretch says of the others; these rows of all stretches are the
 system that is solved. Where the others are known, a stretch's own variables follow by back substitution. That is the
 whole system's elimination in another order, hence exact. Stretches are looked at in several processes, where there may
-be more than one (`pipelines.parallel`); what these find is the same to the last digit.
+be more than one (`alidade.pipelines.parallel`); what these find is the same to the last digit.
 
 Of a recording of many hours memory does not hold all that is made of its stretches: what of them is not kept, see Keep,
 is made anew whenever it is needed, one stretch at a time, and what is held of a state is its value and residuals. A
@@ -24,16 +24,16 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.loss import TruncatedLoss
-from factors.vectorized import jacobian_factor, residuals_at
-from pipelines.graph.problem import Array, Factor, Residuals
-from pipelines.parallel import Crew, room
-from pipelines.solvers.assembly import StepBoundary
-from pipelines.solvers.history import moments_of
-from pipelines.solvers.linear_system import damped, elimination_ordering, graph_of
-from pipelines.solvers.marginals import IndeterminateError, joint_information, marginal, ordering_of
-from pipelines.solvers.stretch import Excess, Keep, Part, Stretch, StretchAt, vectorized
-from pipelines.solvers.triangular import Triangular, rows_of
+from alidade.factors.loss import TruncatedLoss
+from alidade.factors.vectorized import jacobian_factor, residuals_at
+from alidade.pipelines.graph.problem import Array, Factor, Residuals
+from alidade.pipelines.parallel import Crew, room
+from alidade.pipelines.solvers.assembly import StepBoundary
+from alidade.pipelines.solvers.history import moments_of
+from alidade.pipelines.solvers.linear_system import damped, elimination_ordering, graph_of
+from alidade.pipelines.solvers.marginals import IndeterminateError, joint_information, marginal, ordering_of
+from alidade.pipelines.solvers.stretch import Excess, Keep, Part, Stretch, StretchAt, vectorized
+from alidade.pipelines.solvers.triangular import Triangular, rows_of
 
 Answer = TypeVar("Answer")
 Elimination = Callable[

@@ -7,11 +7,11 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 import gtsam
 import numpy as np
 
-from pipelines.belief import Belief, root_of_information
-from pipelines.graph.believing import about_alone
-from pipelines.graph.problem import Array, Problem, Told
-from pipelines.solvers.marginals import coordinate_inverse, marginal, reported
-from pipelines.solvers.system import Linear
+from alidade.pipelines.belief import Belief, root_of_information
+from alidade.pipelines.graph.believing import about_alone
+from alidade.pipelines.graph.problem import Array, Problem, Told
+from alidade.pipelines.solvers.marginals import coordinate_inverse, marginal, reported
+from alidade.pipelines.solvers.system import Linear
 
 # Combinations whose sigma would be so many times their prior's are not told at all.
 _UNKNOWN = 1e6

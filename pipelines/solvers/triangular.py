@@ -11,8 +11,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.graph.problem import Array
-from pipelines.solvers.marginals import IndeterminateError, eliminated, explain
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.solvers.marginals import IndeterminateError, eliminated, explain
 
 
 @dataclass(frozen=True)

@@ -8,15 +8,15 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from factors.loss import TruncatedLoss
-from pipelines.graph.noise import Level
-from pipelines.graph.problem import Array, Factor, Problem
-from pipelines.solvers.assembly import StepBoundary
-from pipelines.solvers.gauss_newton import MOST_DAMPING, MOST_ITERATIONS, Solution, minimize
-from pipelines.solvers.marginals import rows_used
-from pipelines.solvers.noise_levels import far, refined, weigh
-from pipelines.solvers.redundancy import expected_squares
-from pipelines.solvers.system import Linear, System
+from alidade.factors.loss import TruncatedLoss
+from alidade.pipelines.graph.noise import Level
+from alidade.pipelines.graph.problem import Array, Factor, Problem
+from alidade.pipelines.solvers.assembly import StepBoundary
+from alidade.pipelines.solvers.gauss_newton import MOST_DAMPING, MOST_ITERATIONS, Solution, minimize
+from alidade.pipelines.solvers.marginals import rows_used
+from alidade.pipelines.solvers.noise_levels import far, refined, weigh
+from alidade.pipelines.solvers.redundancy import expected_squares
+from alidade.pipelines.solvers.system import Linear, System
 
 # So much a measurement is near enough to tell which ones lie outside the gate: on average they move by 0.05 sigma yet.
 _ROUGH_TOLERANCE = 1e-3

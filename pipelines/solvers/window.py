@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numbers
 
-from pipelines.errors import InputError
+from alidade.pipelines.errors import InputError
 
 # After a number of keyframes.
 _KEYFRAMES = "kf"

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
-from pipelines.vision.camera import Camera
-from pipelines.vision.parallel import UNREADABLE, detections
-from pipelines.vision.pose import BodyPose, TagBody, estimate_pose
-from pipelines.vision.tags import Detections
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.vision.camera import Camera
+from alidade.pipelines.vision.parallel import UNREADABLE, detections
+from alidade.pipelines.vision.pose import BodyPose, TagBody, estimate_pose
+from alidade.pipelines.vision.tags import Detections
 
 Array = NDArray[np.float64]
 

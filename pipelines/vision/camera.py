@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipelines.errors import InputError
+from alidade.pipelines.errors import InputError
 
 Array = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ from itertools import islice
 
 import numpy as np
 
-from pipelines.parallel import allowed
-from pipelines.vision.camera import Camera
-from pipelines.vision.tags import Detections, Picture, detect
+from alidade.pipelines.parallel import allowed
+from alidade.pipelines.vision.camera import Camera
+from alidade.pipelines.vision.tags import Detections, Picture, detect
 
 UNREADABLE = "picture does not decode"
 

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors import so3
-from pipelines.errors import InputError
-from pipelines.vision.camera import Camera
-from pipelines.vision.tags import Detections
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.vision.camera import Camera
+from alidade.pipelines.vision.tags import Detections
 
 if TYPE_CHECKING:
-    from pipelines.settings import Board
+    from alidade.pipelines.settings import Board
 
 Array = NDArray[np.float64]
 

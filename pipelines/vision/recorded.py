@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipelines.recording.reading import Recording
-from pipelines.recording.topics import CAMERA_INFO
-from pipelines.settings import Config
+from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.topics import CAMERA_INFO
+from alidade.pipelines.settings import Config
 
 if TYPE_CHECKING:
-    from pipelines.vision.camera import Camera
+    from alidade.pipelines.vision.camera import Camera
 
 
 def camera_of(recording: Recording, config: Config) -> Camera:
     """The camera. Raises InputError when its topic is missing or says what no camera can be."""
-    from pipelines.vision.camera import Camera
+    from alidade.pipelines.vision.camera import Camera
 
     info = recording.camera_info(config.topic(CAMERA_INFO))
     return Camera(info.width, info.height, info.k, info.distortion_model, info.d)

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
-from pipelines.vision.camera import Camera
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.vision.camera import Camera
 
 Array = NDArray[np.float64]
 Picture = NDArray[np.uint8]

@@ -15,11 +15,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from pipelines.errors import InputError
-from pipelines.vision.camera import Camera
-from pipelines.vision.parallel import UNREADABLE, decode
-from pipelines.vision.tags import Picture, detect
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.vision.camera import Camera
+from alidade.pipelines.vision.parallel import UNREADABLE, decode
+from alidade.pipelines.vision.tags import Picture, detect
 
 Array = NDArray[np.float64]
 

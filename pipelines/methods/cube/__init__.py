@@ -6,23 +6,23 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from pipelines.methods import Method, Scenario
+from alidade.pipelines.methods import Method, Scenario
 
 if TYPE_CHECKING:
-    from pipelines.graph.problem import Array, Estimate, Findings, Problem
-    from pipelines.judgement.checklist import ChecklistItem
-    from pipelines.judgement.hypotheses import Hypotheses
-    from pipelines.judgement.validation import Validation
-    from pipelines.methods.cube.data import CubeData
-    from pipelines.methods.cube.scenario import CubeScenario
-    from pipelines.methods.cube.topics import CubeConfig
-    from pipelines.methods.formula import Formula
-    from pipelines.recording.reading import Recording
-    from pipelines.recording.topics import Need, Topic
-    from pipelines.reports.calibration import SavedCalibration
-    from pipelines.reports.result import Calibration, Plot, Table
-    from pipelines.settings import Config
-    from pipelines.simulation.simulated import Simulated
+    from alidade.pipelines.graph.problem import Array, Estimate, Findings, Problem
+    from alidade.pipelines.judgement.checklist import ChecklistItem
+    from alidade.pipelines.judgement.hypotheses import Hypotheses
+    from alidade.pipelines.judgement.validation import Validation
+    from alidade.pipelines.methods.cube.data import CubeData
+    from alidade.pipelines.methods.cube.scenario import CubeScenario
+    from alidade.pipelines.methods.cube.topics import CubeConfig
+    from alidade.pipelines.methods.formula import Formula
+    from alidade.pipelines.recording.reading import Recording
+    from alidade.pipelines.recording.topics import Need, Topic
+    from alidade.pipelines.reports.calibration import SavedCalibration
+    from alidade.pipelines.reports.result import Calibration, Plot, Table
+    from alidade.pipelines.settings import Config
+    from alidade.pipelines.simulation.simulated import Simulated
 
 
 class Cube(Method):
@@ -54,108 +54,108 @@ class Cube(Method):
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        from pipelines.methods.cube.topics import TOPICS
+        from alidade.pipelines.methods.cube.topics import TOPICS
 
         return TOPICS
 
     @property
     def needs(self) -> tuple[Need, ...]:
-        from pipelines.methods.cube.topics import NEEDS
+        from alidade.pipelines.methods.cube.topics import NEEDS
 
         return NEEDS
 
     @property
     def section(self) -> type[CubeConfig]:
-        from pipelines.methods.cube.topics import CubeConfig
+        from alidade.pipelines.methods.cube.topics import CubeConfig
 
         return CubeConfig
 
     @property
     def data(self) -> type[CubeData]:
-        from pipelines.methods.cube.data import CubeData
+        from alidade.pipelines.methods.cube.data import CubeData
 
         return CubeData
 
     def read(self, recording: Recording, config: Config) -> CubeData:
-        from pipelines.methods.cube.recording import read_cube
+        from alidade.pipelines.methods.cube.recording import read_cube
 
         return read_cube(recording, config)
 
     def problem(self, data: CubeData, config: Config) -> Problem:
-        from pipelines.methods.cube.graph import problem
+        from alidade.pipelines.methods.cube.graph import problem
 
         return problem(data, config)
 
     def published(self, data: CubeData, config: Config, problem: Problem) -> Estimate:
-        from pipelines.methods.cube.published import published_estimate
+        from alidade.pipelines.methods.cube.published import published_estimate
 
         return published_estimate(data, config, problem)
 
     @property
     def scenario(self) -> type[CubeScenario]:
-        from pipelines.methods.cube.scenario import CubeScenario
+        from alidade.pipelines.methods.cube.scenario import CubeScenario
 
         return CubeScenario
 
     def simulate(self, scenario: CubeScenario, seed: int, images: bool = False) -> Simulated:
-        from pipelines.methods.cube.simulation import simulated
+        from alidade.pipelines.methods.cube.simulation import simulated
 
         return simulated(scenario, seed, images)
 
     def write(self, path: Path, simulated: Simulated) -> None:
-        from pipelines.methods.cube.writing import write_cube
+        from alidade.pipelines.methods.cube.writing import write_cube
 
         write_cube(path, simulated.data, simulated.truth, simulated.config, simulated.pictures)
 
     def candidates(self, scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
-        from pipelines.methods.cube.candidates import candidates
+        from alidade.pipelines.methods.cube.candidates import candidates
 
         return candidates(scenario)
 
     def hypotheses(self) -> Hypotheses:
-        from pipelines.methods.cube.hypotheses import HYPOTHESES
+        from alidade.pipelines.methods.cube.hypotheses import HYPOTHESES
 
         return HYPOTHESES
 
     def validate(self, data: CubeData, config: Config, values: Mapping[str, float]) -> Sequence[Validation]:
-        from pipelines.methods.cube.validation import validate
+        from alidade.pipelines.methods.cube.validation import validate
 
         return validate(data, config, values)
 
     def checklist(self, data: CubeData, config: Config) -> Sequence[ChecklistItem]:
-        from pipelines.methods.cube.guidance import checklist
+        from alidade.pipelines.methods.cube.guidance import checklist
 
         return checklist(data, config)
 
     def formulas(self, parameters: Collection[str], config: Config) -> Sequence[Formula]:
-        from pipelines.methods.cube.formulas import formulas
+        from alidade.pipelines.methods.cube.formulas import formulas
 
         return formulas(parameters, config)
 
     def stated(self, config: Config) -> Mapping[str, Array]:
-        from pipelines.methods.cube.formulas import stated
+        from alidade.pipelines.methods.cube.formulas import stated
 
         return stated(config)
 
     def figures(self, data: CubeData, calibration: Calibration) -> Sequence[Plot | Table]:
-        from pipelines.methods.cube.figures import cube_plots
+        from alidade.pipelines.methods.cube.figures import cube_plots
 
         return cube_plots(data, calibration)
 
     def findings(self, data: CubeData, config: Config, estimate: Estimate) -> Findings:
-        from pipelines.methods.cube.findings import findings
+        from alidade.pipelines.methods.cube.findings import findings
 
         return findings(data, config, estimate)
 
     @property
     def exporters(self) -> Mapping[str, Callable[[SavedCalibration], str]]:
-        from pipelines.methods.triad_export import FORMATS
+        from alidade.pipelines.methods.triad_export import FORMATS
 
         return FORMATS
 
     @property
     def commands(self) -> Mapping[str, Callable[..., None]]:
-        from pipelines.methods.cube.commands import cube_layout, cube_print
+        from alidade.pipelines.methods.cube.commands import cube_layout, cube_print
 
         return {"cube-layout": cube_layout, "cube-print": cube_print}
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from pipelines.graph.motion import Motion
-from pipelines.judgement.pictures import swaying
-from pipelines.methods.cube.faces import Side
-from pipelines.methods.cube.picture import rested
+from alidade.pipelines.graph.motion import Motion
+from alidade.pipelines.judgement.pictures import swaying
+from alidade.pipelines.methods.cube.faces import Side
+from alidade.pipelines.methods.cube.picture import rested
 
 _UP: dict[str, Side] = {"x": "+x", "y": "+y", "z": "+z"}
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from pipelines.methods import Scenario
-from pipelines.methods.cube.next_poses import next_poses
-from pipelines.methods.cube.scenario import CubeScenario
+from alidade.pipelines.methods import Scenario
+from alidade.pipelines.methods.cube.next_poses import next_poses
+from alidade.pipelines.methods.cube.scenario import CubeScenario
 
 # Poses that are proposed together, and the seed of their simulation.
 _SERIES, _SEED = 6, 0

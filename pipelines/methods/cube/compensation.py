@@ -6,13 +6,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from pipelines.graph.problem import Array
-from pipelines.methods.cube.data import CubeData, nominal, recorded
-from pipelines.methods.cube.parameters import CUBE, SENSITIVITY, SQUARE, TEMPERATURE
-from pipelines.methods.cube.topics import CubeConfig
-from pipelines.methods.temperature import FIRST
-from pipelines.methods.triads import triad_of
-from pipelines.settings import Config
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.methods.cube.data import CubeData, nominal, recorded
+from alidade.pipelines.methods.cube.parameters import CUBE, SENSITIVITY, SQUARE, TEMPERATURE
+from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.methods.temperature import FIRST
+from alidade.pipelines.methods.triads import triad_of
+from alidade.pipelines.settings import Config
 
 
 def calibrated(

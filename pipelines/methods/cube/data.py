@@ -10,14 +10,14 @@ from typing import TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.graph.noise import Noise
-from pipelines.methods.cube.topics import CubeConfig, RawConversion, field_date
-from pipelines.methods.noise import stated
-from pipelines.methods.place import field_at
-from pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
-from pipelines.recording.temperature import Temperature
-from pipelines.settings import Config
-from pipelines.vision.camera import Camera
+from alidade.pipelines.graph.noise import Noise
+from alidade.pipelines.methods.cube.topics import CubeConfig, RawConversion, field_date
+from alidade.pipelines.methods.noise import stated
+from alidade.pipelines.methods.place import field_at
+from alidade.pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
+from alidade.pipelines.recording.temperature import Temperature
+from alidade.pipelines.settings import Config
+from alidade.pipelines.vision.camera import Camera
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, model_validator
 
-from factors import so3
+from alidade.factors import so3
 
 Array = NDArray[np.float64]
 

@@ -6,20 +6,20 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from factors import so3
-from factors.earth import earth_rate, gravity
-from factors.preintegration import GyroPath
-from pipelines.graph.problem import Array
-from pipelines.methods.cube.compensation import calibrated, calibrated_rates
-from pipelines.methods.cube.coverage import coverage
-from pipelines.methods.cube.data import CubeData, local_field, nominal
-from pipelines.methods.cube.poses import StaticPoses, static_poses, turn
-from pipelines.methods.cube.tables import NAMES, cube_tables
-from pipelines.methods.cube.topics import CubeConfig
-from pipelines.reports.figure import BEFORE, COLORS, FAINT, Figure, thin
-from pipelines.reports.result import Calibration, Plot, Table
-from pipelines.reports.units import rounded
-from pipelines.settings import Config
+from alidade.factors import so3
+from alidade.factors.earth import earth_rate, gravity
+from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.methods.cube.compensation import calibrated, calibrated_rates
+from alidade.pipelines.methods.cube.coverage import coverage
+from alidade.pipelines.methods.cube.data import CubeData, local_field, nominal
+from alidade.pipelines.methods.cube.poses import StaticPoses, static_poses, turn
+from alidade.pipelines.methods.cube.tables import NAMES, cube_tables
+from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.reports.figure import BEFORE, COLORS, FAINT, Figure, thin
+from alidade.pipelines.reports.result import Calibration, Plot, Table
+from alidade.pipelines.reports.units import rounded
+from alidade.pipelines.settings import Config
 
 # Unit that people read an error in, and what to multiply its SI number by.
 _ERRORS = {"accel": ("mg", 1e3 / 9.80665), "gyro": ("deg", np.rad2deg(1.0)), "mag": ("nT", 1e9)}

@@ -6,18 +6,18 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from factors import so3
-from pipelines.graph.problem import Array, Estimate, Findings
-from pipelines.methods import temperature
-from pipelines.methods.cube.compensation import calibrated
-from pipelines.methods.cube.data import CubeData, local_field, noise_densities, nominal
-from pipelines.methods.cube.noises import noises
-from pipelines.methods.cube.poses import StaticPoses, static_poses
-from pipelines.methods.cube.topics import CubeConfig
-from pipelines.methods.place import FIELD
-from pipelines.methods.triads import TRIADS, parts_row, parts_with_sigmas, triad_names
-from pipelines.recording.topics import IMU, MAG
-from pipelines.settings import Config
+from alidade.factors import so3
+from alidade.pipelines.graph.problem import Array, Estimate, Findings
+from alidade.pipelines.methods import temperature
+from alidade.pipelines.methods.cube.compensation import calibrated
+from alidade.pipelines.methods.cube.data import CubeData, local_field, noise_densities, nominal
+from alidade.pipelines.methods.cube.noises import noises
+from alidade.pipelines.methods.cube.poses import StaticPoses, static_poses
+from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.methods.place import FIELD
+from alidade.pipelines.methods.triads import TRIADS, parts_row, parts_with_sigmas, triad_names
+from alidade.pipelines.recording.topics import IMU, MAG
+from alidade.pipelines.settings import Config
 
 # White noise is told from means over this much time, s: shorter ones are what the device's own filter leaves.
 _BLOCK = 0.25

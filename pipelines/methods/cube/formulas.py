@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from factors import so3
-from pipelines.methods.cube.compensation import straightened
-from pipelines.methods.cube.data import nominal, recorded
-from pipelines.methods.cube.parameters import CUBE, SENSITIVITY, SQUARE, TEMPERATURE, TILT
-from pipelines.methods.cube.topics import CubeConfig, RawConversion
-from pipelines.methods.formula import (
+from alidade.factors import so3
+from alidade.pipelines.methods.cube.compensation import straightened
+from alidade.pipelines.methods.cube.data import nominal, recorded
+from alidade.pipelines.methods.cube.parameters import CUBE, SENSITIVITY, SQUARE, TEMPERATURE, TILT
+from alidade.pipelines.methods.cube.topics import CubeConfig, RawConversion
+from alidade.pipelines.methods.formula import (
     Formula,
     matrix_text,
     numbers_of,
@@ -20,8 +20,8 @@ from pipelines.methods.formula import (
     temperature_text,
     vector_text,
 )
-from pipelines.methods.triads import triad_formula
-from pipelines.settings import Config
+from alidade.pipelines.methods.triads import triad_formula
+from alidade.pipelines.settings import Config
 
 
 def formulas(parameters: Collection[str], config: Config) -> list[Formula]:

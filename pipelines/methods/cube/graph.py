@@ -18,14 +18,14 @@ from functools import partial
 import gtsam
 import numpy as np
 
-from factors import so3
-from factors.turns import Samples, Turns
-from pipelines.graph.believing import believing
-from pipelines.graph.problem import Attitudes, Factor, Problem, Step
-from pipelines.methods import temperature
-from pipelines.methods.cube.advice import advice
-from pipelines.methods.cube.data import CubeData
-from pipelines.methods.cube.measurements import (
+from alidade.factors import so3
+from alidade.factors.turns import Samples, Turns
+from alidade.pipelines.graph.believing import believing
+from alidade.pipelines.graph.problem import Attitudes, Factor, Problem, Step
+from alidade.pipelines.methods import temperature
+from alidade.pipelines.methods.cube.advice import advice
+from alidade.pipelines.methods.cube.data import CubeData
+from alidade.pipelines.methods.cube.measurements import (
     place_key,
     pose_key,
     reference_key,
@@ -33,12 +33,12 @@ from pipelines.methods.cube.measurements import (
     tag_factor,
     turn_factor,
 )
-from pipelines.methods.cube.model import Model, prepare
-from pipelines.methods.cube.noises import noises
-from pipelines.methods.cube.parameters import SENSITIVITY_KEY, SLOPE_KEYS, TRIAD_KEYS, first_priors
-from pipelines.methods.cube.tag_places import layout_belief
-from pipelines.methods.cube.wandering import deviation_key
-from pipelines.settings import Config
+from alidade.pipelines.methods.cube.model import Model, prepare
+from alidade.pipelines.methods.cube.noises import noises
+from alidade.pipelines.methods.cube.parameters import SENSITIVITY_KEY, SLOPE_KEYS, TRIAD_KEYS, first_priors
+from alidade.pipelines.methods.cube.tag_places import layout_belief
+from alidade.pipelines.methods.cube.wandering import deviation_key
+from alidade.pipelines.settings import Config
 
 _NO_FIELD = (
     "The magnetometer is not calibrated, for the field is not known where nobody says where it was: give latitude_deg "

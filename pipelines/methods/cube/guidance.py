@@ -7,15 +7,15 @@ from itertools import permutations
 
 import numpy as np
 
-from pipelines.graph.motion import Motion
-from pipelines.graph.problem import Array
-from pipelines.judgement.checklist import ChecklistItem
-from pipelines.judgement.pictures import covered
-from pipelines.methods.cube.data import CubeData
-from pipelines.methods.cube.faces import SIDES, Side
-from pipelines.methods.cube.picture import rested
-from pipelines.methods.cube.poses import static_poses
-from pipelines.settings import Config
+from alidade.pipelines.graph.motion import Motion
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.judgement.checklist import ChecklistItem
+from alidade.pipelines.judgement.pictures import covered
+from alidade.pipelines.methods.cube.data import CubeData
+from alidade.pipelines.methods.cube.faces import SIDES, Side
+from alidade.pipelines.methods.cube.picture import rested
+from alidade.pipelines.methods.cube.poses import static_poses
+from alidade.pipelines.settings import Config
 
 # Poses that determine the twelve numbers of a triad, and those of published practice: each of six faces thrice.
 _FEWEST_POSES, _POSES_A_FACE = 4, 3

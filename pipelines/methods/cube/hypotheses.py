@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipelines.judgement.hypotheses import AXES, ExactInput, Hypotheses, Scaling
-from pipelines.methods.cube.data import CubeData
-from pipelines.methods.cube.parameters import FOCAL, is_stated
-from pipelines.methods.cube.topics import CubeConfig
-from pipelines.settings import Config
+from alidade.pipelines.judgement.hypotheses import AXES, ExactInput, Hypotheses, Scaling
+from alidade.pipelines.methods.cube.data import CubeData
+from alidade.pipelines.methods.cube.parameters import FOCAL, is_stated
+from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.settings import Config
 
 
 def _tag_sizes(data: CubeData, config: Config, factor: float) -> tuple[CubeData, Config] | None:

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.errors import InputError
-from pipelines.methods.cube.sightings import read_camera
-from pipelines.methods.cube.topics import TAG_DETECTIONS, CubeConfig
-from pipelines.recording.reading import Recording
-from pipelines.recording.topics import IMAGE
-from pipelines.settings import DEFAULT_NOISE, Config, first_given
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.cube.sightings import read_camera
+from alidade.pipelines.methods.cube.topics import TAG_DETECTIONS, CubeConfig
+from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.topics import IMAGE
+from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 if TYPE_CHECKING:
-    from pipelines.vision.camera import Camera
-    from pipelines.vision.layout import Layout, Shots
-    from pipelines.vision.tags import Detections
+    from alidade.pipelines.vision.camera import Camera
+    from alidade.pipelines.vision.layout import Layout, Shots
+    from alidade.pipelines.vision.tags import Detections
 
 
 # A line of the file holds whatever belongs together.
@@ -39,8 +39,8 @@ def cube_layout(recordings: Sequence[tuple[Recording, Config]], refine_camera: b
 
     Raises InputError when there are no pictures or detections, or none that ties the tags together.
     """
-    from pipelines.vision.layout import estimate_layout
-    from pipelines.vision.pose import TagBody
+    from alidade.pipelines.vision.layout import estimate_layout
+    from alidade.pipelines.vision.pose import TagBody
 
     shots = [_shots(recording, config) for recording, config in recordings]
     if not any(len(found) for each in shots for found in each.pictures):
@@ -51,7 +51,7 @@ def cube_layout(recordings: Sequence[tuple[Recording, Config]], refine_camera: b
 
 def _shots(recording: Recording, config: Config) -> Shots:
     """The camera, and the tags in each picture."""
-    from pipelines.vision.layout import Shots
+    from alidade.pipelines.vision.layout import Shots
 
     found = _tags(recording, config)
     time = [(t_ns - found[0][0]) / 1e9 for t_ns, _ in found]
@@ -63,7 +63,7 @@ def _tags(recording: Recording, config: Config) -> list[tuple[int, Detections]]:
     topic = config.topic(IMAGE)
     if topic not in recording.topics:
         return _detections(recording, config)
-    from pipelines.vision.parallel import detections
+    from alidade.pipelines.vision.parallel import detections
 
     pictures = islice(recording.images(topic), None, None, _every(recording.topics[topic].count))
     seen = detections(pictures, config.section(CubeConfig).tag_family, read_camera(recording, config))
@@ -76,7 +76,7 @@ def _every(pictures: int) -> int:
 
 
 def _detections(recording: Recording, config: Config) -> list[tuple[int, Detections]]:
-    from pipelines.vision.tags import Detections
+    from alidade.pipelines.vision.tags import Detections
 
     seen = recording.detections(config.topic(TAG_DETECTIONS))
     sigma = first_given(config.noise.corner_px, DEFAULT_NOISE.corner_px)

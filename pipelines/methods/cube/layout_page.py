@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from factors import so3
-from pipelines.graph.problem import Array
-from pipelines.reports.answer import Answer, Tone
-from pipelines.reports.figure import COLORS, Figure
-from pipelines.reports.plain_json import plain_json
-from pipelines.reports.result import Plot
-from pipelines.reports.templating import page
-from pipelines.reports.units import to_digits_of
+from alidade.factors import so3
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.reports.answer import Answer, Tone
+from alidade.pipelines.reports.figure import COLORS, Figure
+from alidade.pipelines.reports.plain_json import plain_json
+from alidade.pipelines.reports.result import Plot
+from alidade.pipelines.reports.templating import page
+from alidade.pipelines.reports.units import to_digits_of
 
 if TYPE_CHECKING:
-    from pipelines.vision.layout import Layout
+    from alidade.pipelines.vision.layout import Layout
 
 COLUMNS = ("tag", "pictures", "px", "sigma, deg", "sigma, mm", "false", "correlation")
 
@@ -105,7 +105,7 @@ def layout_json(layout: Layout) -> str:
 
 def camera_rows(layout: Layout) -> list[tuple[str, ...]]:
     """Camera, name, value given, value found and sigma of each number that was adjusted and that pictures tell."""
-    from pipelines.vision.layout import LINE_TIME
+    from alidade.pipelines.vision.layout import LINE_TIME
 
     out: list[tuple[str, ...]] = []
     for k, (found, given) in enumerate(zip(layout.cameras, layout.given_cameras, strict=True)):
@@ -124,7 +124,7 @@ def camera_rows(layout: Layout) -> list[tuple[str, ...]]:
 def layout_html(layout: Layout, recordings: Sequence[str]) -> str:
     """The page as one HTML text that opens offline."""
     return page(
-        "pipelines.methods.cube",
+        "alidade.pipelines.methods.cube",
         "layout.html",
         [_picture(layout), _bars(layout)],
         recordings=", ".join(recordings),

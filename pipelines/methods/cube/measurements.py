@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING
 import gtsam
 import numpy as np
 
-from factors import so3
-from factors.tags import TagAttitudeFactor
-from factors.triad import AccelFactor, GyroStaticFactor, MagFactor
-from factors.turns import GyroRotationFactor
-from pipelines.graph.problem import Array, Factor
-from pipelines.methods.cube.model import Model
-from pipelines.methods.cube.parameters import (
+from alidade.factors import so3
+from alidade.factors.tags import TagAttitudeFactor
+from alidade.factors.triad import AccelFactor, GyroStaticFactor, MagFactor
+from alidade.factors.turns import GyroRotationFactor
+from alidade.pipelines.graph.problem import Array, Factor
+from alidade.pipelines.methods.cube.model import Model
+from alidade.pipelines.methods.cube.parameters import (
     CURVATURE_KEY,
     FIELD_KEY,
     LENS_KEY,
@@ -24,13 +24,13 @@ from pipelines.methods.cube.parameters import (
     TRIAD_KEYS,
     tag_key,
 )
-from pipelines.methods.cube.poses import SeenTags
-from pipelines.methods.cube.tag_places import tag_place_key
-from pipelines.methods.cube.topics import CubeConfig
-from pipelines.methods.cube.wandering import deviation_key
+from alidade.pipelines.methods.cube.poses import SeenTags
+from alidade.pipelines.methods.cube.tag_places import tag_place_key
+from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.methods.cube.wandering import deviation_key
 
 if TYPE_CHECKING:
-    from pipelines.vision.camera import Camera
+    from alidade.pipelines.vision.camera import Camera
 
 
 # Steps of derivatives by a share of the focal length and by the centre, px.
@@ -82,7 +82,7 @@ def sensor_factors(model: Model, k: int) -> list[Factor]:
 
 def tag_factor(model: Model, k: int, seen: SeenTags) -> Factor:
     """All tags seen in pose k."""
-    from pipelines.vision.pose import TagBody
+    from alidade.pipelines.vision.pose import TagBody
 
     body = TagBody.from_board(model.config.section(CubeConfig))
     camera = model.data.camera

@@ -7,21 +7,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factors import so3
-from factors.chi_square import gate
-from factors.earth import earth_rate, gravity
-from factors.loss import TruncatedLoss
-from factors.preintegration import GyroPath
-from pipelines.errors import InputError
-from pipelines.graph.problem import Array
-from pipelines.methods.cube.data import DENSITIES, CubeData, local_field, nominal
-from pipelines.methods.cube.noises import noises
-from pipelines.methods.cube.parameters import Parameters, cube_parameters
-from pipelines.methods.cube.poses import StaticPoses, static_poses, turn
-from pipelines.methods.cube.reference import Reference, cube_reference, from_vectors
-from pipelines.methods.cube.topics import CubeConfig
-from pipelines.methods.cube.wandering import GaussMarkovDeviation
-from pipelines.settings import Config
+from alidade.factors import so3
+from alidade.factors.chi_square import gate
+from alidade.factors.earth import earth_rate, gravity
+from alidade.factors.loss import TruncatedLoss
+from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.methods.cube.data import DENSITIES, CubeData, local_field, nominal
+from alidade.pipelines.methods.cube.noises import noises
+from alidade.pipelines.methods.cube.parameters import Parameters, cube_parameters
+from alidade.pipelines.methods.cube.poses import StaticPoses, static_poses, turn
+from alidade.pipelines.methods.cube.reference import Reference, cube_reference, from_vectors
+from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.methods.cube.wandering import GaussMarkovDeviation
+from alidade.pipelines.settings import Config
 
 # A pause of the gyro's record in a turn longer than this, s, breaks the chain of turns.
 _LONGEST_GAP = 0.1

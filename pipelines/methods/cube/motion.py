@@ -8,8 +8,8 @@ import numpy as np
 from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
-from factors import so3
-from pipelines.methods.cube.scenario import CubeScenario
+from alidade.factors import so3
+from alidade.pipelines.methods.cube.scenario import CubeScenario
 
 Array = NDArray[np.float64]
 

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factors import so3
-from factors.earth import magnetic_field
-from pipelines.graph.problem import Array
-from pipelines.methods.cube.faces import SIDES, Resting
-from pipelines.methods.cube.scenario import YEAR, CubeScenario
-from pipelines.methods.cube.simulation import attitudes
+from alidade.factors import so3
+from alidade.factors.earth import magnetic_field
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.methods.cube.faces import SIDES, Resting
+from alidade.pipelines.methods.cube.scenario import YEAR, CubeScenario
+from alidade.pipelines.methods.cube.simulation import attitudes
 
 _LEANS = (0.0, 45.0)
 # Fisher information before any pose, small beside what one adds: makes the sum invertible.

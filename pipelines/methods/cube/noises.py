@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.graph.noise import Level
-from pipelines.methods.cube.data import CubeData, computed_once, nominal, stated_density
-from pipelines.methods.cube.poses import static_poses
-from pipelines.methods.cube.topics import CubeConfig
-from pipelines.methods.noise import repeatability, sampled, stated, typical, walked
-from pipelines.settings import Config
+from alidade.pipelines.graph.noise import Level
+from alidade.pipelines.methods.cube.data import CubeData, computed_once, nominal, stated_density
+from alidade.pipelines.methods.cube.poses import static_poses
+from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.methods.noise import repeatability, sampled, stated, typical, walked
+from alidade.pipelines.settings import Config
 
 
 @computed_once

@@ -9,19 +9,25 @@ from functools import partial
 import gtsam
 import numpy as np
 
-from factors import so3
-from factors.triad import TriadPriorFactor, calibration, triad
-from pipelines.errors import InputError
-from pipelines.graph import assumptions
-from pipelines.graph.assumptions import Assumption, quantities, sensitivity_assumption, stated, temperature_assumption
-from pipelines.graph.linear import linear_factor
-from pipelines.graph.priors import prior_sigmas, rotation_prior, vector_prior
-from pipelines.graph.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
-from pipelines.methods.cube.tag_places import CAMERA_NUMBERS, tag_place_names, tag_places
-from pipelines.methods.cube.topics import CubeConfig, RawConversion
-from pipelines.methods.place import FIELD, STRENGTH_SIGMA
-from pipelines.methods.triads import TRIADS, triad_names
-from pipelines.settings import Config, check_names
+from alidade.factors import so3
+from alidade.factors.triad import TriadPriorFactor, calibration, triad
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph import assumptions
+from alidade.pipelines.graph.assumptions import (
+    Assumption,
+    quantities,
+    sensitivity_assumption,
+    stated,
+    temperature_assumption,
+)
+from alidade.pipelines.graph.linear import linear_factor
+from alidade.pipelines.graph.priors import prior_sigmas, rotation_prior, vector_prior
+from alidade.pipelines.graph.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
+from alidade.pipelines.methods.cube.tag_places import CAMERA_NUMBERS, tag_place_names, tag_places
+from alidade.pipelines.methods.cube.topics import CubeConfig, RawConversion
+from alidade.pipelines.methods.place import FIELD, STRENGTH_SIGMA
+from alidade.pipelines.methods.triads import TRIADS, triad_names
+from alidade.pipelines.settings import Config, check_names
 
 TRIAD_KEYS: dict[str, int] = {name: int(gtsam.symbol(c, 0)) for name, c in zip(TRIADS, "AGM", strict=True)}
 MOUNT_KEY, SAID_KEY, FIELD_KEY, SENSITIVITY_KEY, CURVATURE_KEY, LENS_KEY = (int(gtsam.symbol(c, 0)) for c in "CHFSQL")

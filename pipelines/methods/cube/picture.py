@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from functools import cache
 
-from pipelines.judgement.pictures import resting
-from pipelines.methods.cube.faces import SIDES, Resting, Side
+from alidade.pipelines.judgement.pictures import resting
+from alidade.pipelines.methods.cube.faces import SIDES, Resting, Side
 
 
 @cache

@@ -8,17 +8,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from factors.preintegration import GyroPath
-from pipelines.errors import InputError
-from pipelines.methods.cube.data import CubeData, computed_once, nominal
-from pipelines.methods.cube.static_intervals import static_intervals
-from pipelines.methods.cube.topics import CubeConfig
-from pipelines.recording.checks import count
-from pipelines.settings import DEFAULT_NOISE, Config, first_given
+from alidade.factors import so3
+from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.cube.data import CubeData, computed_once, nominal
+from alidade.pipelines.methods.cube.static_intervals import static_intervals
+from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.recording.checks import count
+from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 if TYPE_CHECKING:
-    from pipelines.vision.pose import BodyPose, TagBody
+    from alidade.pipelines.vision.pose import BodyPose, TagBody
 
 Array = NDArray[np.float64]
 
@@ -122,7 +122,7 @@ def _means(t: Array, values: Array, span: Array) -> tuple[Array, Array]:
 def _seen_tags(
     data: CubeData, config: Config, span: Array, gyro: Array, dropped: dict[str, int]
 ) -> tuple[SeenTags | None, ...]:
-    from pipelines.vision.pose import TagBody
+    from alidade.pipelines.vision.pose import TagBody
 
     assert data.sightings is not None
     body = TagBody.from_board(config.section(CubeConfig))
@@ -157,8 +157,8 @@ def _seen_in(
     dropped: dict[str, int],
 ) -> SeenTags | None:
     """The tags in the pictures taken from start to stop; counts those that do not fit in `wrong`."""
-    from pipelines.vision.pose import estimate_pose
-    from pipelines.vision.tags import Detections
+    from alidade.pipelines.vision.pose import estimate_pose
+    from alidade.pipelines.vision.tags import Detections
 
     seen, camera = data.sightings, data.camera
     assert seen is not None

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from pipelines.errors import InputError
-from pipelines.methods.cube.faces import FACES, SIDES
-from pipelines.reports.whole import write_file
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.cube.faces import FACES, SIDES
+from alidade.pipelines.reports.whole import write_file
 
 _POINTS_PER_M = 72.0 / 0.0254
 _PAGE = (0.210, 0.297)  # A4, m
@@ -66,7 +66,7 @@ def _side(axis: NDArray[np.float64]) -> str:
 
 def _face(edge: float, tag: int, bRt: NDArray[np.float64]) -> str:
     """Drawing commands of one page."""
-    from pipelines.simulation.rendering import tag_bits
+    from alidade.pipelines.simulation.rendering import tag_bits
 
     bits = tag_bits(tag)
     cell = edge / _CELLS

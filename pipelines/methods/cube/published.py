@@ -17,15 +17,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from factors.earth import EARTH_RATE, earth_rate, gravity
-from pipelines.errors import InputError
-from pipelines.graph.problem import Attitudes, Estimate, Problem, Residuals
-from pipelines.methods.cube.data import CubeData, local_field, recorded
-from pipelines.methods.cube.poses import StaticPoses, static_poses
-from pipelines.methods.cube.topics import CubeConfig
-from pipelines.methods.triads import triad_names
-from pipelines.settings import Config
+from alidade.factors import so3
+from alidade.factors.earth import EARTH_RATE, earth_rate, gravity
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Attitudes, Estimate, Problem, Residuals
+from alidade.pipelines.methods.cube.data import CubeData, local_field, recorded
+from alidade.pipelines.methods.cube.poses import StaticPoses, static_poses
+from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.methods.triads import triad_names
+from alidade.pipelines.settings import Config
 
 Array = NDArray[np.float64]
 

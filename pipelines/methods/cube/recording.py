@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipelines.errors import InputError
-from pipelines.methods import temperature
-from pipelines.methods.cube.data import Array, CubeData
-from pipelines.methods.cube.parameters import TEMPERATURE
-from pipelines.methods.cube.sightings import read_camera, read_sightings
-from pipelines.methods.cube.topics import REFERENCE_FIX, REFERENCE_IMU, TAG_DETECTIONS, CubeConfig
-from pipelines.methods.cube.units import Readings, check_units
-from pipelines.methods.place import read_place
-from pipelines.recording.checks import (
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import temperature
+from alidade.pipelines.methods.cube.data import Array, CubeData
+from alidade.pipelines.methods.cube.parameters import TEMPERATURE
+from alidade.pipelines.methods.cube.sightings import read_camera, read_sightings
+from alidade.pipelines.methods.cube.topics import REFERENCE_FIX, REFERENCE_IMU, TAG_DETECTIONS, CubeConfig
+from alidade.pipelines.methods.cube.units import Readings, check_units
+from alidade.pipelines.methods.place import read_place
+from alidade.pipelines.recording.checks import (
     LEAST_ACCEL,
     LEAST_GYRO,
     LEAST_MAG,
@@ -25,10 +25,10 @@ from pipelines.recording.checks import (
     density,
     unit_quaternions,
 )
-from pipelines.recording.faults import drop_faults
-from pipelines.recording.reading import Recording
-from pipelines.recording.topics import IMAGE, IMU, MAG, wanted
-from pipelines.settings import Config
+from alidade.pipelines.recording.faults import drop_faults
+from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.topics import IMAGE, IMU, MAG, wanted
+from alidade.pipelines.settings import Config
 
 # rad^2; no reference is as good.
 _LEAST_VARIANCE = 1e-11
@@ -41,8 +41,8 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
 
     What the recording holds decides what there is: magnetometer, reference and camera may each be missing.
 
-    Raises InputError when a topic is unusable (pipelines.recording.checks) or in an implausible unit, when the topics
-    have no time in common, and with pictures when there is no static pose or no tag in any.
+    Raises InputError when a topic is unusable (alidade.pipelines.recording.checks) or in an implausible unit, when the
+    topics have no time in common, and with pictures when there is no static pose or no tag in any.
     """
     dropped: dict[str, int] = {}
     epoch = recording.epoch_ns

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factors import so3
-from pipelines.errors import InputError
-from pipelines.graph.problem import Array
-from pipelines.methods.cube.data import CubeData
-from pipelines.methods.cube.poses import StaticPoses
-from pipelines.methods.cube.topics import REFERENCE_IMU, CubeConfig
-from pipelines.settings import Config
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.methods.cube.data import CubeData
+from alidade.pipelines.methods.cube.poses import StaticPoses
+from alidade.pipelines.methods.cube.topics import REFERENCE_IMU, CubeConfig
+from alidade.pipelines.settings import Config
 
 # Messages that scatter by more than this many times their stated variance are those of a reference that moved.
 _MOVES = 2.0

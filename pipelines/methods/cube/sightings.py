@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
-from pipelines.methods.cube.data import Array, CubeData, Sightings
-from pipelines.methods.cube.static_intervals import static_intervals
-from pipelines.methods.cube.topics import TAG_DETECTIONS, CubeConfig, RefinedCamera
-from pipelines.recording.checks import clean, count
-from pipelines.recording.reading import Recording
-from pipelines.recording.topics import IMAGE, wanted
-from pipelines.settings import Config
-from pipelines.vision.recorded import camera_of
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.cube.data import Array, CubeData, Sightings
+from alidade.pipelines.methods.cube.static_intervals import static_intervals
+from alidade.pipelines.methods.cube.topics import TAG_DETECTIONS, CubeConfig, RefinedCamera
+from alidade.pipelines.recording.checks import clean, count
+from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.topics import IMAGE, wanted
+from alidade.pipelines.settings import Config
+from alidade.pipelines.vision.recorded import camera_of
 
 if TYPE_CHECKING:
-    from pipelines.vision.camera import Camera
+    from alidade.pipelines.vision.camera import Camera
 
 _FAMILIES = ("", "36h11", "tag36h11")
 # More pictures than this share with one id twice are two tags with one id, not a false detection.
@@ -80,7 +80,7 @@ def _detections(recording: Recording, config: Config, epoch_ns: int, dropped: di
 
 def _pictures(recording: Recording, config: Config, data: CubeData, dropped: dict[str, int]) -> Sightings:
     """Tags found in the pictures of the static intervals; the others are not looked at."""
-    from pipelines.vision.parallel import UNREADABLE, detections
+    from alidade.pipelines.vision.parallel import UNREADABLE, detections
 
     assert data.camera is not None
     epoch_ns, (start, stop) = data.epoch_ns, static_intervals(data, config).T

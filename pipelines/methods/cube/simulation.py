@@ -14,14 +14,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from factors.earth import earth_rate, gravity, magnetic_field
-from pipelines.errors import InputError
-from pipelines.graph.assumptions import stated
-from pipelines.methods.cube.data import CubeData, Sightings
-from pipelines.methods.cube.faces import FACES
-from pipelines.methods.cube.motion import drawn_motion
-from pipelines.methods.cube.parameters import (
+from alidade.factors import so3
+from alidade.factors.earth import earth_rate, gravity, magnetic_field
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.assumptions import stated
+from alidade.pipelines.methods.cube.data import CubeData, Sightings
+from alidade.pipelines.methods.cube.faces import FACES
+from alidade.pipelines.methods.cube.motion import drawn_motion
+from alidade.pipelines.methods.cube.parameters import (
     ASSUMPTIONS,
     CENTRE,
     CUBE,
@@ -32,7 +32,7 @@ from pipelines.methods.cube.parameters import (
     TILT,
     is_stated,
 )
-from pipelines.methods.cube.scenario import (
+from alidade.pipelines.methods.cube.scenario import (
     EPOCH_NS,
     FORWARD,
     YEAR,
@@ -43,14 +43,14 @@ from pipelines.methods.cube.scenario import (
     ReferenceAttitude,
     cube_config,
 )
-from pipelines.methods.place import FIELD
-from pipelines.settings import Config, Sensors
-from pipelines.simulation.motion import sample_times
-from pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
-from pipelines.simulation.sensors import true_values
-from pipelines.simulation.simulated import Simulated
-from pipelines.simulation.temperature import drift, known, measured
-from pipelines.vision.camera import Camera
+from alidade.pipelines.methods.place import FIELD
+from alidade.pipelines.settings import Config, Sensors
+from alidade.pipelines.simulation.motion import sample_times
+from alidade.pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
+from alidade.pipelines.simulation.sensors import true_values
+from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.temperature import drift, known, measured
+from alidade.pipelines.vision.camera import Camera
 
 Array = NDArray[np.float64]
 _PARTS = 8

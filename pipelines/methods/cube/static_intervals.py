@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipelines.methods.cube.data import Array, CubeData, computed_once, noise_densities, nominal
-from pipelines.methods.cube.topics import CubeConfig
-from pipelines.methods.static_intervals import find_static_intervals
-from pipelines.settings import Config
+from alidade.pipelines.methods.cube.data import Array, CubeData, computed_once, noise_densities, nominal
+from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.methods.static_intervals import find_static_intervals
+from alidade.pipelines.settings import Config
 
 
 @computed_once

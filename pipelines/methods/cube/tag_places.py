@@ -5,10 +5,10 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from pipelines.belief import Belief
-from pipelines.graph.problem import Parameter, Quantity
-from pipelines.methods.cube.topics import CubeConfig
-from pipelines.settings import Config
+from alidade.pipelines.belief import Belief
+from alidade.pipelines.graph.problem import Parameter, Quantity
+from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.settings import Config
 
 # Of a tag, as cube.covariance has them: rotation, position.
 _NUMBERS = ("x", "y", "z", "px", "py", "pz")

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from pipelines.recording import messages
-from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, MAG, TEMPERATURE, Need, Setting, Topic
-from pipelines.settings import Board, Config, Date, MethodSection, Quaternion, Section, Sigma
+from alidade.pipelines.recording import messages
+from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, MAG, TEMPERATURE, Need, Setting, Topic
+from alidade.pipelines.settings import Board, Config, Date, MethodSection, Quaternion, Section, Sigma
 
 REFERENCE_FIX = Topic("reference_fix", "/reference/fix", (messages.NAV_SAT_FIX,))
 REFERENCE_IMU = Topic("reference_imu", "/reference/imu", (messages.IMU,))

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.errors import InputError
-from pipelines.methods.cube.data import Array, nominal
-from pipelines.methods.cube.topics import RawConversion
-from pipelines.recording.checks import too_fast
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.cube.data import Array, nominal
+from alidade.pipelines.methods.cube.topics import RawConversion
+from alidade.pipelines.recording.checks import too_fast
 
 # Norms at rest that no accelerometer in m/s^2 and no magnetometer in T shows, and what they are likely to be.
 _PLAUSIBLE = {"accel": (3.0, 30.0), "mag": (1e-6, 1e-3)}

@@ -6,16 +6,16 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from factors import so3
-from factors.earth import gravity
-from factors.preintegration import GyroPath
-from pipelines.errors import InputError
-from pipelines.judgement.validation import Validation
-from pipelines.methods.cube.compensation import calibrated, calibrated_rates
-from pipelines.methods.cube.data import CubeData, local_field, nominal
-from pipelines.methods.cube.poses import StaticPoses, static_poses, turn
-from pipelines.methods.cube.topics import CubeConfig
-from pipelines.settings import Config
+from alidade.factors import so3
+from alidade.factors.earth import gravity
+from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.judgement.validation import Validation
+from alidade.pipelines.methods.cube.compensation import calibrated, calibrated_rates
+from alidade.pipelines.methods.cube.data import CubeData, local_field, nominal
+from alidade.pipelines.methods.cube.poses import StaticPoses, static_poses, turn
+from alidade.pipelines.methods.cube.topics import CubeConfig
+from alidade.pipelines.settings import Config
 
 
 def validate(data: CubeData, config: Config, values: Mapping[str, float]) -> list[Validation]:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from factors.triad import WeightedSumFactor
-from pipelines.graph.linear import linear_factor
-from pipelines.graph.problem import Array, Factor
-from pipelines.methods.cube.poses import StaticPoses
+from alidade.factors.triad import WeightedSumFactor
+from alidade.pipelines.graph.linear import linear_factor
+from alidade.pipelines.graph.problem import Array, Factor
+from alidade.pipelines.methods.cube.poses import StaticPoses
 
 # A gyro bias that does not walk still does so by this much, rad/s, for the sake of the arithmetic.
 _STEADY = 1e-8

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.methods import temperature
-from pipelines.methods.cube.data import Array, CubeData, Sightings
-from pipelines.methods.cube.topics import REFERENCE_FIX, REFERENCE_IMU, TAG_DETECTIONS
-from pipelines.recording import series
-from pipelines.recording.checks import nanoseconds
-from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, MAG
-from pipelines.recording.writing import attached, write_session
+from alidade.pipelines.methods import temperature
+from alidade.pipelines.methods.cube.data import Array, CubeData, Sightings
+from alidade.pipelines.methods.cube.topics import REFERENCE_FIX, REFERENCE_IMU, TAG_DETECTIONS
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.checks import nanoseconds
+from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, MAG
+from alidade.pipelines.recording.writing import attached, write_session
 
 if TYPE_CHECKING:
-    from pipelines.vision.camera import Camera
+    from alidade.pipelines.vision.camera import Camera
 
 
 def write_cube(

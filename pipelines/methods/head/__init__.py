@@ -6,22 +6,22 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from pipelines.methods import Method, Scenario
+from alidade.pipelines.methods import Method, Scenario
 
 if TYPE_CHECKING:
-    from pipelines.graph.problem import Estimate, Findings, Problem
-    from pipelines.judgement.checklist import ChecklistItem
-    from pipelines.judgement.hypotheses import Hypotheses
-    from pipelines.judgement.validation import Validation
-    from pipelines.methods.formula import Formula
-    from pipelines.methods.head.recording import HeadData
-    from pipelines.methods.head.simulation import HeadScenario
-    from pipelines.methods.head.topics import HeadConfig
-    from pipelines.recording.reading import Recording
-    from pipelines.recording.topics import Need, Topic
-    from pipelines.reports.result import Calibration, Plot
-    from pipelines.settings import Config
-    from pipelines.simulation.simulated import Simulated
+    from alidade.pipelines.graph.problem import Estimate, Findings, Problem
+    from alidade.pipelines.judgement.checklist import ChecklistItem
+    from alidade.pipelines.judgement.hypotheses import Hypotheses
+    from alidade.pipelines.judgement.validation import Validation
+    from alidade.pipelines.methods.formula import Formula
+    from alidade.pipelines.methods.head.recording import HeadData
+    from alidade.pipelines.methods.head.simulation import HeadScenario
+    from alidade.pipelines.methods.head.topics import HeadConfig
+    from alidade.pipelines.recording.reading import Recording
+    from alidade.pipelines.recording.topics import Need, Topic
+    from alidade.pipelines.reports.result import Calibration, Plot
+    from alidade.pipelines.settings import Config
+    from alidade.pipelines.simulation.simulated import Simulated
 
 
 class Head(Method):
@@ -46,51 +46,51 @@ class Head(Method):
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        from pipelines.methods.head.topics import TOPICS
+        from alidade.pipelines.methods.head.topics import TOPICS
 
         return TOPICS
 
     @property
     def needs(self) -> tuple[Need, ...]:
-        from pipelines.methods.head.topics import NEEDS
+        from alidade.pipelines.methods.head.topics import NEEDS
 
         return NEEDS
 
     @property
     def section(self) -> type[HeadConfig]:
-        from pipelines.methods.head.topics import HeadConfig
+        from alidade.pipelines.methods.head.topics import HeadConfig
 
         return HeadConfig
 
     @property
     def data(self) -> type[HeadData]:
-        from pipelines.methods.head.recording import HeadData
+        from alidade.pipelines.methods.head.recording import HeadData
 
         return HeadData
 
     def read(self, recording: Recording, config: Config) -> HeadData:
-        from pipelines.methods.head.recording import read_head
+        from alidade.pipelines.methods.head.recording import read_head
 
         return read_head(recording, config)
 
     def problem(self, data: HeadData, config: Config) -> Problem:
-        from pipelines.methods.head.graph import problem
+        from alidade.pipelines.methods.head.graph import problem
 
         return problem(data, config)
 
     def published(self, data: HeadData, config: Config, problem: Problem) -> Estimate:
-        from pipelines.methods.head.published import published_estimate
+        from alidade.pipelines.methods.head.published import published_estimate
 
         return published_estimate(data, config, problem)
 
     @property
     def scenario(self) -> type[HeadScenario]:
-        from pipelines.methods.head.simulation import HeadScenario
+        from alidade.pipelines.methods.head.simulation import HeadScenario
 
         return HeadScenario
 
     def simulate(self, scenario: HeadScenario, seed: int, images: bool = False) -> Simulated:
-        from pipelines.methods.head.simulation import simulated
+        from alidade.pipelines.methods.head.simulation import simulated
 
         return simulated(scenario, seed, images)
 
@@ -98,42 +98,42 @@ class Head(Method):
         return "head_pictures" if images else "head_nominal"
 
     def write(self, path: Path, simulated: Simulated) -> None:
-        from pipelines.methods.head.recording import write_head
+        from alidade.pipelines.methods.head.recording import write_head
 
         write_head(path, simulated.data, simulated.truth, simulated.config, simulated.pictures)
 
     def candidates(self, scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
-        from pipelines.methods.head.candidates import candidates
+        from alidade.pipelines.methods.head.candidates import candidates
 
         return candidates(scenario)
 
     def hypotheses(self) -> Hypotheses:
-        from pipelines.methods.head.hypotheses import HYPOTHESES
+        from alidade.pipelines.methods.head.hypotheses import HYPOTHESES
 
         return HYPOTHESES
 
     def validate(self, data: HeadData, config: Config, values: Mapping[str, float]) -> Sequence[Validation]:
-        from pipelines.methods.head.validation import validate
+        from alidade.pipelines.methods.head.validation import validate
 
         return validate(data, config, values)
 
     def checklist(self, data: HeadData, config: Config) -> Sequence[ChecklistItem]:
-        from pipelines.methods.head.guidance import checklist
+        from alidade.pipelines.methods.head.guidance import checklist
 
         return checklist(data, config)
 
     def formulas(self, parameters: Collection[str], config: Config) -> Sequence[Formula]:  # noqa: ARG002
-        from pipelines.methods.head.formulas import formulas
+        from alidade.pipelines.methods.head.formulas import formulas
 
         return formulas(parameters)
 
     def findings(self, data: HeadData, config: Config, estimate: Estimate) -> Findings:
-        from pipelines.methods.head.findings import findings
+        from alidade.pipelines.methods.head.findings import findings
 
         return findings(data, config, estimate)
 
     def figures(self, data: HeadData, calibration: Calibration) -> Sequence[Plot]:
-        from pipelines.methods.head.figures import head_plots
+        from alidade.pipelines.methods.head.figures import head_plots
 
         return head_plots(data, calibration)
 

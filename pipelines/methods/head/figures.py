@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from pipelines.graph.problem import Array, Attitudes
-from pipelines.graph.robust import robust_sigma
-from pipelines.methods.head.recording import HeadData
-from pipelines.reports.figure import COLORS, PALE, Figure
-from pipelines.reports.result import Calibration, Plot
+from alidade.factors import so3
+from alidade.pipelines.graph.problem import Array, Attitudes
+from alidade.pipelines.graph.robust import robust_sigma
+from alidade.pipelines.methods.head.recording import HeadData
+from alidade.pipelines.reports.figure import COLORS, PALE, Figure
+from alidade.pipelines.reports.result import Calibration, Plot
 
 _AXES = "xyz"
 

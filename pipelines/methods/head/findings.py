@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pipelines.graph.assumptions import fixed_without_force
-from pipelines.graph.problem import Estimate, Findings
-from pipelines.methods.head.parameters import SENSITIVITY
-from pipelines.methods.head.recording import HeadData
-from pipelines.methods.head.topics import HEAD_IMU
-from pipelines.settings import Config
+from alidade.pipelines.graph.assumptions import fixed_without_force
+from alidade.pipelines.graph.problem import Estimate, Findings
+from alidade.pipelines.methods.head.parameters import SENSITIVITY
+from alidade.pipelines.methods.head.recording import HeadData
+from alidade.pipelines.methods.head.topics import HEAD_IMU
+from alidade.pipelines.settings import Config
 
 
 def findings(data: HeadData, config: Config, _: Estimate) -> Findings:

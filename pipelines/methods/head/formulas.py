@@ -7,10 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from factors import so3
-from factors.gyro import symmetric
-from pipelines.methods.formula import Formula, gyro_rate, numbers_of, symmetric_text, vector_text
-from pipelines.methods.head.parameters import CLOCK_SKEW, PLATFORM_BIAS, PLATFORM_SCALE, SCALE, SENSITIVITY, TEMPERATURE
+from alidade.factors import so3
+from alidade.factors.gyro import symmetric
+from alidade.pipelines.methods.formula import Formula, gyro_rate, numbers_of, symmetric_text, vector_text
+from alidade.pipelines.methods.head.parameters import (
+    CLOCK_SKEW,
+    PLATFORM_BIAS,
+    PLATFORM_SCALE,
+    SCALE,
+    SENSITIVITY,
+    TEMPERATURE,
+)
 
 _S, _PLATFORM_S = (tuple(name for each in scale for name in each.names) for scale in (SCALE, PLATFORM_SCALE))
 _DRIVERS = SENSITIVITY.names, TEMPERATURE.names

@@ -14,29 +14,29 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from factors.attitude import VisionAttitudeFactor
-from factors.chi_square import gate
-from factors.loss import TruncatedLoss
-from factors.preintegration import GyroPath
-from pipelines.errors import InputError
-from pipelines.graph.assumptions import acting
-from pipelines.graph.clock import Clock, Keyframes
-from pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk, shared_keyframes
-from pipelines.graph.motion import Motion
-from pipelines.graph.noise import Level
-from pipelines.graph.priors import rotation_prior, vector_prior
-from pipelines.graph.problem import Array, Attitudes, Factor, Problem, Step
-from pipelines.judgement.pictures import swaying
-from pipelines.methods import temperature
-from pipelines.methods.head.guess import guess, guess_picture_clock
-from pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, SENSITIVITY, TEMPERATURE, HeadParameters
-from pipelines.methods.head.recording import HeadData
-from pipelines.methods.noise import sampled, stated, typical, walking
-from pipelines.settings import DEFAULT_NOISE, Config, first_given
+from alidade.factors import so3
+from alidade.factors.attitude import VisionAttitudeFactor
+from alidade.factors.chi_square import gate
+from alidade.factors.loss import TruncatedLoss
+from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.assumptions import acting
+from alidade.pipelines.graph.clock import Clock, Keyframes
+from alidade.pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk, shared_keyframes
+from alidade.pipelines.graph.motion import Motion
+from alidade.pipelines.graph.noise import Level
+from alidade.pipelines.graph.priors import rotation_prior, vector_prior
+from alidade.pipelines.graph.problem import Array, Attitudes, Factor, Problem, Step
+from alidade.pipelines.judgement.pictures import swaying
+from alidade.pipelines.methods import temperature
+from alidade.pipelines.methods.head.guess import guess, guess_picture_clock
+from alidade.pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, SENSITIVITY, TEMPERATURE, HeadParameters
+from alidade.pipelines.methods.head.recording import HeadData
+from alidade.pipelines.methods.noise import sampled, stated, typical, walking
+from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 # Pictures share a keyframe within this time, s, and keyframes are never farther apart than this, s: increments are
-# corrected for the gyro's errors to first order only, see factors.gyro.
+# corrected for the gyro's errors to first order only, see alidade.factors.gyro.
 _SHARED, _LONGEST_INCREMENT = 0.1, 0.25
 # Pictures share a keyframe as far as what gyro noise adds on the way is at most this part of vision's.
 _NEGLIGIBLE = 0.1

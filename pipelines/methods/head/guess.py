@@ -8,11 +8,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from factors.preintegration import GyroPath
-from pipelines.graph.clock import Clock, Miss, first_span, guess_clock, turns_near
-from pipelines.graph.priors import prior_sigmas
-from pipelines.graph.problem import Array, Parameter
+from alidade.factors import so3
+from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.graph.clock import Clock, Miss, first_span, guess_clock, turns_near
+from alidade.pipelines.graph.priors import prior_sigmas
+from alidade.pipelines.graph.problem import Array, Parameter
 
 # Rates for the first guess are taken over this time, s: long against vision noise, short against turns.
 _GUESS_SPAN = 0.3

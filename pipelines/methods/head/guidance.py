@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipelines.judgement.checklist import ChecklistItem, swayed, turned
-from pipelines.methods.head.recording import HeadData
-from pipelines.settings import Config
+from alidade.pipelines.judgement.checklist import ChecklistItem, swayed, turned
+from alidade.pipelines.methods.head.recording import HeadData
+from alidade.pipelines.settings import Config
 
 # Turns of a head and of the platform it sits in count from these angles on, rad.
 _NOD, _MANOEUVRE = np.deg2rad(10.0), np.deg2rad(5.0)

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from factors import so3
-from pipelines.judgement.hypotheses import AXES, Fault, Hypotheses
-from pipelines.methods.head.recording import HeadData
-from pipelines.settings import Config
+from alidade.factors import so3
+from alidade.pipelines.judgement.hypotheses import AXES, Fault, Hypotheses
+from alidade.pipelines.methods.head.recording import HeadData
+from alidade.pipelines.settings import Config
 
 # A platform's rate, taken for a bias, wanders by this much, rad/s/sqrt(s): an aircraft's manoeuvres.
 _MANOEUVRES = 0.3

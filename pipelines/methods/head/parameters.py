@@ -8,9 +8,9 @@ from itertools import chain
 
 import gtsam
 
-from factors.earth import EARTH_RATE
-from pipelines.errors import InputError
-from pipelines.graph.assumptions import (
+from alidade.factors.earth import EARTH_RATE
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.assumptions import (
     Assumption,
     gyro_errors,
     parameter,
@@ -19,9 +19,9 @@ from pipelines.graph.assumptions import (
     sensitivity_assumption,
     temperature_assumption,
 )
-from pipelines.graph.problem import Parameter, Quantity, rotation_vector_coordinates
-from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
-from pipelines.settings import Config, check_names
+from alidade.pipelines.graph.problem import Parameter, Quantity, rotation_vector_coordinates
+from alidade.pipelines.graph.walking_bias import FIRST as FIRST_BIAS
+from alidade.pipelines.settings import Config, check_names
 
 BIAS, HELMET, CAMERA, OFFSET = "gyro_bias", "helmet_mount", "camera_mount", "time_offset"
 
@@ -44,7 +44,7 @@ class HeadParameters:
         bias: the helmet gyro's (3), rad/s, its first node.
         helmet, camera: vRh, cRb.
         picture: time offset alone, or with clock skew and vision scale.
-        gyro: S of the helmet's gyro and what its drivers do, see factors.gyro; None for a perfect one.
+        gyro: S of the helmet's gyro and what its drivers do, see alidade.factors.gyro; None for a perfect one.
         platform: bias and S of the platform's gyro (9); None for a perfect one, or none.
     """
 

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from factors import so3
-from pipelines.recording import series
-from pipelines.settings import Board, Tag
-from pipelines.simulation.rendering import Renderer, encode, expose, tag_quad
-from pipelines.vision.camera import Camera
+from alidade.factors import so3
+from alidade.pipelines.recording import series
+from alidade.pipelines.settings import Board, Tag
+from alidade.pipelines.simulation.rendering import Renderer, encode, expose, tag_quad
+from alidade.pipelines.vision.camera import Camera
 
 Array = NDArray[np.float64]
 Positive = Annotated[float, Field(gt=0.0)]

@@ -14,11 +14,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors import so3
-from pipelines.errors import InputError
-from pipelines.graph.problem import Attitudes, ChiSquare, Estimate, History, Problem, Residuals
-from pipelines.methods.head.recording import HeadData
-from pipelines.settings import DEFAULT_NOISE, Config, first_given
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Attitudes, ChiSquare, Estimate, History, Problem, Residuals
+from alidade.pipelines.methods.head.recording import HeadData
+from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 Array = NDArray[np.float64]
 

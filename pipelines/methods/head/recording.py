@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
-from pipelines.methods import temperature
-from pipelines.methods.head import parameters
-from pipelines.methods.head.topics import HEAD_IMU, PLATFORM_IMU, TRUTH_ATTITUDE, VISION_ATTITUDE, HeadConfig
-from pipelines.recording import series
-from pipelines.recording.checks import (
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import temperature
+from alidade.pipelines.methods.head import parameters
+from alidade.pipelines.methods.head.topics import HEAD_IMU, PLATFORM_IMU, TRUTH_ATTITUDE, VISION_ATTITUDE, HeadConfig
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.checks import (
     believed,
     check_overlap,
     clean,
@@ -22,14 +22,14 @@ from pipelines.recording.checks import (
     nanoseconds,
     unit_quaternions,
 )
-from pipelines.recording.gyro import read_gyro, read_imu
-from pipelines.recording.reading import Recording
-from pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
-from pipelines.recording.temperature import Temperature
-from pipelines.recording.topics import CAMERA_INFO, IMAGE, wanted
-from pipelines.recording.writing import attached, write_session
-from pipelines.settings import Config
-from pipelines.vision.recorded import camera_of
+from alidade.pipelines.recording.gyro import read_gyro, read_imu
+from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
+from alidade.pipelines.recording.temperature import Temperature
+from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, wanted
+from alidade.pipelines.recording.writing import attached, write_session
+from alidade.pipelines.settings import Config
+from alidade.pipelines.vision.recorded import camera_of
 
 Array = NDArray[np.float64]
 
@@ -73,8 +73,8 @@ class HeadData:
 def read_head(recording: Recording, config: Config) -> HeadData:
     """Read and check a head session; without vision attitudes they are taken from the pictures of the tag board.
 
-    Raises InputError when a topic is missing or unusable, see pipelines.recording.checks, and when the topics have no
-    time in common.
+    Raises InputError when a topic is missing or unusable, see alidade.pipelines.recording.checks, and when the topics
+    have no time in common.
     """
     dropped: dict[str, int] = {}
     epoch = recording.epoch_ns
@@ -165,8 +165,8 @@ def _from_pictures(
     recording: Recording, config: Config, epoch_ns: int, dropped: dict[str, int]
 ) -> tuple[Array, Array, Array]:
     """Attitudes of the helmet's tag board, seen in the pictures."""
-    from pipelines.vision.board import board_attitudes
-    from pipelines.vision.pose import TagBody
+    from alidade.pipelines.vision.board import board_attitudes
+    from alidade.pipelines.vision.pose import TagBody
 
     topic = config.topic(IMAGE)
     on_helmet = config.section(HeadConfig).board

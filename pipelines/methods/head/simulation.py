@@ -16,19 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from factors import so3
-from factors.earth import earth_rate, gravity
-from pipelines.errors import InputError
-from pipelines.methods.head.parameters import ASSUMPTIONS
-from pipelines.methods.head.pictures import HeadPictures, draw
-from pipelines.methods.head.recording import HeadData
-from pipelines.recording import series
-from pipelines.recording.checks import nanoseconds
-from pipelines.settings import SensorSheets
-from pipelines.simulation.motion import EulerMotion, Swing, sample_times
-from pipelines.simulation.sensors import read_by, true_values
-from pipelines.simulation.simulated import Simulated
-from pipelines.simulation.temperature import Warming, drift, known, measured
+from alidade.factors import so3
+from alidade.factors.earth import earth_rate, gravity
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.head.parameters import ASSUMPTIONS
+from alidade.pipelines.methods.head.pictures import HeadPictures, draw
+from alidade.pipelines.methods.head.recording import HeadData
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.checks import nanoseconds
+from alidade.pipelines.settings import SensorSheets
+from alidade.pipelines.simulation.motion import EulerMotion, Swing, sample_times
+from alidade.pipelines.simulation.sensors import read_by, true_values
+from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.temperature import Warming, drift, known, measured
 
 Array = NDArray[np.float64]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from pipelines.recording import messages
-from pipelines.recording.topics import CAMERA_INFO, IMAGE, TEMPERATURE, Need, Setting, Topic
-from pipelines.settings import Board, MethodSection
+from alidade.pipelines.recording import messages
+from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, TEMPERATURE, Need, Setting, Topic
+from alidade.pipelines.settings import Board, MethodSection
 
 HEAD_IMU = Topic("head_imu", "/head/imu", messages.RATES)
 PLATFORM_IMU = Topic("platform_imu", "/platform/imu", messages.RATES)

@@ -15,13 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from factors.preintegration import GyroPath
-from pipelines.errors import InputError
-from pipelines.graph.problem import Array
-from pipelines.judgement.validation import Validation
-from pipelines.methods.head.recording import HeadData
-from pipelines.settings import Config
+from alidade.factors import so3
+from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.judgement.validation import Validation
+from alidade.pipelines.methods.head.recording import HeadData
+from alidade.pipelines.settings import Config
 
 # How long the gyros carry the attitude, s, and how far from that frames may lie.
 _SPAN, _SLACK = 1.0, 0.25

@@ -6,22 +6,22 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from pipelines.methods import Method, Scenario
+from alidade.pipelines.methods import Method, Scenario
 
 if TYPE_CHECKING:
-    from pipelines.graph.problem import Estimate, Problem
-    from pipelines.judgement.checklist import ChecklistItem
-    from pipelines.judgement.hypotheses import Hypotheses
-    from pipelines.judgement.validation import Validation
-    from pipelines.methods.formula import Formula
-    from pipelines.methods.indexer.recording import IndexerData
-    from pipelines.methods.indexer.simulation import IndexerScenario
-    from pipelines.methods.indexer.topics import IndexerConfig
-    from pipelines.recording.reading import Recording
-    from pipelines.recording.topics import Need, Topic
-    from pipelines.reports.result import Calibration, Plot
-    from pipelines.settings import Config
-    from pipelines.simulation.simulated import Simulated
+    from alidade.pipelines.graph.problem import Estimate, Problem
+    from alidade.pipelines.judgement.checklist import ChecklistItem
+    from alidade.pipelines.judgement.hypotheses import Hypotheses
+    from alidade.pipelines.judgement.validation import Validation
+    from alidade.pipelines.methods.formula import Formula
+    from alidade.pipelines.methods.indexer.recording import IndexerData
+    from alidade.pipelines.methods.indexer.simulation import IndexerScenario
+    from alidade.pipelines.methods.indexer.topics import IndexerConfig
+    from alidade.pipelines.recording.reading import Recording
+    from alidade.pipelines.recording.topics import Need, Topic
+    from alidade.pipelines.reports.result import Calibration, Plot
+    from alidade.pipelines.settings import Config
+    from alidade.pipelines.simulation.simulated import Simulated
 
 
 class Indexer(Method):
@@ -42,86 +42,86 @@ class Indexer(Method):
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        from pipelines.methods.indexer.topics import TOPICS
+        from alidade.pipelines.methods.indexer.topics import TOPICS
 
         return TOPICS
 
     @property
     def needs(self) -> tuple[Need, ...]:
-        from pipelines.methods.indexer.topics import NEEDS
+        from alidade.pipelines.methods.indexer.topics import NEEDS
 
         return NEEDS
 
     @property
     def section(self) -> type[IndexerConfig]:
-        from pipelines.methods.indexer.topics import IndexerConfig
+        from alidade.pipelines.methods.indexer.topics import IndexerConfig
 
         return IndexerConfig
 
     @property
     def data(self) -> type[IndexerData]:
-        from pipelines.methods.indexer.recording import IndexerData
+        from alidade.pipelines.methods.indexer.recording import IndexerData
 
         return IndexerData
 
     def read(self, recording: Recording, config: Config) -> IndexerData:
-        from pipelines.methods.indexer.recording import read_indexer
+        from alidade.pipelines.methods.indexer.recording import read_indexer
 
         return read_indexer(recording, config)
 
     def problem(self, data: IndexerData, config: Config) -> Problem:
-        from pipelines.methods.indexer.graph import problem
+        from alidade.pipelines.methods.indexer.graph import problem
 
         return problem(data, config)
 
     def published(self, data: IndexerData, config: Config, problem: Problem) -> Estimate:
-        from pipelines.methods.indexer.published import published_estimate
+        from alidade.pipelines.methods.indexer.published import published_estimate
 
         return published_estimate(data, config, problem)
 
     @property
     def scenario(self) -> type[IndexerScenario]:
-        from pipelines.methods.indexer.simulation import IndexerScenario
+        from alidade.pipelines.methods.indexer.simulation import IndexerScenario
 
         return IndexerScenario
 
     def simulate(self, scenario: IndexerScenario, seed: int, images: bool = False) -> Simulated:
-        from pipelines.methods.indexer.simulation import simulated
+        from alidade.pipelines.methods.indexer.simulation import simulated
 
         return simulated(scenario, seed, images)
 
     def write(self, path: Path, simulated: Simulated) -> None:
-        from pipelines.methods.indexer.recording import write_indexer
+        from alidade.pipelines.methods.indexer.recording import write_indexer
 
         write_indexer(path, simulated.data, simulated.truth, simulated.config)
 
     def candidates(self, scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
-        from pipelines.methods.indexer.candidates import candidates
+        from alidade.pipelines.methods.indexer.candidates import candidates
 
         return candidates(scenario)
 
     def hypotheses(self) -> Hypotheses:
-        from pipelines.methods.indexer.hypotheses import HYPOTHESES
+        from alidade.pipelines.methods.indexer.hypotheses import HYPOTHESES
 
         return HYPOTHESES
 
     def validate(self, data: IndexerData, config: Config, values: Mapping[str, float]) -> Sequence[Validation]:
-        from pipelines.methods.indexer.validation import validate
+        from alidade.pipelines.methods.indexer.validation import validate
 
         return validate(data, config, values)
 
     def checklist(self, data: IndexerData, config: Config) -> Sequence[ChecklistItem]:
-        from pipelines.methods.indexer.guidance import checklist
+        from alidade.pipelines.methods.indexer.guidance import checklist
 
         return checklist(data, config)
 
     def formulas(self, parameters: Collection[str], config: Config) -> Sequence[Formula]:  # noqa: ARG002
-        from pipelines.methods.indexer.formulas import formulas
+        from alidade.pipelines.methods.indexer.formulas import formulas
 
         return formulas(parameters)
 
     def figures(self, data: IndexerData, calibration: Calibration) -> Sequence[Plot]:
-        from pipelines.methods.indexer.figures import indexer_plots
+        from alidade.pipelines.methods.indexer.figures import indexer_plots
 
         return indexer_plots(data, calibration)
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from factors.indexer import base_from_platform, mounting
-from pipelines.graph.problem import Array
-from pipelines.methods.indexer.recording import IndexerData
-from pipelines.methods.indexer.runs import AxisMotion
+from alidade.factors import so3
+from alidade.factors.indexer import base_from_platform, mounting
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.methods.indexer.recording import IndexerData
+from alidade.pipelines.methods.indexer.runs import AxisMotion
 
 # Of the trajectory, Hz.
 _ATTITUDE_RATE = 10.0
@@ -26,7 +26,7 @@ def frames(data: IndexerData, motion: AxisMotion) -> NDArray[np.intp]:
 def carrier(
     data: IndexerData, motion: AxisMotion, rows: NDArray[np.intp], theta: Array, epsilon: float, encoder: Array
 ) -> Array:
-    """nRb = nRm mRt tRb at gyro samples; the encoders' errors (5,) as factors.indexer has them."""
+    """nRb = nRm mRt tRb at gyro samples; the encoders' errors (5,) as alidade.factors.indexer has them."""
     assert data.attitude is not None
     at = data.gyro_t[rows] - encoder[4]
     outer, inner = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from pipelines.methods import Scenario
+from alidade.pipelines.methods import Scenario
 
 
 def candidates(scenario: Scenario) -> Iterator[tuple[str, Scenario]]:

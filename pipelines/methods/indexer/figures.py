@@ -6,19 +6,19 @@ from itertools import cycle
 
 import numpy as np
 
-from factors import so3
-from factors.indexer import IndexerAverageFactor, mounting
-from pipelines.errors import InputError
-from pipelines.graph.problem import Array
-from pipelines.methods.indexer.groups import Group, groups_of
-from pipelines.methods.indexer.parameters import BIAS, THETA
-from pipelines.methods.indexer.published import half_differences
-from pipelines.methods.indexer.recording import IndexerData
-from pipelines.methods.indexer.runs import axis_motion
-from pipelines.methods.indexer.validation import misfit, validate
-from pipelines.reports.figure import COLORS, Figure
-from pipelines.reports.result import Calibration, Plot
-from pipelines.settings import Config
+from alidade.factors import so3
+from alidade.factors.indexer import IndexerAverageFactor, mounting
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.methods.indexer.groups import Group, groups_of
+from alidade.pipelines.methods.indexer.parameters import BIAS, THETA
+from alidade.pipelines.methods.indexer.published import half_differences
+from alidade.pipelines.methods.indexer.recording import IndexerData
+from alidade.pipelines.methods.indexer.runs import axis_motion
+from alidade.pipelines.methods.indexer.validation import misfit, validate
+from alidade.pipelines.reports.figure import COLORS, Figure
+from alidade.pipelines.reports.result import Calibration, Plot
+from alidade.pipelines.settings import Config
 
 _ARCSEC = np.rad2deg(1.0) * 3600.0
 _AXES = "xyz"

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from factors import so3
-from pipelines.methods.formula import Formula, axis_angles, gyro_rate, passive
-from pipelines.methods.indexer.parameters import DELAY, ERRORS, ONCE_PER_TURN, TEMPERATURE
+from alidade.factors import so3
+from alidade.pipelines.methods.formula import Formula, axis_angles, gyro_rate, passive
+from alidade.pipelines.methods.indexer.parameters import DELAY, ERRORS, ONCE_PER_TURN, TEMPERATURE
 
 _AXES = ("outer", "inner")
 

@@ -19,20 +19,20 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.earth import EARTH_RATE
-from factors.indexer import ENCODER_ERRORS, IndexerAverageFactor, Option
-from pipelines.errors import InputError
-from pipelines.graph.motion import Motion
-from pipelines.graph.noise import Level, Noise
-from pipelines.graph.priors import prior_sigmas, vector_prior
-from pipelines.graph.problem import Array, Attitudes, Factor, Parameter, Problem, Step
-from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
-from pipelines.graph.walking_bias import WalkingBias
-from pipelines.methods import temperature
-from pipelines.methods.indexer.attitude import carrier, frames
-from pipelines.methods.indexer.groups import KINDS, Group, groups_of
-from pipelines.methods.indexer.guess import agreeing, guess
-from pipelines.methods.indexer.parameters import (
+from alidade.factors.earth import EARTH_RATE
+from alidade.factors.indexer import ENCODER_ERRORS, IndexerAverageFactor, Option
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.motion import Motion
+from alidade.pipelines.graph.noise import Level, Noise
+from alidade.pipelines.graph.priors import prior_sigmas, vector_prior
+from alidade.pipelines.graph.problem import Array, Attitudes, Factor, Parameter, Problem, Step
+from alidade.pipelines.graph.walking_bias import FIRST as FIRST_BIAS
+from alidade.pipelines.graph.walking_bias import WalkingBias
+from alidade.pipelines.methods import temperature
+from alidade.pipelines.methods.indexer.attitude import carrier, frames
+from alidade.pipelines.methods.indexer.groups import KINDS, Group, groups_of
+from alidade.pipelines.methods.indexer.guess import agreeing, guess
+from alidade.pipelines.methods.indexer.parameters import (
     EPSILON,
     KEYS,
     SCALE,
@@ -41,12 +41,12 @@ from pipelines.methods.indexer.parameters import (
     indexer_parameters,
     theta_coordinates,
 )
-from pipelines.methods.indexer.picture import turning
-from pipelines.methods.indexer.recording import IndexerData
-from pipelines.methods.indexer.runs import AxisMotion, axis_motion, cut_turns, encoder_scatter
-from pipelines.methods.noise import sampled, stated, walking
-from pipelines.recording.topics import FIX
-from pipelines.settings import Config
+from alidade.pipelines.methods.indexer.picture import turning
+from alidade.pipelines.methods.indexer.recording import IndexerData
+from alidade.pipelines.methods.indexer.runs import AxisMotion, axis_motion, cut_turns, encoder_scatter
+from alidade.pipelines.methods.noise import sampled, stated, walking
+from alidade.pipelines.recording.topics import FIX
+from alidade.pipelines.settings import Config
 
 # So many groups stay in a smoother whatever its window, s: a schedule of four positions, to be linearised anew when its
 # later positions move the angles that its earlier ones left open.

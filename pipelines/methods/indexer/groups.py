@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factors import so3
-from factors.earth import earth_rate
-from factors.indexer import AxisPath, PlatformRates, gyro_edges, gyro_means
-from pipelines.graph.problem import Array
-from pipelines.methods import temperature
-from pipelines.methods.indexer.recording import IndexerData
-from pipelines.methods.indexer.runs import AxisMotion, Run
-from pipelines.methods.indexer.topics import IndexerConfig
-from pipelines.settings import Config
+from alidade.factors import so3
+from alidade.factors.earth import earth_rate
+from alidade.factors.indexer import AxisPath, PlatformRates, gyro_edges, gyro_means
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.methods import temperature
+from alidade.pipelines.methods.indexer.recording import IndexerData
+from alidade.pipelines.methods.indexer.runs import AxisMotion, Run
+from alidade.pipelines.methods.indexer.topics import IndexerConfig
+from alidade.pipelines.settings import Config
 
 # Windows end where the driven axes have turned by this much, rad: short enough to see the earth's rate come and go.
 _WINDOW_ANGLE = np.pi / 4

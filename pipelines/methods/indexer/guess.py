@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from factors import so3
-from factors.indexer import mounting_angles
-from pipelines.errors import InputError
-from pipelines.graph.problem import Array, Parameter
-from pipelines.methods.indexer.groups import Group
-from pipelines.methods.indexer.parameters import SCALE, THETA
+from alidade.factors import so3
+from alidade.factors.indexer import mounting_angles
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Array, Parameter
+from alidade.pipelines.methods.indexer.groups import Group
+from alidade.pipelines.methods.indexer.parameters import SCALE, THETA
 
 # A gyro that departs from the encoders by more than this share of the rate is not the gyro of this axis.
 _DISAGREEMENT = 0.01

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipelines.graph.motion import Motion
-from pipelines.judgement.checklist import ChecklistItem
-from pipelines.methods.indexer.picture import Axis, turning
-from pipelines.methods.indexer.recording import IndexerData
-from pipelines.methods.indexer.runs import axis_motion
-from pipelines.settings import Config
+from alidade.pipelines.graph.motion import Motion
+from alidade.pipelines.judgement.checklist import ChecklistItem
+from alidade.pipelines.methods.indexer.picture import Axis, turning
+from alidade.pipelines.methods.indexer.recording import IndexerData
+from alidade.pipelines.methods.indexer.runs import axis_motion
+from alidade.pipelines.settings import Config
 
 _AXES: tuple[tuple[Axis, Axis], ...] = (("outer", "inner"), ("inner", "outer"))
 # Whole turns each way that are wanted in a position.

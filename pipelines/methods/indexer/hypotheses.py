@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from pipelines.judgement.hypotheses import AXES, ExactInput, Hypotheses
-from pipelines.methods.indexer.recording import IndexerData
-from pipelines.settings import Config
+from alidade.pipelines.judgement.hypotheses import AXES, ExactInput, Hypotheses
+from alidade.pipelines.methods.indexer.recording import IndexerData
+from alidade.pipelines.settings import Config
 
 
 def _latitude(data: IndexerData, config: Config, change: float) -> tuple[IndexerData, Config] | None:

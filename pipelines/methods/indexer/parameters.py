@@ -9,7 +9,7 @@ from itertools import chain
 import gtsam
 import numpy as np
 
-from pipelines.graph.assumptions import (
+from alidade.pipelines.graph.assumptions import (
     encoder_assumptions,
     parameter,
     quantities,
@@ -17,10 +17,10 @@ from pipelines.graph.assumptions import (
     stamped,
     temperature_assumption,
 )
-from pipelines.graph.problem import Array, Parameter, Quantity
-from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
-from pipelines.methods.indexer.topics import JOINTS
-from pipelines.settings import Config, check_names
+from alidade.pipelines.graph.problem import Array, Parameter, Quantity
+from alidade.pipelines.graph.walking_bias import FIRST as FIRST_BIAS
+from alidade.pipelines.methods.indexer.topics import JOINTS
+from alidade.pipelines.settings import Config, check_names
 
 THETA = ("theta_x", "theta_y", "theta_z")
 BIAS = ("gyro_bias_x", "gyro_bias_y", "gyro_bias_z")

@@ -18,12 +18,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from factors import so3
-from pipelines.errors import InputError
-from pipelines.graph.problem import Estimate, Problem
-from pipelines.methods.indexer.recording import IndexerData
-from pipelines.methods.indexer.runs import AxisMotion, Run, axis_motion
-from pipelines.settings import DEFAULT_NOISE, Config, first_given
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Estimate, Problem
+from alidade.pipelines.methods.indexer.recording import IndexerData
+from alidade.pipelines.methods.indexer.runs import AxisMotion, Run, axis_motion
+from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 Array = NDArray[np.float64]
 NAMES = ("theta_x", "theta_y", "theta_z")

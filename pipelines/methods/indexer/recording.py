@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
-from pipelines.methods import temperature
-from pipelines.methods.indexer import parameters
-from pipelines.methods.indexer.topics import INDEXER, JOINTS
-from pipelines.recording import series
-from pipelines.recording.checks import (
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import temperature
+from alidade.pipelines.methods.indexer import parameters
+from alidade.pipelines.methods.indexer.topics import INDEXER, JOINTS
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.checks import (
     LEAST_GYRO,
     check_overlap,
     clean,
@@ -24,13 +24,13 @@ from pipelines.recording.checks import (
     nanoseconds,
     unit_quaternions,
 )
-from pipelines.recording.gyro import usable
-from pipelines.recording.reading import Recording
-from pipelines.recording.shapes import Numbers, Quaternions, Vectors
-from pipelines.recording.temperature import Temperature
-from pipelines.recording.topics import FIX, IMU, wanted
-from pipelines.recording.writing import attached, write_session
-from pipelines.settings import Config
+from alidade.pipelines.recording.gyro import usable
+from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.shapes import Numbers, Quaternions, Vectors
+from alidade.pipelines.recording.temperature import Temperature
+from alidade.pipelines.recording.topics import FIX, IMU, wanted
+from alidade.pipelines.recording.writing import attached, write_session
+from alidade.pipelines.settings import Config
 
 Array = NDArray[np.float64]
 
@@ -63,8 +63,8 @@ class IndexerData:
 def read_indexer(recording: Recording, config: Config) -> IndexerData:
     """Read and check an indexer session.
 
-    Raises InputError when a topic is missing or unusable, see pipelines.recording.checks, and when gyro and encoders
-    have no time in common. A missing latitude is left to the method, which knows whether it is needed.
+    Raises InputError when a topic is missing or unusable, see alidade.pipelines.recording.checks, and when gyro and
+    encoders have no time in common. A missing latitude is left to the method, which knows whether it is needed.
     """
     dropped: dict[str, int] = {}
     epoch = recording.epoch_ns

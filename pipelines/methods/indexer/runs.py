@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
-from pipelines.methods.indexer.recording import IndexerData
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.indexer.recording import IndexerData
 
 Array = NDArray[np.float64]
 Axis = Literal["outer", "inner", "both", "none"]

@@ -16,17 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from factors import so3
-from factors.earth import earth_rate
-from pipelines.errors import InputError
-from pipelines.methods.indexer.parameters import ASSUMPTIONS
-from pipelines.methods.indexer.recording import IndexerData
-from pipelines.methods.indexer.topics import JOINTS
-from pipelines.settings import SensorSheets
-from pipelines.simulation.motion import sample_times
-from pipelines.simulation.sensors import read_by, true_values
-from pipelines.simulation.simulated import Simulated
-from pipelines.simulation.temperature import Warming, drift, known, measured
+from alidade.factors import so3
+from alidade.factors.earth import earth_rate
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.indexer.parameters import ASSUMPTIONS
+from alidade.pipelines.methods.indexer.recording import IndexerData
+from alidade.pipelines.methods.indexer.topics import JOINTS
+from alidade.pipelines.settings import SensorSheets
+from alidade.pipelines.simulation.motion import sample_times
+from alidade.pipelines.simulation.sensors import read_by, true_values
+from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.temperature import Warming, drift, known, measured
 
 Array = NDArray[np.float64]
 

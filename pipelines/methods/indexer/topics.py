@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from pipelines.recording import messages
-from pipelines.recording.topics import FIX, IMU, TEMPERATURE, Need, Setting, Topic
-from pipelines.settings import MethodSection, Quaternion
+from alidade.pipelines.recording import messages
+from alidade.pipelines.recording.topics import FIX, IMU, TEMPERATURE, Need, Setting, Topic
+from alidade.pipelines.settings import MethodSection, Quaternion
 
 INDEXER = Topic("indexer", "/indexer/joint_states", (messages.JOINT_STATE,))
 

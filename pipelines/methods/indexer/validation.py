@@ -7,19 +7,19 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from factors.gyro import symmetric
-from factors.indexer import mounting
-from pipelines.graph.problem import Array
-from pipelines.judgement.validation import Validation
-from pipelines.methods.indexer.attitude import carrier
-from pipelines.methods.indexer.groups import Group, groups_of
-from pipelines.methods.indexer.parameters import BIAS, ENCODER, EPSILON, ERRORS, TEMPERATURE, THETA, several
-from pipelines.methods.indexer.recording import IndexerData
-from pipelines.methods.indexer.runs import AxisMotion, axis_motion
-from pipelines.methods.indexer.topics import IndexerConfig
-from pipelines.methods.temperature import FIRST
-from pipelines.settings import Config
+from alidade.factors import so3
+from alidade.factors.gyro import symmetric
+from alidade.factors.indexer import mounting
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.judgement.validation import Validation
+from alidade.pipelines.methods.indexer.attitude import carrier
+from alidade.pipelines.methods.indexer.groups import Group, groups_of
+from alidade.pipelines.methods.indexer.parameters import BIAS, ENCODER, EPSILON, ERRORS, TEMPERATURE, THETA, several
+from alidade.pipelines.methods.indexer.recording import IndexerData
+from alidade.pipelines.methods.indexer.runs import AxisMotion, axis_motion
+from alidade.pipelines.methods.indexer.topics import IndexerConfig
+from alidade.pipelines.methods.temperature import FIRST
+from alidade.pipelines.settings import Config
 
 
 def validate(data: IndexerData, config: Config, values: Mapping[str, float]) -> list[Validation]:

@@ -6,21 +6,21 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from pipelines.methods import Method, Scenario
+from alidade.pipelines.methods import Method, Scenario
 
 if TYPE_CHECKING:
-    from pipelines.graph.problem import Estimate, Findings, Problem
-    from pipelines.judgement.checklist import ChecklistItem
-    from pipelines.judgement.hypotheses import Hypotheses
-    from pipelines.judgement.validation import Validation
-    from pipelines.methods.formula import Formula
-    from pipelines.methods.los.recording import LosData
-    from pipelines.methods.los.simulation import LosScenario
-    from pipelines.recording.reading import Recording
-    from pipelines.recording.topics import Need, Topic
-    from pipelines.reports.result import Calibration, Plot
-    from pipelines.settings import Config
-    from pipelines.simulation.simulated import Simulated
+    from alidade.pipelines.graph.problem import Estimate, Findings, Problem
+    from alidade.pipelines.judgement.checklist import ChecklistItem
+    from alidade.pipelines.judgement.hypotheses import Hypotheses
+    from alidade.pipelines.judgement.validation import Validation
+    from alidade.pipelines.methods.formula import Formula
+    from alidade.pipelines.methods.los.recording import LosData
+    from alidade.pipelines.methods.los.simulation import LosScenario
+    from alidade.pipelines.recording.reading import Recording
+    from alidade.pipelines.recording.topics import Need, Topic
+    from alidade.pipelines.reports.result import Calibration, Plot
+    from alidade.pipelines.settings import Config
+    from alidade.pipelines.simulation.simulated import Simulated
 
 
 class Los(Method):
@@ -56,45 +56,45 @@ class Los(Method):
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        from pipelines.methods.los.topics import TOPICS
+        from alidade.pipelines.methods.los.topics import TOPICS
 
         return TOPICS
 
     @property
     def needs(self) -> tuple[Need, ...]:
-        from pipelines.methods.los.topics import NEEDS
+        from alidade.pipelines.methods.los.topics import NEEDS
 
         return NEEDS
 
     @property
     def data(self) -> type[LosData]:
-        from pipelines.methods.los.recording import LosData
+        from alidade.pipelines.methods.los.recording import LosData
 
         return LosData
 
     def read(self, recording: Recording, config: Config) -> LosData:
-        from pipelines.methods.los.recording import read_los
+        from alidade.pipelines.methods.los.recording import read_los
 
         return read_los(recording, config)
 
     def problem(self, data: LosData, config: Config) -> Problem:
-        from pipelines.methods.los.graph import problem
+        from alidade.pipelines.methods.los.graph import problem
 
         return problem(data, config)
 
     def published(self, data: LosData, config: Config, problem: Problem) -> Estimate:
-        from pipelines.methods.los.published import published_estimate
+        from alidade.pipelines.methods.los.published import published_estimate
 
         return published_estimate(data, config, problem)
 
     @property
     def scenario(self) -> type[LosScenario]:
-        from pipelines.methods.los.simulation import LosScenario
+        from alidade.pipelines.methods.los.simulation import LosScenario
 
         return LosScenario
 
     def simulate(self, scenario: LosScenario, seed: int, images: bool = False) -> Simulated:
-        from pipelines.methods.los.simulation import simulated
+        from alidade.pipelines.methods.los.simulation import simulated
 
         return simulated(scenario, seed, images)
 
@@ -102,42 +102,42 @@ class Los(Method):
         return "los_images" if images else "los_nominal"
 
     def write(self, path: Path, simulated: Simulated) -> None:
-        from pipelines.methods.los.recording import write_los
+        from alidade.pipelines.methods.los.recording import write_los
 
         write_los(path, simulated.data, simulated.truth, simulated.config, simulated.pictures)
 
     def candidates(self, scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
-        from pipelines.methods.los.candidates import candidates
+        from alidade.pipelines.methods.los.candidates import candidates
 
         return candidates(scenario)
 
     def hypotheses(self) -> Hypotheses:
-        from pipelines.methods.los.hypotheses import HYPOTHESES
+        from alidade.pipelines.methods.los.hypotheses import HYPOTHESES
 
         return HYPOTHESES
 
     def validate(self, data: LosData, config: Config, values: Mapping[str, float]) -> Sequence[Validation]:
-        from pipelines.methods.los.validation import validate
+        from alidade.pipelines.methods.los.validation import validate
 
         return validate(data, config, values)
 
     def checklist(self, data: LosData, config: Config) -> Sequence[ChecklistItem]:
-        from pipelines.methods.los.guidance import checklist
+        from alidade.pipelines.methods.los.guidance import checklist
 
         return checklist(data, config)
 
     def formulas(self, parameters: Collection[str], config: Config) -> Sequence[Formula]:  # noqa: ARG002
-        from pipelines.methods.los.formulas import formulas
+        from alidade.pipelines.methods.los.formulas import formulas
 
         return formulas(parameters)
 
     def findings(self, data: LosData, config: Config, estimate: Estimate) -> Findings:
-        from pipelines.methods.los.findings import findings
+        from alidade.pipelines.methods.los.findings import findings
 
         return findings(data, config, estimate)
 
     def figures(self, data: LosData, calibration: Calibration) -> Sequence[Plot]:
-        from pipelines.methods.los.figures import los_plots
+        from alidade.pipelines.methods.los.figures import los_plots
 
         return los_plots(data, calibration)
 

@@ -10,13 +10,13 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from factors.gimbal import GimbalPath
-from pipelines.graph.problem import Array
-from pipelines.methods.formula import gyro_rate
-from pipelines.methods.los.formulas import DRIVERS, S
-from pipelines.methods.los.parameters import BIAS, ONCE_PER_TURN, SENSITIVITY, TEMPERATURE
-from pipelines.methods.los.recording import LosData
-from pipelines.methods.temperature import FIRST
+from alidade.factors.gimbal import GimbalPath
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.methods.formula import gyro_rate
+from alidade.pipelines.methods.los.formulas import DRIVERS, S
+from alidade.pipelines.methods.los.parameters import BIAS, ONCE_PER_TURN, SENSITIVITY, TEMPERATURE
+from alidade.pipelines.methods.los.recording import LosData
+from alidade.pipelines.methods.temperature import FIRST
 
 # Samples of the gyro worked on together.
 _BLOCK = 100_000

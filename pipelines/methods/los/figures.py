@@ -9,19 +9,19 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from factors.gimbal import SMOOTHING
-from factors.preintegration import GyroPath
-from pipelines.graph.problem import Array
-from pipelines.graph.robust import robust_sigma
-from pipelines.methods.los.corrected import angles, rates, taken
-from pipelines.methods.los.guess import camera, carried_errors
-from pipelines.methods.los.parameters import ANGLES, OFFSET
-from pipelines.methods.los.pictures import select_pictures
-from pipelines.methods.los.recording import LosData
-from pipelines.reports.figure import COLORS, Figure
-from pipelines.reports.result import Calibration, Plot
-from pipelines.reports.units import rounded
-from pipelines.settings import DEFAULT_NOISE, first_given
+from alidade.factors.gimbal import SMOOTHING
+from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.graph.robust import robust_sigma
+from alidade.pipelines.methods.los.corrected import angles, rates, taken
+from alidade.pipelines.methods.los.guess import camera, carried_errors
+from alidade.pipelines.methods.los.parameters import ANGLES, OFFSET
+from alidade.pipelines.methods.los.pictures import select_pictures
+from alidade.pipelines.methods.los.recording import LosData
+from alidade.pipelines.reports.figure import COLORS, Figure
+from alidade.pipelines.reports.result import Calibration, Plot
+from alidade.pipelines.reports.units import rounded
+from alidade.pipelines.settings import DEFAULT_NOISE, first_given
 
 _AXES = ("phx", "phz")
 _MRAD = 1e3

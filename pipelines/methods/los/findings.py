@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pipelines.graph.assumptions import fixed_without_force
-from pipelines.graph.problem import Estimate, Findings
-from pipelines.methods.los.parameters import SENSITIVITY
-from pipelines.methods.los.recording import LosData
-from pipelines.recording.topics import IMU
-from pipelines.settings import Config
+from alidade.pipelines.graph.assumptions import fixed_without_force
+from alidade.pipelines.graph.problem import Estimate, Findings
+from alidade.pipelines.methods.los.parameters import SENSITIVITY
+from alidade.pipelines.methods.los.recording import LosData
+from alidade.pipelines.recording.topics import IMU
+from alidade.pipelines.settings import Config
 
 
 def findings(data: LosData, config: Config, _: Estimate) -> Findings:

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from factors import so3
-from pipelines.methods.formula import Formula, axis_angles, gyro_rate, numbers_of, passive
-from pipelines.methods.los.parameters import (
+from alidade.factors import so3
+from alidade.pipelines.methods.formula import Formula, axis_angles, gyro_rate, numbers_of, passive
+from alidade.pipelines.methods.los.parameters import (
     CLOCK_SKEW,
     DELAY,
     LOS_SCALE,
@@ -19,7 +19,7 @@ from pipelines.methods.los.parameters import (
     SENSITIVITY,
     TEMPERATURE,
 )
-from pipelines.methods.los.topics import JOINTS
+from alidade.pipelines.methods.los.topics import JOINTS
 
 _LEFT, _MIDDLE = ("camera_roll", "collimation"), "axis_nonperpendicularity"
 S = tuple(name for each in SCALE for name in each.names)

@@ -15,28 +15,28 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from factors.chi_square import gate
-from factors.gimbal import SMOOTHING, GimbalPath, LocalMotion
-from factors.los import LosDirectionFactor, Surroundings
-from factors.loss import TruncatedLoss
-from factors.preintegration import GyroPath
-from pipelines.graph.assumptions import acting
-from pipelines.graph.clock import Clock, Keyframes
-from pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk, as_slice
-from pipelines.graph.motion import Motion
-from pipelines.graph.noise import Level
-from pipelines.graph.priors import vector_prior
-from pipelines.graph.problem import Array, Factor, Problem, Step
-from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
-from pipelines.judgement.pictures import swaying
-from pipelines.methods import temperature
-from pipelines.methods.los.guess import camera, foreseen, guess, guess_picture_clock, initial_attitudes, seen
-from pipelines.methods.los.parameters import BIAS, OFFSET, SENSITIVITY, SPLIT, TEMPERATURE, LosParameters
-from pipelines.methods.los.pictures import select_pictures
-from pipelines.methods.los.recording import LosData
-from pipelines.methods.noise import sampled, stated, typical, walking
-from pipelines.settings import DEFAULT_NOISE, Config, first_given
+from alidade.factors import so3
+from alidade.factors.chi_square import gate
+from alidade.factors.gimbal import SMOOTHING, GimbalPath, LocalMotion
+from alidade.factors.los import LosDirectionFactor, Surroundings
+from alidade.factors.loss import TruncatedLoss
+from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.graph.assumptions import acting
+from alidade.pipelines.graph.clock import Clock, Keyframes
+from alidade.pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk, as_slice
+from alidade.pipelines.graph.motion import Motion
+from alidade.pipelines.graph.noise import Level
+from alidade.pipelines.graph.priors import vector_prior
+from alidade.pipelines.graph.problem import Array, Factor, Problem, Step
+from alidade.pipelines.graph.walking_bias import FIRST as FIRST_BIAS
+from alidade.pipelines.judgement.pictures import swaying
+from alidade.pipelines.methods import temperature
+from alidade.pipelines.methods.los.guess import camera, foreseen, guess, guess_picture_clock, initial_attitudes, seen
+from alidade.pipelines.methods.los.parameters import BIAS, OFFSET, SENSITIVITY, SPLIT, TEMPERATURE, LosParameters
+from alidade.pipelines.methods.los.pictures import select_pictures
+from alidade.pipelines.methods.los.recording import LosData
+from alidade.pipelines.methods.noise import sampled, stated, typical, walking
+from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 # Sigmas, rad, of a chain's first attitude about t's axes: wide where pictures tell. Its turn about the line of sight is
 # free when no picture tells the camera's roll (it only turns t), and held for the sake of the arithmetic.

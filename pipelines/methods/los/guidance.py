@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipelines.judgement.checklist import ChecklistItem, swayed, turned
-from pipelines.methods.los.recording import LosData
-from pipelines.settings import Config
+from alidade.pipelines.judgement.checklist import ChecklistItem, swayed, turned
+from alidade.pipelines.methods.los.recording import LosData
+from alidade.pipelines.settings import Config
 
 # Sway of a carrier counts from this angle on, rad.
 _SWAY = np.deg2rad(2.0)

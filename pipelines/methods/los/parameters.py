@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import gtsam
 
-from pipelines.errors import InputError
-from pipelines.graph.assumptions import (
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.assumptions import (
     Assumption,
     encoder_assumptions,
     gyro_errors,
@@ -19,10 +19,10 @@ from pipelines.graph.assumptions import (
     stamped,
     temperature_assumption,
 )
-from pipelines.graph.problem import Parameter, Quantity
-from pipelines.graph.walking_bias import FIRST as FIRST_BIAS
-from pipelines.methods.los.topics import JOINTS
-from pipelines.settings import Config, check_names
+from alidade.pipelines.graph.problem import Parameter, Quantity
+from alidade.pipelines.graph.walking_bias import FIRST as FIRST_BIAS
+from alidade.pipelines.methods.los.topics import JOINTS
+from alidade.pipelines.settings import Config, check_names
 
 _ANGLES = ("delta_px", "delta_gx", "delta_gy")
 SPLIT = ("delta_pz", "delta_gz")
@@ -43,7 +43,7 @@ LOS_SCALE = Assumption(("los_scale",), "", "camera", "scale", 5e-3)
 TARGET_RATE = Assumption(("target_rate_x", "target_rate_z"), "rad/s", "target", "rate", 1e-5)
 ONCE_PER_TURN, DELAY = encoder_assumptions(JOINTS, 2e-4, 1e-3)
 
-# Of the mounting, one by one; and those of factors.los.SIGHT_ERRORS, in its order.
+# Of the mounting, one by one; and those of alidade.factors.los.SIGHT_ERRORS, in its order.
 MOUNTED, SIGHT = (ROLL, COLLIMATION, AXES), (TIME_OFFSET, CLOCK_SKEW, LOS_SCALE, TARGET_RATE, ONCE_PER_TURN, DELAY)
 ASSUMPTIONS = (*SCALE, SENSITIVITY, *MOUNTED, *SIGHT, TEMPERATURE)
 # The angles by which gyro, gimbal axes and camera are mounted.
@@ -59,8 +59,8 @@ class LosParameters:
     Attributes:
         angles: of the mounting.
         bias: of the gyro (3), rad/s, its first node.
-        sight: factors.los.SIGHT_ERRORS; None when all are fixed.
-        gyro: S of the gyro and what its drivers do, see factors.gyro; None for a perfect one.
+        sight: alidade.factors.los.SIGHT_ERRORS; None when all are fixed.
+        gyro: S of the gyro and what its drivers do, see alidade.factors.gyro; None for a perfect one.
     """
 
     angles: Parameter

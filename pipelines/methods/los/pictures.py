@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
-from pipelines.graph.problem import Array
-from pipelines.methods.los.recording import LosData
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.methods.los.recording import LosData
 
 # After a gap longer than this, s, the camera may hold on to another target.
 _LOST = 0.5

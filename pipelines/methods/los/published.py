@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
-from pipelines.graph.problem import ChiSquare, Estimate, History, Problem, Residuals
-from pipelines.methods.los.recording import LosData
-from pipelines.settings import DEFAULT_NOISE, Config, first_given
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import ChiSquare, Estimate, History, Problem, Residuals
+from alidade.pipelines.methods.los.recording import LosData
+from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 Array = NDArray[np.float64]
 

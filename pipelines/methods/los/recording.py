@@ -11,21 +11,21 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
-from pipelines.methods import temperature
-from pipelines.methods.los import parameters
-from pipelines.methods.los.topics import GIMBAL, JOINTS, LOS_ERROR
-from pipelines.recording import series
-from pipelines.recording.checks import check_overlap, clean, count, nanoseconds
-from pipelines.recording.faults import drop_frozen
-from pipelines.recording.gyro import read_imu
-from pipelines.recording.reading import Recording
-from pipelines.recording.shapes import Numbers, Pairs, Rows, Vectors
-from pipelines.recording.temperature import Temperature
-from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, wanted
-from pipelines.recording.writing import attached, write_session
-from pipelines.settings import Config
-from pipelines.vision.recorded import camera_of
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import temperature
+from alidade.pipelines.methods.los import parameters
+from alidade.pipelines.methods.los.topics import GIMBAL, JOINTS, LOS_ERROR
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.checks import check_overlap, clean, count, nanoseconds
+from alidade.pipelines.recording.faults import drop_frozen
+from alidade.pipelines.recording.gyro import read_imu
+from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.shapes import Numbers, Pairs, Rows, Vectors
+from alidade.pipelines.recording.temperature import Temperature
+from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, wanted
+from alidade.pipelines.recording.writing import attached, write_session
+from alidade.pipelines.settings import Config
+from alidade.pipelines.vision.recorded import camera_of
 
 Array = NDArray[np.float64]
 
@@ -75,9 +75,9 @@ class LosData:
 def read_los(recording: Recording, config: Config) -> LosData:
     """Read and check a los session; without LOS errors they are taken from the pictures.
 
-    Raises InputError when a topic is missing or unusable (see pipelines.recording.checks), when the topics have no time
-    in common, when the target was never found, and when sizes say that an encoder is in degrees, an encoder stands
-    still, a gyro axis has the opposite sign, the elevation is beyond 80 deg, or the LOS error is not in radians.
+    Raises InputError when a topic is missing or unusable (see alidade.pipelines.recording.checks), when the topics have
+    no time in common, when the target was never found, and when sizes say that an encoder is in degrees, an encoder
+    stands still, a gyro axis has the opposite sign, the elevation is beyond 80 deg, or the LOS error is not in radians.
     """
     dropped: dict[str, int] = {}
     epoch = recording.epoch_ns
@@ -278,7 +278,7 @@ def _from_pictures(
     recording: Recording, config: Config, epoch_ns: int, dropped: dict[str, int]
 ) -> tuple[Array, Array, Array]:
     """LOS errors of the target that the first picture shows, with the tracker's covariance."""
-    from pipelines.vision.target import los_errors
+    from alidade.pipelines.vision.target import los_errors
 
     topic = config.topic(IMAGE)
     camera = camera_of(recording, config)

@@ -21,19 +21,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from factors import so3
-from factors.earth import earth_rate, gravity
-from pipelines.errors import InputError
-from pipelines.methods.los.parameters import ASSUMPTIONS
-from pipelines.methods.los.recording import LosData
-from pipelines.methods.los.topics import JOINTS
-from pipelines.recording import series
-from pipelines.recording.checks import nanoseconds
-from pipelines.settings import SensorSheets
-from pipelines.simulation.motion import EulerMotion, Swing, sample_times
-from pipelines.simulation.sensors import read_by, true_values
-from pipelines.simulation.simulated import Simulated
-from pipelines.simulation.temperature import Warming, drift, known, measured
+from alidade.factors import so3
+from alidade.factors.earth import earth_rate, gravity
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.los.parameters import ASSUMPTIONS
+from alidade.pipelines.methods.los.recording import LosData
+from alidade.pipelines.methods.los.topics import JOINTS
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.checks import nanoseconds
+from alidade.pipelines.settings import SensorSheets
+from alidade.pipelines.simulation.motion import EulerMotion, Swing, sample_times
+from alidade.pipelines.simulation.sensors import read_by, true_values
+from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.temperature import Warming, drift, known, measured
 
 Array = NDArray[np.float64]
 
@@ -332,8 +332,8 @@ def simulate_pictures(scenario: LosScenario, seed: int) -> tuple[series.CameraIn
 
 def _exposures(settings: LosCamera, K: Array, cRt: Array, rng: np.random.Generator) -> Iterator[bytes]:
     """Pictures of a target at unit distance, as JPEG files."""
-    from pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
-    from pipelines.vision.camera import Camera
+    from alidade.pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
+    from alidade.pipelines.vision.camera import Camera
 
     camera = Camera(settings.width, settings.height, K, "plumb_bob", np.array(settings.distortion))
     renderer = Renderer(camera)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from pipelines.recording import messages
-from pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, TEMPERATURE, Need, Topic
+from alidade.pipelines.recording import messages
+from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, TEMPERATURE, Need, Topic
 
 GIMBAL = Topic("gimbal", "/gimbal/joint_states", (messages.JOINT_STATE,))
 LOS_ERROR = Topic("los_error", "/los/error", (messages.VECTOR,))

@@ -17,15 +17,15 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from factors.gimbal import GimbalPath, command
-from pipelines.graph.problem import Array
-from pipelines.judgement.validation import Validation
-from pipelines.methods.los.corrected import rates
-from pipelines.methods.los.guess import los_direction, los_error
-from pipelines.methods.los.pictures import select_pictures
-from pipelines.methods.los.recording import LosData
-from pipelines.settings import DEFAULT_NOISE, Config, first_given
+from alidade.factors import so3
+from alidade.factors.gimbal import GimbalPath, command
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.judgement.validation import Validation
+from alidade.pipelines.methods.los.corrected import rates
+from alidade.pipelines.methods.los.guess import los_direction, los_error
+from alidade.pipelines.methods.los.pictures import select_pictures
+from alidade.pipelines.methods.los.recording import LosData
+from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 # The replayed gimbal feeds back on its own commands; each pass is better by the carrier's sway, about a tenth.
 _PASSES = 6

@@ -6,22 +6,22 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from pipelines.methods import Method, Scenario
+from alidade.pipelines.methods import Method, Scenario
 
 if TYPE_CHECKING:
-    from pipelines.graph.problem import Estimate, Findings, Problem
-    from pipelines.judgement.checklist import ChecklistItem
-    from pipelines.judgement.hypotheses import Hypotheses
-    from pipelines.judgement.validation import Validation
-    from pipelines.methods.formula import Formula
-    from pipelines.methods.tumble.recording import TumbleData
-    from pipelines.methods.tumble.scenario import TumbleScenario
-    from pipelines.recording.reading import Recording
-    from pipelines.recording.topics import Need, Topic
-    from pipelines.reports.calibration import SavedCalibration
-    from pipelines.reports.result import Calibration, Plot, Table
-    from pipelines.settings import Config
-    from pipelines.simulation.simulated import Simulated
+    from alidade.pipelines.graph.problem import Estimate, Findings, Problem
+    from alidade.pipelines.judgement.checklist import ChecklistItem
+    from alidade.pipelines.judgement.hypotheses import Hypotheses
+    from alidade.pipelines.judgement.validation import Validation
+    from alidade.pipelines.methods.formula import Formula
+    from alidade.pipelines.methods.tumble.recording import TumbleData
+    from alidade.pipelines.methods.tumble.scenario import TumbleScenario
+    from alidade.pipelines.recording.reading import Recording
+    from alidade.pipelines.recording.topics import Need, Topic
+    from alidade.pipelines.reports.calibration import SavedCalibration
+    from alidade.pipelines.reports.result import Calibration, Plot, Table
+    from alidade.pipelines.settings import Config
+    from alidade.pipelines.simulation.simulated import Simulated
 
 
 class Tumble(Method):
@@ -42,91 +42,91 @@ class Tumble(Method):
 
     @property
     def topics(self) -> tuple[Topic, ...]:
-        from pipelines.methods.tumble.topics import TOPICS
+        from alidade.pipelines.methods.tumble.topics import TOPICS
 
         return TOPICS
 
     @property
     def needs(self) -> tuple[Need, ...]:
-        from pipelines.methods.tumble.topics import NEEDS
+        from alidade.pipelines.methods.tumble.topics import NEEDS
 
         return NEEDS
 
     @property
     def data(self) -> type[TumbleData]:
-        from pipelines.methods.tumble.recording import TumbleData
+        from alidade.pipelines.methods.tumble.recording import TumbleData
 
         return TumbleData
 
     def read(self, recording: Recording, config: Config) -> TumbleData:
-        from pipelines.methods.tumble.recording import read_tumble
+        from alidade.pipelines.methods.tumble.recording import read_tumble
 
         return read_tumble(recording, config)
 
     def problem(self, data: TumbleData, config: Config) -> Problem:
-        from pipelines.methods.tumble.graph import problem
+        from alidade.pipelines.methods.tumble.graph import problem
 
         return problem(data, config)
 
     def published(self, data: TumbleData, config: Config, problem: Problem) -> Estimate:
-        from pipelines.methods.tumble.published import published_estimate
+        from alidade.pipelines.methods.tumble.published import published_estimate
 
         return published_estimate(data, config, problem)
 
     @property
     def scenario(self) -> type[TumbleScenario]:
-        from pipelines.methods.tumble.scenario import TumbleScenario
+        from alidade.pipelines.methods.tumble.scenario import TumbleScenario
 
         return TumbleScenario
 
     def simulate(self, scenario: TumbleScenario, seed: int, images: bool = False) -> Simulated:
-        from pipelines.methods.tumble.simulation import simulated
+        from alidade.pipelines.methods.tumble.simulation import simulated
 
         return simulated(scenario, seed, images)
 
     def write(self, path: Path, simulated: Simulated) -> None:
-        from pipelines.methods.tumble.recording import write_tumble
+        from alidade.pipelines.methods.tumble.recording import write_tumble
 
         write_tumble(path, simulated)
 
     def candidates(self, scenario: Scenario) -> Iterator[tuple[str, Scenario]]:
-        from pipelines.methods.tumble.candidates import candidates
+        from alidade.pipelines.methods.tumble.candidates import candidates
 
         return candidates(scenario)
 
     def checklist(self, data: TumbleData, config: Config) -> Sequence[ChecklistItem]:
-        from pipelines.methods.tumble.guidance import checklist
+        from alidade.pipelines.methods.tumble.guidance import checklist
 
         return checklist(data, config)
 
     def hypotheses(self) -> Hypotheses:
-        from pipelines.methods.tumble.hypotheses import HYPOTHESES
+        from alidade.pipelines.methods.tumble.hypotheses import HYPOTHESES
 
         return HYPOTHESES
 
     def validate(self, data: TumbleData, config: Config, values: Mapping[str, float]) -> Sequence[Validation]:
-        from pipelines.methods.tumble.validation import validate
+        from alidade.pipelines.methods.tumble.validation import validate
 
         return validate(data, config, values)
 
     def formulas(self, parameters: Collection[str], config: Config) -> Sequence[Formula]:  # noqa: ARG002
-        from pipelines.methods.tumble.formulas import formulas
+        from alidade.pipelines.methods.tumble.formulas import formulas
 
         return formulas(parameters)
 
     def findings(self, data: TumbleData, config: Config, estimate: Estimate) -> Findings:
-        from pipelines.methods.tumble.findings import findings
+        from alidade.pipelines.methods.tumble.findings import findings
 
         return findings(data, config, estimate)
 
     def figures(self, data: TumbleData, calibration: Calibration) -> Sequence[Plot | Table]:
-        from pipelines.methods.tumble.figures import figures
+        from alidade.pipelines.methods.tumble.figures import figures
 
         return figures(data, calibration)
 
     @property
     def exporters(self) -> Mapping[str, Callable[[SavedCalibration], str]]:
-        from pipelines.methods.triad_export import FORMATS
+        from alidade.pipelines.methods.triad_export import FORMATS
 
         return FORMATS
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from pipelines.methods import Scenario
+from alidade.pipelines.methods import Scenario
 
 # Longer than an accelerometer needs to be seen at rest, s.
 _REST = 1.5

@@ -9,21 +9,21 @@ from functools import partial
 import gtsam
 import numpy as np
 
-from factors import so3
-from factors.chi_square import gate
-from factors.loss import TruncatedLoss
-from factors.turned import FieldFactor, UpFactor
-from pipelines.graph.motion import Motion
-from pipelines.graph.noise import Level
-from pipelines.graph.priors import vector_prior
-from pipelines.graph.problem import Array, Attitudes, Factor, Problem, Step
-from pipelines.judgement.pictures import swaying
-from pipelines.methods import temperature
-from pipelines.methods.tumble.model import Model, Sensor
-from pipelines.methods.tumble.parameters import DIP_KEY, SLOPE_KEY, STRENGTH_KEYS, TRIAD_KEYS, Variable
-from pipelines.methods.tumble.recording import TumbleData
-from pipelines.methods.tumble.turning import DELAY_KEY, Rows, Seen, Turning, turning
-from pipelines.settings import Config
+from alidade.factors import so3
+from alidade.factors.chi_square import gate
+from alidade.factors.loss import TruncatedLoss
+from alidade.factors.turned import FieldFactor, UpFactor
+from alidade.pipelines.graph.motion import Motion
+from alidade.pipelines.graph.noise import Level
+from alidade.pipelines.graph.priors import vector_prior
+from alidade.pipelines.graph.problem import Array, Attitudes, Factor, Problem, Step
+from alidade.pipelines.judgement.pictures import swaying
+from alidade.pipelines.methods import temperature
+from alidade.pipelines.methods.tumble.model import Model, Sensor
+from alidade.pipelines.methods.tumble.parameters import DIP_KEY, SLOPE_KEY, STRENGTH_KEYS, TRIAD_KEYS, Variable
+from alidade.pipelines.methods.tumble.recording import TumbleData
+from alidade.pipelines.methods.tumble.turning import DELAY_KEY, Rows, Seen, Turning, turning
+from alidade.pipelines.settings import Config
 
 FAMILIES = {"accel": "accelerometer", "mag": "magnetometer"}
 # As good as none, rad: of the first attitude, of which nothing tells the turn about the field or about up.

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from pipelines.graph.problem import Array
-from pipelines.methods.triads import triad_of
-from pipelines.methods.tumble.findings import NAMES, directions
-from pipelines.methods.tumble.model import Sensor, prepare
-from pipelines.methods.tumble.recording import TumbleData
-from pipelines.reports.figure import BEFORE, COLORS, Figure, thin
-from pipelines.reports.result import Calibration, Plot, Table
-from pipelines.reports.sphere_map import described, sphere_map
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.methods.triads import triad_of
+from alidade.pipelines.methods.tumble.findings import NAMES, directions
+from alidade.pipelines.methods.tumble.model import Sensor, prepare
+from alidade.pipelines.methods.tumble.recording import TumbleData
+from alidade.pipelines.reports.figure import BEFORE, COLORS, Figure, thin
+from alidade.pipelines.reports.result import Calibration, Plot, Table
+from alidade.pipelines.reports.sphere_map import described, sphere_map
 
 
 def figures(data: TumbleData, calibration: Calibration) -> list[Plot | Table]:

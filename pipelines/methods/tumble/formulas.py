@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipelines.methods.formula import Formula, gyro_rate, over_temperature, temperature_text
-from pipelines.methods.triads import triad_formula
-from pipelines.methods.tumble.recording import ACCEL_SLOPE, GYRO_SLOPE
-from pipelines.methods.tumble.turning import BIAS, SCALE, SENSITIVITY
+from alidade.pipelines.methods.formula import Formula, gyro_rate, over_temperature, temperature_text
+from alidade.pipelines.methods.triads import triad_formula
+from alidade.pipelines.methods.tumble.recording import ACCEL_SLOPE, GYRO_SLOPE
+from alidade.pipelines.methods.tumble.turning import BIAS, SCALE, SENSITIVITY
 
 
 def formulas(parameters: Collection[str]) -> list[Formula]:

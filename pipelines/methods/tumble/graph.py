@@ -17,18 +17,25 @@ from itertools import pairwise, product
 import gtsam
 import numpy as np
 
-from factors.chi_square import gate
-from factors.ellipsoid import DipFactor, StrengthFactor, entries
-from factors.loss import TruncatedLoss
-from pipelines.graph.noise import Level
-from pipelines.graph.problem import Array, Factor, Problem, Step
-from pipelines.methods import temperature
-from pipelines.methods.tumble.chained import FAMILIES, advice, chained
-from pipelines.methods.tumble.model import Model, Moments, Sensor, prepare
-from pipelines.methods.tumble.parameters import DIP_KEY, SLOPE_KEY, STRENGTH_KEYS, TRIAD_KEYS, Variable, variables
-from pipelines.methods.tumble.recording import TumbleData
-from pipelines.methods.tumble.unturned import check_turned, unturned
-from pipelines.settings import Config
+from alidade.factors.chi_square import gate
+from alidade.factors.ellipsoid import DipFactor, StrengthFactor, entries
+from alidade.factors.loss import TruncatedLoss
+from alidade.pipelines.graph.noise import Level
+from alidade.pipelines.graph.problem import Array, Factor, Problem, Step
+from alidade.pipelines.methods import temperature
+from alidade.pipelines.methods.tumble.chained import FAMILIES, advice, chained
+from alidade.pipelines.methods.tumble.model import Model, Moments, Sensor, prepare
+from alidade.pipelines.methods.tumble.parameters import (
+    DIP_KEY,
+    SLOPE_KEY,
+    STRENGTH_KEYS,
+    TRIAD_KEYS,
+    Variable,
+    variables,
+)
+from alidade.pipelines.methods.tumble.recording import TumbleData
+from alidade.pipelines.methods.tumble.unturned import check_turned, unturned
+from alidade.pipelines.settings import Config
 
 # What is measured within this time, s, makes one step.
 _STRETCH = 0.5

@@ -6,15 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from factors import so3
-from pipelines.graph.motion import Motion
-from pipelines.graph.problem import Array
-from pipelines.judgement.checklist import ChecklistItem
-from pipelines.judgement.pictures import along, covered, resting
-from pipelines.methods.tumble.model import prepare
-from pipelines.methods.tumble.recording import TumbleData
-from pipelines.reports.sphere_map import described, share_near, widest_gap
-from pipelines.settings import Config
+from alidade.factors import so3
+from alidade.pipelines.graph.motion import Motion
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.judgement.checklist import ChecklistItem
+from alidade.pipelines.judgement.pictures import along, covered, resting
+from alidade.pipelines.methods.tumble.model import prepare
+from alidade.pipelines.methods.tumble.recording import TumbleData
+from alidade.pipelines.reports.sphere_map import described, share_near, widest_gap
+from alidade.pipelines.settings import Config
 
 # Part of all directions that a vector has to have come near, and the widest gap that is none, rad.
 _ENOUGH, _GAP = 0.9, np.deg2rad(45.0)

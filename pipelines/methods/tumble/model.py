@@ -12,22 +12,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.earth import gravity
-from factors.ellipsoid import StrengthFactor, entries, excess, nominal_of
-from pipelines.errors import InputError
-from pipelines.graph.assumptions import parameter
-from pipelines.graph.assumptions import stated as sheet
-from pipelines.graph.noise import ROUGHLY, Noise
-from pipelines.graph.problem import Array
-from pipelines.graph.robust import robust_sigma
-from pipelines.methods.noise import stated
-from pipelines.methods.place import FIELD, STRENGTH_SIGMA, field_at
-from pipelines.methods.static_intervals import quiet_intervals
-from pipelines.methods.triads import triad_names
-from pipelines.methods.tumble.published import FEWEST, ellipsoid
-from pipelines.methods.tumble.recording import ACCEL_SLOPE, NO_RATE, TumbleData
-from pipelines.methods.tumble.turning import Mounted, mounted
-from pipelines.settings import Config
+from alidade.factors.earth import gravity
+from alidade.factors.ellipsoid import StrengthFactor, entries, excess, nominal_of
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.assumptions import parameter
+from alidade.pipelines.graph.assumptions import stated as sheet
+from alidade.pipelines.graph.noise import ROUGHLY, Noise
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.graph.robust import robust_sigma
+from alidade.pipelines.methods.noise import stated
+from alidade.pipelines.methods.place import FIELD, STRENGTH_SIGMA, field_at
+from alidade.pipelines.methods.static_intervals import quiet_intervals
+from alidade.pipelines.methods.triads import triad_names
+from alidade.pipelines.methods.tumble.published import FEWEST, ellipsoid
+from alidade.pipelines.methods.tumble.recording import ACCEL_SLOPE, NO_RATE, TumbleData
+from alidade.pipelines.methods.tumble.turning import Mounted, mounted
+from alidade.pipelines.settings import Config
 
 # Typical norms, SI, by which counts are told; of a sensor with its offset.
 _PLAUSIBLE = {"accel": (3.0, 30.0), "mag": (1e-6, 1e-3)}

@@ -10,15 +10,15 @@ from itertools import chain
 import gtsam
 import numpy as np
 
-from factors.ellipsoid import entries
-from pipelines.graph.assumptions import quantities
-from pipelines.graph.priors import prior_sigmas
-from pipelines.graph.problem import Array, Factor, Parameter, Quantity
-from pipelines.methods.triads import triad_names
-from pipelines.methods.tumble.model import Model, Sensor, nearest_axes
-from pipelines.methods.tumble.recording import ACCEL_SLOPE, SLOPES
-from pipelines.methods.tumble.turning import ARM, BIAS, DELAY, SCALE, SENSITIVITY
-from pipelines.settings import Config, check_names
+from alidade.factors.ellipsoid import entries
+from alidade.pipelines.graph.assumptions import quantities
+from alidade.pipelines.graph.priors import prior_sigmas
+from alidade.pipelines.graph.problem import Array, Factor, Parameter, Quantity
+from alidade.pipelines.methods.triads import triad_names
+from alidade.pipelines.methods.tumble.model import Model, Sensor, nearest_axes
+from alidade.pipelines.methods.tumble.recording import ACCEL_SLOPE, SLOPES
+from alidade.pipelines.methods.tumble.turning import ARM, BIAS, DELAY, SCALE, SENSITIVITY
+from alidade.pipelines.settings import Config, check_names
 
 TRIAD_KEYS = {"accel": int(gtsam.symbol("A", 0)), "mag": int(gtsam.symbol("M", 0))}
 STRENGTH_KEYS = {"accel": int(gtsam.symbol("g", 0)), "mag": int(gtsam.symbol("f", 0))}

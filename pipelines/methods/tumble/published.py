@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
-from pipelines.graph.problem import Estimate, Problem
-from pipelines.methods.tumble.recording import TumbleData
-from pipelines.settings import Config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Estimate, Problem
+from alidade.pipelines.methods.tumble.recording import TumbleData
+from alidade.pipelines.settings import Config
 
 if TYPE_CHECKING:
-    from pipelines.methods.tumble.model import Sensor
+    from alidade.pipelines.methods.tumble.model import Sensor
 
 Array = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ def published_estimate(data: TumbleData, config: Config, problem: Problem) -> Es
 
     Raises InputError where the best quadric is no ellipsoid.
     """
-    from pipelines.methods.tumble.model import prepare
+    from alidade.pipelines.methods.tumble.model import prepare
 
     start = time.perf_counter()
     names: list[str] = []

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.errors import InputError
-from pipelines.graph.assumptions import temperature_assumption
-from pipelines.methods import temperature
-from pipelines.methods.place import read_place
-from pipelines.recording import series
-from pipelines.recording.checks import (
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.assumptions import temperature_assumption
+from alidade.pipelines.methods import temperature
+from alidade.pipelines.methods.place import read_place
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.checks import (
     LEAST_ACCEL,
     LEAST_GYRO,
     LEAST_MAG,
@@ -24,14 +24,14 @@ from pipelines.recording.checks import (
     nanoseconds,
     too_fast,
 )
-from pipelines.recording.faults import drop_faults
-from pipelines.recording.reading import Recording
-from pipelines.recording.shapes import Numbers, Vectors
-from pipelines.recording.temperature import Temperature
-from pipelines.recording.topics import FIX, IMU, MAG, wanted
-from pipelines.recording.writing import attached, write_session
-from pipelines.settings import Config
-from pipelines.simulation.simulated import Simulated
+from alidade.pipelines.recording.faults import drop_faults
+from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.shapes import Numbers, Vectors
+from alidade.pipelines.recording.temperature import Temperature
+from alidade.pipelines.recording.topics import FIX, IMU, MAG, wanted
+from alidade.pipelines.recording.writing import attached, write_session
+from alidade.pipelines.settings import Config
+from alidade.pipelines.simulation.simulated import Simulated
 
 Array = NDArray[np.float64]
 

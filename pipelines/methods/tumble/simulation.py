@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from factors.earth import earth_rate, gravity, magnetic_field
-from pipelines.errors import InputError
-from pipelines.methods.tumble.recording import TumbleData
-from pipelines.methods.tumble.scenario import (
+from alidade.factors import so3
+from alidade.factors.earth import earth_rate, gravity, magnetic_field
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods.tumble.recording import TumbleData
+from alidade.pipelines.methods.tumble.scenario import (
     EPOCH_NS,
     YEAR,
     TumbledAccelerometer,
@@ -22,9 +22,9 @@ from pipelines.methods.tumble.scenario import (
     TumbleScenario,
     tumble_config,
 )
-from pipelines.simulation.motion import sample_times
-from pipelines.simulation.simulated import Simulated
-from pipelines.simulation.temperature import drift, measured
+from alidade.pipelines.simulation.motion import sample_times
+from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.temperature import drift, measured
 
 Array = NDArray[np.float64]
 

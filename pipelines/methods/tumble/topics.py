@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pipelines.recording.topics import FIX, IMU, MAG, TEMPERATURE, Need, Setting
+from alidade.pipelines.recording.topics import FIX, IMU, MAG, TEMPERATURE, Need, Setting
 
 TOPICS = (MAG, IMU, FIX, TEMPERATURE)
 _METHOD = Setting("`method: tumble` in the config", lambda config: config.method == "tumble")

@@ -1,7 +1,7 @@
 """A tumbled device's gyro: how it is mounted to the magnetometer, and the attitudes that it chains.
 
-Frames as in factors.turned: a inertial, n level along the field, b the body, whose axes are those in which the gyro's
-own errors are symmetric.
+Frames as in alidade.factors.turned: a inertial, n level along the field, b the body, whose axes are those in which the
+gyro's own errors are symmetric.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from factors.earth import earth_rate
-from factors.preintegration import GyroPath
-from pipelines.graph.assumptions import (
+from alidade.factors import so3
+from alidade.factors.earth import earth_rate
+from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.graph.assumptions import (
     Assumption,
     acting,
     gyro_errors,
@@ -23,13 +23,13 @@ from pipelines.graph.assumptions import (
     scale_assumptions,
     sensitivity_assumption,
 )
-from pipelines.graph.gyro_chain import GyroChain, shared_keyframes
-from pipelines.graph.noise import Level
-from pipelines.graph.problem import Array, Parameter, Quantity
-from pipelines.graph.walking_bias import FIRST
-from pipelines.methods.noise import sampled, stated, walking
-from pipelines.methods.tumble.recording import GYRO_SLOPE, TumbleData
-from pipelines.settings import Config
+from alidade.pipelines.graph.gyro_chain import GyroChain, shared_keyframes
+from alidade.pipelines.graph.noise import Level
+from alidade.pipelines.graph.problem import Array, Parameter, Quantity
+from alidade.pipelines.graph.walking_bias import FIRST
+from alidade.pipelines.methods.noise import sampled, stated, walking
+from alidade.pipelines.methods.tumble.recording import GYRO_SLOPE, TumbleData
+from alidade.pipelines.settings import Config
 
 Index = NDArray[np.intp]
 

@@ -11,13 +11,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.ellipsoid import entries, excess, sagitta
-from pipelines.errors import InputError
-from pipelines.graph.problem import Array
-from pipelines.methods.tumble.model import Sensor
-from pipelines.methods.tumble.published import FEWEST
-from pipelines.recording.topics import IMU, MAG
-from pipelines.settings import Config
+from alidade.factors.ellipsoid import entries, excess, sagitta
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.methods.tumble.model import Sensor
+from alidade.pipelines.methods.tumble.published import FEWEST
+from alidade.pipelines.recording.topics import IMU, MAG
+from alidade.pipelines.settings import Config
 
 # A mean may lie inside the ellipsoid, which is allowed for, by this many times its own sigma ...
 _OFF = 1.0

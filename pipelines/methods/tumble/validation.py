@@ -6,14 +6,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from pipelines.errors import InputError
-from pipelines.judgement.validation import Validation
-from pipelines.methods.temperature import FIRST
-from pipelines.methods.triads import triad_of
-from pipelines.methods.tumble.model import prepare
-from pipelines.methods.tumble.parameters import STRENGTHS
-from pipelines.methods.tumble.recording import ACCEL_SLOPE, TumbleData
-from pipelines.settings import Config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.judgement.validation import Validation
+from alidade.pipelines.methods.temperature import FIRST
+from alidade.pipelines.methods.triads import triad_of
+from alidade.pipelines.methods.tumble.model import prepare
+from alidade.pipelines.methods.tumble.parameters import STRENGTHS
+from alidade.pipelines.methods.tumble.recording import ACCEL_SLOPE, TumbleData
+from alidade.pipelines.settings import Config
 
 _WHAT = {"accel": "specific force at rest, its strength", "mag": "magnetic field, its strength"}
 

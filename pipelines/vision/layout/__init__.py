@@ -13,18 +13,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines import progress
-from pipelines.errors import InputError
-from pipelines.vision.camera import Camera
-from pipelines.vision.layout.additional import LINE_TIME, shutters, with_intrinsics
-from pipelines.vision.layout.bundle import moved, refined_pictures
-from pipelines.vision.layout.covariance import Covariance, covariance
-from pipelines.vision.layout.pictures import Gathered, Shots, gathered
-from pipelines.vision.layout.placing import joint
-from pipelines.vision.layout.robust import Fit, fitted
-from pipelines.vision.layout.sights import Array, Sights, linearized
-from pipelines.vision.layout.whole import adjusted_whole, flip_told
-from pipelines.vision.pose import TagBody, part
+from alidade.pipelines import progress
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.vision.camera import Camera
+from alidade.pipelines.vision.layout.additional import LINE_TIME, shutters, with_intrinsics
+from alidade.pipelines.vision.layout.bundle import moved, refined_pictures
+from alidade.pipelines.vision.layout.covariance import Covariance, covariance
+from alidade.pipelines.vision.layout.pictures import Gathered, Shots, gathered
+from alidade.pipelines.vision.layout.placing import joint
+from alidade.pipelines.vision.layout.robust import Fit, fitted
+from alidade.pipelines.vision.layout.sights import Array, Sights, linearized
+from alidade.pipelines.vision.layout.whole import adjusted_whole, flip_told
+from alidade.pipelines.vision.pose import TagBody, part
 
 __all__ = ["LINE_TIME", "Layout", "Shots", "TagSeen", "estimate_layout"]
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from factors import so3
-from pipelines.vision.layout.sights import Array, Bundle, Rows, Sights
-from pipelines.vision.pose import SQUARE
+from alidade.factors import so3
+from alidade.pipelines.vision.layout.sights import Array, Bundle, Rows, Sights
+from alidade.pipelines.vision.pose import SQUARE
 
 # What paper is like, of a corner each way, and how well that is known, in the logarithm.
 _PAPER, _ROUGHLY = 2e-3, 2.0

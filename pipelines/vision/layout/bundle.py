@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from factors import so3
-from pipelines.vision.layout.additional import Additional
-from pipelines.vision.layout.normal import normal_equations, of_pictures
-from pipelines.vision.layout.sights import Array, Bundle, Rows, Sights, linearized
+from alidade.factors import so3
+from alidade.pipelines.vision.layout.additional import Additional
+from alidade.pipelines.vision.layout.normal import normal_equations, of_pictures
+from alidade.pipelines.vision.layout.sights import Array, Bundle, Rows, Sights, linearized
 
 _STEPS = 40
 _DIAGONAL = np.arange(6)

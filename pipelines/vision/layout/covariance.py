@@ -3,9 +3,9 @@
 A tag's corners err by what its print, its blur and the camera's model have wrong: nearly the same in the next picture,
 and the more so in one in which nothing has moved. The layout errs by L r, L the influence of the whitened errors r, so
 with autocovariance g of r its covariance is the sum over tags, views and lags of L' g(lag) L, as for noise coloured in
-time (pipelines.solvers.coloured). g is that of the errors left, all tags together, up to the lag where it has died out;
-tags that fit worse than the others have a variance of their own. What stays the same in all pictures of a tag is in
-`bending`.
+time (alidade.pipelines.solvers.coloured). g is that of the errors left, all tags together, up to the lag where it has
+died out; tags that fit worse than the others have a variance of their own. What stays the same in all pictures of a tag
+is in `bending`.
 
 Priors of additional parameters are weighed against such errors, not against independent ones: with the information A
 of independent errors, of which the gradient has covariance S, and that of the priors P, the best linear estimate has
@@ -19,10 +19,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipelines.vision.layout.bending import BENDS, bend_rows, bending
-from pipelines.vision.layout.normal import normal_equations, shared_rows
-from pipelines.vision.layout.robust import Fit
-from pipelines.vision.layout.sights import Array, Index
+from alidade.pipelines.vision.layout.bending import BENDS, bend_rows, bending
+from alidade.pipelines.vision.layout.normal import normal_equations, shared_rows
+from alidade.pipelines.vision.layout.robust import Fit
+from alidade.pipelines.vision.layout.sights import Array, Index
 
 # A correlation within this many of its sigmas of zero has died out; the first one is asked to be beyond more of them.
 _DIED_OUT, _COLOURED = 2.0, 4.0

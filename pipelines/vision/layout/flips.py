@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factors import so3
-from pipelines.vision.layout.bundle import loss, refined_pictures
-from pipelines.vision.layout.sights import Array, Bundle, Index, Sights, linearized
-from pipelines.vision.pose import planar_solutions
+from alidade.factors import so3
+from alidade.pipelines.vision.layout.bundle import loss, refined_pictures
+from alidade.pipelines.vision.layout.sights import Array, Bundle, Index, Sights, linearized
+from alidade.pipelines.vision.pose import planar_solutions
 
 # Poses closer than this, rad, are one.
 _SAME = 1e-3

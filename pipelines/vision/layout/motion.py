@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from factors import so3
-from pipelines.vision.layout.sights import Array, Bundle, Index
+from alidade.factors import so3
+from alidade.pipelines.vision.layout.sights import Array, Bundle, Index
 
 # Pictures farther apart than this, s, tell nothing of the motion in each other.
 _APART = 0.25

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.vision.layout.additional import Additional
-from pipelines.vision.layout.sights import Array, Bundle, Rows, Sights
+from alidade.pipelines.vision.layout.additional import Additional
+from alidade.pipelines.vision.layout.sights import Array, Bundle, Rows, Sights
 
 _DIAGONAL = np.arange(6)
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from factors import so3
-from pipelines.vision.camera import Camera
-from pipelines.vision.layout.sights import Array, Bundle, Index, Sights
-from pipelines.vision.pose import TagBody
-from pipelines.vision.tags import Detections
+from alidade.factors import so3
+from alidade.pipelines.vision.camera import Camera
+from alidade.pipelines.vision.layout.sights import Array, Bundle, Index, Sights
+from alidade.pipelines.vision.pose import TagBody
+from alidade.pipelines.vision.tags import Detections
 
 # Corners that differ by less than this many sigmas, root mean square, stand still; noise alone makes it 1.4.
 _STILL = 2.0

@@ -13,12 +13,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from pipelines.vision.layout.additional import nothing
-from pipelines.vision.layout.bundle import adjusted, loss
-from pipelines.vision.layout.flips import Flips, Sides, pairs, sides
-from pipelines.vision.layout.sights import Array, Bundle, Index, Sights, linearized
-from pipelines.vision.pose import TagBody, part
+from alidade.factors import so3
+from alidade.pipelines.vision.layout.additional import nothing
+from alidade.pipelines.vision.layout.bundle import adjusted, loss
+from alidade.pipelines.vision.layout.flips import Flips, Sides, pairs, sides
+from alidade.pipelines.vision.layout.sights import Array, Bundle, Index, Sights, linearized
+from alidade.pipelines.vision.pose import TagBody, part
 
 # Sum of squares of a tag in a picture, eight numbers in sigmas, beyond which it counts less and less.
 FAR = 8.0 * 4.0**2

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.vision.layout.additional import Additional
-from pipelines.vision.layout.bundle import adjusted
-from pipelines.vision.layout.motion import with_motion
-from pipelines.vision.layout.sights import Array, Bundle, Index, Rows, Sights, linearized
+from alidade.pipelines.vision.layout.additional import Additional
+from alidade.pipelines.vision.layout.bundle import adjusted
+from alidade.pipelines.vision.layout.motion import with_motion
+from alidade.pipelines.vision.layout.sights import Array, Bundle, Index, Rows, Sights, linearized
 
 # Degrees of freedom of the t distribution.
 _NU = 4.0

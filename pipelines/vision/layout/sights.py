@@ -12,9 +12,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from pipelines.vision.camera import Camera
-from pipelines.vision.pose import SQUARE, TagBody
+from alidade.factors import so3
+from alidade.pipelines.vision.camera import Camera
+from alidade.pipelines.vision.pose import SQUARE, TagBody
 
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]

@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from factors import so3
-from pipelines.errors import InputError
-from pipelines.vision.layout.additional import nothing
-from pipelines.vision.layout.bundle import adjusted, loss
-from pipelines.vision.layout.flips import Flips, flips, lone_scale, pairs, sides
-from pipelines.vision.layout.pictures import Gathered
-from pipelines.vision.layout.placing import FAR, grown, joint, mirrored, together, vote, with_pictures
-from pipelines.vision.layout.robust import Fit, fitted
-from pipelines.vision.layout.sights import Array, Bundle, Index, Sights
-from pipelines.vision.pose import TagBody
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.vision.layout.additional import nothing
+from alidade.pipelines.vision.layout.bundle import adjusted, loss
+from alidade.pipelines.vision.layout.flips import Flips, flips, lone_scale, pairs, sides
+from alidade.pipelines.vision.layout.pictures import Gathered
+from alidade.pipelines.vision.layout.placing import FAR, grown, joint, mirrored, together, vote, with_pictures
+from alidade.pipelines.vision.layout.robust import Fit, fitted
+from alidade.pipelines.vision.layout.sights import Array, Bundle, Index, Sights
+from alidade.pipelines.vision.pose import TagBody
 
 # Twice the logarithm of the odds, a thousand to one, from which a flip is told.
 _TOLD = 2.0 * float(np.log(1e3))

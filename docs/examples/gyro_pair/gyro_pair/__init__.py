@@ -10,22 +10,22 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from pipelines.methods import Method, Scenario
+from alidade.pipelines.methods import Method, Scenario
 
 if TYPE_CHECKING:
+    from alidade.pipelines.graph.problem import Estimate, Problem
+    from alidade.pipelines.judgement.checklist import ChecklistItem
+    from alidade.pipelines.judgement.hypotheses import Hypotheses
+    from alidade.pipelines.judgement.validation import Validation
+    from alidade.pipelines.methods.formula import Formula
+    from alidade.pipelines.recording.reading import Recording
+    from alidade.pipelines.recording.topics import Need, Topic
+    from alidade.pipelines.reports.result import Calibration, Plot
+    from alidade.pipelines.settings import Config
+    from alidade.pipelines.simulation.simulated import Simulated
     from gyro_pair.recording import GyroPairData
     from gyro_pair.simulation import GyroPairScenario
     from gyro_pair.topics import GyroPairConfig
-    from pipelines.graph.problem import Estimate, Problem
-    from pipelines.judgement.checklist import ChecklistItem
-    from pipelines.judgement.hypotheses import Hypotheses
-    from pipelines.judgement.validation import Validation
-    from pipelines.methods.formula import Formula
-    from pipelines.recording.reading import Recording
-    from pipelines.recording.topics import Need, Topic
-    from pipelines.reports.result import Calibration, Plot
-    from pipelines.settings import Config
-    from pipelines.simulation.simulated import Simulated
 
 
 class GyroPair(Method):

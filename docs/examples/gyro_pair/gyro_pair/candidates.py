@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from pipelines.methods import Scenario
-from pipelines.simulation.sways import sways
+from alidade.pipelines.methods import Scenario
+from alidade.pipelines.simulation.sways import sways
 
 # The sway added.
 _SWAY = {"amplitude_deg": 20.0, "frequency_hz": 0.29}

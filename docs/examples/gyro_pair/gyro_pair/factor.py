@@ -13,9 +13,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from factors import so3
-from factors.model import ROT3, Array, Model, Residuals
-from factors.preintegration import GyroPath, Increments
+from alidade.factors import so3
+from alidade.factors.model import ROT3, Array, Model, Residuals
+from alidade.factors.preintegration import GyroPath, Increments
 
 
 @dataclass(frozen=True)

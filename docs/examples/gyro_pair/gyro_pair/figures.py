@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from alidade.pipelines.judgement.validation import rms
+from alidade.pipelines.reports.figure import COLORS, Figure
+from alidade.pipelines.reports.result import Calibration, Plot
 from gyro_pair.recording import GyroPairData
 from gyro_pair.validation import rates
-from pipelines.judgement.validation import rms
-from pipelines.reports.figure import COLORS, Figure
-from pipelines.reports.result import Calibration, Plot
 
 
 def figures(data: GyroPairData, calibration: Calibration) -> list[Plot]:

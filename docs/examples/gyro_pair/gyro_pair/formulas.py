@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from factors import so3
-from pipelines.methods.formula import Formula
+from alidade.factors import so3
+from alidade.pipelines.methods.formula import Formula
 
 
 def formulas(_: Collection[str]) -> list[Formula]:

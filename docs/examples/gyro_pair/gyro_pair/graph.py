@@ -13,19 +13,27 @@ from functools import partial
 import gtsam
 import numpy as np
 
-from factors import so3
-from factors.preintegration import GyroPath
+from alidade.factors import so3
+from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.motion import Motion
+from alidade.pipelines.graph.noise import Level
+from alidade.pipelines.graph.priors import rotation_prior, vector_prior
+from alidade.pipelines.graph.problem import (
+    Array,
+    Factor,
+    Parameter,
+    Problem,
+    Quantity,
+    Step,
+    rotation_vector_coordinates,
+)
+from alidade.pipelines.judgement.pictures import swaying
+from alidade.pipelines.methods.noise import stated
+from alidade.pipelines.settings import DEFAULT_NOISE, Config, check_names, first_given
 from gyro_pair.factor import GyroPairFactor
 from gyro_pair.published import FARTHEST, align
 from gyro_pair.recording import GyroPairData, densities
-from pipelines.errors import InputError
-from pipelines.graph.motion import Motion
-from pipelines.graph.noise import Level
-from pipelines.graph.priors import rotation_prior, vector_prior
-from pipelines.graph.problem import Array, Factor, Parameter, Problem, Quantity, Step, rotation_vector_coordinates
-from pipelines.judgement.pictures import swaying
-from pipelines.methods.noise import stated
-from pipelines.settings import DEFAULT_NOISE, Config, check_names, first_given
 
 _ROTATION, _OFFSET, _DIFFERENCE = "rotation", "time_offset", "bias_difference"
 _ROTATION_KEY, _OFFSET_KEY, _DIFFERENCE_KEY = (int(gtsam.symbol(c, 0)) for c in "RTd")

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from alidade.pipelines.judgement.checklist import ChecklistItem, turned
+from alidade.pipelines.settings import Config
 from gyro_pair.recording import GyroPairData
-from pipelines.judgement.checklist import ChecklistItem, turned
-from pipelines.settings import Config
 
 # Turns count from this angle on, rad.
 _TURN = np.deg2rad(20.0)

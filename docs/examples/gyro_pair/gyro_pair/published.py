@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
+from alidade.factors import so3
+from alidade.pipelines.graph.problem import Estimate, Problem
+from alidade.pipelines.settings import Config
 from gyro_pair.recording import GyroPairData, densities
-from pipelines.graph.problem import Estimate, Problem
-from pipelines.settings import Config
 
 Array = NDArray[np.float64]
 

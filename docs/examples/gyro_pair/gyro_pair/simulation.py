@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from factors import so3
+from alidade.factors import so3
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.simulation.motion import EulerMotion, Swing, sample_times
+from alidade.pipelines.simulation.simulated import Simulated
 from gyro_pair.recording import GyroPairData
-from pipelines.errors import InputError
-from pipelines.simulation.motion import EulerMotion, Swing, sample_times
-from pipelines.simulation.simulated import Simulated
 
 Array = NDArray[np.float64]
 

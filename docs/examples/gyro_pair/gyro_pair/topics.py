@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from pipelines.recording import messages
-from pipelines.recording.topics import Need, Topic
-from pipelines.settings import MethodSection, Sigma
+from alidade.pipelines.recording import messages
+from alidade.pipelines.recording.topics import Need, Topic
+from alidade.pipelines.settings import MethodSection, Sigma
 
 GYRO_A = Topic("gyro_a", "/gyro_a/imu", messages.RATES)
 GYRO_B = Topic("gyro_b", "/gyro_b/imu", messages.RATES)

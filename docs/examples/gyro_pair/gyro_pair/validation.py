@@ -7,12 +7,12 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import so3
-from factors.preintegration import GyroPath
+from alidade.factors import so3
+from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.judgement.validation import Validation
+from alidade.pipelines.settings import Config
 from gyro_pair.graph import windows
 from gyro_pair.recording import GyroPairData
-from pipelines.judgement.validation import Validation
-from pipelines.settings import Config
 
 Array = NDArray[np.float64]
 

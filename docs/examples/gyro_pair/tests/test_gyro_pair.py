@@ -11,24 +11,24 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from factors import so3
-from factors.preintegration import GyroPath
-from factors.testing import assert_jacobians
+from alidade.factors import so3
+from alidade.factors.preintegration import GyroPath
+from alidade.factors.testing import assert_jacobians
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.graph.problem import Estimate, Problem
+from alidade.pipelines.judgement.causes import find_causes
+from alidade.pipelines.judgement.observability import assess
+from alidade.pipelines.methods.formula import apply
+from alidade.pipelines.settings import Config
+from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import Run, solve_incremental
 from gyro_pair import GyroPair
 from gyro_pair.factor import GyroPairFactor
 from gyro_pair.graph import problem, windows
 from gyro_pair.published import align
 from gyro_pair.recording import GyroPairData
 from gyro_pair.simulation import GyroPairScenario
-from pipelines.errors import InputError
-from pipelines.graph.problem import Estimate, Problem
-from pipelines.judgement.causes import find_causes
-from pipelines.judgement.observability import assess
-from pipelines.methods.formula import apply
-from pipelines.settings import Config
-from pipelines.simulation.simulated import Simulated
-from pipelines.solvers.batch import solve_batch
-from pipelines.solvers.incremental import Run, solve_incremental
 
 Array = NDArray[np.float64]
 METHOD = GyroPair()
