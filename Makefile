@@ -37,11 +37,11 @@ dist: $(VENV)/dev
 	for made in dist/*.whl dist/*.tar.gz; do \
 	  rm -rf build/smoke && $(PYTHON) -m venv build/smoke && \
 	  build/smoke/bin/python -m pip install --quiet --disable-pip-version-check $$made -c constraints.txt && \
-	  cp tests/smoke.py tests/walk.py build/smoke/ && (cd build/smoke && bin/python smoke.py) || exit 1; \
+	  cp tests/install/smoke.py tests/install/walk.py build/smoke/ && (cd build/smoke && bin/python smoke.py) || exit 1; \
 	done
 	cd build/smoke && bin/python walk.py $(CURDIR)/README.md $(CURDIR)/docs/tutorials/*.md
 
-# The site; tests/test_docs.py runs what its pages show.
+# The site; tests/applications/test_docs.py runs what its pages show.
 docs: $(VENV)/dev
 	$(BIN)/python -m sphinx -q -W --keep-going -d build/doctrees docs build/docs
 	@echo "The site: build/docs/index.html"

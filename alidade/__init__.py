@@ -18,12 +18,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from alidade.pipelines.api import Config, calibrate, follow, load, open, plan, simulate
+    from alidade.pipelines.applications.api import Config, calibrate, follow, load, open, plan, simulate
+    from alidade.pipelines.applications.session import Session
     from alidade.pipelines.errors import InputError
     from alidade.pipelines.methods import Method
     from alidade.pipelines.methods import names as methods
     from alidade.pipelines.reports.result import Calibration
-    from alidade.pipelines.session import Session
     from alidade.pipelines.simulation.simulated import Simulated
     from alidade.pipelines.solvers.marginals import IndeterminateError
 
@@ -47,18 +47,18 @@ __all__ = [
 
 _MODULES = {
     "Calibration": "alidade.pipelines.reports.result",
-    "Config": "alidade.pipelines.api",
+    "Config": "alidade.pipelines.applications.api",
     "IndeterminateError": "alidade.pipelines.solvers.marginals",
     "InputError": "alidade.pipelines.errors",
     "Method": "alidade.pipelines.methods",
-    "Session": "alidade.pipelines.session",
+    "Session": "alidade.pipelines.applications.session",
     "Simulated": "alidade.pipelines.simulation.simulated",
-    "calibrate": "alidade.pipelines.api",
-    "follow": "alidade.pipelines.api",
-    "load": "alidade.pipelines.api",
-    "open": "alidade.pipelines.api",
-    "plan": "alidade.pipelines.api",
-    "simulate": "alidade.pipelines.api",
+    "calibrate": "alidade.pipelines.applications.api",
+    "follow": "alidade.pipelines.applications.api",
+    "load": "alidade.pipelines.applications.api",
+    "open": "alidade.pipelines.applications.api",
+    "plan": "alidade.pipelines.applications.api",
+    "simulate": "alidade.pipelines.applications.api",
 }
 
 

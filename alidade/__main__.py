@@ -1,5 +1,5 @@
 """`python -m alidade` is the command `alidade`."""
 
-from alidade.pipelines.cli import main
+from alidade.pipelines.applications.cli import main
 
 main()

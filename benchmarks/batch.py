@@ -10,9 +10,9 @@ import numpy as np
 
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.config import load_config
-from alidade.pipelines.graph.gyro_chain import GyroChain, state
-from alidade.pipelines.graph.problem import Factor, Problem, Step
-from alidade.pipelines.graph.walking_bias import FIRST as FIRST_BIAS
+from alidade.pipelines.estimation.gyro_chain import GyroChain, state
+from alidade.pipelines.estimation.problem import Factor, Problem, Step
+from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
 from alidade.pipelines.methods.head import graph as head
 from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head

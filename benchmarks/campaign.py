@@ -27,14 +27,14 @@ import fsspec
 import numpy as np
 
 from alidade.pipelines import methods
-from alidade.pipelines.fleet.analysis import counting, populations
-from alidade.pipelines.fleet.fleet import Outcome, Settings, calibrate_recording
-from alidade.pipelines.fleet.histories import histories, packed, unpacked
-from alidade.pipelines.fleet.recordings import Recording, find, local
-from alidade.pipelines.fleet.store import Result, Store
-from alidade.pipelines.fleet.write import write_fleet
+from alidade.pipelines.applications.fleet.analysis import counting, populations
+from alidade.pipelines.applications.fleet.fleet import Outcome, Settings, calibrate_recording
+from alidade.pipelines.applications.fleet.histories import histories, packed, unpacked
+from alidade.pipelines.applications.fleet.recordings import Recording, find, local
+from alidade.pipelines.applications.fleet.store import Result, Store
+from alidade.pipelines.applications.fleet.write import write_fleet
+from alidade.pipelines.applications.session import Session
 from alidade.pipelines.recording.reading import open_recording
-from alidade.pipelines.session import Session
 from benchmarks.measure import peak_mib
 
 # Of a unit, in the table that is compared.

@@ -22,7 +22,7 @@ from benchmarks.measure import Cost, Ratio, costs
 
 MINUTES = LosScenario(duration_s=600.0, gyro_rate_hz=1000.0, gimbal_rate_hz=1000.0, image_rate_hz=50.0)
 Clock = Callable[[], float]
-_ALIDADE = (sys.executable, "-m", "alidade.pipelines.cli")
+_ALIDADE = (sys.executable, "-m", "alidade")
 
 
 def process(*command: str, rounds: int = 3, clock: Clock | None = None) -> Cost:

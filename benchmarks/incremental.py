@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.config import load_config
-from alidade.pipelines.graph.problem import Array, Problem
+from alidade.pipelines.estimation.problem import Array, Problem
 from alidade.pipelines.methods.head import graph as head
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.methods.los import graph as los

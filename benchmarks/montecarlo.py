@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 
 from alidade.pipelines import methods
-from alidade.pipelines.fleet.montecarlo import simulate_and_solve
-from alidade.pipelines.session import calibrate
+from alidade.pipelines.applications.fleet.montecarlo import simulate_and_solve
+from alidade.pipelines.applications.session import calibrate
 from benchmarks.measure import Ratio, costs
 
 

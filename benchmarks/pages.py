@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.methods import simulate
 from alidade.pipelines.reports.html import report_html
 from alidade.pipelines.reports.result import Calibration
-from alidade.pipelines.session import calibrate
 from benchmarks.measure import Cost, Ratio, costs
-from tests.browser import CHROMIUM
+from tests.support.browser import CHROMIUM
 
 _METHODS = ("los", "indexer", "head", "cube")
 # A page may have so many bytes, and be shown after so many seconds.
@@ -51,7 +51,7 @@ def _write(calibration: Calibration, page: Path) -> None:
 
 def _shown(folder: Path, page: Path, rounds: int = 5) -> Cost:
     """Median wall time until the page and its first figure are drawn, of a browser that has seen no such page."""
-    from tests.devtools import Tab
+    from tests.support.devtools import Tab
 
     seconds = []
     for i in range(rounds):

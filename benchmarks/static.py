@@ -16,7 +16,7 @@ from alidade.factors import so3
 from alidade.factors.los import LosRateFactor, rate_matrix
 from alidade.factors.model import Array, Model, Residuals
 from alidade.factors.triad import AccelFactor
-from alidade.pipelines.graph.problem import Factor
+from alidade.pipelines.estimation.problem import Factor
 from alidade.pipelines.solvers.weighing import optimize
 from benchmarks.measure import Ratio, costs
 

@@ -22,14 +22,14 @@ from scipy.stats import chi2
 from alidade.factors import so3
 from alidade.factors.indexer import mounting_angles
 from alidade.pipelines import methods
-from alidade.pipelines.graph.problem import Array, Problem, rotation_vector_coordinates
+from alidade.pipelines.applications.session import Session
+from alidade.pipelines.estimation.problem import Array, Problem, rotation_vector_coordinates
 from alidade.pipelines.methods.cube.scenario import CubeScenario
 from alidade.pipelines.methods.head.simulation import HeadScenario
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, Position
 from alidade.pipelines.methods.los.simulation import LosAngles, LosScenario
 from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.methods.tumble.scenario import TumbleScenario
-from alidade.pipelines.session import Session
 from alidade.pipelines.settings import Sensors
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, Run

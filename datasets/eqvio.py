@@ -27,7 +27,7 @@ from alidade.factors.chi_square import gate
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.model import ROT3, Array, Model, Residuals
 from alidade.factors.preintegration import GyroPath
-from alidade.pipelines.graph.problem import (
+from alidade.pipelines.estimation.problem import (
     Estimate,
     Factor,
     Parameter,

@@ -11,7 +11,8 @@ project = "alidade"
 author = "The alidade authors"
 version = release = alidade.__version__
 
-# MyST: the pages stay the Markdown that people read in the repository. No notebooks: tests/test_docs.py runs what the
+# MyST: the pages stay the Markdown that people read in the repository. No notebooks:
+# tests/applications/test_docs.py runs what the
 # pages show, commands with their exit codes and outputs included, so that building them runs nothing.
 extensions = [
     "myst_parser",

@@ -16,8 +16,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
 
-from alidade.pipelines import cli
-from tests.command import Command, Run
+from alidade.pipelines.applications import cli
+from tests.support.command import Command, Run
 
 _SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 

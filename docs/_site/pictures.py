@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING
 
 from PIL import Image
 
-from alidade.pipelines import cli
+from alidade.pipelines.applications import cli
 
 if TYPE_CHECKING:
-    from tests.devtools import Tab
+    from tests.support.devtools import Tab
 
 FOLDER = Path(__file__).parents[1] / "pictures"
 _METHODS = ("los", "indexer", "head", "cube", "tumble")
@@ -36,7 +36,7 @@ _SHORT = "{{duration_s: 20, gyro_rate_hz: 100, image_rate_hz: 20, sensors: ideal
 
 def main(wanted: list[str]) -> None:
     """Make the pictures of these names, or all."""
-    from tests.devtools import Tab
+    from tests.support.devtools import Tab
 
     FOLDER.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch, Tab(Path(scratch)) as tab:

@@ -26,7 +26,8 @@ from pydantic import BaseModel
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
-from alidade.pipelines import cli, methods
+from alidade.pipelines import methods
+from alidade.pipelines.applications import cli
 from alidade.pipelines.config import model
 from alidade.pipelines.reports.result import Result
 from alidade.pipelines.simulation.scenario import summary

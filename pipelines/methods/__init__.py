@@ -22,10 +22,10 @@ from alidade.pipelines.errors import InputError, nearest_three
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-    from alidade.pipelines.graph.problem import Array, Estimate, Findings, Problem
-    from alidade.pipelines.judgement.checklist import ChecklistItem
-    from alidade.pipelines.judgement.hypotheses import Hypotheses
-    from alidade.pipelines.judgement.validation import Validation
+    from alidade.pipelines.diagnostics.checklist import ChecklistItem
+    from alidade.pipelines.diagnostics.fault_models import Hypotheses
+    from alidade.pipelines.diagnostics.validation import Validation
+    from alidade.pipelines.estimation.problem import Array, Estimate, Findings, Problem
     from alidade.pipelines.methods.formula import Formula
     from alidade.pipelines.recording.reading import Recording
     from alidade.pipelines.recording.topics import Need, Topic
@@ -111,7 +111,7 @@ class Method(ABC):
 
     def graph(self, data: Any, config: Config) -> Problem:
         """The graph with what the config knows of parameters in place of their priors. Raises as `problem` does."""
-        from alidade.pipelines.graph.believing import believing
+        from alidade.pipelines.estimation.believing import believing
 
         return believing(self.problem(data, config), config.beliefs)
 

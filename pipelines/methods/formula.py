@@ -19,7 +19,7 @@ import numpy as np
 from alidade.factors import so3
 from alidade.factors.gyro import symmetric
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.estimation.problem import Array
 
 
 @dataclass(frozen=True)

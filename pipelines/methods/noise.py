@@ -9,8 +9,8 @@ from math import comb
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.graph.noise import ROUGHLY, Level, Noise, Source
-from alidade.pipelines.graph.robust import robust_sigma
+from alidade.pipelines.estimation.noise import ROUGHLY, Level, Noise, Source
+from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.settings import DEFAULT_NOISE, Config
 
 Array = NDArray[np.float64]

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alidade.pipelines.graph.assumptions import Assumption, parameter
-from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.estimation.assumptions import Assumption, parameter
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
 from alidade.pipelines.recording.reading import Recording

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from alidade.factors import so3
-from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.formula import Formula
 
 TRIADS = ("accel", "gyro", "mag")

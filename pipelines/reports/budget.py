@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from alidade.pipelines.graph.assumptions import kind
-from alidade.pipelines.graph.problem import Quantity
+from alidade.pipelines.estimation.assumptions import kind
+from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.solvers.joint import RECORDING, WALK
 
 _PRIOR = "prior of "

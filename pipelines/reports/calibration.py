@@ -16,9 +16,9 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
 
 from alidade.factors import so3
+from alidade.pipelines.diagnostics.observability import Status, Verdict
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.problem import Array, rotation_vector_coordinates
-from alidade.pipelines.judgement.observability import Status, Verdict
+from alidade.pipelines.estimation.problem import Array, rotation_vector_coordinates
 from alidade.pipelines.methods.formula import Formula, apply
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config

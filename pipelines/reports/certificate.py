@@ -20,14 +20,14 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from alidade.factors.chi_square import student
+from alidade.pipelines.display.units import human_unit, to_digits_of
 from alidade.pipelines.errors import InputError, nearest
-from alidade.pipelines.graph.problem import Quantity
+from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.meanings import meaning
 from alidade.pipelines.reports.answer import Answer, Tone
 from alidade.pipelines.reports.known import load_known
 from alidade.pipelines.reports.templating import environment
-from alidade.pipelines.reports.units import human_unit, to_digits_of
 from alidade.pipelines.reports.whole import write_whole
 from alidade.pipelines.solvers.joint import RECORDING
 

@@ -8,14 +8,14 @@ from statistics import NormalDist
 
 import numpy as np
 
-from alidade.pipelines.graph.problem import Quantity
-from alidade.pipelines.judgement.halves import Halves
+from alidade.pipelines.diagnostics.cross_validation import Halves
+from alidade.pipelines.display.figure import COLORS, Dash, Figure
+from alidade.pipelines.display.units import human_unit, signed, to_digits_of
+from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods.meanings import meaning
 from alidade.pipelines.reports.answer import Answer
-from alidade.pipelines.reports.figure import COLORS, Dash, Figure
 from alidade.pipelines.reports.result import Calibration, Plot, truth_errors
 from alidade.pipelines.reports.templating import page
-from alidade.pipelines.reports.units import human_unit, signed, to_digits_of
 from alidade.pipelines.reports.whole import write_page
 
 FILE = "compare.html"
@@ -36,7 +36,7 @@ def compare_html(
 
     Args:
         calibrations: of one recording, by different solvers.
-        halves: of the recording, see alidade.pipelines.judgement.halves.
+        halves: of the recording, see alidade.pipelines.diagnostics.cross_validation.
         predicted: family -> size of the errors of held-out measurements, sigmas.
     """
     quantities = [q for q in calibrations[0].problem.quantities if q.prior_sigma != 0.0]

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.graph.problem import Array, History
+from alidade.pipelines.estimation.problem import Array, History
 from alidade.pipelines.recording.mcap_records import MESSAGE_HEAD
 from alidade.pipelines.recording.message_source import message_source
 from alidade.pipelines.recording.messages import JOINT_STATE, definition_text

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from itertools import cycle
 from typing import Any
 
-from alidade.pipelines.reports.figure import COLORS, PALETTE
+from alidade.pipelines.display.figure import COLORS, PALETTE
 from alidade.pipelines.reports.plots import variables
 from alidade.pipelines.reports.result import Calibration
 

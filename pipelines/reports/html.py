@@ -10,8 +10,9 @@ import datetime
 from contextlib import suppress
 from dataclasses import dataclass
 
-from alidade.pipelines.graph.problem import Quantity
-from alidade.pipelines.judgement.observability import by_advice
+from alidade.pipelines.diagnostics.observability import by_advice
+from alidade.pipelines.display.units import human_unit, noise_unit, rounded, signed, to_digits_of
+from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods.meanings import NOISES, meaning
 from alidade.pipelines.reports.answer import Answer, Tone
 from alidade.pipelines.reports.budget import Limit, limits
@@ -22,7 +23,6 @@ from alidade.pipelines.reports.ros import ros_parameters
 from alidade.pipelines.reports.sketch import enlarged, sketch_with, told
 from alidade.pipelines.reports.snippets import c_code, python_code
 from alidade.pipelines.reports.templating import environment, page
-from alidade.pipelines.reports.units import human_unit, noise_unit, rounded, signed, to_digits_of
 
 # Beyond so many sigmas of its prior a number says nothing.
 _MEANINGLESS = 10.0

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from alidade.pipelines.judgement.allan import allan_variance
-from alidade.pipelines.judgement.noise_fit import Coefficient
-from alidade.pipelines.noise import NoiseStudy, SensorNoise
+from alidade.pipelines.applications.noise import NoiseStudy, SensorNoise
+from alidade.pipelines.diagnostics.allan import allan_variance
+from alidade.pipelines.diagnostics.noise_spectrum import Coefficient
+from alidade.pipelines.display.figure import COLORS, Figure
 from alidade.pipelines.reports.answer import Answer
-from alidade.pipelines.reports.figure import COLORS, Figure
 from alidade.pipelines.reports.result import Plot, software_versions
 from alidade.pipelines.reports.templating import page
 from alidade.pipelines.reports.whole import write_whole

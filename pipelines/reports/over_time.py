@@ -9,12 +9,12 @@ from itertools import cycle
 
 import numpy as np
 
-from alidade.pipelines.graph.assumptions import kind
-from alidade.pipelines.graph.problem import Quantity
-from alidade.pipelines.judgement.changes import Change, Changes
-from alidade.pipelines.reports.figure import COLORS, Figure, milliseconds
+from alidade.pipelines.diagnostics.device_changes import Change, Changes
+from alidade.pipelines.display.figure import COLORS, Figure, milliseconds
+from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
+from alidade.pipelines.estimation.assumptions import kind
+from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.reports.result import Calibration, PartResult, Plot, Table
-from alidade.pipelines.reports.units import human_unit, rounded, to_digits_of
 
 # Beyond so many days a forecast says nothing.
 _FAR_DAYS = 36_525.0

@@ -8,16 +8,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from alidade.pipelines.judgement.validation import peak, rms
+from alidade.pipelines.diagnostics.validation import peak, rms
 
 if TYPE_CHECKING:
-    from alidade.pipelines.fleet.analysis import Population
-    from alidade.pipelines.fleet.fleet import Outcome
-    from alidade.pipelines.fleet.histories import History
-    from alidade.pipelines.fleet.montecarlo import Study
-    from alidade.pipelines.fleet.statistics import Component
-    from alidade.pipelines.planning import Plan
-    from alidade.pipelines.validate import Validated
+    from alidade.pipelines.applications.fleet.analysis import Population
+    from alidade.pipelines.applications.fleet.fleet import Outcome
+    from alidade.pipelines.applications.fleet.histories import History
+    from alidade.pipelines.applications.fleet.montecarlo import Study
+    from alidade.pipelines.applications.fleet.statistics import Component
+    from alidade.pipelines.applications.planning import Plan
+    from alidade.pipelines.applications.validate import Validated
 
 
 def plain_json(kind: str, content: Mapping[str, Any]) -> str:
@@ -89,9 +89,9 @@ def plan_json(plan: Plan) -> str:
 
 def fleet_json(outcome: Outcome, fleet: Sequence[Population], found: Sequence[History]) -> str:
     """Of `fleet`: the rows of fleet.csv and changes.csv, the components of every parameter, and who needs attention."""
-    from alidade.pipelines.fleet.analysis import table
-    from alidade.pipelines.fleet.attention import units_of_interest
-    from alidade.pipelines.fleet.histories import change_table
+    from alidade.pipelines.applications.fleet.analysis import table
+    from alidade.pipelines.applications.fleet.attention import units_of_interest
+    from alidade.pipelines.applications.fleet.histories import change_table
 
     return plain_json(
         "fleet",
@@ -116,7 +116,7 @@ def _component(component: Component | None) -> dict[str, float] | None:
 
 def study_json(study: Study) -> str:
     """Of `montecarlo`: the rows of runs.csv and summary.csv."""
-    from alidade.pipelines.fleet.montecarlo import run_table, summary_table
+    from alidade.pipelines.applications.fleet.montecarlo import run_table, summary_table
 
     return plain_json(
         "montecarlo",

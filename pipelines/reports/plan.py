@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from alidade.pipelines import methods
+from alidade.pipelines.applications.planning import Plan
+from alidade.pipelines.display.figure import BEFORE, COLORS, Figure
+from alidade.pipelines.display.units import human_unit, rounded
 from alidade.pipelines.methods.meanings import meaning
-from alidade.pipelines.planning import Plan
 from alidade.pipelines.reports.answer import Answer
 from alidade.pipelines.reports.budget import limits
-from alidade.pipelines.reports.figure import BEFORE, COLORS, Figure
 from alidade.pipelines.reports.result import Plot
 from alidade.pipelines.reports.templating import page
-from alidade.pipelines.reports.units import human_unit, rounded
 
 
 def plan_html(plan: Plan) -> str:

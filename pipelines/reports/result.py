@@ -18,17 +18,25 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
-from alidade.pipelines.graph.assumptions import pull
-from alidade.pipelines.graph.noise import Level, Source
-from alidade.pipelines.graph.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
-from alidade.pipelines.judgement.changes import Changes
-from alidade.pipelines.judgement.observability import Assessment, Fit, Innovations, Learning, Status, Verdict, learning
-from alidade.pipelines.judgement.rejection import rejection_sentence
-from alidade.pipelines.judgement.self_check import SelfCheck
-from alidade.pipelines.judgement.stability import Stability
+from alidade.pipelines.diagnostics.change_test import Stability
+from alidade.pipelines.diagnostics.device_changes import Changes
+from alidade.pipelines.diagnostics.observability import (
+    Assessment,
+    Fit,
+    Innovations,
+    Learning,
+    Status,
+    Verdict,
+    learning,
+)
+from alidade.pipelines.diagnostics.rejection import rejection_sentence
+from alidade.pipelines.diagnostics.self_check import SelfCheck
+from alidade.pipelines.display.figure import Figure
+from alidade.pipelines.estimation.assumptions import pull
+from alidade.pipelines.estimation.noise import Level, Source
+from alidade.pipelines.estimation.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
 from alidade.pipelines.recording.faults import CLIPPED
 from alidade.pipelines.recording.info import SessionFacts
-from alidade.pipelines.reports.figure import Figure
 from alidade.pipelines.settings import Config
 
 if TYPE_CHECKING:
@@ -264,7 +272,7 @@ class Calibration:
 
     def __str__(self) -> str:
         """The table and the verdict, as the command prints them."""
-        from alidade.pipelines.terminal import as_text
+        from alidade.pipelines.reports.terminal import as_text
 
         return as_text([self])
 

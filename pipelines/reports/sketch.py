@@ -14,8 +14,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from alidade.factors import so3
+from alidade.pipelines.display.units import rounded
 from alidade.pipelines.reports.calibration import SavedTransform
-from alidade.pipelines.reports.units import rounded
 
 # Where x, y, z of a frame point in a sketch, as columns, and how long they are, px.
 _DIRECTIONS = {

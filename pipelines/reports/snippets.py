@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from alidade.factors import so3
-from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.formula import Formula
 
 Kind = Literal["scalar", "vector", "matrix"]

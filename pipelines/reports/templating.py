@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.graph.problem import Array
-from alidade.pipelines.reports.figure import PALETTE, Figure, Mark
+from alidade.pipelines.display.figure import PALETTE, Figure, Mark
+from alidade.pipelines.estimation.problem import Array
 
 if TYPE_CHECKING:
     from jinja2 import Environment

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from alidade.pipelines.graph.problem import Attitudes
+from alidade.pipelines.estimation.problem import Attitudes
 
 
 def tum(attitudes: Attitudes, epoch_ns: int) -> str:

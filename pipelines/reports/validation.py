@@ -7,12 +7,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alidade.pipelines.judgement.validation import Validation, peak, rms
+from alidade.pipelines.diagnostics.validation import Validation, peak, rms
+from alidade.pipelines.display.figure import BEFORE, COLORS, Figure
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.meanings import meaning
 from alidade.pipelines.reports.answer import Answer, Tone
 from alidade.pipelines.reports.calibration import SavedCalibration
-from alidade.pipelines.reports.figure import BEFORE, COLORS, Figure
 from alidade.pipelines.reports.result import Plot
 from alidade.pipelines.reports.templating import page
 

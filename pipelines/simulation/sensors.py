@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError, nearest
-from alidade.pipelines.graph.assumptions import Assumption, quantities
+from alidade.pipelines.estimation.assumptions import Assumption, quantities
 from alidade.pipelines.settings import Config, Sensors
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from alidade.pipelines.graph.assumptions import Assumption
+from alidade.pipelines.estimation.assumptions import Assumption
 from alidade.pipelines.recording.temperature import Temperature
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import gtsam
 
-from alidade.pipelines.graph.problem import Factor, Problem, Step
+from alidade.pipelines.estimation.problem import Factor, Problem, Step
 
 # Frames in one vectorised factor: past this the Jacobians' zeros cost more than the Python calls they save.
 CHUNK = 20

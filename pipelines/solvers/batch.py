@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from alidade.pipelines.graph.noise import Level
-from alidade.pipelines.graph.problem import Array, Course, Estimate, Factor, History, Minimum, Problem, Pull, Told
+from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.problem import Array, Course, Estimate, Factor, History, Minimum, Problem, Pull, Told
 from alidade.pipelines.solvers.assembly import CHUNK, Assembly, StepBoundary
 from alidade.pipelines.solvers.coloured import added_variance, coloured, inflations
 from alidade.pipelines.solvers.curvature import second_order

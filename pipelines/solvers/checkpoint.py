@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.problem import Problem
+from alidade.pipelines.estimation.problem import Problem
 from alidade.pipelines.solvers.course import Way
 from alidade.pipelines.solvers.incremental import Run
 from alidade.pipelines.solvers.innovations import Innovations

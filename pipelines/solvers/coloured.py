@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 import gtsam
 import numpy as np
 
-from alidade.pipelines.graph.problem import Array, Factor, Problem, Residuals
+from alidade.pipelines.estimation.problem import Array, Factor, Problem, Residuals
 from alidade.pipelines.solvers.influence import FactorRows, Influence
 
 # Families of fewer measurements are too short to tell their colour.

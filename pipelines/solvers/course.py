@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.graph.problem import Array, Course
+from alidade.pipelines.estimation.problem import Array, Course
 from alidade.pipelines.solvers.rows import Rows
 
 # From one moment to the next, as a share of the time since the first.

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.graph.problem import Array, Problem
+from alidade.pipelines.estimation.problem import Array, Problem
 from alidade.pipelines.solvers.marginals import (
     IndeterminateError,
     marginal,

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import gtsam
 import numpy as np
 
-from alidade.pipelines.graph.problem import Array, Course, Problem
+from alidade.pipelines.estimation.problem import Array, Course, Problem
 from alidade.pipelines.solvers.assembly import StepBoundary
 from alidade.pipelines.solvers.marginals import coordinate_inverse, ordering_of, reported, reported_covariance
 

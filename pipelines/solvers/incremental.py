@@ -19,7 +19,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.graph.problem import (
+from alidade.pipelines.estimation.problem import (
     Array,
     Attitudes,
     ChiSquare,

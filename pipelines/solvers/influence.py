@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 import gtsam
 import numpy as np
 
-from alidade.pipelines.graph.problem import Array, Factor, Problem, Pull
+from alidade.pipelines.estimation.problem import Array, Factor, Problem, Pull
 from alidade.pipelines.solvers.marginals import HELD
 from alidade.pipelines.solvers.stretch import Part
 from alidade.pipelines.solvers.system import Linear

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors.chi_square import gate
-from alidade.pipelines.graph.problem import Array, ChiSquare, Factor, Residuals
+from alidade.pipelines.estimation.problem import Array, ChiSquare, Factor, Residuals
 from alidade.pipelines.solvers.linear_system import linear_graph_of
 from alidade.pipelines.solvers.marginals import ordering_of
 from alidade.pipelines.solvers.rows import Rows

@@ -17,8 +17,8 @@ from itertools import pairwise
 import numpy as np
 
 from alidade.pipelines.belief import Belief
-from alidade.pipelines.graph.noise import Level
-from alidade.pipelines.graph.problem import Array, Problem, Told
+from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.problem import Array, Problem, Told
 from alidade.pipelines.solvers.assembly import CHUNK, Assembly
 from alidade.pipelines.solvers.noise_levels import weigh
 from alidade.pipelines.solvers.told import fewest, told

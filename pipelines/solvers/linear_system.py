@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 import gtsam
 import numpy as np
 
-from alidade.pipelines.graph.problem import Factor
+from alidade.pipelines.estimation.problem import Factor
 from alidade.pipelines.solvers.marginals import ordering_of
 
 

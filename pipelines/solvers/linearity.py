@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alidade.pipelines.graph.problem import Problem
+from alidade.pipelines.estimation.problem import Problem
 from alidade.pipelines.solvers.gauss_newton import Solution
 from alidade.pipelines.solvers.marginals import IndeterminateError, coordinate_inverse
 

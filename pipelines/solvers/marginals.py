@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.graph.problem import Array, ChiSquare, Factor, History, Parameter, Problem
+from alidade.pipelines.estimation.problem import Array, ChiSquare, Factor, History, Parameter, Problem
 
 if TYPE_CHECKING:
     from alidade.pipelines.solvers.system import Linear

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import gtsam
 import numpy as np
 
-from alidade.pipelines.graph.problem import Minimum, Problem
+from alidade.pipelines.estimation.problem import Minimum, Problem
 from alidade.pipelines.solvers.marginals import reported
 
 if TYPE_CHECKING:

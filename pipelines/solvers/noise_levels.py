@@ -21,10 +21,10 @@ import gtsam
 import numpy as np
 
 from alidade.factors.vectorized import VectorizedFactor
-from alidade.pipelines.graph.linear import rescaled
-from alidade.pipelines.graph.noise import Level, Noise
-from alidade.pipelines.graph.problem import Array, Factor
-from alidade.pipelines.graph.robust import robust_sigma
+from alidade.pipelines.estimation.linear import rescaled
+from alidade.pipelines.estimation.noise import Level, Noise
+from alidade.pipelines.estimation.problem import Array, Factor
+from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.solvers.marginals import sum_of_squares
 
 # Levels stay as they are while what would change is less than this, in the logarithm.

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from alidade.pipelines.graph.problem import Array, Factor, Problem
+from alidade.pipelines.estimation.problem import Array, Factor, Problem
 from alidade.pipelines.solvers.gauss_newton import MOST_ITERATIONS, Solution, minimize
 from alidade.pipelines.solvers.marginals import HELD, joint_covariance
 from alidade.pipelines.solvers.spurious import Spurious, information_of_noise

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.graph.problem import Array, Factor
+from alidade.pipelines.estimation.problem import Array, Factor
 from alidade.pipelines.solvers.stretch import Part
 from alidade.pipelines.solvers.system import Linear
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.estimation.problem import Array
 
 
 class Rows:

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 
 from alidade.factors.loss import TruncatedLoss
-from alidade.pipelines.graph.problem import Array, Factor
+from alidade.pipelines.estimation.problem import Array, Factor
 from alidade.pipelines.solvers.linear_system import graph_of, linear_graph_of
 from alidade.pipelines.solvers.marginals import ordering_of
 

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from alidade.pipelines.graph.problem import Array, Problem
+from alidade.pipelines.estimation.problem import Array, Problem
 from alidade.pipelines.solvers.marginals import IndeterminateError, joint_information, prior_units
 from alidade.pipelines.solvers.system import Linear
 

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.problem import Factor
+from alidade.pipelines.estimation.problem import Factor
 from alidade.pipelines.solvers.marginals import IndeterminateError, explain, ordering_of
 
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.vectorized import jacobian_factor, residuals_at
-from alidade.pipelines.graph.problem import Array, Factor, Residuals
+from alidade.pipelines.estimation.problem import Array, Factor, Residuals
 from alidade.pipelines.parallel import Crew, room
 from alidade.pipelines.solvers.assembly import StepBoundary
 from alidade.pipelines.solvers.history import moments_of

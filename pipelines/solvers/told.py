@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 
 from alidade.pipelines.belief import Belief, root_of_information
-from alidade.pipelines.graph.believing import about_alone
-from alidade.pipelines.graph.problem import Array, Problem, Told
+from alidade.pipelines.estimation.believing import about_alone
+from alidade.pipelines.estimation.problem import Array, Problem, Told
 from alidade.pipelines.solvers.marginals import coordinate_inverse, marginal, reported
 from alidade.pipelines.solvers.system import Linear
 

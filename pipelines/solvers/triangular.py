@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.solvers.marginals import IndeterminateError, eliminated, explain
 
 

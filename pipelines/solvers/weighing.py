@@ -9,8 +9,8 @@ import gtsam
 import numpy as np
 
 from alidade.factors.loss import TruncatedLoss
-from alidade.pipelines.graph.noise import Level
-from alidade.pipelines.graph.problem import Array, Factor, Problem
+from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.problem import Array, Factor, Problem
 from alidade.pipelines.solvers.assembly import StepBoundary
 from alidade.pipelines.solvers.gauss_newton import MOST_DAMPING, MOST_ITERATIONS, Solution, minimize
 from alidade.pipelines.solvers.marginals import rows_used

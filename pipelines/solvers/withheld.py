@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.graph.problem import Array, Problem
+from alidade.pipelines.estimation.problem import Array, Problem
 
 
 def with_prior(problem: Problem) -> NDArray[np.bool_]:

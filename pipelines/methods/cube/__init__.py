@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, ClassVar
 from alidade.pipelines.methods import Method, Scenario
 
 if TYPE_CHECKING:
-    from alidade.pipelines.graph.problem import Array, Estimate, Findings, Problem
-    from alidade.pipelines.judgement.checklist import ChecklistItem
-    from alidade.pipelines.judgement.hypotheses import Hypotheses
-    from alidade.pipelines.judgement.validation import Validation
+    from alidade.pipelines.diagnostics.checklist import ChecklistItem
+    from alidade.pipelines.diagnostics.fault_models import Hypotheses
+    from alidade.pipelines.diagnostics.validation import Validation
+    from alidade.pipelines.estimation.problem import Array, Estimate, Findings, Problem
     from alidade.pipelines.methods.cube.data import CubeData
     from alidade.pipelines.methods.cube.scenario import CubeScenario
     from alidade.pipelines.methods.cube.topics import CubeConfig

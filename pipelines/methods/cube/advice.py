@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from alidade.pipelines.graph.motion import Motion
-from alidade.pipelines.judgement.pictures import swaying
+from alidade.pipelines.display.drawing import swaying
+from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.methods.cube.faces import Side
 from alidade.pipelines.methods.cube.picture import rested
 

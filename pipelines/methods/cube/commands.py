@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from alidade.pipelines.applications.options import ConfigFile, Json, Quiet
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.options import ConfigFile, Json, Quiet
 
 if TYPE_CHECKING:
     from alidade.pipelines.vision.layout import Layout
@@ -23,12 +23,13 @@ def cube_layout(
     quiet: Quiet = False,
 ) -> None:
     """Where the tags are on a cube, from pictures of it on all sides; the config gives their ids and sizes."""
-    from alidade.pipelines import progress, terminal
+    from alidade.pipelines import progress
     from alidade.pipelines.config import recorded_config
     from alidade.pipelines.methods.cube.layout import cube_layout as estimate
     from alidade.pipelines.methods.cube.layout import layout_yaml
     from alidade.pipelines.methods.cube.layout_page import layout_html, layout_json
     from alidade.pipelines.recording.reading import open_recording
+    from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.whole import write_file
 
     page = out.with_suffix(".html")
@@ -51,8 +52,8 @@ def _show(layout: "Layout") -> None:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
-    from alidade.pipelines import terminal
     from alidade.pipelines.methods.cube.layout_page import COLUMNS, advice, camera_rows, headline, rows
+    from alidade.pipelines.reports import terminal
 
     table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
     for column in COLUMNS:
@@ -75,8 +76,8 @@ def cube_print(
     first_id: Annotated[int, typer.Option(help="Tag on the top face; the others follow.")] = 16,
 ) -> None:
     """Sheets with the six faces of a tag cube, true to scale."""
-    from alidade.pipelines import terminal
     from alidade.pipelines.methods.cube.printing import print_cube
+    from alidade.pipelines.reports import terminal
 
     print_cube(out, edge, first_id)
     terminal.say(f"Wrote {out}: print at 100 % and check the ruler")

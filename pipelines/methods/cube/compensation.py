@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.cube.data import CubeData, nominal, recorded
 from alidade.pipelines.methods.cube.parameters import CUBE, SENSITIVITY, SQUARE, TEMPERATURE
 from alidade.pipelines.methods.cube.topics import CubeConfig

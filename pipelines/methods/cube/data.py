@@ -10,7 +10,7 @@ from typing import TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.graph.noise import Noise
+from alidade.pipelines.estimation.noise import Noise
 from alidade.pipelines.methods.cube.topics import CubeConfig, RawConversion, field_date
 from alidade.pipelines.methods.noise import stated
 from alidade.pipelines.methods.place import field_at

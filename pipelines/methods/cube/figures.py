@@ -9,16 +9,16 @@ import numpy as np
 from alidade.factors import so3
 from alidade.factors.earth import earth_rate, gravity
 from alidade.factors.preintegration import GyroPath
-from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.display.figure import BEFORE, COLORS, FAINT, Figure, thin
+from alidade.pipelines.display.units import rounded
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.cube.compensation import calibrated, calibrated_rates
 from alidade.pipelines.methods.cube.coverage import coverage
 from alidade.pipelines.methods.cube.data import CubeData, local_field, nominal
 from alidade.pipelines.methods.cube.poses import StaticPoses, static_poses, turn
 from alidade.pipelines.methods.cube.tables import NAMES, cube_tables
 from alidade.pipelines.methods.cube.topics import CubeConfig
-from alidade.pipelines.reports.figure import BEFORE, COLORS, FAINT, Figure, thin
 from alidade.pipelines.reports.result import Calibration, Plot, Table
-from alidade.pipelines.reports.units import rounded
 from alidade.pipelines.settings import Config
 
 # Unit that people read an error in, and what to multiply its SI number by.

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from alidade.factors import so3
-from alidade.pipelines.graph.problem import Array, Estimate, Findings
+from alidade.pipelines.estimation.problem import Array, Estimate, Findings
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.cube.compensation import calibrated
 from alidade.pipelines.methods.cube.data import CubeData, local_field, noise_densities, nominal

@@ -20,8 +20,8 @@ import numpy as np
 
 from alidade.factors import so3
 from alidade.factors.turns import Samples, Turns
-from alidade.pipelines.graph.believing import believing
-from alidade.pipelines.graph.problem import Attitudes, Factor, Problem, Step
+from alidade.pipelines.estimation.believing import believing
+from alidade.pipelines.estimation.problem import Attitudes, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.cube.advice import advice
 from alidade.pipelines.methods.cube.data import CubeData

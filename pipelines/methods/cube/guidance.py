@@ -7,10 +7,10 @@ from itertools import permutations
 
 import numpy as np
 
-from alidade.pipelines.graph.motion import Motion
-from alidade.pipelines.graph.problem import Array
-from alidade.pipelines.judgement.checklist import ChecklistItem
-from alidade.pipelines.judgement.pictures import covered
+from alidade.pipelines.diagnostics.checklist import ChecklistItem
+from alidade.pipelines.display.drawing import covered
+from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.cube.data import CubeData
 from alidade.pipelines.methods.cube.faces import SIDES, Side
 from alidade.pipelines.methods.cube.picture import rested

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from alidade.pipelines.judgement.hypotheses import AXES, ExactInput, Hypotheses, Scaling
+from alidade.pipelines.diagnostics.fault_models import AXES, ExactInput, Hypotheses, Scaling
 from alidade.pipelines.methods.cube.data import CubeData
 from alidade.pipelines.methods.cube.parameters import FOCAL, is_stated
 from alidade.pipelines.methods.cube.topics import CubeConfig

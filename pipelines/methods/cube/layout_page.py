@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from alidade.factors import so3
-from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.display.figure import COLORS, Figure
+from alidade.pipelines.display.units import to_digits_of
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.reports.answer import Answer, Tone
-from alidade.pipelines.reports.figure import COLORS, Figure
 from alidade.pipelines.reports.plain_json import plain_json
 from alidade.pipelines.reports.result import Plot
 from alidade.pipelines.reports.templating import page
-from alidade.pipelines.reports.units import to_digits_of
 
 if TYPE_CHECKING:
     from alidade.pipelines.vision.layout import Layout

@@ -11,7 +11,7 @@ from alidade.factors import so3
 from alidade.factors.tags import TagAttitudeFactor
 from alidade.factors.triad import AccelFactor, GyroStaticFactor, MagFactor
 from alidade.factors.turns import GyroRotationFactor
-from alidade.pipelines.graph.problem import Array, Factor
+from alidade.pipelines.estimation.problem import Array, Factor
 from alidade.pipelines.methods.cube.model import Model
 from alidade.pipelines.methods.cube.parameters import (
     CURVATURE_KEY,

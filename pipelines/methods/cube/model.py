@@ -13,7 +13,7 @@ from alidade.factors.earth import earth_rate, gravity
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.cube.data import DENSITIES, CubeData, local_field, nominal
 from alidade.pipelines.methods.cube.noises import noises
 from alidade.pipelines.methods.cube.parameters import Parameters, cube_parameters

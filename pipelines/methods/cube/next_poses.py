@@ -14,7 +14,7 @@ import numpy as np
 
 from alidade.factors import so3
 from alidade.factors.earth import magnetic_field
-from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.cube.faces import SIDES, Resting
 from alidade.pipelines.methods.cube.scenario import YEAR, CubeScenario
 from alidade.pipelines.methods.cube.simulation import attitudes

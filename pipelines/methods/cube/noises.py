@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from alidade.pipelines.graph.noise import Level
+from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.methods.cube.data import CubeData, computed_once, nominal, stated_density
 from alidade.pipelines.methods.cube.poses import static_poses
 from alidade.pipelines.methods.cube.topics import CubeConfig

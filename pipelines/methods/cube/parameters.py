@@ -12,17 +12,17 @@ import numpy as np
 from alidade.factors import so3
 from alidade.factors.triad import TriadPriorFactor, calibration, triad
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph import assumptions
-from alidade.pipelines.graph.assumptions import (
+from alidade.pipelines.estimation import assumptions
+from alidade.pipelines.estimation.assumptions import (
     Assumption,
     quantities,
     sensitivity_assumption,
     stated,
     temperature_assumption,
 )
-from alidade.pipelines.graph.linear import linear_factor
-from alidade.pipelines.graph.priors import prior_sigmas, rotation_prior, vector_prior
-from alidade.pipelines.graph.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
+from alidade.pipelines.estimation.linear import linear_factor
+from alidade.pipelines.estimation.priors import prior_sigmas, rotation_prior, vector_prior
+from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity, rotation_vector_coordinates
 from alidade.pipelines.methods.cube.tag_places import CAMERA_NUMBERS, tag_place_names, tag_places
 from alidade.pipelines.methods.cube.topics import CubeConfig, RawConversion
 from alidade.pipelines.methods.place import FIELD, STRENGTH_SIGMA

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
-from alidade.pipelines.judgement.pictures import resting
+from alidade.pipelines.display.drawing import resting
 from alidade.pipelines.methods.cube.faces import SIDES, Resting, Side
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.earth import EARTH_RATE, earth_rate, gravity
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.problem import Attitudes, Estimate, Problem, Residuals
+from alidade.pipelines.estimation.problem import Attitudes, Estimate, Problem, Residuals
 from alidade.pipelines.methods.cube.data import CubeData, local_field, recorded
 from alidade.pipelines.methods.cube.poses import StaticPoses, static_poses
 from alidade.pipelines.methods.cube.topics import CubeConfig

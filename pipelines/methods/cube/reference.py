@@ -8,7 +8,7 @@ import numpy as np
 
 from alidade.factors import so3
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.cube.data import CubeData
 from alidade.pipelines.methods.cube.poses import StaticPoses
 from alidade.pipelines.methods.cube.topics import REFERENCE_IMU, CubeConfig

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.earth import earth_rate, gravity, magnetic_field
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.assumptions import stated
+from alidade.pipelines.estimation.assumptions import stated
 from alidade.pipelines.methods.cube.data import CubeData, Sightings
 from alidade.pipelines.methods.cube.faces import FACES
 from alidade.pipelines.methods.cube.motion import drawn_motion

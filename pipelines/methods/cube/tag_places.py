@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from alidade.pipelines.belief import Belief
-from alidade.pipelines.graph.problem import Parameter, Quantity
+from alidade.pipelines.estimation.problem import Parameter, Quantity
 from alidade.pipelines.methods.cube.topics import CubeConfig
 from alidade.pipelines.settings import Config
 

@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 
 from alidade.factors.triad import WeightedSumFactor
-from alidade.pipelines.graph.linear import linear_factor
-from alidade.pipelines.graph.problem import Array, Factor
+from alidade.pipelines.estimation.linear import linear_factor
+from alidade.pipelines.estimation.problem import Array, Factor
 from alidade.pipelines.methods.cube.poses import StaticPoses
 
 # A gyro bias that does not walk still does so by this much, rad/s, for the sake of the arithmetic.

@@ -19,15 +19,15 @@ from alidade.factors.attitude import VisionAttitudeFactor
 from alidade.factors.chi_square import gate
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.display.drawing import swaying
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.assumptions import acting
-from alidade.pipelines.graph.clock import Clock, Keyframes
-from alidade.pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk, shared_keyframes
-from alidade.pipelines.graph.motion import Motion
-from alidade.pipelines.graph.noise import Level
-from alidade.pipelines.graph.priors import rotation_prior, vector_prior
-from alidade.pipelines.graph.problem import Array, Attitudes, Factor, Problem, Step
-from alidade.pipelines.judgement.pictures import swaying
+from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.assumptions import acting
+from alidade.pipelines.estimation.camera_clock import Clock, Keyframes
+from alidade.pipelines.estimation.gyro_chain import ROOT, GyroChain, Trunk, shared_keyframes
+from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.priors import rotation_prior, vector_prior
+from alidade.pipelines.estimation.problem import Array, Attitudes, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.head.guess import guess, guess_picture_clock
 from alidade.pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, SENSITIVITY, TEMPERATURE, HeadParameters

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from alidade.factors import so3
 from alidade.factors.preintegration import GyroPath
-from alidade.pipelines.graph.clock import Clock, Miss, first_span, guess_clock, turns_near
-from alidade.pipelines.graph.priors import prior_sigmas
-from alidade.pipelines.graph.problem import Array, Parameter
+from alidade.pipelines.estimation.camera_clock import Clock, Miss, first_span, guess_clock, turns_near
+from alidade.pipelines.estimation.priors import prior_sigmas
+from alidade.pipelines.estimation.problem import Array, Parameter
 
 # Rates for the first guess are taken over this time, s: long against vision noise, short against turns.
 _GUESS_SPAN = 0.3

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from alidade.factors import so3
-from alidade.pipelines.judgement.hypotheses import AXES, Fault, Hypotheses
+from alidade.pipelines.diagnostics.fault_models import AXES, Fault, Hypotheses
 from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.settings import Config
 

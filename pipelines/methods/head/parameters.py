@@ -10,7 +10,7 @@ import gtsam
 
 from alidade.factors.earth import EARTH_RATE
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.assumptions import (
+from alidade.pipelines.estimation.assumptions import (
     Assumption,
     gyro_errors,
     parameter,
@@ -19,8 +19,8 @@ from alidade.pipelines.graph.assumptions import (
     sensitivity_assumption,
     temperature_assumption,
 )
-from alidade.pipelines.graph.problem import Parameter, Quantity, rotation_vector_coordinates
-from alidade.pipelines.graph.walking_bias import FIRST as FIRST_BIAS
+from alidade.pipelines.estimation.problem import Parameter, Quantity, rotation_vector_coordinates
+from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
 from alidade.pipelines.settings import Config, check_names
 
 BIAS, HELMET, CAMERA, OFFSET = "gyro_bias", "helmet_mount", "camera_mount", "time_offset"

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from alidade.factors import so3
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.problem import Attitudes, ChiSquare, Estimate, History, Problem, Residuals
+from alidade.pipelines.estimation.problem import Attitudes, ChiSquare, Estimate, History, Problem, Residuals
 from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from alidade.factors import so3
 from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.diagnostics.validation import Validation
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.problem import Array
-from alidade.pipelines.judgement.validation import Validation
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.settings import Config
 

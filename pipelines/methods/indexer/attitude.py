@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from alidade.factors import so3
 from alidade.factors.indexer import base_from_platform, mounting
-from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.indexer.recording import IndexerData
 from alidade.pipelines.methods.indexer.runs import AxisMotion
 

@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from alidade.factors.earth import EARTH_RATE
 from alidade.factors.indexer import ENCODER_ERRORS, IndexerAverageFactor, Option
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.motion import Motion
-from alidade.pipelines.graph.noise import Level, Noise
-from alidade.pipelines.graph.priors import prior_sigmas, vector_prior
-from alidade.pipelines.graph.problem import Array, Attitudes, Factor, Parameter, Problem, Step
-from alidade.pipelines.graph.walking_bias import FIRST as FIRST_BIAS
-from alidade.pipelines.graph.walking_bias import WalkingBias
+from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.noise import Level, Noise
+from alidade.pipelines.estimation.priors import prior_sigmas, vector_prior
+from alidade.pipelines.estimation.problem import Array, Attitudes, Factor, Parameter, Problem, Step
+from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
+from alidade.pipelines.estimation.walking_bias import WalkingBias
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.indexer.attitude import carrier, frames
 from alidade.pipelines.methods.indexer.groups import KINDS, Group, groups_of

@@ -10,7 +10,7 @@ import numpy as np
 from alidade.factors import so3
 from alidade.factors.earth import earth_rate
 from alidade.factors.indexer import AxisPath, PlatformRates, gyro_edges, gyro_means
-from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.indexer.recording import IndexerData
 from alidade.pipelines.methods.indexer.runs import AxisMotion, Run

@@ -9,7 +9,7 @@ import numpy as np
 from alidade.factors import so3
 from alidade.factors.indexer import mounting_angles
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.problem import Array, Parameter
+from alidade.pipelines.estimation.problem import Array, Parameter
 from alidade.pipelines.methods.indexer.groups import Group
 from alidade.pipelines.methods.indexer.parameters import SCALE, THETA
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alidade.pipelines.graph.motion import Motion
-from alidade.pipelines.judgement.checklist import ChecklistItem
+from alidade.pipelines.diagnostics.checklist import ChecklistItem
+from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.methods.indexer.picture import Axis, turning
 from alidade.pipelines.methods.indexer.recording import IndexerData
 from alidade.pipelines.methods.indexer.runs import axis_motion

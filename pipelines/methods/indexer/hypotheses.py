@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from alidade.pipelines.judgement.hypotheses import AXES, ExactInput, Hypotheses
+from alidade.pipelines.diagnostics.fault_models import AXES, ExactInput, Hypotheses
 from alidade.pipelines.methods.indexer.recording import IndexerData
 from alidade.pipelines.settings import Config
 

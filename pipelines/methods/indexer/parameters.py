@@ -9,7 +9,7 @@ from itertools import chain
 import gtsam
 import numpy as np
 
-from alidade.pipelines.graph.assumptions import (
+from alidade.pipelines.estimation.assumptions import (
     encoder_assumptions,
     parameter,
     quantities,
@@ -17,8 +17,8 @@ from alidade.pipelines.graph.assumptions import (
     stamped,
     temperature_assumption,
 )
-from alidade.pipelines.graph.problem import Array, Parameter, Quantity
-from alidade.pipelines.graph.walking_bias import FIRST as FIRST_BIAS
+from alidade.pipelines.estimation.problem import Array, Parameter, Quantity
+from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
 from alidade.pipelines.methods.indexer.topics import JOINTS
 from alidade.pipelines.settings import Config, check_names
 

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from alidade.factors import so3
-from alidade.pipelines.judgement.pictures import BEHIND, Drawing
+from alidade.pipelines.display.drawing import BEHIND, Drawing
 
 # Half the width and height of the outer frame, radius of the platform.
 _WIDE, _HIGH, _PLATFORM = 1.1, 1.0, 0.75

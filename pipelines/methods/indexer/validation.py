@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.gyro import symmetric
 from alidade.factors.indexer import mounting
-from alidade.pipelines.graph.problem import Array
-from alidade.pipelines.judgement.validation import Validation
+from alidade.pipelines.diagnostics.validation import Validation
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.indexer.attitude import carrier
 from alidade.pipelines.methods.indexer.groups import Group, groups_of
 from alidade.pipelines.methods.indexer.parameters import BIAS, ENCODER, EPSILON, ERRORS, TEMPERATURE, THETA, several

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from alidade.factors.gimbal import GimbalPath
-from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.formula import gyro_rate
 from alidade.pipelines.methods.los.formulas import DRIVERS, S
 from alidade.pipelines.methods.los.parameters import BIAS, ONCE_PER_TURN, SENSITIVITY, TEMPERATURE

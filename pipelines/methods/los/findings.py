@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from alidade.pipelines.graph.assumptions import fixed_without_force
-from alidade.pipelines.graph.problem import Estimate, Findings
+from alidade.pipelines.estimation.assumptions import fixed_without_force
+from alidade.pipelines.estimation.problem import Estimate, Findings
 from alidade.pipelines.methods.los.parameters import SENSITIVITY
 from alidade.pipelines.methods.los.recording import LosData
 from alidade.pipelines.recording.topics import IMU

@@ -21,15 +21,15 @@ from alidade.factors.gimbal import SMOOTHING, GimbalPath, LocalMotion
 from alidade.factors.los import LosDirectionFactor, Surroundings
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.preintegration import GyroPath
-from alidade.pipelines.graph.assumptions import acting
-from alidade.pipelines.graph.clock import Clock, Keyframes
-from alidade.pipelines.graph.gyro_chain import ROOT, GyroChain, Trunk, as_slice
-from alidade.pipelines.graph.motion import Motion
-from alidade.pipelines.graph.noise import Level
-from alidade.pipelines.graph.priors import vector_prior
-from alidade.pipelines.graph.problem import Array, Factor, Problem, Step
-from alidade.pipelines.graph.walking_bias import FIRST as FIRST_BIAS
-from alidade.pipelines.judgement.pictures import swaying
+from alidade.pipelines.display.drawing import swaying
+from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.assumptions import acting
+from alidade.pipelines.estimation.camera_clock import Clock, Keyframes
+from alidade.pipelines.estimation.gyro_chain import ROOT, GyroChain, Trunk, as_slice
+from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.priors import vector_prior
+from alidade.pipelines.estimation.problem import Array, Factor, Problem, Step
+from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.los.guess import camera, foreseen, guess, guess_picture_clock, initial_attitudes, seen
 from alidade.pipelines.methods.los.parameters import BIAS, OFFSET, SENSITIVITY, SPLIT, TEMPERATURE, LosParameters

@@ -16,10 +16,10 @@ from alidade.factors import so3
 from alidade.factors.gimbal import GimbalPath
 from alidade.factors.los import LosDirectionFactor
 from alidade.factors.preintegration import GyroPath, Increments
-from alidade.pipelines.graph.clock import Clock, Miss, guess_clock, turns_near
-from alidade.pipelines.graph.priors import prior_sigmas
-from alidade.pipelines.graph.problem import Array, Parameter
-from alidade.pipelines.graph.robust import fitted
+from alidade.pipelines.estimation.camera_clock import Clock, Miss, guess_clock, turns_near
+from alidade.pipelines.estimation.priors import prior_sigmas
+from alidade.pipelines.estimation.problem import Array, Parameter
+from alidade.pipelines.estimation.robust import fitted
 
 # Pictures so far apart, s, are compared, long against their noise, and no more than so many pairs of them.
 _SPAN, _MOST_PAIRS = 1.0, 2000

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alidade.pipelines.judgement.checklist import ChecklistItem, swayed, turned
+from alidade.pipelines.diagnostics.checklist import ChecklistItem, swayed, turned
 from alidade.pipelines.methods.los.recording import LosData
 from alidade.pipelines.settings import Config
 

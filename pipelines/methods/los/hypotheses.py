@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from alidade.pipelines.judgement.hypotheses import AXES, Hypotheses
+from alidade.pipelines.diagnostics.fault_models import AXES, Hypotheses
 
 HYPOTHESES = Hypotheses(
     streams={"gyro_t": ("gyro", "force"), "gimbal_t": ("gimbal",), "image_t": ("error", "error_cov")},

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import gtsam
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.assumptions import (
+from alidade.pipelines.estimation.assumptions import (
     Assumption,
     encoder_assumptions,
     gyro_errors,
@@ -19,8 +19,8 @@ from alidade.pipelines.graph.assumptions import (
     stamped,
     temperature_assumption,
 )
-from alidade.pipelines.graph.problem import Parameter, Quantity
-from alidade.pipelines.graph.walking_bias import FIRST as FIRST_BIAS
+from alidade.pipelines.estimation.problem import Parameter, Quantity
+from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
 from alidade.pipelines.methods.los.topics import JOINTS
 from alidade.pipelines.settings import Config, check_names
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.los.recording import LosData
 
 # After a gap longer than this, s, the camera may hold on to another target.

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.problem import ChiSquare, Estimate, History, Problem, Residuals
+from alidade.pipelines.estimation.problem import ChiSquare, Estimate, History, Problem, Residuals
 from alidade.pipelines.methods.los.recording import LosData
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 

@@ -13,11 +13,11 @@ from alidade.factors import so3
 from alidade.factors.chi_square import gate
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.turned import FieldFactor, UpFactor
-from alidade.pipelines.graph.motion import Motion
-from alidade.pipelines.graph.noise import Level
-from alidade.pipelines.graph.priors import vector_prior
-from alidade.pipelines.graph.problem import Array, Attitudes, Factor, Problem, Step
-from alidade.pipelines.judgement.pictures import swaying
+from alidade.pipelines.display.drawing import swaying
+from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.priors import vector_prior
+from alidade.pipelines.estimation.problem import Array, Attitudes, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.tumble.model import Model, Sensor
 from alidade.pipelines.methods.tumble.parameters import DIP_KEY, SLOPE_KEY, STRENGTH_KEYS, TRIAD_KEYS, Variable

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from alidade.pipelines.graph.problem import Array, Estimate, Findings
+from alidade.pipelines.display.sphere_map import described, share_near, widest_gap
+from alidade.pipelines.estimation.problem import Array, Estimate, Findings
 from alidade.pipelines.methods.triads import gain_names, parts_row, parts_with_sigmas, triad_names, triad_of
 from alidade.pipelines.methods.tumble.model import Sensor, prepare
 from alidade.pipelines.methods.tumble.recording import TumbleData
-from alidade.pipelines.reports.sphere_map import described, share_near, widest_gap
 from alidade.pipelines.settings import Config
 
 NAMES = {"accel": "accelerometer", "mag": "magnetometer"}

@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from alidade.factors import so3
-from alidade.pipelines.graph.motion import Motion
-from alidade.pipelines.graph.problem import Array
-from alidade.pipelines.judgement.checklist import ChecklistItem
-from alidade.pipelines.judgement.pictures import along, covered, resting
+from alidade.pipelines.diagnostics.checklist import ChecklistItem
+from alidade.pipelines.display.drawing import along, covered, resting
+from alidade.pipelines.display.sphere_map import described, share_near, widest_gap
+from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.tumble.model import prepare
 from alidade.pipelines.methods.tumble.recording import TumbleData
-from alidade.pipelines.reports.sphere_map import described, share_near, widest_gap
 from alidade.pipelines.settings import Config
 
 # Part of all directions that a vector has to have come near, and the widest gap that is none, rad.

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from alidade.factors.earth import gravity
 from alidade.factors.ellipsoid import StrengthFactor, entries, excess, nominal_of
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.assumptions import parameter
-from alidade.pipelines.graph.assumptions import stated as sheet
-from alidade.pipelines.graph.noise import ROUGHLY, Noise
-from alidade.pipelines.graph.problem import Array
-from alidade.pipelines.graph.robust import robust_sigma
+from alidade.pipelines.estimation.assumptions import parameter
+from alidade.pipelines.estimation.assumptions import stated as sheet
+from alidade.pipelines.estimation.noise import ROUGHLY, Noise
+from alidade.pipelines.estimation.problem import Array
+from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods.noise import stated
 from alidade.pipelines.methods.place import FIELD, STRENGTH_SIGMA, field_at
 from alidade.pipelines.methods.static_intervals import quiet_intervals

@@ -11,9 +11,9 @@ import gtsam
 import numpy as np
 
 from alidade.factors.ellipsoid import entries
-from alidade.pipelines.graph.assumptions import quantities
-from alidade.pipelines.graph.priors import prior_sigmas
-from alidade.pipelines.graph.problem import Array, Factor, Parameter, Quantity
+from alidade.pipelines.estimation.assumptions import quantities
+from alidade.pipelines.estimation.priors import prior_sigmas
+from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity
 from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.methods.tumble.model import Model, Sensor, nearest_axes
 from alidade.pipelines.methods.tumble.recording import ACCEL_SLOPE, SLOPES

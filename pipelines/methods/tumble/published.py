@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.problem import Estimate, Problem
+from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods.tumble.recording import TumbleData
 from alidade.pipelines.settings import Config
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.assumptions import temperature_assumption
+from alidade.pipelines.estimation.assumptions import temperature_assumption
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.place import read_place
 from alidade.pipelines.recording import series

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.earth import earth_rate
 from alidade.factors.preintegration import GyroPath
-from alidade.pipelines.graph.assumptions import (
+from alidade.pipelines.estimation.assumptions import (
     Assumption,
     acting,
     gyro_errors,
@@ -23,10 +23,10 @@ from alidade.pipelines.graph.assumptions import (
     scale_assumptions,
     sensitivity_assumption,
 )
-from alidade.pipelines.graph.gyro_chain import GyroChain, shared_keyframes
-from alidade.pipelines.graph.noise import Level
-from alidade.pipelines.graph.problem import Array, Parameter, Quantity
-from alidade.pipelines.graph.walking_bias import FIRST
+from alidade.pipelines.estimation.gyro_chain import GyroChain, shared_keyframes
+from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.problem import Array, Parameter, Quantity
+from alidade.pipelines.estimation.walking_bias import FIRST
 from alidade.pipelines.methods.noise import sampled, stated, walking
 from alidade.pipelines.methods.tumble.recording import GYRO_SLOPE, TumbleData
 from alidade.pipelines.settings import Config

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from alidade.factors.ellipsoid import entries, excess, sagitta
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.problem import Array
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.tumble.model import Sensor
 from alidade.pipelines.methods.tumble.published import FEWEST
 from alidade.pipelines.recording.topics import IMU, MAG

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from alidade.pipelines.diagnostics.validation import Validation
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.judgement.validation import Validation
 from alidade.pipelines.methods.temperature import FIRST
 from alidade.pipelines.methods.triads import triad_of
 from alidade.pipelines.methods.tumble.model import prepare

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from alidade.pipelines.judgement.validation import rms
-from alidade.pipelines.reports.figure import COLORS, Figure
+from alidade.pipelines.diagnostics.validation import rms
+from alidade.pipelines.display.figure import COLORS, Figure
 from alidade.pipelines.reports.result import Calibration, Plot
 from gyro_pair.recording import GyroPairData
 from gyro_pair.validation import rates

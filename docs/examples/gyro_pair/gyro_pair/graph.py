@@ -15,11 +15,12 @@ import numpy as np
 
 from alidade.factors import so3
 from alidade.factors.preintegration import GyroPath
+from alidade.pipelines.display.drawing import swaying
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.motion import Motion
-from alidade.pipelines.graph.noise import Level
-from alidade.pipelines.graph.priors import rotation_prior, vector_prior
-from alidade.pipelines.graph.problem import (
+from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.priors import rotation_prior, vector_prior
+from alidade.pipelines.estimation.problem import (
     Array,
     Factor,
     Parameter,
@@ -28,7 +29,6 @@ from alidade.pipelines.graph.problem import (
     Step,
     rotation_vector_coordinates,
 )
-from alidade.pipelines.judgement.pictures import swaying
 from alidade.pipelines.methods.noise import stated
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, check_names, first_given
 from gyro_pair.factor import GyroPairFactor

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alidade.pipelines.judgement.checklist import ChecklistItem, turned
+from alidade.pipelines.diagnostics.checklist import ChecklistItem, turned
 from alidade.pipelines.settings import Config
 from gyro_pair.recording import GyroPairData
 

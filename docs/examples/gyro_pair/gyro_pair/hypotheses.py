@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from alidade.pipelines.judgement.hypotheses import AXES, Hypotheses
+from alidade.pipelines.diagnostics.fault_models import AXES, Hypotheses
 
 HYPOTHESES = Hypotheses(
     streams={"a_t": ("a_gyro",), "b_t": ("b_gyro",)},

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.pipelines.graph.problem import Estimate, Problem
+from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.settings import Config
 from gyro_pair.recording import GyroPairData, densities
 

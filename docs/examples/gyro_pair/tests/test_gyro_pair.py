@@ -14,10 +14,10 @@ from scipy.stats import chi2
 from alidade.factors import so3
 from alidade.factors.preintegration import GyroPath
 from alidade.factors.testing import assert_jacobians
+from alidade.pipelines.diagnostics.hypothesis_tests import find_causes
+from alidade.pipelines.diagnostics.observability import assess
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.graph.problem import Estimate, Problem
-from alidade.pipelines.judgement.causes import find_causes
-from alidade.pipelines.judgement.observability import assess
+from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods.formula import apply
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.simulated import Simulated

@@ -1,0 +1,298 @@
+"""What `import alidade` gives: the functions behind the commands, with files or with arrays in memory."""
+
+from __future__ import annotations
+
+import numbers
+import typing
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, fields, is_dataclass, replace
+from functools import partial
+from pathlib import Path
+from types import NoneType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import BaseModel, ValidationError
+
+from alidade.pipelines import methods
+from alidade.pipelines.applications.session import Arrays, Session
+from alidade.pipelines.config import load_config
+from alidade.pipelines.config import model as _config_model
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import Method
+from alidade.pipelines.recording.opening import Where
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.shapes import Array, Rows, rows_by_name
+from alidade.pipelines.settings import Config as _BaseConfig
+from alidade.pipelines.simulation.simulated import Simulated
+
+if TYPE_CHECKING:
+    from alidade.pipelines.applications.follow.guidance import View
+    from alidade.pipelines.applications.planning import Plan
+    from alidade.pipelines.reports.calibration import SavedCalibration
+    from alidade.pipelines.reports.result import Calibration
+
+    Config = _BaseConfig
+else:
+    Config = _config_model()
+
+# What can be opened: a recording, its files, simulated data, a method's own data or its fields by name.
+Source = str | Path | list[str | Path] | Simulated | Mapping[str, Any] | Any
+# Settings that override the recording's own: an alidade.Config or a YAML file.
+Settings = _BaseConfig | str | Path | None
+
+# No session takes longer, s; stamps in ns, and in us after ten seconds, look as if one had.
+_LONGEST = 1e7
+
+
+def open(
+    source: Source,
+    method: str | None = None,
+    config: Settings = None,
+    strict: bool = False,
+    prior: str | Path | None = None,
+) -> Session:
+    """A recording, or arrays, ready to be calibrated.
+
+        alidade.open("session.mcap")
+        alidade.open({"head_t": t, "head_gyro": w, "vision_t": tv, "vision_wxyz": q}, method="head")
+
+    Args:
+        source: a recording, or a list of its files; what `simulate` returns; or arrays, either by name (those of the
+            method's data, see `alidade.Method.data`; what is not there counts as not recorded) or as an object of that
+            class. Times are s, everything else SI; lists, integers and masked arrays become arrays of floats.
+        method: its name; by default that of the config, or the only one the recording can serve.
+        config: overrides, key by key, the config that comes with the source.
+        strict: refuse a recording of which anything is lost.
+        prior: an earlier calibration of the device to begin from: its result.json or calibration.yaml.
+
+    Raises:
+        InputError: source, config or prior cannot be used; of arrays, which one and why.
+    """
+    session = _open(source, method, config, strict)
+    return session if prior is None else session.beginning_from(Path(prior))
+
+
+def _open(source: Source, method: str | None, config: Settings, strict: bool) -> Session:
+    override = _override(config)
+    if isinstance(source, str | Path | list | tuple):
+        return Session.read(open_recording(_files(source), strict), method, override)
+    if isinstance(source, Simulated):
+        text = load_config(source.config.encode(), override)
+        chosen = methods.method(method or text.method or "")
+        return Session(chosen, source.data, text, Arrays(chosen, source.data, source.truth))
+    settings = load_config(None, override)
+    name = method or settings.method
+    if name is None:
+        raise InputError("arrays do not say which method they are for: open(..., method=...)")
+    chosen = methods.method(name)
+    data = _checked(chosen, _data(chosen, source))
+    return Session(chosen, data, settings, Arrays(chosen, data))
+
+
+def _override(config: object) -> Path | _BaseConfig | None:
+    """A config, or the file of one. Raises InputError when it is neither."""
+    if config is None or isinstance(config, _BaseConfig | Path):
+        return config
+    if isinstance(config, str):
+        return Path(config)
+    kind = type(config).__name__
+    raise InputError(f"config: a file or an alidade.Config is needed, not {kind}; alidade.Config(**keys) makes one")
+
+
+def _files(source: str | Path | Sequence[Any]) -> Where:
+    """A recording's path, or the paths of its files. Raises InputError when a list has anything else."""
+    if isinstance(source, str | Path):
+        return source
+    if not all(isinstance(file, str | Path) for file in source):
+        raise InputError("open([...]) takes the files of one recording; calibrate([...]) takes several recordings")
+    return [Path(file) for file in source]
+
+
+def calibrate(
+    source: Source,
+    solver: str = "batch",
+    *,
+    method: str | None = None,
+    config: Settings = None,
+    window: float | None = 1.0,
+    prior: str | Path | None = None,
+) -> Calibration:
+    """Open and calibrate in one go (arguments as `open` and `Session.calibrate` have them).
+
+    A list of sources is several recordings of one device, calibrated together by batch; the files of one recording are
+    opened first: `open([...]).calibrate()`.
+
+    Raises:
+        InputError: source or config cannot be used, or there is no such solver or window.
+        IndeterminateError: states other than the parameters are not determined.
+    """
+    if isinstance(source, list | tuple):
+        if solver != "batch":
+            raise InputError(f"solver {solver!r}: several recordings are calibrated together by batch alone")
+        from alidade.pipelines.applications.joint import calibrate_together
+
+        return calibrate_together([partial(open, each, method, config, prior=prior) for each in source])
+    return open(source, method, config, prior=prior).calibrate(solver, window)
+
+
+def load(path: str | Path, config: Settings = None) -> SavedCalibration:
+    """A calibration.yaml, to be applied: `.parameters`, `.rotations`, `.transforms`, `.apply(...)`.
+
+    Args:
+        path: of the file.
+        config: that it was made with, where its formulas depend on one: a cube's conversions of counts.
+
+    Raises:
+        InputError: file or config cannot be used.
+    """
+    from alidade.pipelines.reports.calibration import load_calibration
+
+    return load_calibration(Path(path), load_config(None, _override(config)))
+
+
+def simulate(
+    method: str, scenario: str | Path | Mapping[str, Any] | BaseModel | None = None, seed: int = 0, images: bool = False
+) -> Simulated:
+    """A recording in memory, with its truth.
+
+        data, truth = alidade.simulate("head", {"duration_s": 20.0}, seed=1)
+
+    Args:
+        method: its name.
+        scenario: a name, a YAML file, the keys of one, or the model; None is the method's nominal scenario.
+        seed: of the noise, 0 or more.
+        images: draw pictures in place of what is measured in them.
+
+    Raises:
+        InputError: no such method or scenario, a scenario that cannot be drawn, or a seed below zero.
+    """
+    _check_seed(seed)
+    chosen = methods.method(method)
+    return chosen.simulate(_scenario(chosen, scenario, images), seed, images)
+
+
+def plan(
+    method: str,
+    scenario: str | Path | None = None,
+    *,
+    config: Settings = None,
+    require: Mapping[str, float] | None = None,
+) -> Plan:
+    """How well a planned motion would determine each parameter, and a better one: `.now.sigmas`, `.steps`, `.best`.
+
+    Raises:
+        InputError: no such method, scenario or parameter, or the config cannot be used.
+    """
+    from alidade.pipelines.applications.planning import make_plan
+
+    named = None if scenario is None else str(scenario)
+    return make_plan(method, named, _override(config), require)
+
+
+def follow(
+    path: str | Path,
+    show: Callable[[View], None] | None = None,
+    *,
+    method: str | None = None,
+    config: Settings = None,
+    window: float | None = 1.0,
+    patience: float = 30.0,
+    prior: str | Path | None = None,
+) -> Calibration:
+    """Calibrate a recording while it is being made; returns when it is finished, or nothing is new for `patience` s.
+
+    `path` is a file or a folder that is being written, `ws://host:port` of a Foxglove bridge, or `-` for standard
+    input; `show` is given what is known whenever that changes; `prior` is as `open` has it.
+
+    Raises:
+        InputError: no such window or config, or the file does not appear, is no recording, or cannot be used in the
+            end.
+        IndeterminateError: states other than the parameters are not determined.
+    """
+    from alidade.pipelines.applications.follow.follower import Follower
+    from alidade.pipelines.applications.follow.follower import Settings as Following
+    from alidade.pipelines.applications.follow.sources import source_of
+
+    earlier = None if prior is None else Path(prior)
+    settings = Following(method, _override(config), window, patience, prior=earlier)
+    with source_of(str(path), say=lambda _: None) as source:
+        return Follower(source, settings, show or (lambda _: None), lambda _: None, lambda: False).follow()
+
+
+def _check_seed(seed: object) -> None:
+    if not isinstance(seed, numbers.Integral) or int(seed) < 0:
+        raise InputError(f"seed: {seed!r} is no whole number from zero on")
+
+
+def _scenario(method: Method, given: str | Path | Mapping[str, Any] | BaseModel | None, images: bool) -> BaseModel:
+    from alidade.pipelines.simulation.scenario import explain
+
+    if isinstance(given, BaseModel):
+        return given
+    if isinstance(given, Mapping):
+        try:
+            return method.scenario.model_validate(dict(given))
+        except ValidationError as error:
+            raise InputError(f"scenario: {explain(error.errors()[0], method.scenario)}") from error
+    return method.settings(None if given is None else str(given), images)
+
+
+def _data(method: Method, given: Any) -> Any:
+    """The method's data from its fields, by name or as an object of its class; None is what was not recorded."""
+    kind = method.data
+    if is_dataclass(given):
+        if not isinstance(given, kind):
+            raise InputError(f"arrays: {method.name} takes {kind.__name__}, not {type(given).__name__}")
+        given = {field.name: getattr(given, field.name) for field in fields(kind)}
+    if not isinstance(given, Mapping):
+        raise InputError(f"open(...) takes a recording, simulated data or arrays by name, not {type(given).__name__}")
+    hints = typing.get_type_hints(kind)
+    known = {field.name: field for field in fields(kind)}
+    for name in given:
+        if name not in known:
+            raise InputError(f"arrays: {method.name} has no {name}; it has {', '.join(known)}")
+    values = {"epoch_ns": 0} | {name: value for name, value in given.items() if value is not None}
+    for name, field in known.items():
+        if name not in values and field.default is MISSING and field.default_factory is MISSING:
+            if NoneType not in typing.get_args(hints[name]):
+                raise InputError(f"arrays: {method.name} needs {name}")
+            values[name] = None
+    return kind(**values)
+
+
+def _checked(method: Method, data: Any) -> Any:
+    """The data with all arrays as floats.
+
+    Raises:
+        InputError: an array is none of numbers or has rows of another shape than its class says, stamps do not increase
+            or are not in s, or what they stamp is not as long as they are, or not finite.
+    """
+    streams = method.hypotheses().streams
+    # Stamps and what they stamp are arrays, whatever annotations say.
+    rows = {name: Rows() for stamps, carried in streams.items() for name in (stamps, *carried)}
+    rows |= rows_by_name(method.data)
+    given = {name: value for name in rows if (value := getattr(data, name)) is not None}
+    arrays = {name: rows[name].read(name, value) for name, value in given.items()}
+    for stamps, carried in streams.items():
+        t = arrays.get(stamps)
+        if t is not None:
+            _check_stamps(stamps, t)
+        for name in (name for name in carried if name in arrays):
+            values = arrays[name]
+            if t is None:
+                raise InputError(f"arrays: {name} needs its stamps, {stamps}")
+            if len(values) != len(t):
+                raise InputError(f"arrays: {name} has {len(values)} rows for the {len(t)} stamps of {stamps}")
+            lost = rows[name].lost(values)
+            if len(lost):
+                more = f" (and {len(lost) - 1} more)" if len(lost) > 1 else ""
+                raise InputError(f"arrays: {name} is not finite at {t[lost[0]]:.6f} s{more}; leave out such rows")
+    return replace(data, **arrays)
+
+
+def _check_stamps(name: str, t: Array) -> None:
+    if t.ndim != 1 or not np.isfinite(t).all() or not (np.diff(t) > 0.0).all():
+        raise InputError(f"arrays: {name} has to be one row of stamps in s, each later than the one before")
+    if t[-1] - t[0] > _LONGEST:
+        raise InputError(f"arrays: {name} spans {t[-1] - t[0]:.3g} s; times have to be in s, not in us or ns")

@@ -1,0 +1,654 @@
+"""The command `alidade`: parses, calls, prints.
+
+The help asks for the options of all commands: annotations are objects, since strings would have to be compiled, and
+what a command works with is imported by the command.
+"""
+
+import os
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from enum import StrEnum
+from functools import cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+from typer.core import TyperGroup
+
+from alidade.pipelines.applications import exit_codes
+from alidade.pipelines.applications.options import ConfigFile, Json, Quiet, RecordingPath, RecordingPaths
+from alidade.pipelines.solvers.window import parse_window
+
+if TYPE_CHECKING:
+    from alidade.pipelines.reports.result import Calibration
+
+# Errors that are told in one line, by name: to import the second takes gtsam's quarter of a second.
+_TROUBLE = {"InputError": exit_codes.BAD_INPUT, "IndeterminateError": exit_codes.UNDETERMINED}
+
+
+class _WithMethods(TyperGroup):
+    """The commands below and those that methods bring: methods take long to import, and are asked last."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return [*super().list_commands(ctx), *_of_methods()]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        return super().get_command(ctx, cmd_name) or _of_methods().get(cmd_name)
+
+    def get_params(self, ctx: Any) -> Any:
+        """Flags all of them: those of typer default to None, and typer imports pydantic to check that; not False."""
+        params = super().get_params(ctx)
+        for flag in params:
+            flag.default = flag.default or False
+        return params
+
+
+@cache
+def _of_methods() -> Mapping[str, Any]:
+    from alidade.pipelines import methods
+
+    own = typer.Typer(rich_markup_mode=None)
+    own.callback()(lambda: None)
+    for name in methods.names():
+        for word, command in methods.method(name).commands.items():
+            own.command(word)(command)
+    return typer.main.get_group(own).commands
+
+
+app = typer.Typer(
+    cls=_WithMethods,
+    no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # boxes around the help would take three times as long to import as all else
+    help="Calibrates how sensors are mounted and how wrong they are, from recordings, and says how sure it is.",
+)
+
+
+def _complete_method(incomplete: str) -> list[str]:
+    from alidade.pipelines import methods
+
+    return [name for name in methods.names() if name.startswith(incomplete)]
+
+
+def _complete_scenario(incomplete: str) -> list[str]:
+    from alidade.pipelines import methods
+
+    return [name for known in methods.scenarios().values() for name in known if name.startswith(incomplete)]
+
+
+class Solver(StrEnum):
+    """The solvers of `calibrate`."""
+
+    batch = "batch"
+    incremental = "incremental"
+    published = "published"
+
+
+_METHODS = "los, indexer, head, cube, tumble or one installed"
+_MethodName = Annotated[
+    str | None,
+    typer.Option("--method", help=f"{_METHODS}; by default what fits.", autocompletion=_complete_method),
+]
+_OfMethod = Annotated[str, typer.Argument(help=f"{_METHODS}.", autocompletion=_complete_method)]
+_Scenario = Annotated[
+    str | None,
+    typer.Option(
+        help="YAML file, or a name that `scenarios` lists; default: the nominal one.", autocompletion=_complete_scenario
+    ),
+]
+_Scheduler = Annotated[str | None, typer.Option(help="Of a dask cluster, tcp://host:8786; default: this machine.")]
+_Jobs = Annotated[int | None, typer.Option(help="Local worker processes; default: one a core.")]
+_OwnJobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Processes to be used; default: one a core.")]
+_Strict = Annotated[bool, typer.Option("--strict", help="Refuse a recording of which anything is lost.")]
+_AutoTopics = Annotated[bool, typer.Option("--auto-topics", help="Take the topics that `info` suggests.")]
+_NoCheck = Annotated[bool, typer.Option("--no-check", help="Do not hold an incremental result against batch.")]
+_Prior = Annotated[
+    Path | None, typer.Option(help="An earlier calibration of the device to begin from: result.json, calibration.yaml.")
+]
+_Window = Annotated[str, typer.Option(help="Of the incremental solver: seconds kept, keyframes (50kf), or 'all'.")]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from alidade.pipelines.reports.result import software_versions
+
+        typer.echo(software_versions()["alidade"])
+        raise typer.Exit
+
+
+_Version = Annotated[bool, typer.Option("--version", "-V", callback=_version, is_eager=True, help="Print it.")]
+
+
+@app.callback()
+def _options(version: _Version = False) -> None: ...
+
+
+@app.command()
+def calibrate(
+    sessions: RecordingPaths,
+    method: _MethodName = None,
+    config: ConfigFile = None,
+    solver: Annotated[Solver, typer.Option(help="How to solve.")] = Solver.batch,
+    window: _Window = "1",
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; default: SESSION-SOLVER.")] = None,
+    strict: _Strict = False,
+    auto_topics: _AutoTopics = False,
+    jobs: _OwnJobs = None,
+    prior: _Prior = None,
+    no_check: _NoCheck = False,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Calibrate a recording, or several of one device together.
+
+    Exit code 0 calibrated, 2 unusable input, 3 weak or unobservable, 4 inconsistent.
+    """
+    from tempfile import TemporaryDirectory
+
+    from alidade.pipelines import parallel, progress
+    from alidade.pipelines.applications.joint import calibrate_device
+    from alidade.pipelines.applications.session import calibrate as run
+    from alidade.pipelines.errors import InputError
+    from alidade.pipelines.recording.opening import recordings_of, told
+    from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.whole import require_room
+    from alidade.pipelines.reports.write import adopt_parts, write_part, write_results
+
+    recordings, folder = recordings_of(sessions), out or _beside(sessions[0], solver.value)
+    if len(recordings) > 1:
+        if solver != Solver.batch:
+            raise InputError(f"--solver {solver.value}: several recordings are calibrated together by batch alone")
+        folder = out or _beside(sessions[0], "device")
+        if not as_json:
+            terminal.say(f"{len(recordings)} recordings of one device: {told(recordings)}")
+    require_room(folder)
+    with progress.shown(quiet or as_json), parallel.processes(jobs), TemporaryDirectory(prefix="alidade-") as parts:
+        if len(recordings) > 1:
+            by_itself = partial(write_part, Path(parts))
+            calibration = calibrate_device(recordings, method, config, strict, auto_topics, prior, by_itself)
+        else:
+            (calibration,) = run(
+                recordings[0],
+                [solver.value],
+                method,
+                config,
+                parse_window(window),
+                strict,
+                auto_topics,
+                not no_check,
+                prior,
+            )
+        with progress.doing("writing"):
+            written = write_results(folder, calibration)
+            if len(recordings) > 1:
+                adopt_parts(folder, Path(parts))
+    _tell(calibration, folder, written, as_json)
+
+
+@app.command()
+def compare(
+    session: RecordingPath,
+    method: _MethodName = None,
+    config: ConfigFile = None,
+    window: _Window = "1",
+    prior: _Prior = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for compare.html, which also splits the recording.")] = None,
+    strict: _Strict = False,
+    auto_topics: _AutoTopics = False,
+    jobs: _OwnJobs = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """The published, batch and incremental solvers side by side, with errors where the truth is known."""
+    from alidade.pipelines import parallel, progress
+    from alidade.pipelines.applications.session import calibrate as run
+    from alidade.pipelines.applications.session import self_agreement
+    from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.compare import write_compare
+    from alidade.pipelines.reports.whole import require_room
+
+    require_room(out)
+    solvers = ["published", "batch", "incremental"]
+    with progress.shown(quiet or as_json), parallel.processes(jobs):
+        calibrations = run(session, solvers, method, config, parse_window(window), strict, auto_topics, prior=prior)
+    if as_json:
+        terminal.show_json(calibrations)
+    else:
+        terminal.show(calibrations)
+    if out is not None:
+        with progress.shown(quiet), parallel.processes(jobs), progress.doing("solving parts of the recording"):
+            written = write_compare(out, calibrations, *self_agreement(session, method, config))
+        if not as_json:
+            terminal.say(f"Comparison in {written}")
+
+
+@app.command()
+def follow(
+    source: Annotated[
+        str,
+        typer.Argument(metavar="SOURCE", help="A file or folder being written, ws://host:port, - for standard input."),
+    ],
+    method: _MethodName = None,
+    config: ConfigFile = None,
+    window: _Window = "1",
+    patience: Annotated[
+        float, typer.Option(help="Seconds without anything new that end an unfinished file.", min=0.0)
+    ] = 30.0,
+    prior: _Prior = None,
+    checkpoint: Annotated[Path | None, typer.Option(help="File to save the run in, and to go on from.")] = None,
+    serve: Annotated[bool, typer.Option("--serve", help="Estimates live over Foxglove's WebSocket.")] = False,
+    port: Annotated[int, typer.Option(help="Of --serve, on this machine alone.")] = 8765,
+    page: Annotated[
+        bool, typer.Option("--page", help="A page that says what to do, for a browser or a phone.")
+    ] = False,
+    host: Annotated[
+        str, typer.Option(help="Of --page: 0.0.0.0 opens it to the network, by a token in its address.")
+    ] = "127.0.0.1",
+    page_port: Annotated[int, typer.Option(help="Of --page.")] = 8766,
+    record: Annotated[
+        Path | None, typer.Option(help="Folder to keep what comes by ws:// or -; a later run goes on in it.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; default: SOURCE-incremental.")] = None,
+    no_check: _NoCheck = False,
+    as_json: Json = False,
+) -> None:
+    """Calibrate a recording while it is being written, and say what is still missing. Ctrl-C ends it."""
+    from alidade.pipelines.applications.follow.follow import follow as run
+    from alidade.pipelines.applications.follow.follower import Settings
+    from alidade.pipelines.reports.whole import require_room
+    from alidade.pipelines.reports.write import write_results
+
+    folder = out or _beside(Path(_file_name(source)), "incremental")
+    for place in (folder, checkpoint and checkpoint.parent):
+        require_room(place)
+    settings = Settings(method, config, parse_window(window), patience, checkpoint, not no_check, prior)
+    calibration = run(source, settings, port if serve else None, record, as_json, (host, page_port) if page else None)
+    written = write_results(folder, calibration)
+    _tell(calibration, folder, written, as_json)
+
+
+@app.command()
+def validate(
+    session: RecordingPath,
+    calibration: Annotated[Path, typer.Option(help="The calibration.yaml or result.json to try on the recording.")],
+    method: _MethodName = None,
+    config: ConfigFile = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the page; default: SESSION-validation.")] = None,
+    strict: _Strict = False,
+    jobs: _OwnJobs = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Whether a calibration made on another recording still holds, and errors before and after compensation with it.
+
+    Exit code 0 it holds, 2 unusable input, 3 the recording cannot say, 4 it does not hold.
+    """
+    from alidade.pipelines import parallel, progress
+    from alidade.pipelines.applications.validate import table, write_validation
+    from alidade.pipelines.applications.validate import validate as run
+    from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.plain_json import validation_json
+
+    with progress.shown(quiet or as_json), parallel.processes(jobs), progress.doing("validating"):
+        validated = run(session, calibration, method, config, strict)
+        written = write_validation(out or _beside(session, "validation"), validated)
+    if as_json:
+        print(validation_json(validated))
+    else:
+        for line in table(validated):
+            terminal.say(line)
+        for note in validated.notes:
+            terminal.say(f"  note: {note}")
+        terminal.say(f"Plots in {written}")
+    raise typer.Exit(exit_codes.OF_VALIDATION[validated.verdict])
+
+
+@app.command()
+def simulate(
+    method: _OfMethod,
+    out: Annotated[Path, typer.Option(help="The recording to write.")],
+    scenario: _Scenario = None,
+    seed: Annotated[int, typer.Option(help="Of the noise.", min=0)] = 0,
+    images: Annotated[bool, typer.Option("--images", help="Pictures instead of what is measured in them.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Simulate a recording with its truth."""
+    from alidade.pipelines import progress
+    from alidade.pipelines.methods import simulate as run
+    from alidade.pipelines.reports import terminal
+
+    with progress.shown(quiet), progress.doing("simulating"):
+        run(method, scenario, seed, out, images)
+    terminal.say(f"Wrote {out}")
+
+
+@app.command()
+def scenarios(
+    name: Annotated[
+        str | None,
+        typer.Argument(help="Of a scenario, to print its file; or of a method.", autocompletion=_complete_scenario),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """The scenarios that `simulate`, `plan` and `montecarlo` find by name, or the YAML of one, to be changed."""
+    from alidade.pipelines import methods
+    from alidade.pipelines.errors import InputError, nearest_three
+    from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.plain_json import plain_json
+    from alidade.pipelines.simulation.scenario import summary
+
+    known = methods.scenarios()
+    files = {scenario: path for found in known.values() for scenario, path in found.items()}
+    if name in files and not as_json:
+        print(files[name].read_text(encoding="utf-8"), end="")
+        return
+    if name is not None and name not in (*files, *known):
+        raise InputError(f"no scenario or method {name}; {nearest_three(name, [*known, *files])}")
+    listed = [
+        {"name": scenario, "method": method, "summary": summary(path), "file": str(path)}
+        for method, found in known.items()
+        for scenario, path in found.items()
+        if name in (None, method, scenario)
+    ]
+    if as_json:
+        print(plain_json("scenarios", {"scenarios": listed}))
+    else:
+        terminal.show_scenarios(listed)
+
+
+@app.command()
+def plan(
+    method: _OfMethod,
+    scenario: _Scenario = None,
+    config: ConfigFile = None,
+    require: Annotated[list[str] | None, typer.Option(help="NAME=SIGMA wanted, SI; may be repeated.")] = None,
+    out: Annotated[Path | None, typer.Option(help="File for the better motion, as a scenario.")] = None,
+    page: Annotated[Path | None, typer.Option(help="File for the plan as a page, HTML.")] = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """How well a planned motion would determine each parameter, and a better one. Exit code 3 if less than required."""
+    from alidade.pipelines import progress
+    from alidade.pipelines.applications.planning import make_plan, requirements, write_scenario
+    from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.plain_json import plan_json
+    from alidade.pipelines.reports.plan import plan_html
+    from alidade.pipelines.reports.whole import write_file
+
+    with progress.shown(quiet or as_json):
+        planned = make_plan(method, scenario, config, requirements(require or []))
+    if out is not None:
+        write_scenario(out, planned)
+    if page is not None:
+        write_file(page, plan_html(planned))
+    if as_json:
+        print(plan_json(planned))
+    else:
+        terminal.show_plan(planned)
+        if out is not None:
+            terminal.say(f"The better motion is in {out}")
+        if page is not None:
+            terminal.say(f"The page is {page}")
+    raise typer.Exit(exit_codes.OF_STATUS[planned.now.assessment.status])
+
+
+@app.command()
+def info(
+    session: RecordingPath,
+    config: ConfigFile = None,
+    strict: _Strict = False,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """What can be calibrated from a recording, with which topics, what is missing, and what is in it."""
+    from alidade.pipelines import progress
+    from alidade.pipelines.applications.discovery import suggestions, unused
+    from alidade.pipelines.applications.session import session_facts
+    from alidade.pipelines.config import recorded_config
+    from alidade.pipelines.recording.reading import open_recording
+    from alidade.pipelines.reports import terminal
+
+    with progress.shown(quiet), progress.doing("reading"):
+        recording = open_recording(session, strict)
+        settings = recorded_config(recording, config)
+        facts = session_facts(recording, settings)
+        found, left = suggestions(recording, settings), unused(recording, settings)
+    if as_json:
+        print(terminal.facts_json(facts, found, left))
+    else:
+        terminal.show_facts(session.name, facts, found, left)
+
+
+@app.command()
+def noise(
+    session: RecordingPath,
+    config: Annotated[Path | None, typer.Option(help="YAML with `topics` and `columns` of the recording.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for noise.html and noise.json.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print noise.json and nothing else.")] = False,
+    strict: _Strict = False,
+    quiet: Quiet = False,
+) -> None:
+    """The noise of gyros, accelerometers and magnetometers from their time at rest, and the config's section for it."""
+    from alidade.pipelines import progress
+    from alidade.pipelines.applications.noise import noise_of
+    from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.noise import noise_json, write_noise
+
+    with progress.shown(quiet):
+        study = noise_of(session, strict, config)
+    written = () if out is None else write_noise(out, study)
+    if as_json:
+        print(noise_json(study), end="")
+        return
+    terminal.show_noise(study)
+    if out is not None:
+        terminal.say(f"Results in {out}: {', '.join(p.name for p in written)}")
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the recording and its results.")] = Path("alidade-demo"),
+    quiet: Quiet = False,
+) -> None:
+    """Simulate a helmet on a manoeuvring platform, calibrate it with all three solvers, say where the report is."""
+    from alidade.pipelines import progress
+    from alidade.pipelines.applications.session import calibrate as run
+    from alidade.pipelines.methods import simulate as simulated
+    from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.whole import require_room
+    from alidade.pipelines.reports.write import write_results
+
+    require_room(out)
+    out.mkdir(parents=True, exist_ok=True)
+    session = out / "head_mounts.mcap"
+    with progress.shown(quiet):
+        with progress.doing("simulating"):
+            simulated("head", "head_mounts", 1, session, False)
+        calibrations = run(session, ["published", "batch", "incremental"])
+        for calibration in progress.track(calibrations, "writing", len(calibrations)):
+            write_results(out / calibration.estimate.solver, calibration)
+    terminal.show(calibrations)
+    terminal.say(f"Report: {(out / 'batch' / 'report.html').resolve()}")
+
+
+@app.command()
+def montecarlo(
+    method: _OfMethod,
+    runs: Annotated[int, typer.Option(help="How many recordings to simulate, one a seed.")] = 200,
+    scenario: _Scenario = None,
+    seed: Annotated[int, typer.Option(help="Of the first run; the others follow.", min=0)] = 0,
+    solvers: Annotated[str, typer.Option(help="'all', or some of published,batch,incremental.")] = "all",
+    window: _Window = "1",
+    scheduler: _Scheduler = None,
+    jobs: _Jobs = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; default: METHOD-montecarlo.")] = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Simulate and solve many recordings: are the sigmas true? The same command goes on after an interruption."""
+    from alidade.pipelines import progress
+    from alidade.pipelines.applications.fleet.montecarlo import SOLVERS, run_study
+    from alidade.pipelines.applications.fleet.write import write_study
+    from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.plain_json import study_json
+
+    folder = out or Path(f"{method}-montecarlo")
+    chosen = SOLVERS if solvers == "all" else tuple(solvers.split(","))
+    seeds = range(seed, seed + runs)
+    with progress.shown(quiet or as_json):
+        study = run_study(method, scenario, seeds, chosen, folder, scheduler, jobs, parse_window(window))
+    written = write_study(folder, study)
+    for line in () if as_json else study.summary:
+        terminal.say(line)
+    if as_json:
+        print(study_json(study))
+    else:
+        terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
+    if study.interrupted:
+        raise typer.Exit(exit_codes.INTERRUPTED)
+
+
+@app.command()
+def fleet(
+    recordings: Annotated[list[str], typer.Argument(metavar="FILES", help="Paths or patterns, 'recordings/*.mcap'.")],
+    method: _MethodName = None,
+    config: ConfigFile = None,
+    solver: Annotated[Solver, typer.Option(help="How to solve.")] = Solver.batch,
+    window: _Window = "1",
+    names: Annotated[str | None, typer.Option(help="What file names tell: '{unit}_{date}*'.")] = None,
+    prior: Annotated[
+        str | None, typer.Option(help="Earlier calibrations to begin from: 'last/{unit}/result.json'.")
+    ] = None,
+    scheduler: _Scheduler = None,
+    jobs: _Jobs = None,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("alidade-fleet"),
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Calibrate many recordings and compare units and dates. The same command goes on after an interruption."""
+    from alidade.pipelines import progress
+    from alidade.pipelines.applications.fleet.analysis import counting, populations
+    from alidade.pipelines.applications.fleet.attention import sentence, units_of_interest
+    from alidade.pipelines.applications.fleet.fleet import Settings, calibrate_fleet
+    from alidade.pipelines.applications.fleet.histories import histories
+    from alidade.pipelines.applications.fleet.recordings import find
+    from alidade.pipelines.applications.fleet.write import write_fleet
+    from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.plain_json import fleet_json
+
+    settings = Settings.of(method, config, solver.value, parse_window(window), prior)
+    with progress.shown(quiet or as_json):
+        outcome = calibrate_fleet(find(recordings), settings, out, scheduler, jobs, names)
+    several = histories(outcome.results, {name: counting(result) for name, result in outcome.results.items()})
+    found = populations(outcome.results, several)
+    written = write_fleet(out, outcome, found, several)
+    if as_json:
+        print(fleet_json(outcome, found, several))
+    else:
+        for line in outcome.summary:
+            terminal.say(line)
+        terminal.say(sentence(units_of_interest(outcome.results, found, several)))
+        terminal.say(f"Results in {out}: {', '.join(p.name for p in written)}")
+    if outcome.interrupted:
+        raise typer.Exit(exit_codes.INTERRUPTED)
+
+
+@app.command()
+def export(
+    calibration: Annotated[Path, typer.Argument(metavar="CALIBRATION.yaml", help="The calibration.")],
+    form: Annotated[
+        str, typer.Option("--format", help="px4, ardupilot, ros2, kalibr, openvins (sensors); tf, urdf (mounts).")
+    ],
+    out: Annotated[Path | None, typer.Option(help="The file to write; default: printed.")] = None,
+    as_json: Json = False,
+) -> None:
+    """A calibration as the parameters of another program, in its own conventions."""
+    from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.calibration import load_calibration
+    from alidade.pipelines.reports.export import exported
+    from alidade.pipelines.reports.plain_json import plain_json
+    from alidade.pipelines.reports.whole import write_file
+
+    saved = load_calibration(calibration)
+    text = exported(saved, form)
+    if out is not None:
+        write_file(out, text)
+    if as_json:
+        print(plain_json("export", {"method": saved.method, "format": form, "text": text}))
+    elif out is None:
+        print(text, end="")
+    else:
+        terminal.say(f"Wrote {out}")
+
+
+@app.command()
+def certificate(
+    results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a calibration, or its result.json.")],
+    fields: Annotated[Path | None, typer.Option(help="YAML of what only people know: number, item, serial ...")] = None,
+    before: Annotated[Path | None, typer.Option(help="An earlier result.json or calibration.yaml of the item.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the certificate; default: that of the results.")] = None,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Print it too, certificate.pdf.")] = False,
+) -> None:
+    """A calibration certificate, certificate.html to be printed and certificate.json."""
+    from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.certificate import write_certificate
+
+    written, missing = write_certificate(results, fields, before, out, pdf)
+    terminal.say(f"Wrote {', '.join(map(str, written))}")
+    if missing:
+        terminal.say(f"not stated: {', '.join(missing)}")
+
+
+def _beside(session: Path, what: str) -> Path:
+    """The folder for results where none is named: beside the recording, under its name."""
+    session = session if session.name else session.resolve()
+    name = "".join(letter for letter in session.stem if letter not in "*?[]").rstrip("_-.") or "recording"
+    return session.with_name(f"{name}-{what}")
+
+
+def _file_name(source: str) -> str:
+    """A source by a name that a file may have: a stream by letters and digits alone."""
+    if source == "-":
+        return "stdin"
+    return re.sub(r"\W+", "-", source.partition("://")[2]).strip("-") if "://" in source else source
+
+
+def _tell(calibration: "Calibration", folder: Path, written: Sequence[Path], as_json: bool = False) -> NoReturn:
+    """Show a calibration and where its results are; its status is the exit code."""
+    from alidade.pipelines.reports import terminal
+
+    if as_json:
+        terminal.show_json([calibration])
+    else:
+        terminal.show([calibration])
+        terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
+    raise typer.Exit(exit_codes.OF_STATUS[calibration.assessment.status])
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is behind an error, as it is behind the ImportError of a module that it met half loaded."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+def main() -> None:
+    """Run the command; known trouble is one line on stderr."""
+    # The matrices are small: threads that wait for each other cost more than they bring, most on a busy machine.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    try:
+        app(prog_name="alidade")
+    except BaseException as error:
+        if _interrupted(error):
+            sys.exit(exit_codes.INTERRUPTED)
+        code = _TROUBLE.get(type(error).__name__)
+        if code is None:
+            raise
+        print(f"alidade: {error}", file=sys.stderr)
+        sys.exit(code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,288 @@
+"""Many recordings calibrated, and what they say together.
+
+    outcome = calibrate_fleet(find(["recordings/*.mcap"]), Settings(), out, scheduler=None, jobs=2)
+
+Each worker reads its own recording and sends back a small mapping; nothing else of a recording reaches this process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+from alidade.pipelines import methods, progress
+from alidade.pipelines.applications import exit_codes
+from alidade.pipelines.applications.fleet import require_extra
+from alidade.pipelines.applications.fleet.engine import Killed, cluster, completed, source_version
+from alidade.pipelines.applications.fleet.histories import packed
+from alidade.pipelines.applications.fleet.isolated import failure, quarantined, run_isolated
+from alidade.pipelines.applications.fleet.recordings import Recording, as_date, from_metadata, from_name, local
+from alidade.pipelines.applications.fleet.store import Result, Store, settings_key
+from alidade.pipelines.applications.sharing import walks
+from alidade.pipelines.belief import Belief
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording.container import sha256_of, sha256_together
+from alidade.pipelines.reports.known import load_known
+
+if TYPE_CHECKING:
+    from alidade.pipelines.estimation.problem import Told
+    from alidade.pipelines.reports.result import Calibration
+
+
+# In the path of earlier calibrations.
+_UNIT = "{unit}"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How every recording of a fleet is calibrated.
+
+    Attributes:
+        method: overrides the recordings' own; None: what fits.
+        config: text of a YAML file that overrides the recordings' own config key by key.
+        solver: batch, incremental or published.
+        window: s, of the incremental solver; None keeps the whole history.
+        prior: path or fsspec's address of the earlier calibration that each begins from, `{unit}` in place of the unit;
+            None: of none.
+    """
+
+    method: str | None = None
+    config: str | None = None
+    solver: str = "batch"
+    window: float | None = 1.0
+    prior: str | None = None
+
+    @classmethod
+    def of(
+        cls, method: str | None, config: Path | None, solver: str, window: float | None, prior: str | None = None
+    ) -> Settings:
+        """With the text of a config file. Raises InputError when there is no such method, or a file cannot be used."""
+        require_extra()
+        if method is not None:
+            methods.method(method)  # there is one of that name
+        if prior is not None:
+            prior = prior if "://" in prior else str(Path(prior).absolute())
+            if _UNIT not in prior:
+                with _earlier(prior):
+                    pass  # it can be used
+        if config is None:
+            return cls(method, None, solver, window, prior)
+        load_config(None, config)
+        return cls(method, config.read_text(encoding="utf-8"), solver, window, prior)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run of a fleet ended with.
+
+    Attributes:
+        results: by recording, in their order; of those that are finished.
+        recordings: how many there are.
+        kept: how many had been finished by an earlier run.
+        interrupted: Ctrl-C came before the end.
+    """
+
+    results: Mapping[str, Result]
+    recordings: int
+    kept: int
+    interrupted: bool
+
+    @property
+    def summary(self) -> list[str]:
+        """In a few lines: how many, with what verdicts, and what was quarantined."""
+        statuses = [result["status"] for result in self.results.values()]
+        verdicts = ", ".join(f"{statuses.count(status)} {status}" for status in sorted(set(statuses)))
+        lines = [f"{len(self.results)} of {self.recordings} recordings, {self.kept} from an earlier run: {verdicts}"]
+        aside = [name for name, result in self.results.items() if result["exit_code"] == exit_codes.KILLED]
+        lines += [f"quarantined, it kills workers: {name}" for name in aside]
+        return [*lines, "interrupted; the same command continues"] if self.interrupted else lines
+
+
+def calibrate_fleet(
+    recordings: Mapping[str, Recording],
+    settings: Settings,
+    out: Path,
+    scheduler: str | None = None,
+    jobs: int | None = None,
+    names: str | None = None,
+) -> Outcome:
+    """Calibrate every recording that has not been finished before with these settings and this version.
+
+    Args:
+        recordings: by name.
+        settings: for all of them.
+        out: folder; results are kept there as they come.
+        scheduler: address; None works on this machine.
+        jobs: how many local workers.
+        names: pattern of the file names, see recordings.from_name.
+
+    Raises:
+        InputError: out cannot be written to, no cluster can be had, or a name does not fit.
+    """
+    told = {name: from_name(name, names) for name in recordings}
+    for fields in told.values():
+        if "date" in fields:
+            as_date(fields["date"])
+    store = Store(out, settings_key(source_version(), asdict(settings)))
+    unchanged = {name for name in recordings if _unchanged(recordings[name], settings, store.results.get(name))}
+    tasks = {
+        name: (recording, settings, told[name].get("unit"), _inputs(store.results.get(name)))
+        for name, recording in recordings.items()
+        if name not in unchanged
+    }
+    fresh, again, interrupted = _calibrated_all(tasks, store, scheduler, jobs)
+    known = {**{name: store.results[name] for name in recordings if name in store.results}, **fresh}
+    results = {name: _placed(name, known[name], told[name]) for name in recordings if name in known}
+    return Outcome(results, len(recordings), len(unchanged) + again, interrupted)
+
+
+def _calibrated_all(
+    tasks: Mapping[str, tuple[Any, ...]], store: Store, scheduler: str | None, jobs: int | None
+) -> tuple[dict[str, Result], int, bool]:
+    """Results that are not to be kept; how many kept ones stand; and whether Ctrl-C came before the end."""
+    fresh: dict[str, Result] = {}
+    again = 0
+    if not tasks:
+        return fresh, again, False
+    with cluster(scheduler, jobs) as client:
+        try:
+            for name, result in progress.track(
+                completed(client, calibrate_recording, tasks), "calibrating", len(tasks)
+            ):
+                if isinstance(result, Killed):
+                    fresh[name] = quarantined()
+                elif result is None:
+                    again += 1
+                elif "sha256" in result:
+                    store.add(name, result)
+                else:
+                    fresh[name] = result
+        except KeyboardInterrupt:
+            return fresh, again, True
+    return fresh, again, False
+
+
+def calibrate_recording(
+    recording: Recording, settings: Settings, unit: str | None = None, known: tuple[str, str | None] | None = None
+) -> Result | None:
+    """On the worker: the result of one recording, None when it was made of the very same.
+
+    A result without `sha256` is of a file that could not be read at all; the next run tries again.
+
+    Args:
+        recording: where it is.
+        settings: how.
+        unit: as the file's name has it.
+        known: SHA-256 of the recording and of the earlier calibration that the result known was made of.
+    """
+    try:
+        with local(recording.file, recording.is_bag) as path:
+            told = _told(path)
+            with _prior(settings, unit or told.get("unit") or Path(recording.file.path).stem) as prior:
+                result = {"sha256": _sha256(path), "prior_sha256": prior and _sha256(prior), **told}
+                if _inputs(result) == known:
+                    return None
+                return {**result, "tag": recording.tag, **_calibrated(path, settings, prior)}
+    except (OSError, InputError) as error:
+        return failure(exit_codes.BAD_INPUT, str(error))
+
+
+def _inputs(result: Result | None) -> tuple[str, str | None] | None:
+    """What a result was made of."""
+    return (result["sha256"], result["prior_sha256"]) if result else None
+
+
+def _unchanged(recording: Recording, settings: Settings, kept: Result | None) -> bool:
+    """Whether a kept result stands by what the listing says, so that nothing is to be fetched for it."""
+    return bool(kept and recording.tag and kept.get("tag") == recording.tag and settings.prior is None)
+
+
+def _prior(settings: Settings, unit: str) -> AbstractContextManager[Path | None]:
+    """The earlier calibration that a unit begins from, on this machine; None: of none."""
+    return nullcontext() if settings.prior is None else _earlier(settings.prior.replace(_UNIT, unit))
+
+
+@contextmanager
+def _earlier(address: str) -> Iterator[Path]:
+    import fsspec
+
+    with local(fsspec.open(address)) as path:
+        load_known(path)
+        yield path
+
+
+def _told(path: Path) -> Result:
+    """Unit and date by the recording's own metadata."""
+    return {key: value for key, value in from_metadata(path).items() if key != "date" or as_date(value)}
+
+
+def _calibrated(path: Path, settings: Settings, prior: Path | None) -> Result:
+    with TemporaryDirectory(prefix="alidade.") as folder:
+        config = None
+        if settings.config is not None:
+            config = Path(folder) / "config.yaml"
+            config.write_text(settings.config, encoding="utf-8")
+        return run_isolated(_summary, lambda: _calibration(path, settings, config, prior))
+
+
+def _calibration(path: Path, settings: Settings, config: Path | None, prior: Path | None) -> Calibration:
+    from alidade.pipelines.applications.session import calibrate
+
+    (calibration,) = calibrate(
+        path, [settings.solver], settings.method, config, settings.window, prior=prior, report=False
+    )
+    return calibration
+
+
+def _summary(calibration: Calibration) -> Result:
+    """The numbers of a calibration that a fleet is about; SI."""
+    names = [q.name for q in calibration.problem.quantities]
+    return {
+        "start_ns": calibration.facts.epoch_ns,
+        "duration_s": calibration.facts.duration_s,
+        "method": calibration.problem.method,
+        "device": walks(calibration.method, calibration.config, names),
+        "told": packed(_says(calibration)),
+        "parameters": {
+            p.name: {
+                "value": p.value,
+                "sigma": p.sigma,
+                "unit": p.unit,
+                "require": p.require,
+                "verdict": p.observability,
+                "inflation": p.inflation,
+            }
+            for p in calibration.parameters.values()
+        },
+    }
+
+
+def _says(calibration: Calibration) -> Told:
+    """What a calibration says of its numbers; of solvers that do not tell it, by their covariance."""
+    from alidade.pipelines.solvers.told import told_of
+
+    estimate = calibration.estimate
+    if estimate.told is not None:
+        return estimate.told
+    scales = {q.name: q.prior_scale for q in calibration.problem.quantities}
+    known = [name for name, sigma in zip(estimate.names, estimate.sigmas, strict=True) if sigma > 0.0]
+    belief = Belief(estimate.names, estimate.values, estimate.covariance).of(known)
+    return told_of(belief, [scales[name] for name in belief.names])
+
+
+def _placed(name: str, result: Result, told: Mapping[str, str]) -> Result:
+    """With unit and date: by the file's name, else by the recording's metadata, else the file and its start."""
+    unit = told.get("unit") or result.get("unit") or Path(name).stem
+    text = told.get("date") or result.get("date")
+    date = as_date(text).timestamp() if text else result.get("start_ns", 0) * 1e-9 or None
+    return {**result, "unit": unit, "date": date}
+
+
+def _sha256(path: Path) -> str:
+    """Of a file, or of all that is in a folder."""
+    return sha256_together(map(sha256_of, sorted(path.iterdir()))) if path.is_dir() else sha256_of(path)

@@ -1,0 +1,167 @@
+"""Units that were recorded several times: whether they changed, as several recordings of one device are judged.
+
+The recordings of a unit are joined as `calibrate` joins them, linear about each one's own estimate. What belongs to a
+recording is its own; priors and assumptions count once. What chance makes is counted over all units of the fleet.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from alidade.pipelines.applications.fleet import statistics
+from alidade.pipelines.applications.fleet.store import Result
+from alidade.pipelines.applications.fleet.tables import Row
+from alidade.pipelines.applications.sharing import DAY_S
+from alidade.pipelines.diagnostics.device_changes import Change, Changes, changes
+from alidade.pipelines.estimation.problem import Told
+from alidade.pipelines.solvers.joint import grown, join
+
+
+@dataclass(frozen=True)
+class History:
+    """A unit over its recordings.
+
+    Attributes:
+        unit: its name.
+        method: of its recordings.
+        recordings: their names, in the order of their dates; two at least.
+        dates: of these, Unix s.
+        changes: steps of the device between them.
+        found: those that the unit is to be looked after for.
+    """
+
+    unit: str
+    method: str
+    recordings: tuple[str, ...]
+    dates: tuple[float, ...]
+    changes: Changes
+    found: tuple[Change, ...]
+
+    def after(self, step: Change) -> tuple[str, ...]:
+        """The recordings after a step."""
+        return self.recordings[step.after + 1 :]
+
+    @property
+    def together(self) -> tuple[int, ...]:
+        """After which recordings all numbers together changed, where none did by itself."""
+        return () if self.changes.found else tuple(each.after for each in self.changes.together if each.significant)
+
+    @property
+    def steps(self) -> tuple[Change, ...]:
+        """Of every number after every recording, those found as they are with all of them."""
+        found = {(step.name, step.after): step for step in self.changes.found}
+        return tuple(found.get((step.name, step.after), step) for step in self.changes.steps)
+
+
+def packed(told: Told) -> str:
+    """What a recording says of its numbers, as text."""
+    triangle = np.linalg.qr(np.column_stack([told.R, told.d])).R
+    with io.BytesIO() as stream:
+        np.savez_compressed(
+            stream,
+            names=np.array(told.names),
+            at=told.at,
+            whole=triangle,
+            prior_R=told.prior_R,
+            prior_d=told.prior_d,
+            scales=told.scales,
+        )
+        return base64.b64encode(stream.getvalue()).decode()
+
+
+def unpacked(text: str) -> Told:
+    """The other way round."""
+    with np.load(io.BytesIO(base64.b64decode(text)), allow_pickle=False) as each:
+        whole = each["whole"]
+        return Told(
+            names=tuple(each["names"].tolist()),
+            at=each["at"],
+            R=whole[:, :-1],
+            d=whole[:, -1],
+            prior_R=each["prior_R"],
+            prior_d=each["prior_d"],
+            scales=each["scales"],
+        )
+
+
+def histories(results: Mapping[str, Result], asked: Mapping[str, Sequence[str]]) -> list[History]:
+    """Of every unit that was recorded several times.
+
+    Args:
+        results: of the fleet, by recording.
+        asked: recording -> its parameters that count; none: the recording does not.
+    """
+    groups: dict[tuple[str, str], list[str]] = {}
+    for recording, result in results.items():
+        if asked.get(recording):
+            groups.setdefault((result["unit"], result["method"]), []).append(recording)
+    several = {group: names for group, names in groups.items() if len(names) > 1}
+    level = statistics.FALSE_ALARM / max(len(several), 1)
+    return _red([_history(results, unit, method, names, asked, level) for (unit, method), names in several.items()])
+
+
+def change_table(found: Sequence[History]) -> list[Row]:
+    """A row a step of a unit's device between two recordings, SI."""
+    return [
+        {
+            "unit": history.unit,
+            "method": history.method,
+            "parameter": step.name,
+            "before": history.recordings[step.after],
+            "after": history.recordings[step.after + 1],
+            "difference": step.size,
+            "sigma": step.sigma,
+            "z": step.z,
+            "changed": int(step in history.found),
+        }
+        for history in found
+        for step in history.steps
+    ]
+
+
+def _history(
+    results: Mapping[str, Result],
+    unit: str,
+    method: str,
+    recordings: Sequence[str],
+    asked: Mapping[str, Sequence[str]],
+    level: float,
+) -> History:
+    order = sorted(recordings, key=lambda recording: results[recording]["date"])
+    parameters = [results[recording]["parameters"] for recording in order]
+    days = [results[recording]["date"] / DAY_S for recording in order]
+    joined = join([unpacked(results[recording]["told"]) for recording in order], results[order[-1]]["device"], days)
+    names = {name for recording in order for name in asked[recording]}
+    known = {name: [each[name] for each in parameters if name in each] for name in names}
+    inflations = {name: grown([p["sigma"] for p in own], [p["inflation"] for p in own]) for name, own in known.items()}
+    found = changes(joined, days, inflations, names, level)
+    dates = tuple(results[recording]["date"] for recording in order)
+    return History(unit, method, tuple(order), dates, found, found.found)
+
+
+def _red(each: Sequence[History]) -> list[History]:
+    """The same, without steps that are no larger than most units make: these differ between recordings by nature."""
+    made: dict[tuple[str, str], list[Change]] = {}
+    for history in each:
+        for step in history.steps:
+            made.setdefault((history.method, step.name), []).append(step)
+    usual = {}
+    for key, steps in made.items():
+        if statistics.varies(np.array([step.z for step in steps])):
+            sizes, sigmas = np.array([(step.size, step.sigma) for step in steps]).T
+            usual[key] = statistics.spread(sizes, sigmas, centre=0.0)
+    tests = sum(map(len, made.values()))
+
+    def beyond(method: str, step: Change) -> bool:
+        spread = usual.get((method, step.name))
+        if spread is None:
+            return True
+        z = spread.z(np.array([step.size]), np.array([step.sigma]))
+        return bool(abs(z[0]) > statistics.limit(tests, len(made[method, step.name])))
+
+    return [replace(h, found=tuple(step for step in h.found if beyond(h.method, step))) for h in each]

@@ -1,0 +1,262 @@
+"""Are the sigmas true? Many simulated recordings of one scenario, solved, and their errors held against the sigmas.
+
+    study = run_study("head", "head_nominal", seeds=range(200), solvers=SOLVERS, out=Path("study"))
+    study.nees("batch").consistent
+
+Every seed is simulated and solved by one task on one core, so that the numbers do not depend on how many workers there
+are. The simulated arrays are solved as they are: written to a file and read again they are the same, but for the last
+digits of noise densities, which messages carry as variances. A worker sends back numbers only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from alidade.pipelines import methods, progress
+from alidade.pipelines.applications.fleet import require_extra, statistics
+from alidade.pipelines.applications.fleet.engine import Killed, cluster, completed, source_version
+from alidade.pipelines.applications.fleet.isolated import quarantined, run_isolated
+from alidade.pipelines.applications.fleet.store import Result, Store, settings_key
+from alidade.pipelines.applications.fleet.tables import Cell, Row
+from alidade.pipelines.errors import InputError
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    from alidade.pipelines.methods import Method
+    from alidade.pipelines.reports.result import Calibration
+
+SOLVERS = ("published", "batch", "incremental")
+
+
+@dataclass(frozen=True)
+class Study:
+    """Runs of one scenario.
+
+    Attributes:
+        method: simulated and solved.
+        scenario: its name.
+        solvers: in the order of the tables.
+        results: seed -> solver -> numbers, in the order of the seeds; of those that are finished.
+        seeds: how many were asked for.
+        kept: how many had been finished by an earlier run.
+        interrupted: Ctrl-C came before the end.
+    """
+
+    method: str
+    scenario: str
+    solvers: tuple[str, ...]
+    results: Mapping[int, Mapping[str, Result]]
+    seeds: int
+    kept: int
+    interrupted: bool
+
+    @property
+    def summary(self) -> list[str]:
+        """A line a solver: mean NEES with its interval, coverage; and what is missing."""
+        lines = [f"{len(self.results)} of {self.seeds} runs, {self.kept} from an earlier run"]
+        for solver in self.solvers:
+            if self.estimates(solver):
+                n = self.nees(solver)
+                shares = " ".join(f"{100.0 * share:.1f} %" for share in statistics.coverage(self.normalised(solver)))
+                verdict = "inside" if n.consistent else "outside"
+                lines.append(
+                    f"{solver}: mean NEES {n.mean:.3f} of {n.dof:g} parameters, {verdict} its 99 % interval "
+                    f"{n.low:.3f} to {n.high:.3f}; within 1, 2, 3 sigmas {shares}"
+                )
+            lines += [f"{solver}: seed {seed}: {reason}" for seed, reason in self.failures(solver).items()]
+        return [*lines, "interrupted; the same command continues"] if self.interrupted else lines
+
+    def estimates(self, solver: str) -> list[Result]:
+        """The results of the runs in which this solver came to an estimate whose truth is known."""
+        return [run[solver] for run in self.results.values() if run.get(solver, {}).get("dof")]
+
+    def failures(self, solver: str) -> dict[int, str]:
+        """Seed -> why there is no estimate."""
+        return {
+            seed: run[solver]["reason"]
+            for seed, run in self.results.items()
+            if solver in run and run[solver]["status"] == "failed"
+        }
+
+    def statuses(self, solver: str) -> dict[str, int]:
+        """Status -> number of runs."""
+        found = [run[solver]["status"] for run in self.results.values() if solver in run]
+        return {status: found.count(status) for status in sorted(set(found))}
+
+    def nees(self, solver: str) -> statistics.Nees:
+        """Mean NEES; needs an estimate."""
+        found = self.estimates(solver)
+        return statistics.mean_nees(np.array([r["nees"] for r in found]), np.array([float(r["dof"]) for r in found]))
+
+    def normalised(self, solver: str) -> statistics.Array:
+        """All errors in sigmas, over runs and parameters."""
+        return np.array([p["error"] / p["sigma"] for r in self.estimates(solver) for p in r["parameters"].values()])
+
+    def accuracies(self, solver: str) -> dict[str, tuple[statistics.Accuracy, Result]]:
+        """Parameter -> accuracy over the runs, and what one result says of the parameter (unit, require)."""
+        members: dict[str, list[Result]] = {}
+        for result in self.estimates(solver):
+            for name, parameter in result["parameters"].items():
+                members.setdefault(name, []).append(parameter)
+        return {
+            name: (
+                statistics.accuracy(np.array([p["error"] for p in found]), np.array([p["sigma"] for p in found])),
+                found[0],
+            )
+            for name, found in members.items()
+        }
+
+
+def run_study(
+    method: str,
+    scenario: str | None,
+    seeds: Sequence[int],
+    solvers: Sequence[str],
+    out: Path,
+    scheduler: str | None = None,
+    jobs: int | None = None,
+    window: float | None = 1.0,
+) -> Study:
+    """Simulate and solve every seed that has not been finished before.
+
+    Args:
+        method: to simulate and solve.
+        scenario: name or YAML file; None is the method's nominal one.
+        seeds: one run each.
+        solvers: of SOLVERS.
+        out: folder; results are kept there as they come.
+        scheduler: address; None works on this machine.
+        jobs: how many local workers.
+        window: s, of the incremental solver; None keeps the whole history.
+
+    Raises:
+        InputError: no such method, scenario or solver, out cannot be written to, or no cluster can be had.
+    """
+    require_extra()
+    unknown = [solver for solver in solvers if solver not in SOLVERS]
+    if unknown or not solvers:
+        raise InputError(f"no solver {', '.join(unknown)!r}; the solvers are {', '.join(SOLVERS)}, or all")
+    if not seeds:
+        raise InputError("--runs: at least one run is needed")
+    chosen = methods.method(method)
+    settings = chosen.settings(scenario)
+    # The first recording tells this scenario and simulator from others; and one that cannot be drawn is refused here.
+    store = Store(out, settings_key(source_version(), *_first(chosen, settings, seeds[0]), list(solvers), window))
+    tasks = {
+        str(seed): (method, settings, seed, tuple(solvers), window) for seed in seeds if str(seed) not in store.results
+    }
+    kept, interrupted = len(seeds) - len(tasks), False
+    killed: dict[str, Result] = {}
+    if tasks:
+        with cluster(scheduler, jobs) as client:
+            try:
+                for name, result in progress.track(
+                    completed(client, simulate_and_solve, tasks), "simulating and solving", len(tasks)
+                ):
+                    if isinstance(result, Killed):
+                        killed[name] = dict.fromkeys(solvers, quarantined())
+                    else:
+                        store.add(name, result)
+            except KeyboardInterrupt:
+                interrupted = True
+    known = {**store.results, **killed}
+    results = {seed: known[str(seed)] for seed in seeds if str(seed) in known}
+    name = Path(scenario or chosen.nominal()).stem
+    return Study(method, name, tuple(solvers), results, len(seeds), kept, interrupted)
+
+
+def simulate_and_solve(
+    method: str, scenario: BaseModel, seed: int, solvers: Sequence[str], window: float | None
+) -> dict[str, Result]:
+    """On the worker: solver -> numbers of one seed of a scenario."""
+    from alidade.pipelines.applications.session import Session
+
+    chosen = methods.method(method)
+    session = Session.of(chosen, chosen.simulate(scenario, seed))
+    return {
+        solver: run_isolated(_numbers, partial(session.calibrate, solver, window, report=False)) for solver in solvers
+    }
+
+
+def run_table(study: Study) -> list[Row]:
+    """A row a seed and solver: verdict, NEES, chi-square, and of every parameter error and sigma, SI."""
+    rows: list[Row] = []
+    for seed, run in study.results.items():
+        for solver, result in run.items():
+            row: dict[str, Cell] = {"seed": seed, "solver": solver}
+            row |= {k: result.get(k) for k in ("status", "exit_code", "reason", "nees", "dof")}
+            row |= {k: result.get(k) for k in ("chi_square", "chi_square_dof")}
+            for name, parameter in result["parameters"].items():
+                row |= {f"{name}_error": parameter["error"], f"{name}_sigma": parameter["sigma"]}
+            rows.append(row)
+    return rows
+
+
+def summary_table(study: Study) -> list[Row]:
+    """A row a solver and parameter, and one for all parameters of a solver together; SI."""
+    rows: list[Row] = []
+    for solver in study.solvers:
+        if not study.estimates(solver):
+            continue
+        nees, shares = study.nees(solver), statistics.coverage(study.normalised(solver))
+        rows.append(
+            {
+                "solver": solver,
+                "parameter": "all",
+                "runs": nees.runs,
+                "mean_nees": nees.mean,
+                "nees_low": nees.low,
+                "nees_high": nees.high,
+                "dof": nees.dof,
+                **_coverage_cells(shares),
+            }
+        )
+        for name, (a, _) in study.accuracies(solver).items():
+            cells: dict[str, Cell] = {"solver": solver, "parameter": name, "bias": a.bias, "bias_sigma": a.bias_sigma}
+            rows.append(cells | {"rms_error": a.rms, "rms_sigma": a.sigma} | _coverage_cells(a.coverage))
+    return rows
+
+
+def _coverage_cells(shares: tuple[float, float, float]) -> dict[str, Cell]:
+    return {f"within_{k}_sigma": share for k, share in enumerate(shares, start=1)}
+
+
+def _first(method: Method, scenario: BaseModel, seed: int) -> tuple[str, str, str, dict[str, float]]:
+    """What tells a study's recordings from others: method, data of one, their config and truth."""
+    from alidade.pipelines.applications.session import Arrays
+
+    simulated = method.simulate(scenario, seed)
+    return method.name, Arrays(method, simulated.data).sha256(), simulated.config, dict(simulated.truth)
+
+
+def _numbers(calibration: Calibration) -> Result:
+    """Errors against sigmas, of what was estimated and whose truth is known."""
+    from alidade.pipelines.reports.result import truth_errors
+
+    errors = truth_errors(calibration)
+    judged = [p for p in calibration.parameters.values() if p.name in errors and p.sigma > 0.0]
+    numbers: Result = {
+        "parameters": {
+            p.name: {"error": errors[p.name].error, "sigma": p.sigma, "unit": p.unit, "require": p.require}
+            for p in judged
+        }
+    }
+    if judged:
+        places = [calibration.estimate.names.index(p.name) for p in judged]
+        sigmas = np.array([p.sigma for p in judged])
+        correlation = calibration.assessment.covariance[np.ix_(places, places)] / np.outer(sigmas, sigmas)
+        normalised = np.array([errors[p.name].error for p in judged]) / sigmas
+        numbers |= {"nees": float(normalised @ np.linalg.solve(correlation, normalised)), "dof": len(judged)}
+    if calibration.estimate.chi_square is not None:
+        numbers |= {
+            "chi_square": calibration.estimate.chi_square.value,
+            "chi_square_dof": calibration.estimate.chi_square.dof,
+        }
+    return numbers

@@ -1,0 +1,229 @@
+"""Statistics of many calibrations: are the sigmas true, which units stand out, which have changed.
+
+Values x_i come with their own sigmas s_i. A fleet has a spread t of its own beside them, so that x_i scatters about the
+centre with variance t^2 + s_i^2; centre and t are told from medians, which up to half of the units cannot spoil.
+Of what does not stand out, t is taken apart into what units differ by and what recordings of one unit differ by.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.factors.chi_square import quantile, student
+from alidade.pipelines.diagnostics.likelihood import likeliest
+
+Array = NDArray[np.float64]
+
+# Chance that anything at all is flagged among good units, over all tests of a page.
+FALSE_ALARM = 0.01
+# Fewer values than these tell no spread.
+ENOUGH = 5
+# Median of chi-square with one degree of freedom.
+_MEDIAN = NormalDist().inv_cdf(0.75) ** 2
+# A median tells a spread as well as the usual estimate from this share of the values.
+_EFFICIENCY = 0.37
+
+
+@dataclass(frozen=True)
+class Nees:
+    """Mean normalised estimation error squared of `runs` runs, and its 99 % interval if the covariances are true."""
+
+    mean: float
+    low: float
+    high: float
+    runs: int
+    dof: float
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the mean lies in the interval."""
+        return self.low <= self.mean <= self.high
+
+
+def mean_nees(nees: Array, dof: Array) -> Nees:
+    """The mean of e' P^-1 e over runs (n,), each of `dof` (n,) parameters; n times it is chi-square (Bar-Shalom)."""
+    n, total = len(nees), float(dof.sum())
+    return Nees(float(nees.mean()), quantile(0.005, total) / n, quantile(0.995, total) / n, n, total / n)
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Errors of one parameter over many runs, beside the sigmas predicted.
+
+    Attributes:
+        bias: mean error; `bias_sigma` is its standard error.
+        rms: root mean square error.
+        sigma: root mean square of the sigmas predicted.
+        coverage: share of errors within 1, 2 and 3 sigmas; 0.683, 0.954 and 0.997 if the sigmas are true.
+    """
+
+    bias: float
+    bias_sigma: float
+    rms: float
+    sigma: float
+    coverage: tuple[float, float, float]
+
+
+def accuracy(errors: Array, sigmas: Array) -> Accuracy:
+    """Of errors and sigmas (n,)."""
+    scatter = float(errors.std(ddof=1)) if len(errors) > 1 else math.nan
+    return Accuracy(
+        float(errors.mean()),
+        scatter / math.sqrt(len(errors)),
+        float(np.sqrt((errors**2).mean())),
+        float(np.sqrt((sigmas**2).mean())),
+        coverage(errors / sigmas),
+    )
+
+
+def coverage(normalised: Array) -> tuple[float, float, float]:
+    """Share of errors, in sigmas, within 1, 2 and 3."""
+    size = np.abs(normalised)
+    return float((size < 1.0).mean()), float((size < 2.0).mean()), float((size < 3.0).mean())
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Where a parameter lies in the fleet: `centre`, and the spread `tau` that sigmas do not explain."""
+
+    centre: float
+    tau: float
+
+    def z(self, values: Array, sigmas: Array) -> Array:
+        """Distances from the centre in standard deviations: the fleet's spread and the own sigma together."""
+        return np.asarray((values - self.centre) / np.hypot(self.tau, sigmas))
+
+
+def spread(values: Array, sigmas: Array, centre: float | None = None) -> Spread:
+    """Robust centre and spread of values (n,) with sigmas (n,); a centre that is known is kept."""
+    tau = 0.0
+    where = centre if centre is not None else float(np.median(values))
+    for _ in range(20):
+        if centre is None:
+            weights = 1.0 / np.hypot(tau, sigmas)
+            where = float(np.quantile(values, 0.5, weights=weights, method="inverted_cdf"))
+        previous, tau = tau, _excess((values - where) ** 2, sigmas**2)
+        if math.isclose(tau, previous, rel_tol=1e-6):
+            break
+    return Spread(where, tau)
+
+
+def limit(tests: int, values: int | None = None) -> float:
+    """|z| that none of so many tests exceeds by chance, but for one page in a hundred.
+
+    Args:
+        tests: made on the whole page.
+        values: the spread was told from so many (Student's t then, by Wallace's approximation of 1959, which is
+            2 % large at 40 values, 10 % at 12); None: it is known.
+    """
+    z = NormalDist().inv_cdf(1.0 - 0.5 * FALSE_ALARM / max(tests, 1))
+    if values is None:
+        return z
+    return student(z, _EFFICIENCY * (values - 1))
+
+
+@dataclass(frozen=True)
+class Trend:
+    """A straight line through values over time: change per unit of time, and its sigma."""
+
+    slope: float
+    sigma: float
+
+    @property
+    def z(self) -> float:
+        """The slope in its sigmas."""
+        return self.slope / self.sigma
+
+
+def trend(time: Array, values: Array, sigmas: Array) -> Trend | None:
+    """Weighted least squares with these sigmas (n,), the spread included; None without two moments."""
+    weights = 1.0 / sigmas**2
+    centred = time - np.average(time, weights=weights)
+    information = float((weights * centred**2).sum())
+    if len(time) < 3 or not np.ptp(time) > 0.0:
+        return None
+    return Trend(float((weights * centred * values).sum()) / information, information**-0.5)
+
+
+@dataclass(frozen=True)
+class Component:
+    """A standard deviation of what values scatter by beyond their sigmas.
+
+    Attributes:
+        value: of the largest likelihood; 0 where the sigmas suffice.
+        sigma: of that; NaN at 0, where `upper` says what is known.
+        upper: it is not larger than that (95 %).
+    """
+
+    value: float
+    sigma: float
+    upper: float
+
+
+def components(values: Array, sigmas: Array, units: NDArray[np.intp]) -> tuple[Component | None, Component | None]:
+    """From unit to unit, and from recording to recording of one unit: x = centre + unit + recording + noise.
+
+    The second is told by what recordings differ from their unit's mean, the first by these means, each by its
+    restricted likelihood (Searle, Casella, McCulloch, Variance Components, 1992, 3.7 and 6.6).
+
+    Args:
+        values, sigmas: (n,).
+        units: (n,) which unit each shows.
+
+    Returns:
+        The first from five units on, the second where a unit has several recordings.
+    """
+    groups = np.unique(units, return_inverse=True)[1]
+    several = np.bincount(groups) > 1 if len(groups) else np.empty(0, dtype=bool)
+    some = several[groups]
+    recording = _component(values[some], sigmas[some], groups[some]) if several.any() else None
+    if len(several) < ENOUGH:
+        return None, recording
+    weights = 1.0 / (sigmas**2 + (recording.value if recording else 0.0) ** 2)
+    total = np.bincount(groups, weights)
+    means = np.bincount(groups, weights * values) / total
+    return _component(means, np.asarray(total**-0.5), np.zeros(len(means), dtype=np.intp)), recording
+
+
+def _component(values: Array, sigmas: Array, groups: NDArray[np.intp]) -> Component:
+    """Of values (n,) about the means of their groups (n,), each of which has two at least."""
+    groups = np.unique(groups, return_inverse=True)[1]
+
+    def sums(weights: Array) -> Array:
+        return np.asarray(np.bincount(groups, weights), dtype=float)
+
+    def doubled(tau: float) -> float:
+        w = 1.0 / (sigmas**2 + tau**2)
+        total = sums(w)
+        mean = sums(w * values) / total
+        return float(np.log(total).sum() - np.log(w).sum() + (w * (values - mean[groups]) ** 2).sum())
+
+    tau, upper = likeliest(doubled, float(np.median(sigmas)))
+    w = 1.0 / (sigmas**2 + tau**2)
+    one, two, three = sums(w), sums(w**2), sums(w**3)
+    information = 0.5 * float((two - 2.0 * three / one + (two / one) ** 2).sum())  # of tau squared
+    return Component(tau, 0.5 / tau * information**-0.5 if tau > 0.0 else math.nan, upper)
+
+
+def varies(z: Array) -> bool:
+    """Whether most units change beyond two sigmas: then sessions differ by nature, as a turn-on bias does."""
+    return len(z) >= ENOUGH and float((np.abs(z) > 2.0).mean()) > 0.5
+
+
+def _excess(squares: Array, variances: Array) -> float:
+    """tau with median(squares / (tau^2 + variances)) = the median of chi-square; 0 if the variances suffice."""
+    low, high = 0.0, float(squares.max()) / _MEDIAN
+    if float(np.median(squares / variances)) <= _MEDIAN:
+        return 0.0
+    for _ in range(100):
+        middle = 0.5 * (low + high)
+        if float(np.median(squares / (middle + variances))) > _MEDIAN:
+            low = middle
+        else:
+            high = middle
+    return math.sqrt(high)

@@ -1,0 +1,367 @@
+"""Follows a growing recording: looks at it again and again, and hands what is new to the incremental solver.
+
+A look costs what is new, not what was there: once the solver has marginalised the past out, data are read and the graph
+is built from there on alone (Problem.onward). Methods whose past may still change, as with turns and poses under way,
+and errors taken from pictures of a first target, are read whole; their looks are followed by longer pauses, so that
+following never takes more than a third of a core for reading.
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+
+from alidade.pipelines.applications.follow.guidance import View, Watch, view_of
+from alidade.pipelines.applications.follow.sources import Source
+from alidade.pipelines.applications.session import Session
+from alidade.pipelines.diagnostics.checklist import ChecklistItem
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.camera_clock import Clock
+from alidade.pipelines.estimation.problem import Problem, Step
+from alidade.pipelines.recording.container import sha256_of
+from alidade.pipelines.recording.growing import Growing
+from alidade.pipelines.recording.opening import identity
+from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.reports.known import load_known
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.settings import Config
+from alidade.pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
+from alidade.pipelines.solvers.incremental import Run
+from alidade.pipelines.solvers.window import check_window
+
+# At least so long from one look to the next, s, and so many times what it took to read: steps wait for nothing.
+_PAUSE, _REST = 0.05, 2.0
+# The files' size is looked at so often, s.
+_POLL = 0.01
+# The end of a recording is read from so long before the first step taken of it, s: what is logged late, and samples and
+# pictures by which those beside them are judged. Where that is too little, more.
+_MARGINS = (2.0, 20.0)
+# First guesses serve until the recording is so many times as long.
+_LONG_AGO = 1.5
+# While a long recording is caught up with, the view is renewed this often, s.
+_VIEW = 1.0
+# Times are differences of stamps, which are whole ns: they are told apart beyond this, s.
+_ROUNDING = 1e-9
+_CLOCK = "time_offset", "clock_skew"
+_MISPLACED = "by now pictures are taken farther from their stamps than motion around these can be carried"
+# A picture serves once gyro and gimbal have been read after it: so long a picture is waited for beyond its time, s.
+_SAMPLE = 0.01
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to follow.
+
+    Attributes:
+        method, config: override the recording's own.
+        window: s, of the incremental solver; None keeps the whole history.
+        patience: s, without anything new, after which what is there is taken as all there will be.
+        checkpoint: file the run is saved in from time to time, and resumed from.
+        check: hold the result against batch.
+        prior: an earlier calibration of the device to begin from.
+    """
+
+    method: str | None = None
+    config: Path | Config | None = None
+    window: float | None = 1.0
+    patience: float = 30.0
+    checkpoint: Path | None = None
+    check: bool = False
+    prior: Path | None = None
+
+
+class Follower:
+    """A recording being followed.
+
+    Args:
+        source: of the recording.
+        settings: how.
+        show: is given the view of what is known whenever it changes.
+        say: is given sentences for the person recording.
+        stopped: whether to go on no longer; asked often.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        settings: Settings,
+        show: Callable[[View], None],
+        say: Callable[[str], None],
+        stopped: Callable[[], bool],
+    ) -> None:
+        self.source = source
+        self.settings, self._show, self._say, self._stopped = settings, show, say, stopped
+        self._run: Run | None = None
+        self._watch = Watch()
+        self._epoch_ns = 0
+        self._identity: dict[str, str] = {}
+        self._resumable = settings.checkpoint is not None and settings.checkpoint.exists()
+        self._shown = 0.0
+        self._waiting = ""
+        self._checklist: dict[str, ChecklistItem] = {}
+        self._growing = Growing()
+        self._session: Session | None = None  # as last read whole
+        self._delay_ns, self._attachments = 0, 0
+        self._guessed = 0.0  # from a recording of so many s
+        self._held: Step | None = None  # the first step that is not settled
+        self._misplaced = False  # whether it was said that pictures were taken far from their stamps
+        check_window(settings.window)
+        if settings.checkpoint is not None and settings.window is None:
+            raise InputError("--window all has no checkpoints: it forgets nothing; give seconds")
+        if settings.prior is not None:
+            load_known(settings.prior)  # told now, not when the recording has begun
+
+    def follow(self) -> Calibration:
+        """Until the recording is finished, stops growing, or `stopped`; then the calibration by all there is.
+
+        Raises:
+            InputError: the file does not appear, is no MCAP, cannot be used in the end, or the checkpoint is of
+                another recording, config or version.
+            IndeterminateError: states other than the parameters are not determined.
+        """
+        # What is there by now stays: to look through it for garbage takes as long as dozens of updates, every minute.
+        gc.freeze()
+        source, patience = self.source, self.settings.patience
+        size, grown, due = -1, time.monotonic(), 0.0
+        while True:
+            now = time.monotonic()
+            if source.size != size:
+                size, grown, new = source.size, now, True
+            finished = source.is_finished
+            over = finished or self._stopped() or now - grown > patience
+            if over:
+                return self._end(finished, size)
+            if new and now >= due and size > 0 and self._may_settle():
+                new = False
+                cost = self._look()
+                due = time.monotonic() + max(_PAUSE, _REST * cost)
+            time.sleep(_POLL)
+
+    # -- one look
+
+    def _look(self) -> float:
+        """Take what is settled of what is there now; returns what it took of a core to read it, s."""
+        started = time.thread_time()
+        try:
+            problem, steps = self._end_alone() or self._whole()
+        except InputError as error:
+            self._wait(str(error))
+            return time.thread_time() - started
+        cost = time.thread_time() - started
+        self._take(problem, self._settled(steps, problem.unsettled))
+        return cost
+
+    def _may_settle(self) -> bool:
+        """Whether what has come may settle a step: to look takes long, and another look has to wait for this one."""
+        run, held = self._run, self._held
+        last_ns = self._growing.last_log_ns(self.source.parts)
+        if run is None or held is None or last_ns is None:
+            return True
+        settled_s = held.time + run.problem.unsettled + _SAMPLE
+        return last_ns >= self._epoch_ns + self._delay_ns + int(settled_s * 1e9)
+
+    def _settled(self, steps: Iterable[Step], unsettled: float) -> Iterator[Step]:
+        """The steps that are so much older, s, than the last, which may still grow; the first that is not is held."""
+        held: deque[Step] = deque()
+        for step in steps:
+            held.append(step)
+            while len(held) > 1 and held[0].time <= step.time - unsettled + _ROUNDING:
+                yield held.popleft()
+        self._held = held[0] if held else None
+
+    def _whole(self) -> tuple[Problem, Iterator[Step]]:
+        """The graph of all there is, and its steps that were not taken yet."""
+        recording = Recording(self._growing.look(self.source.parts, None))
+        session = self._read(recording)
+        problem = self._guessed_before(session) or _that_grows(session.problem(), session)
+        steps = self._new_steps(session, problem)
+        self._session, self._checklist = session, {}
+        self._delay_ns, self._attachments = recording.delay_ns, len(self._growing.attachments)
+        self._collect(session)
+        return problem, steps
+
+    def _read(self, recording: Recording) -> Session:
+        settings = self.settings
+        return Session.read(recording, settings.method, settings.config, prior=settings.prior)
+
+    def _guessed_before(self, session: Session) -> Problem | None:
+        """The graph from the first guesses of a look before, where that is not long ago: they take most of the time."""
+        run = self._run
+        if run is None or run.problem.onward is None or run.time > _LONG_AGO * self._guessed:
+            self._guessed = 0.0 if run is None else run.time
+            return None
+        return run.problem.onward(session.data, -np.inf)
+
+    def _end_alone(self) -> tuple[Problem, Iterator[Step]] | None:
+        """The graph from where the past was marginalised out, and its new steps; None where that is too little."""
+        run, session = self._run, self._session
+        if run is None or run.base is None or run.problem.onward is None or session is None:
+            return None
+        for margin in _MARGINS:
+            since = self._epoch_ns + self._delay_ns + round((run.base.time - margin) * 1e9)
+            recording = Recording(self._growing.look(self.source.parts, since), self._epoch_ns)
+            if len(self._growing.attachments) != self._attachments:
+                return None
+            late = session.again(recording)
+            problem = run.problem.onward(late.data, run.base.time)
+            if problem is not None and problem.steps_after is not None:
+                self._delay_ns = recording.delay_ns
+                self._collect(late)
+                run.update_problem(problem)
+                return problem, problem.steps_after(run.time)
+        return None
+
+    def _wait(self, reason: str) -> None:
+        """The recording cannot be read yet, or holds too little; raises InputError when it never will."""
+        if "not an MCAP file" in reason:
+            raise InputError(reason)
+        reason = reason.removeprefix(f"{self.source.path}: ")
+        if reason != self._waiting:
+            self._waiting = reason
+            self._say(f"not enough yet: {reason}")
+
+    def _new_steps(self, session: Session, problem: Problem) -> Iterator[Step]:
+        """The steps not taken yet, for a run that is the one to take them: a new one if the past has changed."""
+        belongs = self._identify(session)
+        # A sensor whose first message comes late may bring variables of its own.
+        if self._run is not None and _names(self._run.problem) != _names(problem):
+            self._run = None
+        if problem.steps_after is None or belongs != self._identity or session.origin.epoch_ns != self._epoch_ns:
+            self._run = None
+        self._identity, self._epoch_ns = belongs, session.origin.epoch_ns
+        if self._run is None and problem.steps_after is not None:
+            self._run = self._resumed(problem)
+        if self._run is None:
+            self._run = Run(problem, self.settings.window)
+            return problem.steps(1)
+        assert problem.steps_after is not None
+        steps = deque(_first(problem.steps_after(self._run.time)))
+        if steps and steps[0].keyframes.start != self._run.keyframes:
+            self._say("what was recorded before now reads otherwise: beginning anew")
+            self._run = Run(problem, self.settings.window)
+            return problem.steps(1)
+        self._run.update_problem(problem)
+        return problem.steps_after(self._run.time)
+
+    def _collect(self, session: Session) -> None:
+        """What there is by now; what was enough once stays so."""
+        before, self._checklist = self._checklist, {}
+        for item in session.method.checklist(session.data, session.config):
+            earlier = before.get(item.what, item)
+            self._checklist[item.what] = earlier if item.wanted and not earlier.wanted else item
+
+    def _take(self, problem: Problem, steps: Iterable[Step]) -> None:
+        run = self._run
+        assert run is not None
+        goes_on = problem.steps_after is not None
+        for step in steps:
+            run.add_step(step)
+            if run.just_marginalized and goes_on:
+                self._save(run)
+            if goes_on and time.monotonic() - self._shown > _VIEW:
+                self._view()
+        self._view()
+
+    def _view(self) -> None:
+        assert self._run is not None
+        if not self._misplaced and _is_misplaced(self._run):
+            self._misplaced = True
+            self._say(f"{_MISPLACED}; what is shown may be off by that, and is solved anew when the recording ends")
+        self._watch.look(self._run)
+        self._show(view_of(self._epoch_ns, self._run, tuple(self._checklist.values()), self._watch.change))
+        self._shown = time.monotonic()
+
+    # -- the checkpoint
+
+    def _save(self, run: Run) -> None:
+        if self.settings.checkpoint is None:
+            return
+        try:
+            save_checkpoint(self.settings.checkpoint, run, self._identity)
+        except InputError as error:  # a full disk is no reason to stop
+            self._say(str(error))
+
+    def _resumed(self, problem: Problem) -> Run | None:
+        if not self._resumable or self.settings.checkpoint is None:
+            return None
+        self._resumable = False
+        run = load_checkpoint(self.settings.checkpoint, problem, self._identity)
+        self._say(f"resumed at {run.time:.1f} s from {self.settings.checkpoint}")
+        return run
+
+    def _identify(self, session: Session) -> dict[str, str]:
+        """What a checkpoint belongs to, in words."""
+        return {
+            "recording": f"one that starts at {session.origin.epoch_ns} ns ({identity(self.source.parts[0])})",
+            "method": session.method.name,
+            "config": session.config.model_dump_json(exclude_defaults=True),
+            "window": str(self.settings.window),
+            "prior": "none" if self.settings.prior is None else sha256_of(self.settings.prior),
+            "version": f"alidade {metadata.version('alidade')} with gtsam {metadata.version('gtsam')}",
+        }
+
+    # -- the end
+
+    def _end(self, finished: bool, size: int) -> Calibration:
+        """Everything there is."""
+        if size <= 0:
+            wait = "" if finished else f", after {self.settings.patience:g} s of waiting"
+            raise InputError(f"{self.source.name}: nothing there, or nothing in it{wait}")
+        if not finished:
+            why = "stopped" if self._stopped() else f"nothing new for {self.settings.patience:g} s"
+            self._say(f"{why}: the recording is not finished, the result is that of what is there")
+        started = time.perf_counter()
+        session = self._read(open_recording(self.source.where))
+        problem = session.problem()
+        read = time.perf_counter() - started
+        started = time.perf_counter()
+        self._collect(session)
+        # What was never followed is solved as any finished recording.
+        followed = self._run is not None or self.settings.checkpoint is not None
+        growing = _that_grows(problem, session) if followed else problem
+        steps = self._new_steps(session, growing)
+        assert self._run is not None
+        kept, taken = growing.keyframes, problem.keyframes
+        if kept is not None and taken is not None and kept.are_far(taken.clock, session.facts.duration_s):
+            self._say(f"{_MISPLACED}: solved anew, with keyframes where they were")
+            self._run, steps = Run(problem, self.settings.window), problem.steps(1)
+            # It is no run that another process could go on with.
+            growing = replace(problem, steps_after=None)
+        self._take(growing, steps)
+        estimate = self._run.finish(time.perf_counter() - started)
+        (calibration,) = session.judged([(estimate, problem)], {"read": read}, self.settings.check)
+        return calibration
+
+
+def _first(steps: Iterable[Step]) -> Iterator[Step]:
+    """The first step, if there is one."""
+    for step in steps:
+        yield step
+        return
+
+
+def _is_misplaced(run: Run) -> bool:
+    """Whether pictures of a run are certainly far from its keyframes by now."""
+    keyframes, names = run.problem.keyframes, _names(run.problem)
+    if not run.started or keyframes is None or not set(_CLOCK) <= set(names):
+        return False
+    own = [names.index(name) for name in _CLOCK]
+    clock = Clock(keyframes.clock.begun, *run.values()[own].tolist())
+    return keyframes.are_far(clock, run.time, run.covariance()[np.ix_(own, own)])
+
+
+def _names(problem: Problem) -> list[str]:
+    """Of all numbers that are estimated."""
+    return [quantity.name for quantity in problem.quantities]
+
+
+def _that_grows(problem: Problem, session: Session) -> Problem:
+    """The graph of all data in the form in which a recording that grows is continued, if it has one."""
+    return (problem.onward and problem.onward(session.data, -np.inf)) or problem

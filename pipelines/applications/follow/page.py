@@ -1,0 +1,294 @@
+"""The page for the person who holds the device: what to do now, what there is by now, and when it is enough.
+
+    with LivePage(say) as page:      # http://127.0.0.1:8766
+        page.show(view)
+
+One document without anything from elsewhere, and server-sent events that each have the whole state, so that whoever
+comes late, or comes back, has it at once. On the loopback interface whoever asks is answered if they ask for this
+machine by name, lest other pages in the browser read along. On any other address only who has come by the one-time
+token is; what it was traded for is kept in a cookie.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import json
+import math
+import secrets
+import socket
+import threading
+import time
+from collections.abc import AsyncIterator, Callable
+from importlib.resources import files
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from alidade.pipelines.applications.follow.guidance import View
+from alidade.pipelines.display.units import human_unit, to_digits_of
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.reports.result import Calibration
+
+if TYPE_CHECKING:
+    from starlette.requests import Request
+    from starlette.responses import Response
+
+HOST, PORT = "127.0.0.1", 8766
+
+# A client is told of what is new this often, and of nothing new that often, s: the page takes longer silence for a dead
+# connection.
+_GLANCE, _ALIVE = 0.2, 2.0
+# Browsers that have lost the server come back after this, ms.
+_RETRY = 1000
+# Points of a sparkline; of twice as many every other one is kept.
+_POINTS = 60
+# Sentences kept, and for how long, s.
+_NOTES, _FRESH = 3, 30.0
+# A machine beyond every network: what would be sent there goes out by the address that others see. Nothing is sent.
+_ELSEWHERE = ("192.0.2.1", 9)
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+    "img-src data:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+    # A browser that has lost the network would try the idle connections that it kept first, one every few seconds.
+    "Connection": "close",
+}
+
+
+class LivePage:
+    """A server of the page; a context.
+
+    Raises InputError when starlette or uvicorn is not installed, or there is no such address or no port free there.
+
+    Attributes:
+        is_open: to others than this machine, by a token.
+
+    Args:
+        say: is told where the next device finds the page once a token has been used.
+        host: address of this machine to be reached by; the loopback one is for this machine alone.
+        port: 0: any that is free.
+        name: of the recording.
+    """
+
+    def __init__(self, say: Callable[[str], None], host: str = HOST, port: int = PORT, name: str = "") -> None:
+        try:
+            import starlette.applications
+            import starlette.routing
+            import uvicorn
+        except ImportError as error:
+            raise InputError(
+                "--page needs starlette and uvicorn, which are not installed: pip install 'alidade[serve]'"
+            ) from error
+        self._say, self._host = say, host
+        self._socket = _listening(host, port)
+        self._port = self._socket.getsockname()[1]
+        self.is_open = not _is_loopback(self._socket.getsockname()[0])
+        self._token, self._key = _token(), secrets.token_urlsafe(32)
+        self._histories: dict[str, list[tuple[float, float]]] = {}
+        self._state: dict[str, Any] = {"name": name, "notes": [], "over": None}
+        self._noted: list[tuple[float, str]] = []  # when, and what
+        self._lock = threading.Lock()  # sources speak from threads of their own
+        self._event = (0, "")  # number and text of the last one
+        self._over = False
+        app = starlette.applications.Starlette(
+            routes=[
+                starlette.routing.Route("/", self._document),
+                starlette.routing.Route("/events", self._events),
+            ]
+        )
+        self._server = uvicorn.Server(
+            uvicorn.Config(
+                app, log_config=None, log_level="critical", lifespan="off", ws="none", timeout_graceful_shutdown=1
+            )
+        )
+        self._thread = threading.Thread(
+            target=self._server.run, kwargs={"sockets": [self._socket]}, name="page", daemon=True
+        )
+
+    @property
+    def url(self) -> str:
+        """What to open in a browser."""
+        host = self._host
+        if self.is_open and ipaddress.ip_address(self._socket.getsockname()[0]).is_unspecified:
+            host = _outward()
+        address = f"http://{f'[{host}]' if ':' in host else host}:{self._port}/"
+        return f"{address}?token={self._token}" if self.is_open else address
+
+    def __enter__(self) -> LivePage:
+        self._thread.start()
+        self._tell()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if isinstance(error, Exception):
+            self._end("failed", str(error))
+        self._over = self._server.should_exit = True
+        self._thread.join(3.0)
+        self._socket.close()
+
+    def show(self, view: View) -> None:
+        """What is known by now."""
+        self._remember(view)
+        motion = view.motion
+        self._tell(
+            view.summary,
+            notes=self._notes(),
+            done=view.done,
+            alarms=list(view.alarms),
+            now=None if motion is None else {"words": motion.words, "why": motion.why, "picture": motion.picture},
+            coverage=[{"what": c.what, "share": c.share, "chart": c.chart} for c in view.checklist],
+            parameters=self._parameters(view),
+            estimated=len(view.estimated),
+            reached=len(set(view.estimated) - set(view.short)),
+        )
+
+    def say(self, sentence: str) -> None:
+        """A sentence that stays for a while."""
+        self._noted = [*self._noted, (time.monotonic(), sentence)][-_NOTES:]
+        self._tell(notes=self._notes())
+
+    def end(self, calibration: Calibration) -> None:
+        """What came out."""
+        self._end(calibration.assessment.status, calibration.assessment.headline)
+
+    # -- the state
+
+    def _end(self, status: str, headline: str) -> None:
+        self._tell(over={"status": status, "headline": headline})
+
+    def _tell(self, *new: dict[str, Any], **more: Any) -> None:
+        """The state with what is new in it, to everybody."""
+        with self._lock:
+            for changed in (*new, more):
+                self._state |= changed
+            self._event = (self._event[0] + 1, json.dumps(self._state, allow_nan=False))
+
+    def _notes(self) -> list[str]:
+        return [sentence for at, sentence in self._noted if time.monotonic() - at < _FRESH]
+
+    def _remember(self, view: View) -> None:
+        """How far each sigma was from what is required, as log10 of their ratio, over time."""
+        if view.sigmas is None:
+            return
+        for q, sigma in zip(view.quantities, view.sigmas.tolist(), strict=True):
+            ratio = sigma / q.require
+            if not (math.isfinite(ratio) and ratio > 0.0):
+                continue
+            history = self._histories.setdefault(q.name, [])
+            if history and view.time < history[-1][0]:  # begun anew
+                history.clear()
+            history.append((round(view.time, 1), round(math.log10(ratio), 2)))
+            if len(history) > 2 * _POINTS:
+                del history[1:-1:2]
+
+    def _parameters(self, view: View) -> list[dict[str, Any]]:
+        found = []
+        for i in view.shown:
+            q = view.quantities[i]
+            unit, factor = human_unit(q)
+            require = factor * q.require
+            one: dict[str, Any] = {
+                "name": q.name,
+                "unit": unit.replace("^2", "²").strip("1"),
+                "require": to_digits_of(require, require),
+            }
+            if view.values is not None and view.assessment is not None and view.sigmas is not None:
+                sigma = float(view.sigmas[i])
+                one |= {
+                    "value": to_digits_of(factor * float(view.values[i]), factor * sigma),
+                    "sigma": to_digits_of(factor * sigma, factor * sigma),
+                    "verdict": view.assessment.verdicts[q.name],
+                    "history": self._histories.get(q.name, []),
+                }
+            found.append(one)
+        return found
+
+    # -- answers
+
+    def _may(self, request: Request) -> bool:
+        """Whether whoever asks is to be answered."""
+        if self.is_open:
+            return secrets.compare_digest(request.cookies.get(self._cookie, ""), self._key)
+        return request.url.hostname in {"localhost", self._host, self._socket.getsockname()[0]}
+
+    @property
+    def _cookie(self) -> str:
+        """Its name; ports of a machine share their cookies."""
+        return f"alidade-{self._port}"
+
+    async def _document(self, request: Request) -> Response:
+        from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse
+
+        if self._may(request):
+            return HTMLResponse(_html(), headers=_HEADERS)
+        if self.is_open and secrets.compare_digest(request.query_params.get("token", ""), self._token):
+            self._token = _token()
+            self._say(f"page opened from {request.client.host if request.client else '?'}; next device: {self.url}")
+            answer = RedirectResponse("/", 303)
+            answer.set_cookie(self._cookie, self._key, httponly=True, samesite="lax")
+            return answer
+        return PlainTextResponse(_REFUSED, 403)
+
+    async def _events(self, request: Request) -> Response:
+        from starlette.responses import PlainTextResponse, StreamingResponse
+
+        if not self._may(request):
+            return PlainTextResponse(_REFUSED, 403)
+        return StreamingResponse(self._stream(), media_type="text/event-stream", headers=_HEADERS)
+
+    async def _stream(self) -> AsyncIterator[str]:
+        """The last event, and each that is the last one when it is looked again, until all is over."""
+        yield f"retry: {_RETRY}\n\n"
+        sent, last = 0, time.monotonic()
+        while True:
+            is_last = self._over
+            number, text = self._event
+            if number != sent:
+                sent, last = number, time.monotonic()
+                yield f"data: {text}\n\n"
+            elif time.monotonic() - last > _ALIVE:
+                last = time.monotonic()
+                yield "event: alive\ndata: 1\n\n"
+            if is_last:
+                return
+            await asyncio.sleep(_GLANCE)
+
+
+_REFUSED = (
+    "This address was used before, or is none of this page. The terminal in which alidade runs shows the next one.\n"
+)
+
+
+def _html() -> str:
+    return files("alidade.pipelines.applications.follow").joinpath("templates/live.html").read_text(encoding="utf-8")
+
+
+def _listening(host: str, port: int) -> socket.socket:
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        return socket.create_server((host, port), family=family)
+    except (OSError, OverflowError, UnicodeError) as error:
+        raise InputError(f"--page: no server can be started at {host} port {port} ({error}); give another") from error
+
+
+def _is_loopback(address: str) -> bool:
+    return ipaddress.ip_address(address).is_loopback
+
+
+def _token() -> str:
+    """To be typed on a phone; good for one use, it need not be long."""
+    return secrets.token_hex(5)
+
+
+def _outward() -> str:
+    """The address of this machine that others on its network see; its name where there is no network."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(_ELSEWHERE)
+        except OSError:
+            return socket.gethostname()
+        return str(probe.getsockname()[0])

@@ -1,0 +1,203 @@
+"""The state of a recording being followed, live over Foxglove's WebSocket.
+
+One topic per parameter, `/estimate/<parameter>`, with the fields of estimates.mcap (value, sigma, lower, upper) so that
+one layout shows both, and what is required; `/status` says the rest in words. JSON messages with a schema. Whoever
+comes late, or reads slowly, gets the last message of each topic.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from contextlib import suppress
+from types import TracebackType
+from typing import Any, NamedTuple
+
+from alidade.pipelines.applications.follow.guidance import View
+from alidade.pipelines.applications.follow.protocol import MESSAGE_DATA, MESSAGE_HEAD, SUBPROTOCOLS, websockets
+from alidade.pipelines.errors import InputError
+
+# Others on the network have no business with a calibration bench.
+HOST = "127.0.0.1"
+PORT = 8765  # Foxglove's own
+
+# Whoever calls and says no WebSocket is no news for the person recording.
+_SILENT = logging.Logger("alidade.serve", logging.CRITICAL + 1)
+
+_NUMBER = {"type": "number"}
+_TEXT = {"type": "string"}
+_ESTIMATE = {
+    "title": "alidade.Estimate",
+    "type": "object",
+    "properties": {**dict.fromkeys(("value", "sigma", "lower", "upper", "require"), _NUMBER), "verdict": _TEXT},
+}
+_STATUS = {
+    "title": "alidade.Status",
+    "type": "object",
+    "properties": {
+        "time_s": _NUMBER,
+        "status": _TEXT,
+        "headline": _TEXT,
+        "missing": {"type": "array", "items": _TEXT},
+        "collected": {"type": "array", "items": {"type": "object", "properties": {"what": _TEXT, "have": _TEXT}}},
+    },
+}
+
+
+class LiveServer:
+    """A server on the loopback interface; a context.
+
+    Raises InputError when websockets is not installed or the port is taken.
+    """
+
+    def __init__(self, port: int = PORT) -> None:
+        serve = websockets().sync.server.serve
+        self._changed = threading.Condition()
+        self._channels: dict[str, dict[str, Any]] = {}  # topic -> how it is advertised
+        self._last: dict[int, _Last] = {}  # by channel
+        self._over = False
+        try:
+            self._server = serve(self._client, HOST, port, subprotocols=SUBPROTOCOLS, logger=_SILENT)
+        except (OSError, OverflowError) as error:
+            raise InputError(f"--port {port}: no server can be started there ({error}); give another") from error
+        self._advertise("/status", _STATUS, {})
+
+    @property
+    def url(self) -> str:
+        """What to open in Foxglove."""
+        return f"ws://{HOST}:{self._server.socket.getsockname()[1]}"
+
+    def __enter__(self) -> LiveServer:
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._changed:
+            self._over = True
+            self._changed.notify_all()
+        self._server.shutdown()
+
+    def show(self, view: View) -> None:
+        """Send a view to whoever is connected; its log time is that of the recording."""
+        at = view.epoch_ns + round(view.time * 1e9)
+        if view.values is not None and view.sigmas is not None and view.assessment is not None:
+            for q, value, sigma in zip(view.quantities, view.values.tolist(), view.sigmas.tolist(), strict=True):
+                message = {
+                    "value": value,
+                    "sigma": sigma,
+                    "lower": value - sigma,
+                    "upper": value + sigma,
+                }
+                if q.judged:
+                    message |= {"require": q.require, "verdict": view.assessment.verdicts[q.name]}
+                self._log(f"/estimate/{q.name}", _ESTIMATE, {"unit": q.unit}, message, at)
+        self._log("/status", _STATUS, {}, view.summary, at)
+
+    def _advertise(self, topic: str, schema: dict[str, Any], metadata: dict[str, str]) -> int:
+        """The number of a topic's channel; a new one is told to everybody."""
+        with self._changed:
+            if topic not in self._channels:
+                self._channels[topic] = {
+                    "id": len(self._channels) + 1,
+                    "topic": topic,
+                    "encoding": "json",
+                    "schemaName": schema["title"],
+                    "schemaEncoding": "jsonschema",
+                    "schema": json.dumps(schema),
+                    "metadata": metadata,
+                }
+                self._changed.notify_all()
+            return int(self._channels[topic]["id"])
+
+    def _log(
+        self, topic: str, schema: dict[str, Any], metadata: dict[str, str], message: dict[str, Any], at: int
+    ) -> None:
+        number = self._advertise(topic, schema, metadata)
+        with self._changed:
+            before = self._last[number].number if number in self._last else 0
+            self._last[number] = _Last(before + 1, at, json.dumps(message).encode())
+            self._changed.notify_all()
+
+    # -- one client: this thread listens, another one sends
+
+    def _client(self, connection: Any) -> None:
+        from websockets.exceptions import ConnectionClosed as Closed
+
+        client = _Client()
+        sender = threading.Thread(target=self._send, args=(connection, client), daemon=True)
+        sender.start()
+        with suppress(Closed):
+            for text in connection:
+                with self._changed:
+                    client.take(text)
+                    self._changed.notify_all()
+        with self._changed:
+            client.gone = True
+            self._changed.notify_all()
+        sender.join()
+
+    def _send(self, connection: Any, client: _Client) -> None:
+        """All channels, and of those that are wanted each last message once, until the client is gone."""
+        from websockets.exceptions import ConnectionClosed as Closed
+
+        info = {"op": "serverInfo", "name": "alidade", "capabilities": [], "supportedEncodings": [], "metadata": {}}
+        try:
+            connection.send(json.dumps(info))
+            while True:
+                with self._changed:
+                    self._changed.wait_for(lambda: self._news(client))
+                    if self._over or client.gone:
+                        return
+                    channels = list(self._channels.values())[client.channels :]
+                    client.channels += len(channels)
+                    due = self._due(client)
+                    client.sent |= {subscription: last.number for subscription, last in due.items()}
+                if channels:
+                    connection.send(json.dumps({"op": "advertise", "channels": channels}))
+                for subscription, last in due.items():
+                    connection.send(MESSAGE_HEAD.pack(MESSAGE_DATA, subscription, last.at_ns) + last.data)
+        except Closed:
+            return
+
+    def _news(self, client: _Client) -> bool:
+        return self._over or client.gone or len(self._channels) > client.channels or bool(self._due(client))
+
+    def _due(self, client: _Client) -> dict[int, _Last]:
+        """The last messages that a client has not got yet, by subscription."""
+        wanted = {subscription: self._last.get(channel) for subscription, channel in client.wanted.items()}
+        return {s: last for s, last in wanted.items() if last is not None and last.number > client.sent.get(s, 0)}
+
+
+class _Last(NamedTuple):
+    """The last message of a channel: how many there were, its time, its bytes."""
+
+    number: int
+    at_ns: int
+    data: bytes
+
+
+class _Client:
+    """What a client wants, subscription -> channel, and what it has got."""
+
+    def __init__(self) -> None:
+        self.wanted: dict[int, int] = {}
+        self.sent: dict[int, int] = {}  # subscription -> number of the last message
+        self.channels = 0  # told of
+        self.gone = False
+
+    def take(self, text: str | bytes) -> None:
+        """What it asks for; what else it says is nothing to us."""
+        try:
+            told = json.loads(text)
+            subscribed = {int(one["id"]): int(one["channelId"]) for one in told.get("subscriptions", [])}
+            unsubscribed = [int(number) for number in told.get("subscriptionIds", [])]
+        except (ValueError, KeyError, TypeError, AttributeError):
+            return
+        for number in (*subscribed, *unsubscribed):
+            self.wanted.pop(number, None)
+            self.sent.pop(number, None)
+        if told.get("op") == "subscribe":
+            self.wanted |= subscribed

@@ -1,0 +1,162 @@
+"""Where a recording comes from while it is being made: a file or a folder that another process writes, or a stream.
+
+Streams are written down as they come, so that all sources look alike: files that grow.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO
+
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording.mcap_records import MAGIC
+from alidade.pipelines.recording.opening import Where, is_closed, parts_in
+
+_PIECE = 1 << 16
+# Names of the files in which a stream is written down.
+_PART = "live_{}.mcap"
+
+
+class Source(AbstractContextManager["Source"]):
+    """A file, or a folder of the parts of one recording, that may still be written; it need not be there yet.
+
+    Attributes:
+        path: of the file or the folder.
+        name: what it is called in sentences.
+    """
+
+    def __init__(self, path: Path, name: str | None = None) -> None:
+        self.path, self.name = path, name or str(path)
+
+    @property
+    def parts(self) -> list[Path]:
+        """The files by now, but those that nothing is in, in their order. Raises InputError for several recordings."""
+        if not self.path.is_dir():
+            return [self.path] if _size(self.path) else []
+        return [p for p in parts_in(self.path) if _size(p)]
+
+    @property
+    def where(self) -> Where:
+        """What `open_recording` takes to read it."""
+        return self.path if self.is_finished or not self.path.is_dir() else self.parts
+
+    @property
+    def size(self) -> int:
+        """Of all parts, bytes; 0 when there is nothing yet."""
+        return sum(map(_size, self.parts))
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the recording is closed: a file by its closing mark, a folder when its metadata.yaml is there too."""
+        parts = self.parts
+        closed = bool(parts) and is_closed(parts[-1])
+        return closed and (not self.path.is_dir() or (self.path / "metadata.yaml").is_file())
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Nothing to end: another process writes."""
+
+
+class Stream(Source):
+    """Messages that come by themselves, written down in a folder: a file a run, so that a later run can go on.
+
+    Args:
+        name: what it is called.
+        folder: where to; None: a temporary one.
+    """
+
+    def __init__(self, name: str, folder: Path | None) -> None:
+        self._stack = ExitStack()
+        self._ended = threading.Event()
+        if folder is None:
+            folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="alidade-")))
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be written ({error.strerror})") from error
+        super().__init__(folder, name)
+        before = len(list(folder.glob(_PART.format("*"))))
+        self._file = folder / _PART.format(f"{before:04d}")
+        self._over = threading.Event()
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the stream has ended."""
+        return self._ended.is_set()
+
+    @property
+    def where(self) -> Where:
+        """The parts."""
+        return self.parts
+
+    def __enter__(self) -> Stream:
+        threading.Thread(target=self._run, daemon=True).start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._over.set()
+        self._ended.wait(2.0)
+        self._stack.close()
+
+    def _run(self) -> None:
+        try:
+            with self._file.open("wb") as out:
+                self._write(out)
+        finally:
+            self._ended.set()
+
+    def _write(self, out: BinaryIO) -> None:
+        """Write down what comes until it ends, or `_over`."""
+        raise NotImplementedError
+
+
+class StandardInput(Stream):
+    """An MCAP file that comes in on standard input."""
+
+    def __init__(self, folder: Path | None, stream: BinaryIO | None = None) -> None:
+        super().__init__("standard input", folder)
+        self._stream = stream or sys.stdin.buffer
+
+    def _write(self, out: BinaryIO) -> None:
+        read = getattr(self._stream, "read1", self._stream.read)
+        while not self._over.is_set() and (piece := read(_PIECE)):
+            out.write(piece)
+            out.flush()
+
+
+def source_of(what: str, folder: Path | None = None, say: Callable[[str], None] = print) -> Source:
+    """The source that is called so: a path, `-` for standard input, ws:// of a Foxglove WebSocket bridge.
+
+    Args:
+        what: its name.
+        folder: where streams are kept; None: nowhere.
+        say: is told of connections.
+
+    Raises:
+        InputError: a folder cannot be written, or a library is not installed.
+    """
+    if what == "-":
+        return StandardInput(folder)
+    if what.startswith(("ws://", "wss://")):
+        from alidade.pipelines.applications.follow.bridge import Bridge
+
+        return Bridge(what, folder, say)
+    return Source(Path(what))
+
+
+def _size(path: Path) -> int:
+    """In bytes; 0 when there is no such file yet, or not even the mark it begins with."""
+    try:
+        size = path.stat().st_size
+    except OSError:
+        return 0
+    return size if size >= len(MAGIC) else 0

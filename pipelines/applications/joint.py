@@ -1,0 +1,446 @@
+"""Several recordings of one device as one calibration.
+
+Each recording is solved by itself, and what it says of the device, linear about the joint estimate of those before it
+and itself, is joined with what the others say. Then those that were farthest from the final estimate are solved again
+with that of the others as prior, which moves their linearisation there, until the joint estimate stays. What is kept of
+a recording meanwhile is small; its data wait in a temporary file.
+"""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import pickle
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from alidade.pipelines import progress
+from alidade.pipelines.applications.session import Session
+from alidade.pipelines.applications.sharing import DAY_S, walk_as_told, walks
+from alidade.pipelines.belief import Belief
+from alidade.pipelines.diagnostics import noise_levels
+from alidade.pipelines.diagnostics.device_changes import Changes, Rate, changes
+from alidade.pipelines.diagnostics.observability import Assessment, Fit, assess
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.assumptions import kind
+from alidade.pipelines.estimation.believing import believing
+from alidade.pipelines.estimation.problem import Array, ChiSquare, Estimate, Parameter, Problem, Quantity, Step, Told
+from alidade.pipelines.methods import Method
+from alidade.pipelines.recording.info import SessionFacts
+from alidade.pipelines.recording.opening import Where
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.reports.over_time import recordings_shown, sentences
+from alidade.pipelines.reports.result import Calibration, PartParameter, PartResult
+from alidade.pipelines.solvers.joint import Joined, grown, join, tell
+
+# The joint estimate stays when other linearisations move it by less than this, in sigmas (what is left is about the
+# square), and those that were not tried are foreseen to; so many times they are tried.
+_STAYS, _MOST_PASSES = 1e-2, 6
+# Where chi-square between the recordings is so many times its freedoms the device is not one: no need to be exact.
+_FAR_APART = 10.0
+# So many recordings are named in a sentence.
+_MOST_NAMED = 3
+_ADVICE = "Calibrate those after the last change together, or let what changed walk: `share` in the config."
+_OVERLAP = (
+    "recordings overlap in time and count as several all the same; parts of one are named by a folder or a pattern in "
+    "quotes"
+)
+# Of parameters that the last recording's graph does not have.
+_NO_VARIABLE = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Alone:
+    """What is kept of a recording that was calibrated by itself.
+
+    Attributes:
+        calibration: what result.json says of it by itself, without the data behind it.
+        day: its date, days since 1970.
+        told: what it says of its numbers.
+        quantities: of its graph.
+        data: the file in which its data wait.
+    """
+
+    calibration: Calibration
+    day: float
+    told: Told
+    quantities: Mapping[str, Quantity]
+    data: Path
+
+    @classmethod
+    def of(cls, session: Session, calibration: Calibration, data: Path) -> Alone:
+        """Of a session's calibration by batch; its data go into a file."""
+        estimate = calibration.estimate
+        assert estimate.told is not None
+        with data.open("wb") as stream:
+            pickle.dump(session.data, stream)
+        small = Estimate(
+            solver=estimate.solver,
+            names=estimate.names,
+            values=estimate.values,
+            covariance=estimate.covariance,
+            converged=estimate.converged,
+            message=estimate.message,
+            chi_square=estimate.chi_square,
+            rejected=estimate.rejected,
+            levels=estimate.levels,
+            inflation=estimate.inflation,
+        )
+        problem = replace(calibration.problem, steps=_no_steps, steps_after=None, onward=None, attitudes=None)
+        return cls(
+            calibration=replace(calibration, estimate=small, problem=problem, plots=None, beside=None),
+            day=_day(session),
+            told=estimate.told,
+            quantities={q.name: q for q in problem.quantities},
+            data=data,
+        )
+
+    @property
+    def name(self) -> str:
+        """Of the file."""
+        return self.calibration.recording
+
+    @property
+    def start(self) -> datetime.datetime:
+        """Its date."""
+        return datetime.datetime.fromtimestamp(self.day * DAY_S, datetime.UTC)
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Of what it estimated by itself."""
+        found = self.calibration.parameters
+        return {name: p.sigma for name, p in found.items() if p.sigma > 0.0}
+
+    def loaded(self) -> Any:
+        """Its data."""
+        with self.data.open("rb") as stream:
+            return pickle.load(stream)  # written above, into a folder of our own
+
+
+def _no_steps(_: int) -> Iterator[Step]:
+    return iter(())
+
+
+def calibrate_device(
+    recordings: Sequence[Where],
+    method_name: str | None = None,
+    config_file: Path | None = None,
+    strict: bool = False,
+    auto_topics: bool = False,
+    prior: Path | None = None,
+    written: Callable[[Calibration], None] = lambda _: None,
+) -> Calibration:
+    """The joint calibration of several recordings of one device (arguments as `session.calibrate` has them).
+
+    Raises:
+        InputError: a recording cannot be used, or they are of different methods.
+        IndeterminateError: states other than the parameters are not determined.
+    """
+
+    def read(where: Where) -> Session:
+        return Session.read(open_recording(where, strict), method_name, config_file, auto_topics, prior)
+
+    return calibrate_together([partial(read, where) for where in recordings], written)
+
+
+def calibrate_together(
+    sessions: Sequence[Callable[[], Session]], written: Callable[[Calibration], None] = lambda _: None
+) -> Calibration:
+    """The joint calibration by batch.
+
+    Args:
+        sessions: open the recordings, one after the other.
+        written: is given the calibration of each recording by itself.
+
+    Raises:
+        InputError: a recording cannot be used, or they are of different methods.
+        IndeterminateError: states other than the parameters are not determined.
+    """
+    with TemporaryDirectory(prefix="alidade-") as folder:
+        alone: list[Alone] = []
+        for i, read in enumerate(sessions):
+            with progress.doing("reading"):
+                session = read()
+            calibration = session.calibrated_beside(partial(_with_those_before, session, alone))
+            alone.append(Alone.of(session, calibration, Path(folder) / str(i)))
+            written(calibration)
+            del session, calibration
+        method = _one_device(alone)
+        alone.sort(key=lambda each: each.day)
+        rates = _rates(method, alone)
+        known = _walks(alone, rates)
+        rates = {name: known[kind(name)].rate if kind(name) in known else rate for name, rate in rates.items()}
+        joined, step = _joined(method, alone, rates)
+        newest = alone[-1]
+        problem = method.graph(newest.loaded(), newest.calibration.config)
+        return _calibration(problem, method, alone, joined, step, known)
+
+
+def _one_device(alone: Sequence[Alone]) -> Method:
+    """The method of all. Raises InputError when they cannot be of one device, or one is named twice."""
+    if not alone:
+        raise InputError("no recordings are named")
+    first = alone[0].calibration
+    seen: set[str] = set()
+    for each in alone:
+        found = each.calibration
+        if found.method is not first.method:
+            raise InputError(
+                f"{each.name}: is calibrated by {found.method.name}, {first.recording} by {first.method.name}"
+            )
+        if found.sha256 in seen:
+            raise InputError(f"{each.name}: the same recording is named twice; it would count twice")
+        seen.add(found.sha256)
+    return first.method
+
+
+def _rates(method: Method, alone: Sequence[Alone]) -> dict[str, float]:
+    """How far each of the device's numbers walks. Raises InputError as `walks` does."""
+    names = list(dict.fromkeys(name for each in alone for name in each.quantities))
+    return walks(method, alone[0].calibration.config, names)
+
+
+def _with_those_before(session: Session, alone: Sequence[Alone], told: Told) -> dict[str, float]:
+    """A recording's numbers as they are with the recordings before it; none where these are of another device."""
+    if not alone or alone[0].calibration.method is not session.method:
+        return {}
+    rates = _rates(session.method, alone)
+    before = [(each.day, each.told) for each in alone]
+    order = sorted([*before, (_day(session), told)], key=lambda each: each[0])
+    joined = join([each for _, each in order], rates, [day for day, _ in order])
+    if _far_apart(joined):
+        return {}
+    place = next(i for i, (_, each) in enumerate(order) if each is told)
+    belief = joined.all(place)
+    return {name: float(mean) for name, mean in zip(belief.names, belief.mean, strict=True) if name in told.names}
+
+
+def _day(session: Session) -> float:
+    """The date of a recording, days since 1970."""
+    date = session.config.date
+    if date is None:
+        return session.origin.epoch_ns * 1e-9 / DAY_S
+    return datetime.datetime(date.year, date.month, date.day, 12, tzinfo=datetime.UTC).timestamp() / DAY_S
+
+
+def _far_apart(joined: Joined) -> bool:
+    value, dof = joined.disagreement
+    return value > _FAR_APART * max(dof, 1)
+
+
+def _walks(alone: Sequence[Alone], rates: Mapping[str, float]) -> dict[str, Rate]:
+    """Kind of numbers -> how far these walk, where that is stated, or asked of the recordings and told by them."""
+    config = alone[0].calibration.config
+    asked = {kind(name) for name in walk_as_told(config, list(rates))}
+    days = [each.day for each in alone]
+    told = _changes(alone, join([each.told for each in alone], rates, days)).rates if asked else {}
+    stated = {kind(name): Rate(rate, rate) for name, rate in rates.items() if rate}
+    return {**stated, **{which: rate for which, rate in told.items() if which in asked}}
+
+
+def _changes(alone: Sequence[Alone], joined: Joined) -> Changes:
+    inflations = {name: _inflation(name, alone) for name, _ in joined.unknowns}
+    return changes(joined, [each.day for each in alone], inflations)
+
+
+def _joined(method: Method, alone: Sequence[Alone], rates: Mapping[str, float]) -> tuple[Joined, float]:
+    """The joint estimate, and by how much it moved last, in sigmas."""
+    told, days = [each.told for each in alone], [each.day for each in alone]
+    joined, step = join(told, rates, days), np.inf
+    if _far_apart(joined):
+        return joined, 0.0
+    for _ in range(_MOST_PASSES if len(alone) > 1 else 0):
+        before = joined
+        # What is wrong with a linearisation grows with the square of how far it is from there.
+        squares = [joined.distance(i, each) ** 2 for i, each in enumerate(told)]
+        order = sorted(range(len(alone)), key=lambda i: -squares[i])
+        for done, i in enumerate(progress.track(order, "joining", len(order)), 1):
+            told[i] = _again(method, alone[i], joined.others(i), rates).with_priors_of(told[i])
+            joined = join(told, rates, days)
+            step = before.sigmas_to(joined)
+            near, far = (sum(squares[k] for k in some) for some in (order[:done], order[done:]))
+            if step * far < _STAYS * near:
+                break
+        if step < _STAYS:
+            break
+    return joined, step
+
+
+def _again(method: Method, alone: Alone, others: Belief, rates: Mapping[str, float]) -> Told:
+    """What a recording says, linear where the others have the device to be."""
+    problem = believing(method.graph(alone.loaded(), alone.calibration.config), [others])
+    return tell(problem, alone.calibration.estimate.levels, rates)
+
+
+def _calibration(
+    problem: Problem,
+    method: Method,
+    alone: Sequence[Alone],
+    joined: Joined,
+    step: float,
+    known: Mapping[str, Rate],
+) -> Calibration:
+    """The joint estimate as a calibration: of the device as it was last, with that recording's own numbers."""
+    last = len(alone) - 1
+    belief = joined.all(last)
+    found = dict(zip(belief.names, belief.mean.tolist(), strict=True))
+    names = tuple(dict.fromkeys([*(q.name for q in problem.quantities), *found]))
+    problem = replace(problem, parameters=_with_others(problem, alone, found), premises=())
+    quantities = {q.name: q for q in problem.quantities}
+    rows = np.array([names.index(name) for name in belief.names], dtype=np.intp)
+    values = np.array([found.get(name, quantities[name].prior_mean) for name in names])
+    of_device = {name for name, _ in joined.unknowns}
+    inflation = np.array([_inflation(name, alone if name in of_device else alone[last:]) for name in names])
+    covariance = np.zeros((len(names), len(names)))
+    covariance[np.ix_(rows, rows)] = belief.covariance
+    extra = np.diag([quantities[name].extra_sigma ** 2 if name in found else 0.0 for name in names])
+    covariance = covariance * np.outer(inflation, inflation) + extra
+    converged = len(alone) == 1 or step < _STAYS
+    shares = joined.budget(last, [each.name for each in alone])
+    estimate = Estimate(
+        solver="batch",
+        names=names,
+        values=values,
+        covariance=covariance,
+        converged=converged,
+        message=f"{len(alone)} recordings; the joint estimate moved last by {step:.1g} sigmas",
+        chi_square=_sum([each.calibration.estimate.chi_square for each in alone]),
+        rejected=_counts([each.calibration.estimate.rejected for each in alone]),
+        inflation=inflation,
+        budget={name: _with_extra(shares[name], names.index(name), covariance, extra) for name in shares},
+    )
+    parts = [_part(each, joined, i) for i, each in enumerate(alone)]
+    changed = _changes(alone, joined)
+    changed = replace(changed, rates={**changed.rates, **known})
+    decides = not any(noise_levels.asked(each.calibration.estimate.levels) for each in alone)
+    ordered = [quantities[name] for name in names]
+    assessment = assess(ordered, covariance, estimate.chi_square, problem.advice, decides)
+    return Calibration(
+        method=method,
+        problem=problem,
+        estimate=estimate,
+        assessment=_judged(assessment, alone, joined, converged, sentences(changed, parts, problem.quantities)),
+        recording=_named([each.name for each in alone]),
+        sha256=hashlib.sha256(b"".join(bytes.fromhex(each.calibration.sha256) for each in alone)).hexdigest(),
+        facts=_facts([each.calibration.facts for each in alone]),
+        config=alone[last].calibration.config,
+        recordings=parts,
+        changes=changed,
+        plots=recordings_shown,
+    )
+
+
+def _with_extra(shares: Mapping[str, float], k: int, covariance: Array, extra: Array) -> dict[str, float]:
+    """Shares of a number's variance with that of what its graph does not model."""
+    beyond = float(extra[k, k] / covariance[k, k])
+    told = {source: share * (1.0 - beyond) for source, share in shares.items()}
+    return {**told, "not modelled": beyond} if beyond else told
+
+
+def _with_others(problem: Problem, alone: Sequence[Alone], found: Mapping[str, float]) -> tuple[Parameter, ...]:
+    """The parameters of the last recording, and those of the device that others alone determine.
+
+    What is fixed in the last recording and known from others is as the others have it.
+    """
+    known: dict[str, Quantity] = {}
+    for each in alone:
+        known.update({q.name: q for q in each.quantities.values() if q.prior_sigma != 0.0 and q.name in found})
+    own = tuple(replace(p, quantities=tuple(known.get(q.name, q) for q in p.quantities)) for p in problem.parameters)
+    there = {q.name for p in own for q in p.quantities}
+    missing = tuple(q for name, q in known.items() if name not in there)
+    return (*own, *((Parameter(_NO_VARIABLE, missing),) if missing else ()))
+
+
+def _inflation(name: str, alone: Sequence[Alone]) -> float:
+    """By what a number's sigma grows."""
+    found = [p for each in alone if (p := each.calibration.parameters.get(name)) is not None]
+    return grown([p.sigma for p in found], [p.inflation for p in found])
+
+
+def _judged(
+    assessment: Assessment, alone: Sequence[Alone], joined: Joined, converged: bool, changed: Sequence[str]
+) -> Assessment:
+    """With what the recordings say beside each other; `changed` are sentences about steps of the device."""
+    if not converged:
+        return assessment.unsolved("linearised at the joint estimate the recordings lead elsewhere again and again")
+    wrong = [each.calibration for each in alone if each.calibration.status == "inconsistent"]
+    for each in wrong[:_MOST_NAMED]:
+        assessment = assessment.misfit(f"{each.recording} by itself: {each.headline}")
+    value, dof = joined.disagreement
+    if changed:
+        assessment = assessment.misfit(f"The device is not the same in all recordings. {' '.join(changed)} {_ADVICE}")
+    elif dof >= 1 and value > Fit.of(value, float(dof)).high:
+        assessment = assessment.misfit(
+            f"The recordings disagree about the device: chi-square {value:.4g} for {dof} degrees of freedom."
+        )
+    return assessment.remarked(f"{len(alone)} recordings of one device.")
+
+
+def _sum(found: Sequence[ChiSquare | None]) -> ChiSquare:
+    each = [c for c in found if c is not None]
+    families: dict[str, tuple[float, float]] = {}
+    for chi_square in each:
+        for family, (value, dof) in chi_square.families.items():
+            before = families.get(family, (0.0, 0.0))
+            families[family] = before[0] + value, before[1] + dof
+    return ChiSquare(sum(c.value for c in each), sum(c.dof for c in each), families)
+
+
+def _counts(each: Sequence[Mapping[str, int]]) -> dict[str, int]:
+    total: Counter[str] = Counter()
+    for counts in each:
+        total.update(counts)
+    return dict(total)
+
+
+def _named(names: Sequence[str]) -> str:
+    """Recordings in a few words."""
+    return ", ".join(names) if len(names) <= _MOST_NAMED else f"{names[0]} to {names[-1]}, {len(names)} recordings"
+
+
+def _facts(facts: Sequence[SessionFacts]) -> SessionFacts:
+    """The recordings' as one's: it starts when the last does, with which the result is up to date."""
+    last = facts[-1]
+    lost = _counts([each.lost for each in facts])
+    notes = tuple(dict.fromkeys(note for each in facts for note in each.notes))
+    if any(0 < b.epoch_ns - a.epoch_ns < 1e9 * a.duration_s for a, b in pairwise(facts)):
+        notes = (*notes, _OVERLAP)
+    return SessionFacts(last.epoch_ns, sum(each.duration_s for each in facts), (), (), last.missing, lost, notes)
+
+
+def _part(alone: Alone, joined: Joined, i: int) -> PartResult:
+    """What a recording has of its own, from all recordings, and what it says of the device by itself."""
+    by_itself, part = alone.calibration, joined.parts[i]
+    belief = joined.all(i).of([*part.own, *joined.walking])
+
+    def number(name: str, value: float, sigma: float) -> PartParameter:
+        quantity = alone.quantities[name]
+        whole = float(np.hypot(sigma * by_itself.parameters[name].inflation, quantity.extra_sigma))
+        return PartParameter(name=name, value=value, sigma=whole, unit=quantity.unit)
+
+    found = [by_itself.parameters[name] for name in part.names]
+    return PartResult(
+        recording=alone.name,
+        sha256=by_itself.sha256,
+        start=alone.start.isoformat(timespec="seconds"),
+        duration_s=by_itself.facts.duration_s,
+        status=by_itself.assessment.status,
+        headline=by_itself.headline,
+        dof=_freedoms(by_itself),
+        parameters=[number(*each) for each in zip(belief.names, belief.mean, belief.sigmas, strict=True)],
+        alone=[PartParameter(name=p.name, value=p.value, sigma=p.sigma, unit=p.unit) for p in found],
+    )
+
+
+def _freedoms(by_itself: Calibration) -> float | None:
+    """Degrees of freedom by which a recording tells its own noise; None: it was stated, or there is no chi-square."""
+    estimate = by_itself.estimate
+    return estimate.chi_square.dof if estimate.chi_square and noise_levels.asked(estimate.levels) else None

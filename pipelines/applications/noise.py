@@ -1,0 +1,191 @@
+"""From a recording to the noise of its gyros, accelerometers and magnetometers: all that the time at rest tells."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.pipelines import methods, progress
+from alidade.pipelines.config import load_config
+from alidade.pipelines.diagnostics.sensor_noise import AxisNoise, axis_noise
+from alidade.pipelines.diagnostics.static_intervals import stretches_at_rest
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording import messages
+from alidade.pipelines.recording.checks import clean
+from alidade.pipelines.recording.even import even_pieces
+from alidade.pipelines.recording.faults import drop_faults
+from alidade.pipelines.recording.reading import Recording, open_recording
+
+Array = NDArray[np.float64]
+
+# Pieces shorter than this many samples are left out.
+_SHORTEST = 16
+_UNITS = {"gyro": "rad/s", "accel": "m/s^2", "mag": "T"}
+
+
+@dataclass(frozen=True, eq=False)
+class SensorNoise:
+    """Noise of one sensor.
+
+    Attributes:
+        topic: where it is in the recording.
+        kind: gyro, accel or mag.
+        unit: of its samples, SI.
+        rate_hz: of its samples.
+        rests: (P, 2) s from the recording's start, the stretches at rest that were used.
+        samples: how many; filled: how many of them stand for lost ones.
+        axes: x, y, z -> its noise; an axis that never changes is left out.
+    """
+
+    topic: str
+    kind: str
+    unit: str
+    rate_hz: float
+    rests: Array
+    samples: int
+    filled: int
+    axes: dict[str, AxisNoise]
+
+    @property
+    def length_s(self) -> float:
+        """Time at rest, all stretches together."""
+        return self.samples / self.rate_hz
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseStudy:
+    """Noise of all sensors of a recording; notes are sentences about what is lost of it or could not be used."""
+
+    recording: str
+    epoch_ns: int
+    duration_s: float
+    sensors: tuple[SensorNoise, ...]
+    notes: tuple[str, ...]
+
+
+class _Device(NamedTuple):
+    """What one topic measured: stamps, and the samples (N, 3) of each sensor by its kind."""
+
+    t_ns: NDArray[np.int64]
+    sensors: dict[str, Array]
+
+
+def noise_of(path: Path, strict: bool = False, config: Path | None = None) -> NoiseStudy:
+    """The noise of every gyro, accelerometer and magnetometer of a recording.
+
+    Args:
+        path: the recording.
+        strict: refuse it if anything of it is lost.
+        config: YAML file with the columns of tables, topics made of others, and those with rates alone.
+
+    Raises:
+        InputError: recording or config cannot be used, there is no such sensor, or nothing in it is at rest.
+    """
+    recording = open_recording(path, strict)
+    rates = set() if config is None else _described(recording, config)
+    names = [
+        name
+        for name, topic in recording.topics.items()
+        if (topic.type in (messages.IMU, messages.MAGNETIC_FIELD) or name in rates)
+        and topic.is_readable
+        and topic.count
+    ]
+    if not names:
+        kinds = f"{messages.IMU} or {messages.MAGNETIC_FIELD}"
+        raise InputError(
+            f"{path}: no messages of an inertial sensor or magnetometer ({kinds}); {recording.there()}; tables need "
+            "--config with their `columns`, rates alone their topic under `topics` in it, as head_imu"
+        )
+    found: list[SensorNoise] = []
+    troubles: list[str] = []
+    notes: list[str] = []
+    for name in progress.track(names, "noise", len(names)):
+        try:
+            found += _topic_noise(recording, name, notes)
+        except InputError as error:
+            troubles.append(str(error))
+    if not found:
+        raise InputError(
+            "; ".join([*troubles, *notes]) or f"{path}: {', '.join(names)}: no sensor, all values are zero or NaN"
+        )
+    notes = [*recording.notes, *troubles, *notes]
+    return NoiseStudy(path.name, recording.epoch_ns, recording.duration_s, tuple(found), tuple(notes))
+
+
+def _described(recording: Recording, config: Path) -> set[str]:
+    """Have a recording know what the config says of its topics; those that it names where a gyro's rates will do."""
+    settings = load_config(None, config)
+    recording.use(settings.topics.values(), settings.columns)
+    known = [topic for name in methods.names() for topic in methods.method(name).topics]
+    takes = {topic.key for topic in known if set(messages.RATES) <= set(topic.types)}
+    return {source.name for key, source in settings.topics.items() if key in takes}
+
+
+def _topic_noise(recording: Recording, name: str, notes: list[str]) -> Iterator[SensorNoise]:
+    """The sensors of a topic. Raises InputError when it cannot be used; nothing of one without sensors."""
+    device = _device(recording, name)
+    if not device.sensors:
+        return
+    dropped: dict[str, int] = {}
+    together = np.hstack(list(device.sensors.values()))
+    t, keep = clean(name, device.t_ns, recording.epoch_ns, together, dropped, least=3)
+    samples = {kind: values[keep] for kind, values in device.sensors.items()}
+    rests = stretches_at_rest(t, list(samples.values()), samples.get("gyro"))
+    if not len(rests):
+        raise InputError(
+            f"topic {name}: nowhere at rest for two seconds in {t[-1] - t[0]:.3g} s; record it lying still, "
+            "ten minutes for the densities, hours for the rest"
+        )
+    for kind, values in samples.items():
+        part = f"{name} {kind}"
+        # At rest a coarse sensor may read one value, which is told below.
+        sound = drop_faults(part, t, values, dropped, _UNITS[kind], may_stand=True)
+        pieces, interval, filled = _pieces(t[sound], values[sound], rests)
+        if not pieces:
+            raise InputError(f"topic {part}: too many samples are missing in the {len(rests)} stretches at rest")
+        axes = {}
+        for axis, letter in enumerate("xyz"):
+            columns = [piece[:, axis] for piece in pieces]
+            if any(np.ptp(column) > 0.0 for column in columns):
+                axes[letter] = axis_noise(columns, interval)
+            else:
+                notes.append(f"{part}: axis {letter} reads the same value whenever it is at rest")
+        count = sum(len(piece) for piece in pieces)
+        if axes:
+            yield SensorNoise(name, kind, _UNITS[kind], 1.0 / interval, rests, count, filled, axes)
+    notes += [f"{reason}: {number}" for reason, number in dropped.items()]
+
+
+def _device(recording: Recording, name: str) -> _Device:
+    if recording.topics[name].type == messages.MAGNETIC_FIELD:
+        field = recording.magnetic(name)
+        sensors, t_ns = {"mag": field.field}, field.t_ns
+    else:
+        imu = recording.imu(name)
+        sensors, t_ns = {"gyro": imu.gyro, "accel": imu.accel}, imu.t_ns
+        if imu.gyro_cov[0, 0, 0] == -1.0:
+            del sensors["gyro"]
+        if imu.accel_cov[0, 0, 0] == -1.0:
+            del sensors["accel"]
+    # A field of the message that nobody filled in is no sensor.
+    return _Device(t_ns, {kind: values for kind, values in sensors.items() if np.any(np.nan_to_num(values))})
+
+
+def _pieces(t: Array, values: Array, rests: Array) -> tuple[list[Array], float, int]:
+    """Evenly spaced pieces (n, 3) of the stretches at rest, their interval, s, and the number of samples filled in."""
+    pieces, lengths, intervals, filled = [], [], [], 0
+    for start, end in rests:
+        inside = slice(*np.searchsorted(t, [start, end + 1e-9]))
+        if len(t[inside]) < _SHORTEST:
+            continue
+        parts, interval, holes = even_pieces(t[inside], values[inside])
+        pieces += [part for part in parts if len(part) >= _SHORTEST]
+        lengths.append(len(t[inside]))
+        intervals.append(interval)
+        filled += holes
+    return pieces, float(np.average(intervals, weights=lengths)) if pieces else 0.0, filled

@@ -1,0 +1,260 @@
+"""Before recording: what a planned motion would determine, what it would leave weak, and a motion that determines more.
+
+    plan = make_plan("los", "my_sway.yaml", None, {"delta_px": 1e-4})
+    plan.now.assessment.status, [step.change for step in plan.steps]
+
+The motion is simulated with the noise that its scenario states and goes through the method's own graph; the joint
+covariance there depends on motion and noise levels, and next to nothing on the noise drawn. Where the motion itself, or
+sensors far from nominal, are drawn, several draws are predicted, and what is promised is the largest sigma of each
+parameter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from alidade.pipelines import methods, progress
+from alidade.pipelines.diagnostics.observability import Advice, Assessment, assess
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.problem import Quantity
+from alidade.pipelines.methods import Method, Scenario
+from alidade.pipelines.settings import Config
+
+_MOST_STEPS = 3
+# A change that brings less information than this on what is missing, nats, is not worth the trouble.
+_LEAST_GAIN = 0.1
+# Simulations of a scenario whose motion is drawn; of others there is one.
+_DRAWS = 5
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What a recording of a motion would determine.
+
+    Attributes:
+        scenario: the motion.
+        duration: of the recording, s.
+        quantities: what is estimated.
+        assessment: its sigmas and verdicts are the predicted ones.
+        budget: parameter -> source -> its share of the variance, of the worst draw.
+        worst: the seed of the draw that falls shortest of what is required.
+        advice: of the graph, for weak directions.
+    """
+
+    scenario: Scenario
+    duration: float
+    quantities: tuple[Quantity, ...]
+    assessment: Assessment
+    budget: Mapping[str, Mapping[str, float]]
+    worst: int = 0
+    advice: Advice | None = None
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Parameter -> predicted sigma, SI."""
+        sigmas = self.assessment.sigmas.tolist()
+        return {q.name: sigma for q, sigma in zip(self.quantities, sigmas, strict=True)}
+
+    @property
+    def missing(self) -> dict[str, float]:
+        """Parameter -> predicted sigma over the one required, of those that fall short."""
+        sigmas = self.sigmas
+        estimated = [q for q in self.quantities if q.prior_sigma != 0.0]
+        return {q.name: sigmas[q.name] / q.require for q in estimated if sigmas[q.name] > q.require}
+
+
+# Scenario, as text, and seed -> what is predicted of that draw.
+Made = dict[tuple[str, int], Prediction]
+
+
+@dataclass(frozen=True)
+class Step:
+    """A change of the motion.
+
+    Attributes:
+        change: in words.
+        gain: information it adds about what falls short, nats, beyond what more time alone would.
+        prediction: with this change and those before it.
+    """
+
+    change: str
+    gain: float
+    prediction: Prediction
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A planned motion and the changes that would make it determine more, the most informative first."""
+
+    method: str
+    now: Prediction
+    steps: tuple[Step, ...]
+
+    @property
+    def best(self) -> Prediction:
+        """With all changes."""
+        return self.steps[-1].prediction if self.steps else self.now
+
+    @property
+    def scenario_text(self) -> str:
+        """The best motion as a scenario file, what is as by default left out."""
+        model = methods.method(self.method).scenario
+        return scenario_yaml(model.model_validate(self.best.scenario).model_dump(exclude_defaults=True))
+
+
+def make_plan(
+    method_name: str,
+    scenario: str | None = None,
+    config_file: Path | Config | None = None,
+    require: Mapping[str, float] | None = None,
+    most_steps: int = _MOST_STEPS,
+) -> Plan:
+    """Predict a planned motion's sigmas and, where they fall short, better it greedily.
+
+    Args:
+        method_name: los, indexer, ...
+        scenario: YAML file or name; None is the method's nominal one.
+        config_file: a file or a config: overrides key by key the config that the simulated recording brings.
+        require: parameter -> sigma wanted, over those of the config.
+        most_steps: changes at most.
+
+    Raises:
+        InputError: no such method, scenario or parameter, or a scenario without usable data.
+    """
+    wanted = dict(require or {})
+    method = methods.method(method_name)
+    settings = method.settings(scenario).model_dump()
+    made: Made = {}
+    with progress.doing("predicting"):
+        now = predict(method_name, settings, config_file, wanted, made=made)
+    steps: list[Step] = []
+    best = now
+    while best.missing and len(steps) < most_steps:
+        found = list(progress.track(_candidates(method, best, config_file, wanted, made), "trying other motions"))
+        if not found:
+            break
+        step = max(found, key=lambda each: each.gain)
+        if step.gain < _LEAST_GAIN:
+            break
+        best = predict(method_name, step.prediction.scenario, config_file, wanted, made=made)
+        steps.append(replace(step, prediction=best))
+    return Plan(method_name, now, tuple(steps))
+
+
+def predict(
+    method_name: str,
+    scenario: Scenario,
+    config_file: Path | Config | None,
+    require: Mapping[str, float],
+    seeds: Sequence[int] | None = None,
+    made: Made | None = None,
+) -> Prediction:
+    """The sigmas that a recording of this motion would end with, the largest of some draws of what is drawn in it.
+
+    Args:
+        method_name, config_file, require: as in `make_plan`.
+        scenario: the motion.
+        seeds: of the draws; None: as many as the method's scenarios need.
+        made: predictions of draws, which are not made again; new ones are added. All else has to be the same.
+
+    Raises:
+        InputError: the recording would be unusable.
+    """
+    made = {} if made is None else made
+    drawn = range(_DRAWS if methods.method(method_name).drawn else 1) if seeds is None else seeds
+    for seed in drawn:
+        if (repr(scenario), seed) not in made:
+            made[repr(scenario), seed] = _predicted(method_name, scenario, config_file, require, seed)
+    each = [made[repr(scenario), seed] for seed in drawn]
+    worst = max(each, key=lambda prediction: max(prediction.missing.values(), default=0.0))
+    largest = np.max([prediction.assessment.sigmas for prediction in each], axis=0)
+    own = worst.assessment.sigmas
+    grown = np.divide(largest, own, out=np.ones_like(own), where=own > 0.0)
+    covariance = worst.assessment.covariance * np.outer(grown, grown)
+    return replace(worst, assessment=assess(worst.quantities, covariance, None, worst.advice))
+
+
+def _predicted(
+    method_name: str, scenario: Scenario, config_file: Path | Config | None, require: Mapping[str, float], seed: int
+) -> Prediction:
+    """Of one draw."""
+    from alidade.pipelines.applications.session import Session
+    from alidade.pipelines.solvers.batch import solve_batch
+    from alidade.pipelines.solvers.marginals import IndeterminateError
+
+    method = methods.method(method_name)
+    session = Session.of(method, method.simulate(method.scenario.model_validate(scenario), seed), config_file)
+    # The noise asked about is that of the config; the recording is only simulated.
+    config = session.config.model_copy(update={"require": {**session.config.require, **require}, "noise_known": 0.0})
+    problem = method.graph(session.data, config)
+    try:
+        estimate = solve_batch(problem, budget=True)
+    except IndeterminateError as error:
+        raise InputError(f"scenario: {error}") from error
+    assessment = assess(problem.quantities, estimate.covariance, None, problem.advice)
+    return Prediction(
+        scenario, session.facts.duration_s, problem.quantities, assessment, estimate.budget or {}, seed, problem.advice
+    )
+
+
+def requirements(given: Sequence[str]) -> dict[str, float]:
+    """Parameter -> sigma from words like delta_px=1e-4. Raises InputError when one is no such thing."""
+    found = {}
+    for word in given:
+        name, _, number = word.partition("=")
+        try:
+            sigma = float(number)
+        except ValueError:
+            sigma = 0.0
+        if not (name and 0.0 < sigma < float("inf")):
+            raise InputError(f"--require {word}: NAME=SIGMA is needed, sigma a number above zero in SI units")
+        found[name] = sigma
+    return found
+
+
+def write_scenario(path: Path, plan: Plan) -> None:
+    """Write the best motion as a scenario file. Raises InputError when it cannot be written."""
+    try:
+        path.write_text(plan.scenario_text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror})") from error
+
+
+def scenario_yaml(scenario: Scenario) -> str:
+    """The text of a scenario file."""
+    from io import StringIO
+
+    from ruamel.yaml import YAML
+
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = None
+    text = StringIO()
+    yaml.dump(scenario, text)
+    return text.getvalue()
+
+
+def _candidates(
+    method: Method, before: Prediction, config_file: Path | Config | None, require: Mapping[str, float], made: Made
+) -> Iterator[Step]:
+    """Each possible change with what it would bring to the worst draw; those that cannot be recorded are left out."""
+    seeds = (before.worst,)
+    now = predict(method.name, before.scenario, config_file, require, seeds, made)
+    for change, scenario in method.candidates(before.scenario):
+        try:
+            after = predict(method.name, scenario, config_file, require, seeds, made)
+        except InputError:
+            continue
+        yield Step(change, _gain(now, after), after)
+
+
+def _gain(before: Prediction, after: Prediction) -> float:
+    """Fall of what is missing, nats, less what a recording as long would bring by its length."""
+    sigmas = after.sigmas
+    required = {q.name: q.require for q in after.quantities}
+    by_time = 0.5 * float(np.log(after.duration / before.duration))
+    fall = [np.log(ratio / max(sigmas[name] / required[name], 1.0)) for name, ratio in before.missing.items()]
+    return float(np.sum(fall)) - by_time * len(fall)

@@ -1,0 +1,197 @@
+"""From a recording and a calibration to the errors without and with it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from alidade.pipelines import progress
+from alidade.pipelines.applications.session import Recorded, Session, resolve_method
+from alidade.pipelines.applications.sharing import device_belief, walks
+from alidade.pipelines.config import recorded_config
+from alidade.pipelines.diagnostics.calibration_check import Holding, Verdict, holding
+from alidade.pipelines.diagnostics.device_changes import Change
+from alidade.pipelines.diagnostics.validation import Validation
+from alidade.pipelines.display.units import human_unit, to_digits_of
+from alidade.pipelines.methods import method
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.reports.calibration import SavedCalibration
+from alidade.pipelines.reports.known import Known, load_known, saved_of, with_covariance
+from alidade.pipelines.reports.validation import validation_html, validation_rows
+from alidade.pipelines.reports.whole import write_page
+
+FILE = "validation.html"
+
+
+@dataclass(frozen=True, eq=False)
+class Validated:
+    """A calibration held against a recording.
+
+    Attributes:
+        calibration: the one validated.
+        recording: name of the file.
+        validations: what the method says.
+        same_recording: it was calibrated on the very recording.
+        lost: sentences about what of the recording cannot be used.
+        held: whether the calibration holds; None where the recording cannot say.
+        device: what the method says of the calibration's device with the recording's own numbers, bias and the like.
+        best: the same of the recording's own calibration: errors that are to be expected of one that holds.
+    """
+
+    calibration: SavedCalibration
+    recording: str
+    validations: Sequence[Validation]
+    same_recording: bool
+    lost: tuple[str, ...] = ()
+    held: Holding | None = None
+    device: Sequence[Validation] = ()
+    best: Sequence[Validation] = ()
+
+    @property
+    def verdict(self) -> Verdict:
+        """Holds, changed, or unknown; same of the very recording, which always agrees."""
+        if self.same_recording:
+            return "same"
+        return "unknown" if self.held is None else self.held.verdict
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in words."""
+        if self.same_recording:
+            return "Whether the calibration holds is not asked of the recording that it is from."
+        if self.held is None or self.verdict == "unknown":
+            return "Whether the calibration holds is not known: the recording does not say."
+        steps = self.held.steps
+        if self.verdict == "holds":
+            return f"The calibration holds: none of {len(steps)} parameters differs by more than chance."
+        found = [_stepped(step, self.held) for step in steps if step in self.held.changes.found]
+        what = "; ".join(found) or "all parameters together, none by more than chance for itself"
+        small = "" if self.held.matters or not found else " That is less than what is required of them."
+        return f"The calibration does not hold: {what}.{small}"
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader has to know beside the numbers."""
+        out = [*self.lost, *(f"{v.name}: {v.note}" for v in self.validations if v.note)]
+        if self.same_recording:
+            out.append("this is the recording it was calibrated on; another one says more")
+        if self.calibration.status != "calibrated":
+            out.append(f"the calibration's own verdict is {self.calibration.status}")
+        return out
+
+
+def validate(
+    path: Path,
+    calibration_file: Path,
+    method_name: str | None = None,
+    config_file: Path | None = None,
+    strict: bool = False,
+) -> Validated:
+    """The errors of a recording before and after compensation.
+
+    Args:
+        path: the recording.
+        calibration_file: calibration.yaml.
+        method_name: overrides the config's.
+        config_file: overrides the recording's own config key by key.
+        strict: refuse a recording of which anything is lost.
+
+    Raises:
+        InputError: recording, config or calibration cannot be used, or the calibration is another method's.
+    """
+    known = load_known(calibration_file)
+    calibration = saved_of(known, calibration_file)
+    recording = open_recording(path, strict)
+    config = recorded_config(recording, config_file)
+    name = resolve_method(method_name or calibration.method, recording, config)
+    known.of_method(name)
+    chosen = method(name)
+    data = chosen.read(recording, config)
+    values = calibration.values
+    validations = chosen.validate(data, config, values)
+    if known.sha256 == recording.sha256():
+        return Validated(calibration, path.name, validations, True, recording.notes)
+    held, own = _held(Session(chosen, data, config, Recorded(recording)), with_covariance(known, calibration_file))
+    if held is None:
+        return Validated(calibration, path.name, validations, False, recording.notes)
+    of_device = walks(chosen, config, [name for name in own if name in calibration.parameters])
+    mixed = {**own, **{name: value for name, value in values.items() if name in of_device}}
+    device, best = (chosen.validate(data, config, each) for each in (mixed, own))
+    return Validated(calibration, path.name, validations, False, recording.notes, held, device, best)
+
+
+def _held(session: Session, known: Known) -> tuple[Holding | None, dict[str, float]]:
+    """What the recording says of the calibration, and its own parameters; neither where it cannot be solved."""
+    from alidade.pipelines.solvers.batch import solve_batch
+    from alidade.pipelines.solvers.marginals import IndeterminateError
+
+    if known.solver == "published":
+        return None, {}
+    problem = session.problem()
+    device = walks(session.method, session.config, [q.name for q in problem.quantities])
+    belief = device_belief(known, session.method, session.config, session.origin.sha256(), session.origin.epoch_ns)
+    try:
+        with progress.doing("solving"):
+            estimate = solve_batch(problem, device=device)
+    except IndeterminateError:
+        return None, {}
+    own = problem.numbers(estimate)
+    if not estimate.converged or estimate.told is None:
+        return None, {}
+    inflations = dict(zip(estimate.names, estimate.inflations.tolist(), strict=True))
+    return holding(belief, estimate.told, problem.quantities, inflations), own
+
+
+def _stepped(step: Change, held: Holding) -> str:
+    """A parameter that changed, in the unit people read."""
+    unit, factor = human_unit(held.quantities[step.name])
+    size, sigma = (to_digits_of(factor * x, factor * step.sigma) for x in (step.size, step.sigma))
+    return f"{step.name} changed by {size} ± {sigma} {unit}".strip()
+
+
+def parameter_rows(validated: Validated) -> list[tuple[str, str, str, str, str]]:
+    """For each parameter that is compared: name, change, its sigma, from what on it would be noticed, unit."""
+    if validated.held is None:
+        return []
+    held, rows = validated.held, []
+    for step in held.steps:
+        unit, factor = human_unit(held.quantities[step.name])
+        numbers = (step.size, step.sigma, held.changes.limit * step.sigma)
+        size, sigma, least = (to_digits_of(factor * x, factor * step.sigma) for x in numbers)
+        rows.append((step.name, size, sigma, least, unit))
+    return rows
+
+
+def table(validated: Validated) -> list[str]:
+    """Lines of text: for each error RMS and peak before and after, then what each parameter changed by."""
+    rows = validation_rows(validated.validations, validated.device, validated.best)
+    width = max(len(row[0]) for row in rows)
+    lines = [
+        f"{'':{width}}  {'RMS':>9} {'':>9} {'':>9} {'':>9}  {'peak':>9}",
+        f"{'error':{width}}  {'before':>9} {'after':>9} {'device':>9} {'expected':>9}  {'before':>9} {'after':>9}",
+        *(
+            f"{row[0]:{width}}  {' '.join(f'{x:>9}' for x in row[1:5])}  {row[5]:>9} {row[6]:>9}  {row[7]}"
+            for row in rows
+        ),
+    ]
+    compared = parameter_rows(validated)
+    if compared:
+        width = max(len(row[0]) for row in compared)
+        lines.append(f"{'parameter':{width}}  {'change':>9} {'sigma':>9} {'noticed':>9}")
+        lines += [f"{name:{width}}  {a:>9} {b:>9} {c:>9}  {unit}" for name, a, b, c, unit in compared]
+    return [*lines, validated.sentence]
+
+
+def write_validation(out_dir: Path, validated: Validated) -> Path:
+    """Write validation.html; returns its path. Raises InputError when it cannot be written."""
+    page = validation_html(
+        validation_rows(validated.validations, validated.device, validated.best),
+        validated.validations,
+        validated.calibration,
+        validated.recording,
+        validated.verdict,
+        validated.sentence,
+        parameter_rows(validated),
+    )
+    return write_page(out_dir, FILE, page)

@@ -1,0 +1,204 @@
+"""Whether what was calibrated stayed as it was over the recording.
+
+If nothing changed, the estimate from what was recorded until t differs from the final one by a normal number with the
+covariance P(t) - P(T): the later estimate uses all that the earlier one does, and more (Hausman 1978, for an estimator
+that is efficient). The largest such difference over the recording is held against what chance does: paths drawn with
+the same covariances, whose steps from moment to moment are independent.
+
+That takes the priors for true. A parameter far beyond its prior departs from it as it becomes known, and nothing has
+changed: such priors are widened to what was found before anything is compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from alidade.pipelines.diagnostics.cross_validation import Halves
+from alidade.pipelines.estimation.assumptions import pull
+from alidade.pipelines.estimation.problem import Array, Estimate, Quantity
+
+# A recording in which nothing changed is taken for one in which something did so often.
+LEVEL = 1e-3
+# Paths drawn, a batch at a time.
+_PATHS, _BATCH = 4000, 500
+# Directions in which the rest of the recording added less than this share of the variance say nothing of a change.
+_LEAST = 1e-3
+# A step between the sides of a change is more than chance beyond so many sigmas.
+_STEP = 3.0
+# Priors are widened to what was found from so many sigmas on.
+_BEYOND = 3.0
+# Two moments make no path.
+_FEWEST_MOMENTS = 5
+# Coloured residuals are as many measurements as they are independent stretches. With fewer of these for each number
+# than this, inflated covariances, which hold for long recordings, say too little of how far an estimate may be off.
+_STRETCHES = 3.0
+
+
+@dataclass(frozen=True)
+class Stability:
+    """The largest difference between an estimate on the way and the final one.
+
+    Attributes:
+        statistic: its size as a standard normal number, by the cube root of chi-square over its degrees of freedom.
+        level: how often chance alone makes it as large or larger, anywhere in the recording.
+        time_s: when, s.
+        departures: parameter -> estimate until then less the final one, in the sigmas of that difference; largest
+            first.
+    """
+
+    statistic: float
+    level: float
+    time_s: float
+    departures: dict[str, float]
+
+    @property
+    def changed(self) -> bool:
+        """Whether it is more than chance."""
+        return self.level < LEVEL
+
+    @property
+    def sentence(self) -> str:
+        """What changed and when."""
+        name, size = next(iter(self.departures.items()))
+        when, far = f"{self.time_s:.0f} s", f"{abs(size):.1f} sigmas"
+        return f"Something changed at about {when}: {name} from before is {far} from that of the whole recording."
+
+
+@dataclass(frozen=True)
+class Moved:
+    """What the two sides of a change say of the parameters that both determine.
+
+    Attributes:
+        parts: parameter -> value and sigma before and after; none where the sides cannot be solved.
+    """
+
+    parts: Mapping[str, Halves]
+
+    @property
+    def steps(self) -> dict[str, tuple[float, float]]:
+        """Parameter -> step and its sigma, of those that are more than chance, the surest first."""
+        sure = {name: p for name, p in self.parts.items() if abs(p.difference_sigmas) > _STEP}
+        order = sorted(sure.items(), key=lambda each: -abs(each[1].difference_sigmas))
+        return {name: (p.second - p.first, float(np.hypot(p.first_sigma, p.second_sigma))) for name, p in order}
+
+    def small(self, quantities: Sequence[Quantity]) -> bool:
+        """Whether every step is known, and less than half of what is required."""
+        required = {q.name: q.require for q in quantities}
+        return bool(self.steps) and all(abs(step) < 0.5 * required[name] for name, (step, _) in self.steps.items())
+
+    def widened(self, estimate: Estimate, quantities: Sequence[Quantity]) -> Array:
+        """The estimate's covariance with small steps added in square."""
+        if not self.small(quantities):
+            return estimate.covariance
+        step = np.array([self.steps.get(name, (0.0, 0.0))[0] for name in estimate.names])
+        return estimate.covariance + np.diag(step**2)
+
+
+def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability | None:
+    """Of an estimate; None where its course is not known, or holds nothing that could change.
+
+    Quantities that walk are left out, since they may change, and those that are hardly better known than before.
+
+    Args:
+        estimate: with its course.
+        quantities: of the estimate, in its order.
+    """
+    course = estimate.course
+    if course is None:
+        return None
+    # What a recording tells of other numbers is as much the noise of its states, which moves the estimate without being
+    # chance as the covariances have it.
+    told = [q.determined(sigma) for q, sigma in zip(quantities, estimate.sigmas.tolist(), strict=True)]
+    kept = np.flatnonzero(course.steady & told)
+    late = course.time >= _long_enough(estimate, len(kept))
+    if late.sum() < _FEWEST_MOMENTS or not len(kept):
+        return None
+    time = course.time[late]
+    values, covariance = _with_priors_as_found(estimate, quantities, course.values[late], course.covariance[late])
+    # By one factor: each by its own would turn the directions that are known well, where many are correlated.
+    P = float(estimate.inflations[kept].max()) ** 2 * covariance[:, kept[:, None], kept]
+    difference = values[:-1, kept] - values[-1, kept]
+    whitening = [_whitening(P[i], P[-1]) for i in range(len(P) - 1)]
+    ranks = np.array([len(rows) for rows in whitening])
+    sizes = _as_normal(np.array([((W @ d) ** 2).sum() for W, d in zip(whitening, difference, strict=True)]), ranks)
+    worst = int(np.argmax(sizes))
+    beyond = _exceeded(P, whitening, ranks, float(sizes[worst]))
+    sigmas = np.sqrt(np.maximum(np.diag(P[worst] - P[-1]), 1e-12 * np.diag(P[worst])))
+    by_size = np.argsort(-np.abs(difference[worst] / sigmas))
+    departures = {quantities[kept[j]].name: float(difference[worst, j] / sigmas[j]) for j in by_size}
+    return Stability(float(sizes[worst]), beyond, float(time[worst]), departures)
+
+
+def _long_enough(estimate: Estimate, numbers: int) -> float:
+    """From when on, s, all families of coloured residuals had stretches enough; infinite where they never do."""
+    latest = -np.inf
+    for family, together in estimate.colours.items():
+        times = np.sort(estimate.residuals[family].time)
+        needed = int(np.ceil(_STRETCHES * numbers * together))
+        if together > 1.0:
+            latest = max(latest, float(times[needed - 1]) if needed <= len(times) else np.inf)
+    return latest
+
+
+def _with_priors_as_found(
+    estimate: Estimate, quantities: Sequence[Quantity], values: Array, P: Array
+) -> tuple[Array, Array]:
+    """The course (k, n), (k, n, n) as it is when no parameter lies far beyond its prior.
+
+    Widening one prior changes the information by a number on the diagonal (Sherman, Morrison 1950).
+    """
+    for i, q in enumerate(quantities):
+        prior = q.prior_sigma or 0.0
+        inflation = float(estimate.inflations[i])
+        size = pull(q, float(estimate.values[i]), float(estimate.sigmas[i]), inflation)
+        if size is None or abs(size) < _BEYOND:
+            continue
+        added = 1.0 / (size * prior) ** 2 - 1.0 / prior**2
+        column = P[:, :, i] / (1.0 + added * P[:, i, i])[:, None]
+        values = values - added * (values[:, i] - q.prior_mean)[:, None] * column
+        P = P - added * column[:, :, None] * P[:, i, None, :]
+    return values, P
+
+
+def _whitening(P: Array, last: Array) -> Array:
+    """(r, n): differences between the estimate with covariance P and the last one as r unit normal numbers."""
+    root = np.linalg.cholesky(P + 1e-12 * np.diag(np.diag(P)))
+    scaled = np.linalg.solve(root, np.linalg.solve(root, P - last).T)
+    eigenvalues, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
+    told = eigenvalues > _LEAST
+    return np.asarray((vectors[:, told] / np.sqrt(eigenvalues[told])).T @ np.linalg.inv(root))
+
+
+def _as_normal(square: Array, dof: Array) -> Array:
+    """Chi-square as a standard normal number (Wilson, Hilferty 1931); minus infinity without degrees of freedom."""
+    dof = np.broadcast_to(dof, square.shape)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = (np.cbrt(square / dof) - (1.0 - 2.0 / (9.0 * dof))) / np.sqrt(2.0 / (9.0 * dof))
+    return np.where(dof > 0, size, -np.inf)
+
+
+def _exceeded(P: Array, whitening: Sequence[Array], ranks: Array, size: float) -> float:
+    """Share of drawn paths whose largest difference is as large or larger."""
+    rng = np.random.default_rng(0)
+    n = P.shape[1]
+    roots = [_root(P[i] - P[i + 1]) for i in range(len(P) - 1)]
+    count = 0
+    for _ in range(_PATHS // _BATCH):
+        difference = np.zeros((_BATCH, n))
+        largest = np.full(_BATCH, -np.inf)
+        for i in reversed(range(len(roots))):
+            difference += rng.standard_normal((_BATCH, n)) @ roots[i].T
+            square = ((difference @ whitening[i].T) ** 2).sum(axis=1)
+            largest = np.maximum(largest, _as_normal(square, ranks[i]))
+        count += int((largest >= size).sum())
+    return count / _PATHS
+
+
+def _root(covariance: Array) -> Array:
+    """R with R R' the covariance, what rounding made negative left out."""
+    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(eigenvalues, 0.0)))

@@ -1,0 +1,338 @@
+"""Noise coefficients of a sensor at rest, by maximum likelihood.
+
+The cosine transform (DCT-II) of evenly spaced samples splits them into independent numbers. With u = 4 sin^2(pi k / 2n)
+their variances are, for samples tau0 apart and k = 1 ... n-1,
+
+    N^2 / tau0  +  K^2 tau0 / u  +  B^2 / sqrt(u)  +  Q^2 u / tau0^2
+
+White noise and random walk are split exactly (the basis is that of the walk's increments), the quantised integral but
+for its ends; the term of B is the flicker of Hosking, "Fractional differencing", Biometrika 1981, and agrees with
+B^2 / (2 pi f) of IEEE Std 952. So every number of the transform tells as much of the coefficients as it can, where
+slopes read from an Allan plot use a few of them; the likelihood is Whittle's (1953), exact for N and K.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.factors.chi_square import interval, quantile
+from alidade.pipelines.diagnostics.allan import NOISES
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+# Power of sqrt(u) and of tau0 in the variance, in the order Q, N, B, K.
+_POWER_U, _POWER_TAU = np.array([2.0, 0.0, -1.0, -2.0]), np.array([-2.0, -1.0, 0.0, 1.0])
+_N = NOISES.index("N")
+# Numbers of the transform are averaged within bins of this part of an octave.
+_PER_OCTAVE = 16
+# A noise is part of the model when twice the logarithm of the likelihood rises by more than this without bound, and is
+# told when its square is so many of its sigmas from zero.
+_SHOWS, _TOLD = 10.0, 3.0
+# 95 % of chi-square of one degree of freedom on one side.
+_BELOW = 2.706
+_CONFIDENCE = 0.95
+# An octave contradicts the model when its mean power is off by more than this part, and by what chance does once in so
+# many octaves.
+_OFF, _ONCE_IN = 0.1, 3e6
+# The band that is fitted spans at least so many octaves.
+_LEAST_OCTAVES = 4.0
+# A noise counts as able to be told by a longer record up to this length, s.
+_LONGEST_RECORD = 30.0 * 86400.0
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """One noise coefficient.
+
+    Attributes:
+        name: Q, N, B or K.
+        value: its estimate; None when the record does not determine it.
+        sigma: of the value, one standard deviation.
+        low, high: 95 % interval; of a noise that is not told, 0 and what it is below with 95 % confidence.
+        needed_s: length of a record, s, that would determine a noise of half that bound; None where the value is told,
+            or no record of a month would.
+    """
+
+    name: str
+    value: float | None
+    sigma: float | None
+    low: float
+    high: float
+    needed_s: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseFit:
+    """Noise of one axis.
+
+    Attributes:
+        coefficients: Q, N, B, K.
+        squares: (4,) Q^2, N^2, B^2, K^2 of the model that fits best, zero for what is not in it.
+        band_hz: the frequencies it holds for.
+        filtered: above the band the samples are smoother, or rougher, than any model: a filter in the sensor.
+        misfit: factor between power found and power of the model in the octave where they differ most; 1 where they
+            agree within chance.
+        misfit_hz: that octave's middle.
+    """
+
+    coefficients: tuple[Coefficient, ...]
+    squares: Array
+    band_hz: tuple[float, float]
+    filtered: bool
+    misfit: float
+    misfit_hz: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Bins:
+    """Bins of the transform: mean power (n,), how many numbers are in each, mean variance for each noise (n, 4)."""
+
+    hz: Array
+    power: Array
+    count: Array
+    basis: Array
+
+    def below(self, hz: float) -> _Bins:
+        keep = self.hz <= hz
+        return _Bins(self.hz[keep], self.power[keep], self.count[keep], self.basis[keep])
+
+
+def fit_noise(pieces: Sequence[Array], interval_s: float, lines: Sequence[tuple[float, float]] = ()) -> NoiseFit:
+    """The coefficients from pieces of a record at rest.
+
+    Args:
+        pieces: samples of a rate, each piece evenly spaced by interval_s.
+        interval_s: s.
+        lines: bands, Hz, that are left out because a sinusoid is in them.
+    """
+    bins = _binned(pieces, interval_s, lines)
+    top = float(bins.hz[-1])
+    band, squares, model = _widest_band(bins)
+    off, where = _worst_octave(band, band.basis @ squares)
+    longest = max(len(piece) for piece in pieces)
+    found = tuple(_coefficient(i, band, squares, model, longest, interval_s) for i in range(4))
+    limits = float(band.hz[0]), float(band.hz[-1])
+    return NoiseFit(found, squares, limits, limits[1] < 0.9 * top, off, where)
+
+
+def cosine_transform(x: Array) -> Array:
+    """Orthonormal DCT-II (n,) of x (n,). Makhoul, "A fast cosine transform", IEEE Trans. ASSP 1980."""
+    n = len(x)
+    folded = np.concatenate([x[::2], x[1::2][::-1]])
+    half = np.fft.rfft(folded)
+    k = np.arange(len(half))
+    turned = half * np.exp(-0.5j * np.pi * k / n)
+    out = np.empty(n)
+    out[: len(half)] = turned.real
+    # V[n - k] = conj(V[k]), turned by pi/2 less.
+    out[len(half) :] = -turned.imag[1 : n - len(half) + 1][::-1]
+    out *= np.sqrt(2.0 / n)
+    out[0] *= np.sqrt(0.5)
+    return out
+
+
+def _binned(pieces: Sequence[Array], interval_s: float, lines: Sequence[tuple[float, float]]) -> _Bins:
+    longest = max(len(piece) for piece in pieces)
+    # Bin i begins at this part of half the sampling rate, the last one below the lowest frequency of all.
+    edges = 2.0 ** (-np.arange(np.ceil(_PER_OCTAVE * np.log2(longest)) + 2.0)[::-1] / _PER_OCTAVE)
+    count, power, hz = np.zeros((3, len(edges) - 1))
+    for piece in pieces:
+        n = len(piece)
+        square = cosine_transform(piece - piece.mean()) ** 2
+        f = np.arange(n) / (2.0 * n * interval_s)
+        kept = np.ones(n)
+        for low, high in lines:
+            kept[slice(*np.searchsorted(f, [low, high]))] = 0.0
+        square *= kept
+        starts = np.ceil(n * edges).astype(np.intp)
+        filled = np.flatnonzero(np.diff(starts))
+        for total, values in ((count, kept), (power, square), (hz, f * kept)):
+            total[filled] += np.add.reduceat(values, starts[filled])
+    some = count > 0.0
+    hz = hz[some] / count[some]
+    # A bin is so narrow that its mean variance is that at its mean frequency, to 3e-4.
+    return _Bins(hz, power[some] / count[some], count[some], _variances(hz, interval_s))
+
+
+def _variances(hz: Array, interval_s: float) -> Array:
+    """Variance of the transform at frequencies (n,), Hz, for each noise with a coefficient of one (n, 4)."""
+    root_u = 2.0 * np.sin(np.pi * hz * interval_s)
+    return np.asarray(root_u[:, None] ** _POWER_U * interval_s**_POWER_TAU)
+
+
+def _widest_band(bins: _Bins) -> tuple[_Bins, Array, Mask]:
+    """The band up to the highest frequency at which some model fits; all of it where none does.
+
+    A sensor's own low-pass filter takes away noise near half the sampling rate; what is below it is the density that
+    counts for an integral. Quantisation is what rises up to half the sampling rate; in a narrower band it has no place.
+    """
+    whole = bins, *_select(bins, NOISES)
+    if _fits(*whole[:2]):
+        return whole
+    edge = float(bins.hz[-1])
+    while edge >= bins.hz[0] * 2.0**_LEAST_OCTAVES:
+        edge /= 2.0**0.5
+        band = bins.below(edge)
+        part = band, *_select(band, NOISES[1:])
+        if _fits(*part[:2]):
+            # What a filter takes away falls to a quarter an octave, and was just too little to be seen.
+            lower = bins.below(max(0.5 * edge, bins.hz[0] * 2.0**_LEAST_OCTAVES))
+            return lower, *_select(lower, NOISES[1:])
+    return whole
+
+
+def _fits(bins: _Bins, squares: Array) -> bool:
+    return _worst_octave(bins, bins.basis @ squares)[0] == 1.0
+
+
+def _select(bins: _Bins, candidates: Sequence[str]) -> tuple[Array, Mask]:
+    """Squares of the coefficients (4,) and which of them the model has: one after the other as long as one shows."""
+    left = {NOISES.index(name) for name in candidates} - {_N}
+    model = np.zeros(4, dtype=bool)
+    model[_N] = True
+    squares = _maximise(bins, model)
+    best = _likelihood(bins, squares)
+    while left:
+        trials = []
+        for i in left:
+            wider = model.copy()
+            wider[i] = True
+            trial = _maximise(bins, wider)
+            trials.append((_likelihood(bins, trial), i, trial))
+        likelihood, i, trial = max(trials, key=lambda t: t[0])
+        if likelihood - best < _SHOWS:
+            break
+        model[i] = True
+        left.remove(i)
+        best, squares = likelihood, trial
+    return squares, model
+
+
+def _likelihood(bins: _Bins, squares: Array) -> float:
+    """Twice its logarithm."""
+    variance = bins.basis @ squares
+    return -float(bins.count @ (np.log(variance) + bins.power / variance))
+
+
+def _maximise(bins: _Bins, model: Mask, held: tuple[int, float] | None = None) -> Array:
+    """Squares (4,) of the largest likelihood, zero outside the model; `held` is one of them and its fixed value.
+
+    Fisher scoring in the logarithms, which keeps variances positive; a noise that is not there goes to nearly zero.
+    """
+    basis = bins.basis[:, model]
+    rest = np.zeros(len(bins.hz)) if held is None else held[1] * bins.basis[:, held[0]]
+    weight = np.sqrt(bins.count)
+    # To begin with each explains its part of the power where it is strongest.
+    theta = (weight * bins.power) @ basis / (weight @ basis**2) / basis.shape[1]
+
+    def value(t: Array) -> float:
+        s = basis @ t + rest
+        return -float(bins.count @ (np.log(s) + bins.power / s))
+
+    now, damping = value(theta), 1e-6
+    for _ in range(200):
+        variance = basis @ theta + rest
+        relative = basis * theta / variance[:, None]
+        gradient = relative.T @ (bins.count * (bins.power / variance - 1.0))
+        information = relative.T @ (bins.count[:, None] * relative)
+        information[np.diag_indices_from(information)] += damping * np.diag(information) + 1e-12
+        step = np.clip(np.linalg.solve(information, gradient), -3.0, 3.0)
+        trial = theta * np.exp(step)
+        new = value(trial)
+        if new < now:
+            damping = max(10.0 * damping, 1e-3)
+            if damping > 1e6:
+                break
+            continue
+        gained, theta, now, damping = new - now, trial, new, 0.1 * damping
+        if gained < 1e-7:
+            break
+    out = np.zeros(4)
+    out[model] = theta
+    if held is not None:
+        out[held[0]] = held[1]
+    return out
+
+
+def _sigmas(bins: _Bins, squares: Array, model: Mask) -> Array:
+    """Sigmas (4,) of the squares in the model, from the information of all numbers of the transform."""
+    relative = bins.basis[:, model] * squares[model] / (bins.basis @ squares)[:, None]
+    information = 0.5 * relative.T @ (bins.count[:, None] * relative)
+    out = np.zeros(4)
+    out[model] = np.sqrt(np.diag(np.linalg.pinv(information))) * squares[model]
+    return out
+
+
+def _coefficient(i: int, bins: _Bins, squares: Array, model: Mask, samples: int, interval_s: float) -> Coefficient:
+    sigma = _sigmas(bins, squares, model)[i]
+    if model[i] and squares[i] >= _TOLD * sigma:
+        low, high = interval(_CONFIDENCE, float(2.0 * (squares[i] / sigma) ** 2))
+        root = float(np.sqrt(squares[i]))
+        return Coefficient(NOISES[i], root, float(0.5 * sigma) / root, root * low**0.5, root * high**0.5)
+    bound = _bound(i, bins, squares, model)
+    needed = _needed(i, bins, squares, model, bound / 4.0, samples, interval_s)
+    return Coefficient(NOISES[i], None, None, 0.0, float(np.sqrt(bound)), needed)
+
+
+def _bound(i: int, bins: _Bins, squares: Array, model: Mask) -> float:
+    """What the square is below with 95 % confidence: where the likelihood, the others free, has fallen by so much."""
+    with_it = model.copy()
+    with_it[i] = True
+    start = _maximise(bins, with_it)
+    best = max(_likelihood(bins, start), _likelihood(bins, squares))
+    others = with_it.copy()
+    others[i] = False
+
+    def fallen(square: float) -> bool:
+        return best - _likelihood(bins, _maximise(bins, others, (i, square))) > _BELOW
+
+    # More than all the power there is it cannot be.
+    low, high = float(start[i]), 10.0 * float(np.max(bins.power / bins.basis[:, i]))
+    while high > 1.02 * low:
+        middle = float(np.sqrt(max(low, 1e-12 * high) * high))
+        low, high = (low, middle) if fallen(middle) else (middle, high)
+        if high < 1e-9 * start[i]:
+            break
+    return high
+
+
+def _needed(
+    i: int, bins: _Bins, squares: Array, model: Mask, square: float, samples: int, interval_s: float
+) -> float | None:
+    """Length of one record, s, in which noise i of this square beside the others of the model would be told."""
+    with_it = model.copy()
+    with_it[i] = True
+    there = np.where(np.arange(4) == i, square, squares)
+    edges = 2.0 ** np.arange(np.log2(2.0 * bins.hz[-1] * interval_s), -60.0, -1.0 / _PER_OCTAVE)
+    length = samples * interval_s
+    while length < _LONGEST_RECORD:
+        numbers = length / interval_s
+        mine = edges[edges > 1.0 / numbers]
+        middle = 0.5 * mine / interval_s
+        basis = _variances(middle, interval_s)
+        count = numbers * mine * (1.0 - 2.0 ** (-1.0 / _PER_OCTAVE))
+        ideal = _Bins(middle, basis @ there, count, basis)
+        if square >= _TOLD * _sigmas(ideal, there, with_it)[i]:
+            return length
+        length *= 2.0**0.25
+    return None
+
+
+def _worst_octave(bins: _Bins, variance: Array) -> tuple[float, float]:
+    """Power found over that of the model in the octave where they differ most, 1 within chance; its middle, Hz."""
+    edges = np.append(np.arange(len(bins.hz), 0, -_PER_OCTAVE), 0)[::-1]
+    worst, where = 1.0, float(bins.hz[-1])
+    for start, stop in pairwise(edges.tolist()):
+        count = bins.count[start:stop]
+        ratio = float(count @ (bins.power / variance)[start:stop] / count.sum())
+        low, high = (quantile(p, count.sum()) / count.sum() for p in (1.0 / _ONCE_IN, 1.0 - 1.0 / _ONCE_IN))
+        beyond = not low < ratio < high and abs(ratio - 1.0) > _OFF
+        if beyond and abs(np.log(ratio)) > abs(np.log(worst)):
+            worst, where = ratio, float(np.sqrt(bins.hz[start] * bins.hz[stop - 1]))
+    return worst, where

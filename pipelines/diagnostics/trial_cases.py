@@ -1,0 +1,159 @@
+"""Discrete faults and unknown shifts of a recording, each as changed data or a changed config to be solved again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from itertools import combinations, product
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from alidade.pipelines.diagnostics.fault_models import Hypotheses, Scaling
+from alidade.pipelines.diagnostics.outcome import outcome, quick_score
+from alidade.pipelines.settings import Config
+
+if TYPE_CHECKING:
+    from alidade.pipelines.methods import Method
+
+_OFFSET = "time_offset"
+_DELAY_PRIOR = 0.05
+# Stamps are moved by this much first, s, and numbers scaled by this much; then so many times to the bottom of a
+# parabola.
+_FIRST_SHIFT, _FIRST_SCALING, _SECOND_SCALING, _PARABOLAS = 0.01, 0.01, 5e-3, 4
+
+# What it would be, data and config.
+Trial = tuple[str, Any, Config]
+
+
+def trials(method: Method, data: Any, config: Config) -> Iterator[Trial]:
+    """All that is tried, but for what counts only where nothing else does."""
+    hypotheses = method.hypotheses()
+    yield from faults(hypotheses, data, config)
+    yield from flips(hypotheses, data, config)
+    yield from turned(hypotheses, data, config)
+    yield from units(hypotheses, data, config)
+    yield from offset(method, hypotheses, data, config)
+    yield from scaled(method, hypotheses, data, config)
+
+
+def faults(hypotheses: Hypotheses, data: Any, config: Config, last: bool = False) -> Iterator[Trial]:
+    """The method's own, those that count last or the others."""
+    for fault in hypotheses.faults:
+        if fault.last is last and (mended := fault.mended(data, config)) is not None:
+            yield fault.label, *mended
+
+
+def flips(hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]:
+    """Every choice of opposite signs of a sensor's axes."""
+    for name, (sensor, columns) in hypotheses.signs.items():
+        values = getattr(data, name)
+        if values is None:
+            continue
+        for signs in product((1.0, -1.0), repeat=len(columns)):
+            wrong = [column for column, sign in zip(columns, signs, strict=True) if sign < 0.0]
+            if wrong:
+                axes = " and ".join(wrong)
+                label = f"the sign of the {sensor}'s {axes} is wrong"
+                factor = np.array(signs) if values.ndim > 1 else signs[0]
+                yield label, replace(data, **{name: factor * values}), config
+
+
+def turned(hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]:
+    """Axes of a sensor in another order: two of them swapped, or turned by a right angle about the third."""
+    for name, (sensor, columns) in hypotheses.signs.items():
+        values = getattr(data, name)
+        if values is None or len(columns) < 3:
+            continue
+        for i, j in combinations(range(3), 2):
+            swapped = np.eye(3)
+            swapped[[i, j]] = swapped[[j, i]]
+            third = columns[3 - i - j]
+            labels = {
+                f"the {sensor}'s {columns[i]} and {columns[j]} are swapped": np.ones(3),
+                f"the {sensor} is turned by 90 deg about its {third}": np.where(np.arange(3) == i, -1.0, 1.0),
+                f"the {sensor} is turned by 90 deg the other way about its {third}": np.where(
+                    np.arange(3) == j, -1.0, 1.0
+                ),
+            }
+            for label, signs in labels.items():
+                yield label, replace(data, **{name: values @ swapped * signs}), config
+
+
+def units(hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]:
+    """Rates in degrees a second, or turned into radians twice."""
+    for name, (sensor, _) in hypotheses.signs.items():
+        values = getattr(data, name)
+        if values is not None and "gyro" in name:
+            yield f"the {sensor} is in deg/s, not rad/s", replace(data, **{name: np.deg2rad(values)}), config
+            yield (
+                f"the {sensor} was turned from deg/s to rad/s twice",
+                replace(data, **{name: np.rad2deg(values)}),
+                config,
+            )
+
+
+def offset(method: Method, hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]:
+    """Delays as parameters with wide priors, or the stamps that may be late moved to where residuals are smallest."""
+    known = {_OFFSET: "a time offset of {time_offset} is taken for known"} if hypotheses.offset else {}
+    for name, label in {**known, **hypotheses.delays}.items():
+        yield label, data, config.model_copy(update={"priors": {**config.priors, name: _DELAY_PRIOR}})
+    if hypotheses.clock is None:
+        return
+    stamps, source = hypotheses.clock
+
+    def moved(shift: float) -> tuple[Any, Config]:
+        return replace(data, **{stamps: getattr(data, stamps) + shift}), config
+
+    shift = _lowest(partial(_cost, method, moved), _FIRST_SHIFT)
+    if shift is not None:
+        side = "early" if shift > 0.0 else "late"
+        yield f"the stamps of the {source} are {1e3 * abs(shift):.3g} ms too {side}", *moved(shift)
+
+
+def scaled(method: Method, hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]:
+    """Numbers of the config multiplied by what makes residuals smallest."""
+    for scaling in hypotheses.scalings:
+        if scaling.scaled(data, config, 1.0) is None:
+            continue
+
+        def changed(more: float, scaling: Scaling = scaling) -> tuple[Any, Config]:
+            found = scaling.scaled(data, config, 1.0 + more)
+            assert found is not None
+            return found
+
+        # Not chi-square, which levels off where most measurements are rejected; near the bottom it tells best.
+        rough = _lowest(lambda more: quick_score(method, *changed(more)) ** 2, _FIRST_SCALING)
+        if rough:
+            more = _lowest(partial(_cost, method, changed), _SECOND_SCALING, rough)
+            more = rough if more is None else more
+            yield scaling.label.format(factor=1.0 + more), *changed(more)
+
+
+def _cost(method: Method, changed: Callable[[float], tuple[Any, Config]], size: float) -> float:
+    """Of a solution with a change of some size; infinite where there is none."""
+    found = outcome(method, *changed(size))
+    return found.cost if found else np.inf
+
+
+def _lowest(cost: Callable[[float], float], step: float, start: float = 0.0) -> float | None:
+    """The size of a change that costs least, searched for from `start` on; None when there is none.
+
+    From the best so far a step to either side, and to the bottom of the parabola through the three.
+    """
+    known, best = {start: cost(start)}, start
+    for _ in range(_PARABOLAS):
+        sides = best - step, best + step
+        known |= {size: cost(size) for size in sides if size not in known}
+        left, middle, right = known[sides[0]], known[best], known[sides[1]]
+        bend = left - 2.0 * middle + right
+        if not np.isfinite(bend):
+            return None
+        if bend > 0.0:
+            bottom = best + float(np.clip(0.5 * step * (left - right) / bend, -5.0 * step, 5.0 * step))
+            known[bottom] = cost(bottom)
+        best = min(known, key=known.__getitem__)
+        if best not in sides:
+            step *= 0.2
+    return best

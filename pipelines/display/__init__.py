@@ -1,0 +1,1 @@
+"""Figures, tables, units and drawings as data, numpy alone: methods declare them, reports render them."""

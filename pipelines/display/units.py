@@ -1,0 +1,102 @@
+"""Numbers as people read them: degrees, arc seconds, milliseconds, with as many digits as the sigma warrants."""
+
+from __future__ import annotations
+
+import math
+
+from alidade.pipelines.estimation.problem import Quantity
+
+_G = 9.80665  # standard gravity, m/s^2
+
+# What is wanted to better than this, rad or rad/s, is read in arc seconds or degrees per hour.
+_FINE = 2e-4
+
+
+def human_unit(quantity: Quantity) -> tuple[str, float]:
+    """The unit to show a quantity in, empty for a plain number, and what to multiply its SI number by."""
+    fine = quantity.require < _FINE
+    match quantity.unit:
+        case "rad":
+            return ("arcsec", math.degrees(1.0) * 3600.0) if fine else ("deg", math.degrees(1.0))
+        case "rad/s":
+            return ("deg/h", math.degrees(1.0) * 3600.0) if fine else ("deg/s", math.degrees(1.0))
+        case "s":
+            return "ms", 1e3
+        case "T":
+            return "nT", 1e9
+        case "":
+            return "ppm", 1e6
+        case "rad/s/K":
+            return "deg/s/K", math.degrees(1.0)
+        case "rad/s/(m/s^2)":
+            return "deg/s/g", math.degrees(_G)
+        case "m/s^2":
+            return "m/s²", 1.0
+        case "m/s^2/K":
+            return "m/s²/K", 1.0
+        case "T/K":
+            return "nT/K", 1e9
+        case "s^2/m":
+            return "µg/g²", 1e6 * _G
+        case "s^4/m^2":
+            return "µg/g³", 1e6 * _G**2
+        case "1":
+            return "", 1.0
+        case other:
+            return other, 1.0
+
+
+_ARW = ("deg/√h", math.degrees(60.0))
+_RRW = ("deg/h/√h", math.degrees(60.0) * 3600.0)
+# Noises by their names in the config -> unit people use, and what to multiply SI by.
+_NOISE: dict[str, tuple[str, float]] = {
+    "gyro_density": _ARW,
+    "platform_gyro_density": _ARW,
+    "gyro_bias_walk": _RRW,
+    "gyro_repeatability": ("deg/h", math.degrees(3600.0)),
+    "accel_density": ("µg/√Hz", 1e6 / _G),
+    "accel_repeatability": ("µg", 1e6 / _G),
+    "mag_density": ("nT/√Hz", 1e9),
+    "mag_repeatability": ("nT", 1e9),
+    "los_error": ("µrad", 1e6),
+    "los_roll": ("µrad", 1e6),
+    "encoder": ("arcsec", math.degrees(3600.0)),
+    "vision_attitude": ("deg", math.degrees(1.0)),
+    "turn_rate": ("deg/h", math.degrees(3600.0)),
+    "move_rate": ("deg/h", math.degrees(3600.0)),
+    "dwell_rate": ("deg/h", math.degrees(3600.0)),
+}
+
+
+def noise_unit(name: str, si: str) -> tuple[str, float]:
+    """The unit to show a noise of the config in, and what to multiply its SI number by."""
+    return _NOISE.get(name, (si, 1.0))
+
+
+def signed(value: float, decimals: int = 1) -> str:
+    """A number with its sign, 0 without one."""
+    text = f"{value:+.{decimals}f}"
+    return text[1:] if float(text) == 0.0 else text
+
+
+def rounded(value: float, digits: int = 2) -> str:
+    """A number to so many digits, without an exponent where people can do without."""
+    if value == 0.0 or not math.isfinite(value) or not 1e-5 < abs(value) < 1e7:
+        return f"{value:.{digits}g}"
+    decimals = digits - 1 - math.floor(math.log10(abs(value)))
+    return f"{round(value, decimals):.{max(decimals, 0)}f}"
+
+
+# What rounding leaves of a fixed parameter, in any unit people read.
+_NOTHING = 1e-9
+
+
+def to_digits_of(value: float, sigma: float) -> str:
+    """A number with the digits down to the second one of its sigma; six digits where the sigma is zero."""
+    if not (sigma > 0.0 and math.isfinite(sigma)):
+        return f"{value:.6g}" if abs(value) > _NOTHING else "0"
+    decimals = 1 - math.floor(math.log10(sigma))
+    if decimals > 9:
+        return f"{value:.2e}"
+    text = f"{value:.{max(decimals, 0)}f}"
+    return text.removeprefix("-") if float(text) == 0.0 else text

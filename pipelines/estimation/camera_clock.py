@@ -1,0 +1,135 @@
+"""When pictures were taken, by their stamps, and a first guess of it.
+
+Two ordinary clocks drift apart by 1e-4: 60 ms in ten minutes, 0.36 s in an hour, further than motion around a stamp can
+be carried. So a clock is guessed before the graph is made, and keyframes stand where pictures were taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from alidade.factors import so3
+from alidade.factors.preintegration import GyroPath, Increments
+from alidade.pipelines.estimation.problem import Array
+from alidade.pipelines.estimation.robust import fitted
+
+# A clock is guessed first from as much of a recording as takes it to go wrong by so much, s (sigma), far less than a
+# swing takes, then from so many times as much each time.
+_WRONG_AT_FIRST, _THEN, _PASSES = 0.06, 4.0, 3
+# It is taken for another one than the stamps' beyond so many sigmas.
+_TOLD = 5.0
+
+# What misses (n, d) at numbers near some, the last two of which are a clock's offset and skew.
+Miss = Callable[[Array], Array]
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Pictures were taken at stamp + offset - skew * (stamp - begun).
+
+    Attributes:
+        begun: the recording's first stamp, s.
+        offset: s.
+        skew: s/s.
+    """
+
+    begun: float
+    offset: float = 0.0
+    skew: float = 0.0
+
+    def late(self, elapsed: Array) -> Array:
+        """How much later (n,), s, than their stamps pictures were taken, so long after the first, s."""
+        return np.asarray(self.offset - self.skew * elapsed)
+
+    def taken(self, elapsed: Array) -> Array:
+        """When (n,), s, pictures were taken whose stamps are so long after the first, s."""
+        return np.asarray(self.begun + elapsed + self.late(elapsed))
+
+    def elapsed(self, taken: Array) -> Array:
+        """Stamps (n,) of pictures taken at these times, s, since the first."""
+        return np.asarray((taken - self.begun - self.offset) / (1.0 - self.skew))
+
+
+@dataclass(frozen=True)
+class Keyframes:
+    """Where a graph's keyframes stand: where pictures were taken by some clock, the first guess of theirs.
+
+    Attributes:
+        clock: that clock.
+        near: so far off, s, motion around a keyframe still tells what sensors did when its picture was taken.
+    """
+
+    clock: Clock
+    near: float
+
+    def are_far(self, clock: Clock, time: float, covariance: Array | None = None) -> bool:
+        """Whether pictures at the beginning or by some time, s, were taken elsewhere by another clock.
+
+        With a covariance (2, 2) of that clock's offset and skew: whether they certainly were.
+        """
+        elapsed = np.array([0.0, time - self.clock.begun])
+        sigmas = np.zeros(2) if covariance is None else _sigmas_at(elapsed, covariance)
+        return bool((np.abs(clock.late(elapsed) - self.clock.late(elapsed)) > self.near + _TOLD * sigmas).any())
+
+
+def first_span(skew_sigma: float) -> float:
+    """So long, s, no clock goes wrong by much."""
+    return _WRONG_AT_FIRST / skew_sigma
+
+
+def turns_near(gyro: GyroPath, start: Array, stop: Array) -> Callable[[Array, Array], Increments]:
+    """What a gyro turned over windows whose ends (n,), s, are near these: looked up once, then carried on by its rates.
+
+    A stream longer than what is kept of it is integrated anew for every look.
+    """
+    turns = gyro.increments(start, stop)
+    rates = [np.stack([np.interp(t, gyro.t, each) for each in gyro.read.T], axis=1) for t in (start, stop)]
+
+    def near(*ends: Array) -> Increments:
+        moves = zip(rates, ends, (start, stop), strict=True)
+        back, on = (so3.exp(rate * (end - was)[:, None]) for rate, end, was in moves)
+        return replace(turns, wxyz=so3.compose(so3.inverse(back), turns.wxyz, on))
+
+    return near
+
+
+def guess_clock(
+    begun: float,
+    last: float,
+    x: Array,
+    prior: Array,
+    sigma: float,
+    missing: Callable[[float], Callable[[Array], Miss] | None],
+) -> Clock:
+    """The clock with which a recording's pictures are explained best.
+
+    It is that of the stamps unless pictures at one end of the recording were certainly taken at another time.
+
+    Args:
+        begun: the recording's first stamp, s.
+        last: stamp of the last picture since then, s.
+        x: (d,) numbers to begin with, offset and skew the last two.
+        prior: (d,) their inverse sigmas about zero.
+        sigma: of what misses, where nothing is wrong.
+        missing: of the recording's first so many seconds, what misses near some numbers; None: too little is there.
+    """
+    until, covariance = first_span(1.0 / prior[-1]), np.diag(prior**-2.0)
+    while True:
+        near = missing(until)
+        if near is not None:
+            x, covariance = fitted(near, x, prior, sigma, _PASSES)
+        if until >= last:
+            break
+        until *= _THEN
+    clock, ends = Clock(begun, *x[-2:].tolist()), np.array([0.0, last])
+    told = (np.abs(clock.late(ends)) > _TOLD * _sigmas_at(ends, covariance[-2:, -2:])).any()
+    return clock if told else Clock(begun)
+
+
+def _sigmas_at(elapsed: Array, covariance: Array) -> Array:
+    """Sigmas (n,), s, of how late pictures are so long after the first stamp, s, by those of offset and skew (2, 2)."""
+    rows = np.stack([np.ones_like(elapsed), -elapsed], axis=1)
+    return np.asarray(np.sqrt(np.einsum("ni,ij,nj->n", rows, covariance, rows)))

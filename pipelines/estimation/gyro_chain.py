@@ -1,0 +1,286 @@
+"""Attitudes at keyframes, joined by a gyro whose bias walks: what the graphs of several methods are built on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.factors import so3
+from alidade.factors.attitude import ahrs_factors
+from alidade.factors.gyro import GyroIncrementFactor, carried, corrected, platform_errors
+from alidade.factors.preintegration import GyroPath, Increments
+from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Step
+from alidade.pipelines.estimation.walking_bias import WalkingBias
+
+
+@lru_cache(maxsize=1000)
+def state(keyframe: int) -> int:
+    """Variable of the attitude at a keyframe, Rot3; the same number for all factors that hold it, for memory's sake."""
+    return int(gtsam.symbol("x", keyframe))
+
+
+def shared_keyframes(stamps: Array, origin: float, shared: float, longest: float) -> tuple[Array, NDArray[np.intp]]:
+    """Times (K,) of keyframes and, (K + 1,), where the measurements of each begin; some, in gaps, have none.
+
+    Measurements share one as long as they are within the same `shared` s, counted from `origin`; it is the one in their
+    middle. None is farther than `longest`, s, from the next.
+    """
+    group = np.floor((stamps - origin) / shared) if shared > 0.0 else np.arange(len(stamps))
+    begins = np.flatnonzero(np.diff(group, prepend=-1.0))
+    middles = stamps[(begins + np.append(begins[1:], len(stamps)) - 1) // 2]
+    bridges = [
+        np.linspace(a, b, int(np.ceil((b - a) / longest)) + 1)[1:-1] for a, b in pairwise(middles) if b - a > longest
+    ]
+    time = np.concatenate([middles, *bridges])
+    count = np.zeros(len(time), dtype=int)
+    count[: len(middles)] = np.diff(begins, append=len(stamps))
+    order = np.argsort(time, kind="stable")
+    return time[order], np.append(0, np.cumsum(count[order]))
+
+
+def as_slice(of: NDArray[np.intp]) -> NDArray[np.intp] | slice:
+    """Indexes; consecutive ones as a slice, so that what they take of an array is no copy."""
+    return slice(int(of[0]), int(of[-1]) + 1) if len(of) and (np.diff(of) == 1).all() else of
+
+
+@dataclass(frozen=True)
+class Trunk:
+    """What a chain over the end of a recording that grows goes on from.
+
+    Attributes:
+        keyframe: number of its first keyframe in the recording.
+        begun: (n,) s, where the nodes of the bias begin, the last in force there; empty at the start of a recording.
+    """
+
+    keyframe: int
+    begun: Array
+
+
+# Of a chain that begins with a recording that grows.
+ROOT = Trunk(0, np.empty(0))
+
+
+@dataclass(frozen=True)
+class GyroChain:
+    """Attitudes aRm at K keyframes: m the gyro, a a frame that a chain of increments holds on to.
+
+    That frame is inertial, or turns with a platform that has a gyro of its own.
+
+    Attributes:
+        time: (K,) of the keyframes, s.
+        starts: (K,) whether a new chain begins at a keyframe: no increment leads to it.
+        initial: (K, 4) first guess of the attitudes.
+        gyro: integrated with the first guess of the bias taken off.
+        turns: (K - 1,) increments from keyframe to keyframe.
+        variance: (K - 1,) of each, rad^2 per axis.
+        bias: its nodes over the keyframes.
+        nodes: (K,) whole numbers: the node in force up to each keyframe.
+        errors: of the gyro, as alidade.factors.gyro has them; None: perfect.
+        platform, platform_turns: the platform's gyro and its increments; None in an inertial frame.
+        platform_errors: of that gyro, its bias first; None: perfect.
+        first: number of the first keyframe in the recording, where the chain is over its end alone.
+    """
+
+    time: Array
+    starts: NDArray[np.bool_]
+    initial: Array
+    gyro: GyroPath
+    turns: Increments
+    variance: Array
+    bias: WalkingBias
+    nodes: NDArray[np.intp]
+    errors: Parameter | None = None
+    platform: GyroPath | None = None
+    platform_turns: Increments | None = None
+    platform_errors: Parameter | None = None
+    first: int = 0
+
+    @classmethod
+    def over(
+        cls,
+        time: Array,
+        starts: NDArray[np.bool_],
+        initial: Array,
+        gyro: GyroPath,
+        *,
+        density: float,
+        other_density: float = 0.0,
+        walk: float,
+        errors: Parameter | None = None,
+        platform: GyroPath | None = None,
+        platform_errors: Parameter | None = None,
+        trunk: Trunk | None = None,
+    ) -> GyroChain:
+        """A chain over keyframes.
+
+        Args:
+            time, starts, initial, gyro: as above.
+            density: of the gyro's white noise, rad/s/sqrt(Hz).
+            other_density: what else an increment is uncertain by, as of another gyro that it is made relative to.
+            walk: of the bias, rad/s/sqrt(s).
+            errors, platform, platform_errors: as above.
+            trunk: of a recording that grows, where the first keyframe is known already; None: the whole is there.
+        """
+        turns = gyro.increments(time[:-1], time[1:], scale=errors is not None)
+        unseen, platform_turns = turns.unseen, None
+        if platform is not None:
+            platform_turns = platform.increments(time[:-1], time[1:], scale=platform_errors is not None)
+            unseen = unseen + platform_turns.unseen
+        middles = np.where(starts, time, 0.5 * (time + np.roll(time, 1)))
+        begun = None if trunk is None else time[:1]
+        if trunk is not None and len(trunk.begun):
+            begun, middles[0] = trunk.begun, trunk.begun[-1]
+        bias = WalkingBias.over(time[0], time[-1], middles, walk, density, begun)
+        return cls(
+            time=time,
+            starts=starts,
+            initial=initial,
+            gyro=gyro,
+            turns=turns,
+            variance=(density**2 + other_density**2) * turns.duration + unseen,
+            bias=bias,
+            nodes=bias.node_at(middles),
+            errors=errors,
+            platform=platform,
+            platform_turns=platform_turns,
+            platform_errors=platform_errors,
+            first=0 if trunk is None else trunk.keyframe,
+        )
+
+    def trunk(self, time: float) -> Trunk | None:
+        """What a chain over the end of the same recording goes on from at a keyframe; None if none is at the time."""
+        k = int(np.searchsorted(self.time, time))
+        if k == len(self.time) or self.time[k] != time:
+            return None
+        return Trunk(self.first + k, self.bias.edges[: self.nodes[k] + 1])
+
+    def state(self, keyframe: int) -> int:
+        """Variable of the attitude at a keyframe, Rot3."""
+        return state(self.first + keyframe)
+
+    def numbers(self, keyframes: range) -> range:
+        """The numbers of keyframes in the recording."""
+        return range(self.first + keyframes.start, self.first + keyframes.stop)
+
+    def bias_keys(self, keyframes: Sequence[int] | NDArray[np.intp]) -> list[int]:
+        """Variables of the bias in force up to keyframes."""
+        nodes = self.nodes[keyframes].tolist()
+        keys = {n: self.bias.key(n) for n in set(nodes)}
+        return [keys[n] for n in nodes]
+
+    @property
+    def error_keys(self) -> list[int]:
+        """Variables of the gyros' errors: the last blocks of factors that the gyros carry."""
+        return [p.key for p in (self.errors, self.platform_errors) if p is not None]
+
+    def add(self, step: Step, keyframes: range) -> None:
+        """The attitudes at keyframes, the increments that lead there, and the bias nodes that begin with them.
+
+        What determines the attitude at the start of a chain, and the first bias, is the caller's to add.
+        """
+        nodes, means = self._new(keyframes)
+        for node in nodes:
+            self.bias.begin(step, node, self.gyro.bias_hat)
+        for node in means:
+            self.bias.end(step, node, self.gyro.bias_hat)
+        now = int(self.nodes[keyframes[-1]])
+        if self.bias.nodes > 1:
+            last = keyframes.stop == len(self.time)
+            step.current_keys[self.bias.key(0)] = self.bias.mean_key(now) if last else self.bias.key(now)
+            before = max(nodes.start - 1, 0)
+            self.bias.keep(step, range(before, now + 1), range(max(before - 1, 0), means.stop))
+        for k in keyframes:
+            key = self.state(k)
+            step.initial.insert(key, so3.to_gtsam(self.initial[k]))
+            step.timestamps[key] = float(self.time[k])
+        after = np.array([k for k in keyframes if not self.starts[k]], dtype=np.intp)
+        if len(after):
+            step.factors.extend(self._increments(after))
+
+    def _new(self, keyframes: range) -> tuple[range, range]:
+        """The bias nodes that begin with keyframes, and those that end, so that the mean up to there is defined."""
+        first = 0 if keyframes.start == 0 else int(self.nodes[keyframes.start - 1]) + 1
+        now = int(self.nodes[keyframes[-1]])
+        last = keyframes.stop == len(self.time)
+        return range(first, now + 1), range(max(first - 1, 1), now + 1 if last else now)
+
+    def _increments(self, after: NDArray[np.intp]) -> list[Factor]:
+        """Those that lead to keyframes: gtsam's native factors where all that they depend on is the bias."""
+        states = [self.state(k - 1) for k in after], [self.state(k) for k in after]
+        bias, turns, variance = self.bias_keys(after), self.turns[as_slice(after - 1)], self.variance[after - 1]
+        if self.errors is None and self.platform is None:
+            native = ahrs_factors(*states, bias, turns, self.gyro.bias_hat, variance)
+            return [Factor("gyro", f) for f in native]
+        carrying = None if self.platform_turns is None else self.platform_turns[as_slice(after - 1)]
+        model = GyroIncrementFactor(
+            self.time[as_slice(after)], turns, self.gyro, np.sqrt(variance), carrying, self.platform
+        )
+        return [Factor.process_of("gyro", model.on(*states, bias, *self.error_keys))]
+
+    def predict(
+        self, keyframes: range, seen: Callable[[int, gtsam.Values], Array], current: gtsam.Values
+    ) -> gtsam.Values:
+        """What `add` adds, from the current estimate: attitudes carried by the gyro, biases carried over.
+
+        Args:
+            keyframes: the step's, not the first one.
+            seen: attitude (4,) at a keyframe that starts a chain, from the current estimate.
+            current: the estimate.
+        """
+        out = gtsam.Values()
+        nodes, means = self._new(keyframes)
+        bias = current.atVector(self.bias.key(nodes.start - 1))
+        for key in [*map(self.bias.key, nodes), *map(self.bias.mean_key, means)]:
+            out.insert(key, bias)
+        carried_by, turned = self._turned(keyframes, bias, current)
+        attitude = so3.identity()
+        if not self.starts[keyframes.start]:
+            attitude = so3.from_gtsam([current.atRot3(self.state(keyframes.start - 1))])[0]
+        for k, carrier, turn in zip(keyframes, so3.inverse(carried_by), turned, strict=True):
+            attitude = seen(k, current) if self.starts[k] else so3.compose(carrier, attitude, turn)
+            out.insert(self.state(k), so3.to_gtsam(attitude))
+        return out
+
+    def _turned(self, keyframes: range, bias: Array, values: gtsam.Values) -> tuple[Array, Array]:
+        """Increments (n, 4) of the platform and of the gyro that lead to keyframes, at the values."""
+        n, rows = len(keyframes), slice(keyframes.start - 1, keyframes.stop - 1)
+        errors, platform = self._errors(values, n)
+        turned, _ = corrected(self.turns[rows], np.tile(bias - self.gyro.bias_hat, (n, 1)), errors)
+        if self.platform is None or self.platform_turns is None:
+            return so3.identity(n), turned
+        platform_bias, scale = platform_errors(self.platform, platform, n)
+        return corrected(self.platform_turns[rows], platform_bias - self.platform.bias_hat, scale)[0], turned
+
+    def _errors(self, values: gtsam.Values, n: int) -> tuple[Array | None, Array | None]:
+        """Of the gyro and of the platform's, n equal rows; None for perfect ones."""
+        own, platform = (
+            None if p is None else np.broadcast_to(values.atVector(p.key), (n, len(p.quantities)))
+            for p in (self.errors, self.platform_errors)
+        )
+        return own, platform
+
+    def attitudes(self, keyframes: NDArray[np.intp], stamps: Array, at: Array, values: gtsam.Values) -> Array:
+        """Attitudes (n, 4) at times near keyframes, where the values hold those of the keyframes.
+
+        Args:
+            keyframes: (n,) whose attitude is carried to each time.
+            stamps: (n,) s, the times as first thought, between which and the keyframes the errors are evaluated.
+            at: (n,) s, the times.
+            values: an estimate.
+        """
+        n, start = len(at), self.time[keyframes]
+        middle = 0.5 * (start + stamps)
+        errors, platform = self._errors(values, n)
+        bias = np.array([values.atVector(key) for key in self.bias_keys(keyframes)]).reshape(n, 3)
+        attitude = so3.from_gtsam([values.atRot3(self.state(k)) for k in keyframes])
+        attitude = so3.multiply(attitude, carried(self.gyro, start, middle, at, bias, errors)[0])
+        if self.platform is None:
+            return attitude
+        carrier, *_ = carried(self.platform, start, middle, at, *platform_errors(self.platform, platform, n))
+        return so3.multiply(so3.inverse(carrier), attitude)

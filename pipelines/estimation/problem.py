@@ -1,0 +1,426 @@
+"""What a method hands to a solver, and what a solver hands back.
+
+A method writes its graph once, as a `Problem` that yields `Step`s in time order. The batch solver collects all steps
+and solves once; the incremental solver feeds them one by one to a smoother. Both, and the published solver of the
+method, return an `Estimate`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.factors import so3
+from alidade.factors.loss import TruncatedLoss
+from alidade.factors.vectorized import VectorizedFactor
+from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.noise import Level
+
+if TYPE_CHECKING:
+    import gtsam
+
+    from alidade.pipelines.estimation.camera_clock import Keyframes
+
+Array = NDArray[np.float64]
+
+# What a method found beside its parameters: name of a table -> its rows, plain numbers and words in SI.
+Findings = Mapping[str, Sequence[Mapping[str, object]]]
+
+# Reported numbers (n,) of one variable and their Jacobian (n, d) with respect to its tangent.
+Coordinates = Callable[["gtsam.Values", int], tuple[Array, Array]]
+
+
+def vector_coordinates(values: gtsam.Values, key: int) -> tuple[Array, Array]:
+    """A vector variable, reported as it is."""
+    vector = np.asarray(values.atVector(key), dtype=float)
+    return vector, np.eye(len(vector))
+
+
+def rotation_vector_coordinates(values: gtsam.Values, key: int) -> tuple[Array, Array]:
+    """A Rot3 variable, reported as its rotation vector, rad."""
+    phi = so3.log(so3.from_gtsam([values.atRot3(key)])[0])
+    return phi, so3.right_jacobian_inverse(phi)
+
+
+# A recording says what a number is when its sigma is below this share of the prior's.
+_DETERMINED = 0.5
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One calibrated number as the contract lists it.
+
+    Attributes:
+        name: as in result.json.
+        unit: SI.
+        prior_sigma: sigma of its prior; 0 fixes it, None leaves it free.
+        prior_scale: the contract's default prior sigma, the yardstick for a free one.
+        require: the accuracy wanted, sigma; infinite: none is.
+        extra_sigma: known error that the graph does not model, added in square to the reported sigma.
+        prior_mean: of its prior.
+        group: "assumption" for a systematic effect that is a parameter only lest it spoil the others; None for what
+            is calibrated.
+        nuisance: calibrated, but beside the purpose: a value far beyond its prior is a fault, as of an assumption.
+        sheet: of an assumption, the data sheet's figure that its prior comes from, as in the config: "gyro.scale".
+    """
+
+    name: str
+    unit: str
+    prior_sigma: float | None
+    prior_scale: float
+    require: float
+    extra_sigma: float = 0.0
+    prior_mean: float = 0.0
+    group: Literal["assumption"] | None = None
+    nuisance: bool = False
+    sheet: str = ""
+
+    @property
+    def assumed(self) -> bool:
+        """Whether its prior is what it is, not where it is to be looked for."""
+        return self.nuisance or self.group is not None
+
+    @property
+    def judged(self) -> bool:
+        """Whether an accuracy is wanted of it, so that there is a verdict."""
+        return math.isfinite(self.require)
+
+    @property
+    def scale(self) -> float:
+        """Sigma against which this quantity's own is measured."""
+        return self.prior_sigma or self.prior_scale
+
+    def determined(self, sigma: float) -> bool:
+        """Whether a recording that leaves this sigma says what it is, and not the prior."""
+        return self.prior_sigma != 0.0 and sigma < _DETERMINED * self.scale
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A calibration variable of the graph and the numbers it is reported as."""
+
+    key: int
+    quantities: tuple[Quantity, ...]
+    coordinates: Coordinates = vector_coordinates
+
+
+@dataclass(frozen=True)
+class Factor:
+    """A factor of the graph with the family it is accounted under in chi-square.
+
+    Attributes:
+        family: "vision", "gyro", "prior", ...
+        factor: a gtsam factor.
+        measurement: the vectorised factor behind it when it is a measurement that may be an outlier: the incremental
+            solver gates its innovation, reports plot its residuals.
+        process: the vectorised factor behind it when it is none.
+        beside: (n,) what a unit of the noise beside its own adds to the whitened residuals, see Noise.beside.
+    """
+
+    family: str
+    factor: gtsam.NonlinearFactor
+    measurement: VectorizedFactor | None = None
+    process: VectorizedFactor | None = None
+    beside: Array | None = None
+
+    @classmethod
+    def of(cls, family: str, measurement: VectorizedFactor, beside: Array | None = None) -> Factor:
+        """A measurement that may be an outlier."""
+        return cls(family, measurement.factor, measurement, beside=beside)
+
+    @classmethod
+    def process_of(cls, family: str, process: VectorizedFactor, beside: Array | None = None) -> Factor:
+        """What joins variables and is no outlier."""
+        return cls(family, process.factor, process=process, beside=beside)
+
+    @property
+    def vectorized(self) -> VectorizedFactor | None:
+        """The vectorised factor behind it, whichever it is."""
+        return self.measurement or self.process
+
+    def linearized(self, values: gtsam.Values) -> gtsam.GaussianFactor:
+        """About the values."""
+        return self.factor.linearize(values) if self.vectorized is None else self.vectorized.linearized(values)
+
+
+def _no_values() -> gtsam.Values:
+    import gtsam
+
+    return gtsam.Values()
+
+
+@dataclass(frozen=True)
+class Step:
+    """What one moment adds to the graph. A method builds it by adding to its collections, and then leaves it alone.
+
+    Attributes:
+        time: s from the session's start.
+        initial: the new variables, with values taken from the data around them (batch).
+        factors: the new factors. Those that are no measurements must by themselves determine the new variables: the
+            innovation of a measurement is judged against that prediction.
+        predict: the new variables from the current estimate (incremental); None means `initial` serves.
+        timestamps: variable -> time of last use, s. A smoother with a window forgets a variable when its time leaves
+            the window; one that is named in no step is kept for good. Repeat a key to keep it alive.
+        current_keys: parameter key -> variable that from now on holds its value, for parameters that move along.
+        keyframes: index range of the states this step adds, for `Problem.attitudes`.
+    """
+
+    time: float
+    initial: gtsam.Values = field(default_factory=_no_values)
+    factors: list[Factor] = field(default_factory=list)
+    predict: Callable[[gtsam.Values], gtsam.Values] | None = None
+    timestamps: dict[int, float] = field(default_factory=dict)
+    current_keys: dict[int, int] = field(default_factory=dict)
+    keyframes: range = range(0)
+
+
+@dataclass(frozen=True)
+class Attitudes:
+    """A trajectory: times (n,), s from the session's start, and quaternions (n, 4), w x y z."""
+
+    time: Array
+    wxyz: Array
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The graph of one recording.
+
+    Attributes:
+        method: its name.
+        parameters: what is calibrated, in reporting order.
+        steps: yields the graph; its argument is how many measurements a step takes together at least (one when fed to a
+            smoother, many in batch, where fewer and larger factors are faster). Steps of many end where some of one do.
+        loss: shared by all measurements that may be outliers; the batch solver anneals it. None: no outliers expected.
+        attitudes: the trajectory at some keyframes, given values that hold them; None when the method has none.
+        attitude_name: what the trajectory is, e.g. "bRv".
+        advice: what to do about a weak direction, given its weights by parameter name.
+        dropped: measurements left out before solving, reason -> count.
+        premises: what is taken for granted and a reader has to know, sentences.
+        steps_after: the steps of one measurement or more that are later than a time, s, for graphs whose steps stay
+            as they are while the recording grows, but for those of its last second. None: all may change.
+        onward: the graph of a recording that grows, from the data of its end and the time, s, of a keyframe of this
+            graph that is in them and from which on there are steps; -inf: from all data, with all steps. It agrees with
+            this one on variables, and its steps stay as they are, but for the last one and those of the last
+            `unsettled` s. None if there is no such keyframe. Not every graph can be built from the end alone.
+        unsettled: see `onward`, s.
+        noises: that are in force, with what sensors' own samples say of them.
+        constants: numbers of the recording that formulas need beside the parameters, by name.
+        keyframes: where they stand; None: there are no pictures with a clock that is estimated.
+        elsewhere: of a solution, values that explain the measurements as well in another way, near which there may be
+            other minima. None: the method has no such.
+    """
+
+    method: str
+    parameters: tuple[Parameter, ...]
+    steps: Callable[[int], Iterator[Step]]
+    loss: TruncatedLoss | None = None
+    attitudes: Callable[[Sequence[int], gtsam.Values], Attitudes] | None = None
+    attitude_name: str = ""
+    advice: Callable[[Mapping[str, float]], Motion] | None = None
+    dropped: Mapping[str, int] = field(default_factory=dict)
+    premises: tuple[str, ...] = ()
+    steps_after: Callable[[float], Iterator[Step]] | None = None
+    onward: Callable[[Any, float], Problem | None] | None = None
+    unsettled: float = 1.0
+    noises: tuple[Level, ...] = ()
+    constants: Mapping[str, float] = field(default_factory=dict)
+    keyframes: Keyframes | None = None
+    elsewhere: Callable[[gtsam.Values], Iterator[gtsam.Values]] | None = None
+
+    def numbers(self, estimate: Estimate) -> dict[str, float]:
+        """What formulas need, by name: an estimate's values and the constants."""
+        return {**self.constants, **dict(zip(estimate.names, estimate.values.tolist(), strict=True))}
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """All reported numbers, in order."""
+        return tuple(q for p in self.parameters for q in p.quantities)
+
+    @property
+    def assumed(self) -> tuple[int, ...]:
+        """Keys of the variables that hold assumptions alone."""
+        return tuple(p.key for p in self.parameters if all(q.group is not None for q in p.quantities))
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Residuals of one family of measurements.
+
+    Attributes:
+        time: (n,) s.
+        whitened: (n, m), each of unit variance if the noise is as stated.
+        used: (n,) False for measurements rejected as outliers.
+    """
+
+    time: Array
+    whitened: Array
+    used: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ChiSquare:
+    """Sum of squared whitened residuals, its degrees of freedom and, per family, the same two."""
+
+    value: float
+    dof: float
+    families: Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class History:
+    """Estimates over time: times (k,), values and sigmas (k, n) in the order of Estimate.names."""
+
+    time: Array
+    values: Array
+    sigmas: Array
+
+    def inflated(self, by: Array) -> History:
+        """With sigmas larger by factors (n,)."""
+        return replace(self, sigmas=self.sigmas * by)
+
+
+@dataclass(frozen=True)
+class Course:
+    """What was known jointly at some moments, each of them with all that came before, weighed alike at all moments.
+
+    Attributes:
+        time: (k,), s.
+        values: (k, n) in the order of Estimate.names.
+        covariance: (k, n, n) for white noise.
+        steady: (n,) which quantities are the same number at all times; the others walk.
+    """
+
+    time: Array
+    values: Array
+    covariance: Array
+    steady: NDArray[np.bool_]
+
+    @property
+    def history(self) -> History:
+        """With sigmas alone."""
+        return History(self.time, self.values, np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)))
+
+
+@dataclass(frozen=True)
+class Pull:
+    """What a measurement does to the parameter that it moves most.
+
+    Attributes:
+        family: of the measurement.
+        time: s, its own, or that of the last reading in it.
+        parameter: its name.
+        sigmas: how far the measurement takes it, in the parameter's sigmas; left out, it would be back by that, and by
+            more where few others tell of it.
+    """
+
+    family: str
+    time: float
+    parameter: str
+    sigmas: float
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """What a graph says of its reported numbers, linear about the estimate: R (x - at) = d, rows of unit variance.
+
+    Numbers that are fixed are left out.
+
+    Attributes:
+        names: (n,) of the numbers.
+        at: (n,) the estimate.
+        R: (r, n) all that the graph says but for the priors about numbers of the device alone.
+        d: (r,).
+        prior_R: (p, n) these priors.
+        prior_d: (p,).
+        scales: (n,) the usual priors' sigmas, so that angles, rates and seconds can be told beside each other.
+    """
+
+    names: tuple[str, ...]
+    at: Array
+    R: Array
+    d: Array
+    prior_R: Array
+    prior_d: Array
+    scales: Array
+
+    def with_priors_of(self, other: Told) -> Told:
+        """The same with the device's priors as they are in another telling of the same graph."""
+        return replace(self, prior_R=other.prior_R, prior_d=other.prior_d + other.prior_R @ (other.at - self.at))
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """Another solution: reported values (n,), and by how much its chi-square, priors included, is larger."""
+
+    values: Array
+    chi_square: float
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A calibration by one solver; `names`, `values` (n,) and `covariance` (n, n) belong together.
+
+    Attributes:
+        solver: "batch", "incremental" or "published".
+        names: of the quantities this solver knows (a published one may know fewer than the problem has).
+        values: (n,).
+        covariance: (n, n), joint, of the reported numbers, everything else marginalised out. Rows of fixed quantities
+            are zero. Directions without any information have the variance of a very wide prior, never infinity.
+        converged: whether the solver says so; `message` says how or why not.
+        residuals: family -> residuals of measurements at the estimate (innovations for an incremental solver).
+        chi_square: None for solvers that have none.
+        history: values and sigmas from what was recorded until each moment.
+        course: the same at some moments, jointly; None where moments are not weighed alike.
+        smoothed: values and sigmas at each moment from the whole recording, where parameters move along; the others
+            are as they are at the end.
+        attitudes: the trajectory, if the method has one.
+        budget: quantity -> source -> its share of the quantity's variance, the largest first; None: not asked for.
+        moved: input of the graph -> quantity -> by how much it moves when that input is changed; None: not asked for.
+        strongest: the measurements that move parameters most, the strongest first; None: not asked for.
+        rejected: family -> number of measurements rejected as outliers.
+        levels: of the noises; none: all are as stated.
+        colours: family -> how many of its measurements in a row count as one, of those whose residuals are correlated.
+        inflation: (n,) by what the sigmas are larger because residuals are correlated in time; None: by nothing.
+        told: what the graph says without the device's priors; None: not asked for.
+        second: the second best solution of several, if it is nearly as likely; None: there is none, or not looked for.
+        seconds: phase -> wall time.
+    """
+
+    solver: str
+    names: tuple[str, ...]
+    values: Array
+    covariance: Array
+    converged: bool
+    message: str
+    residuals: Mapping[str, Residuals] = field(default_factory=dict)
+    chi_square: ChiSquare | None = None
+    history: History | None = None
+    course: Course | None = None
+    smoothed: History | None = None
+    attitudes: Attitudes | None = None
+    budget: Mapping[str, Mapping[str, float]] | None = None
+    moved: Mapping[str, Mapping[str, float]] | None = None
+    strongest: tuple[Pull, ...] | None = None
+    rejected: Mapping[str, int] = field(default_factory=dict)
+    levels: tuple[Level, ...] = ()
+    colours: Mapping[str, float] = field(default_factory=dict)
+    inflation: Array | None = None
+    told: Told | None = None
+    second: Minimum | None = None
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def sigmas(self) -> Array:
+        """(n,) standard deviations."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def inflations(self) -> Array:
+        """(n,) `inflation`, ones where it is None."""
+        return np.ones(len(self.values)) if self.inflation is None else self.inflation

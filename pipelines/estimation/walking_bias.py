@@ -1,0 +1,134 @@
+"""A gyro bias that walks, with its mean over the session as the reported parameter.
+
+The bias is constant over stretches, one node each, joined by the random walk. A second chain carries the mean of the
+bias up to the end of each stretch, so that batch and smoothers with a window report the same session mean without
+holding every node.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.pipelines.estimation.linear import linear_factor
+from alidade.pipelines.estimation.problem import Array, Factor, Step
+
+# A stretch may bend the angle by this fraction of what gyro noise does over it ...
+_FRACTION = 0.2
+# ... and is never longer than this, s, so that the bias over time can be seen.
+_LONGEST = 10.0
+# The last stretch is at least this share of the others, and as much longer at most.
+_SHORTEST = 0.1
+# What follows without error, a bias that does not walk and the mean of the nodes, is given these shares of what gyro
+# noise leaves unknown of a stretch's bias, which keeps the arithmetic well conditioned.
+_SLACK = 1e-4
+_MEAN_SLACK = 1e-2
+
+# The first stretch's node, which is the whole bias where it does not walk.
+FIRST = int(gtsam.symbol("b", 0))
+
+
+@dataclass(frozen=True)
+class WalkingBias:
+    """Nodes of a bias over [0, duration].
+
+    Attributes:
+        edges: (J + 1,) s, ends of the stretches.
+        walk: rad/s/sqrt(s).
+        density: of the gyro's white noise, rad/s/sqrt(Hz).
+        stop: s, where the last stretch really ends.
+    """
+
+    edges: Array
+    walk: float
+    density: float
+    stop: float
+
+    @classmethod
+    def over(
+        cls, start: float, stop: float, middles: Array, walk: float, density: float, begun: Array | None = None
+    ) -> WalkingBias:
+        """Stretches short enough for the walk (rad/s/sqrt(s)) to stay below gyro noise (rad/s/sqrt(Hz)).
+
+        All are of one length, so that those behind stay as they are while a recording grows; but one that holds none
+        of the times at which the bias is asked for is part of the stretch before it.
+
+        Args:
+            start, stop: s.
+            middles: (n,) s, the times at which `node_at` will be asked, increasing; every node is in force at one.
+            walk, density: as above.
+            begun: (n,) s, where the nodes before begin in a recording that still grows, the one in force at `start`
+                the last: the others follow, and the last of all is as short as it may be, lest it change.
+        """
+        known = np.array([start]) if begun is None else begun
+        if walk <= 0.0:
+            return cls(np.array([known[0], stop]), 0.0, density, stop)
+        length = max(min(_LONGEST, _FRACTION * np.sqrt(3.0) * density / walk), 1e-3)
+        count = max(1, int(np.ceil((stop - known[-1]) / length - (_SHORTEST if begun is None else 0.0))))
+        edges = known[-1] + length * np.arange(count + 1)
+        asked = np.unique(np.searchsorted(edges[1:-1], middles, side="right"))
+        new = asked[1:] if begun is None else asked[asked > 0]
+        return cls(np.concatenate([known, edges[new], edges[count:]]), walk, density, stop)
+
+    @property
+    def nodes(self) -> int:
+        """Number of nodes."""
+        return len(self.edges) - 1
+
+    def node_at(self, time: Array) -> NDArray[np.intp]:
+        """Index of the node in force at the times."""
+        return np.clip(np.searchsorted(self.edges, time, side="right") - 1, 0, self.nodes - 1)
+
+    def key(self, node: int) -> int:
+        """Variable of a node, (3,) rad/s."""
+        return int(gtsam.symbol("b", node))
+
+    def mean_key(self, node: int) -> int:
+        """Variable of the mean up to the end of a node's stretch; the first stretch's mean is its node."""
+        return self.key(0) if node == 0 else int(gtsam.symbol("m", node))
+
+    def begin(self, step: Step, node: int, guess: Array) -> None:
+        """Add a node to a step; `guess` is (3,) rad/s. What determines the first is the caller's to add."""
+        step.initial.insert(self.key(node), guess)
+        if node > 0:
+            step.factors.append(self._walk_factor(node))
+
+    def end(self, step: Step, node: int, guess: Array) -> None:
+        """Add the mean up to the end of a node's stretch to a step; the first stretch's mean is its node."""
+        if node > 0:
+            step.initial.insert(self.mean_key(node), guess)
+            step.factors.append(self._mean_factor(node))
+
+    def keep(self, step: Step, nodes: range, means: range) -> None:
+        """Keep nodes, and means up to the end of stretches, alive until the step; a bias of one node never ages."""
+        if self.nodes > 1:
+            keys = [*map(self.key, nodes), *map(self.mean_key, means)]
+            step.timestamps.update(dict.fromkeys(keys, step.time))
+
+    def _walk_factor(self, node: int) -> Factor:
+        """Joins a node to the one before it."""
+        spacing = 0.5 * (self.edges[node + 1] - self.edges[node - 1])
+        step = self.walk * np.sqrt(spacing)
+        noise = gtsam.noiseModel.Isotropic.Sigma(3, float(np.hypot(step, _SLACK * self._unknown(spacing))))
+        return Factor("bias walk", gtsam.BetweenFactorVector(self.key(node - 1), self.key(node), np.zeros(3), noise))
+
+    def _unknown(self, stretch: float) -> float:
+        """Sigma that gyro noise leaves to the bias of a stretch (s), rad/s."""
+        return self.density / float(np.sqrt(stretch))
+
+    def _mean_factor(self, node: int) -> Factor:
+        """Defines the mean at the end of a node's stretch from the one before and the node (native, linear)."""
+        end = self.stop if node == self.nodes - 1 else self.edges[node + 1]
+        whole, stretch = end - self.edges[0], end - self.edges[node]
+        share = float(stretch / whole)
+        # Within the stretch the walk's own mean departs from the node's constant by this much.
+        departure = self.walk * np.sqrt(stretch / 12.0) * share
+        sigma = float(np.hypot(departure, _MEAN_SLACK * self._unknown(stretch) * share))
+        blocks = {self.mean_key(node): 1.0, self.mean_key(node - 1): share - 1.0, self.key(node): -share}
+        factor = linear_factor(
+            {key: scale * np.eye(3) for key, scale in blocks.items()}, dict.fromkeys(blocks, np.zeros(3)), sigma
+        )
+        return Factor("definition", factor)

@@ -1,0 +1,291 @@
+"""The toolkit from Python: what `import alidade` gives."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import alidade
+from alidade.pipelines.applications.session import calibrate
+from alidade.pipelines.methods import names
+from alidade.pipelines.methods import simulate as write
+from alidade.pipelines.recording.shapes import rows_by_name
+from tests.support.forms import split
+
+HEAD = {"duration_s": 12.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 20.0}
+
+
+@pytest.fixture(scope="module")
+def simulated() -> alidade.Simulated:
+    return alidade.simulate("head", HEAD, seed=3)
+
+
+@pytest.fixture(scope="module")
+def calibration(simulated: alidade.Simulated) -> alidade.Calibration:
+    return alidade.open(simulated).calibrate()
+
+
+def test_every_name_is_there_and_nothing_heavy_is_imported_before_it_is_used() -> None:
+    assert all(getattr(alidade, name) is not None for name in alidade.__all__)
+    assert set(alidade.__all__) <= set(dir(alidade))
+    with pytest.raises(AttributeError, match="no attribute 'calibrat'"):
+        alidade.calibrat  # noqa: B018
+    heavy = (
+        "import sys, alidade; print([m for m in ('numpy', 'gtsam', 'cv2', 'pydantic', 'typer') if m in sys.modules])"
+    )
+    run = subprocess.run([sys.executable, "-c", heavy], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "[]"
+
+
+def test_python_dash_m_is_the_command() -> None:
+    run = subprocess.run([sys.executable, "-m", "alidade", "--version"], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == alidade.__version__
+
+
+def test_typing_is_announced() -> None:
+    """`Typing :: Typed` once stood in the classifiers without py.typed."""
+    from alidade import factors, pipelines
+
+    for package in (alidade, factors, pipelines):
+        assert (Path(str(package.__file__)).parent / "py.typed").is_file()
+
+
+def test_a_file_its_data_and_its_arrays_give_the_same_calibration(
+    simulated: alidade.Simulated, calibration: alidade.Calibration, tmp_path: Path
+) -> None:
+    from alidade.pipelines.methods import method
+
+    method("head").write(tmp_path / "s.mcap", simulated)
+    data = simulated.data
+    config = alidade.open(simulated).config
+    arrays = {
+        name: getattr(data, name)
+        for name in ("head_t", "head_gyro", "vision_t", "vision_wxyz", "vision_cov", "gyro_density", "head_force")
+    }
+    for session in (
+        alidade.open(tmp_path / "s.mcap"),
+        alidade.open(data, method="head", config=config),
+        alidade.open(arrays, method="head", config=config),
+    ):
+        again = session.calibrate()
+        assert list(again.parameters) == list(calibration.parameters)
+        np.testing.assert_allclose(again.estimate.values, calibration.estimate.values, atol=1e-7)
+        np.testing.assert_allclose(again.covariance, calibration.covariance, rtol=1e-4, atol=1e-12)
+
+
+def test_a_calibration_shows_itself_and_writes_itself(calibration: alidade.Calibration, tmp_path: Path) -> None:
+    assert repr(calibration) == "<Calibration head, batch, of arrays: calibrated>"
+    assert "time_offset" in str(calibration)
+    assert "calibrated." in str(calibration)
+    assert "<td>time_offset</td>" in calibration._repr_html_()
+    assert calibration.status == "calibrated"
+    assert calibration.headline.startswith("All")
+    assert calibration.covariance.shape == 2 * (len(calibration.parameters),)
+    assert calibration.history is not None
+    assert set(calibration.residuals) == {"vision"}
+    assert {path.name for path in calibration.write(tmp_path / "out")} >= {"result.json", "report.html"}
+
+
+def test_a_config_overrides_the_recordings_own_key_by_key(simulated: alidade.Simulated) -> None:
+    config = alidade.Config(priors={"time_offset": 0.0})
+    session = alidade.open(simulated, config=config)
+    assert session.config.priors["time_offset"] == 0.0
+    assert session.config.noise.gyro_density is not None
+
+
+def test_scenarios_come_by_name_keys_file_or_model(tmp_path: Path) -> None:
+    (tmp_path / "s.yaml").write_text("{duration_s: 3.0}")
+    by_file = alidade.simulate("head", tmp_path / "s.yaml", seed=1).data
+    by_keys = alidade.simulate("head", {"duration_s": 3.0}, seed=1).data
+    np.testing.assert_array_equal(by_file.head_gyro, by_keys.head_gyro)
+    assert len(alidade.simulate("head", "head_nominal").data.head_t) > len(by_keys.head_t)
+    with pytest.raises(alidade.InputError, match="scenario: unknown key duration; the nearest known key is duration_s"):
+        alidade.simulate("head", {"duration": 3.0})
+
+
+def test_a_plan_needs_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It once wrote a recording to a temporary folder and read it again."""
+    import tempfile
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("a file was asked for")
+
+    monkeypatch.setattr(tempfile, "TemporaryDirectory", refuse)
+    rates = "gyro_rate_hz: 100, image_rate_hz: 10, gimbal_rate_hz: 100"
+    (tmp_path / "s.yaml").write_text(f"{{duration_s: 12, {rates}, sensors: ideal}}")
+    plan = alidade.plan("los", tmp_path / "s.yaml")
+    assert plan.now.assessment.status == "calibrated"
+    blurred = alidade.Config.model_validate({"noise": {"los_error": 2e-2}})
+    assert alidade.plan("los", tmp_path / "s.yaml", config=blurred).now.assessment.status != "calibrated"
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"head_t": [0.0, 1.0]}, "arrays: head needs head_gyro"),
+        ({"head_tt": [0.0]}, "arrays: head has no head_tt; it has epoch_ns, head_t"),
+        (
+            {"head_t": [0.0, 0.0], "head_gyro": np.zeros((2, 3)), "vision_t": [0.0], "vision_wxyz": np.ones((1, 4))},
+            "arrays: head_t has to be one row of stamps in s, each later than the one before",
+        ),
+        (
+            {"head_t": [0.0, 1.0], "head_gyro": np.zeros((3, 3)), "vision_t": [0.0], "vision_wxyz": np.ones((1, 4))},
+            "arrays: head_gyro has 3 rows for the 2 stamps of head_t",
+        ),
+    ],
+)
+def test_arrays_that_cannot_be_used_are_refused_in_one_line(given: dict[str, object], message: str) -> None:
+    with pytest.raises(alidade.InputError, match=message):
+        alidade.open(given, method="head")
+
+
+# Short recordings of the methods.
+BRIEF: dict[str, dict[str, object]] = {
+    "los": {"duration_s": 3.0, "gyro_rate_hz": 50.0, "gimbal_rate_hz": 50.0, "image_rate_hz": 5.0},
+    "indexer": {"gyro_rate_hz": 5.0, "encoder_rate_hz": 5.0},
+    "head": {"duration_s": 3.0, "gyro_rate_hz": 50.0, "vision_rate_hz": 10.0},
+    "cube": {"poses": 3, "static_s": 1.0, "imu_rate_hz": 50.0},
+    "tumble": {},
+}
+
+
+@pytest.mark.parametrize("name", names())
+def test_every_methods_arrays_are_opened_by_name(name: str) -> None:
+    """Those of a cube were not: what its class was annotated with was there for type checkers alone."""
+    data = alidade.simulate(name, BRIEF.get(name)).data
+    given = {field.name: getattr(data, field.name) for field in fields(data)}
+    opened = alidade.open(given, method=name).data
+    for field in fields(data):
+        np.testing.assert_equal(getattr(opened, field.name), given[field.name])
+    arrays = rows_by_name(type(data))
+    assert {field.name for field in fields(data) if isinstance(given[field.name], np.ndarray)} <= arrays.keys()
+    assert all(rows.shape is not None for rows in arrays.values())
+
+
+def _spoilt(values: Any, *at: int) -> Any:
+    values = values.copy()
+    values[at] = np.nan
+    return values
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil", "message"),
+    [
+        ("head_gyro", lambda w: _spoilt(w, 3, 1), "head_gyro is not finite at 0.030000 s; leave out such rows"),
+        (
+            "head_gyro",
+            lambda w: np.ma.masked_less(w, 9.0),
+            r"head_gyro is not finite at 0.000000 s \(and 1199 more\)",
+        ),
+        ("head_gyro", lambda w: w[:, :2], r"head_gyro has the shape \(1200, 2\); \(N, 3\) is needed"),
+        ("head_gyro", lambda _: 1.0, r"head_gyro has the shape \(\); \(N, 3\) is needed"),
+        ("head_gyro", lambda _: [[1.0, 2.0, 3.0], [1.0]], "head_gyro is no array: its rows differ in length"),
+        ("head_gyro", lambda w: w.astype(str), "head_gyro has to be numbers, not str"),
+        ("head_gyro", lambda w: w.astype(object), "head_gyro has to be numbers, not object"),
+        ("head_gyro", lambda w: w[:0], "head_gyro has no rows; what was not recorded is left out"),
+        ("head_gyro", lambda _: None, "head needs head_gyro"),
+        ("head_t", lambda t: (1e9 * t).astype("datetime64[ns]"), "head_t has to be numbers, not datetime64"),
+        ("head_t", lambda t: 1e9 * t, r"head_t spans 1.2e\+10 s; times have to be in s, not in us or ns"),
+        ("vision_wxyz", lambda q: q[:, 1:], r"vision_wxyz has the shape \(\d+, 3\); \(N, 4\) is needed"),
+        ("platform_gyro", lambda _: np.zeros((1200, 3)), "platform_gyro needs its stamps, platform_t"),
+    ],
+)
+def test_an_array_that_is_not_what_it_has_to_be_is_named(
+    simulated: alidade.Simulated, name: str, spoil: Callable[[Any], object], message: str
+) -> None:
+    given = {field: getattr(simulated.data, field) for field in ("head_t", "head_gyro", "vision_t", "vision_wxyz")}
+    with pytest.raises(alidade.InputError, match=f"^arrays: {message}"):
+        alidade.open(given | {name: spoil(given.get(name))}, method="head")
+    with pytest.raises(alidade.InputError, match=f"^arrays: {message}"):
+        alidade.open(replace(simulated.data, **{name: spoil(given.get(name))}), method="head")
+
+
+def test_lists_integers_and_masked_arrays_become_floats(simulated: alidade.Simulated) -> None:
+    data = simulated.data
+    given = {
+        "head_t": range(len(data.head_t)),
+        "head_gyro": data.head_gyro.tolist(),
+        "vision_t": np.ma.masked_array(data.vision_t),
+        "vision_wxyz": data.vision_wxyz.astype(np.float32),
+    }
+    opened = alidade.open(given, method="head").data
+    assert {type(getattr(opened, name)) for name in given} == {np.ndarray}
+    assert {getattr(opened, name).dtype for name in given} == {np.dtype(float)}
+    np.testing.assert_array_equal(opened.head_gyro, data.head_gyro)
+
+
+def test_a_roll_may_be_missing_and_nothing_else_of_an_los_error() -> None:
+    data = alidade.simulate("los", BRIEF["los"]).data
+    covariance = np.broadcast_to(np.eye(3), (len(data.error), 3, 3)).copy()
+    covariance[:, 2] = covariance[:, :, 2] = np.nan
+    whole = replace(data, error=_spoilt(data.error, 2, 2), error_cov=covariance)
+    assert np.isnan(alidade.open(whole, method="los").data.error[2, 2])
+    at = f"{data.image_t[4]:.6f}"
+    with pytest.raises(alidade.InputError, match=f"arrays: error is not finite at {at} s"):
+        alidade.open(replace(whole, error=_spoilt(whole.error, 4, 0)), method="los")
+    with pytest.raises(alidade.InputError, match=f"arrays: error_cov is not finite at {at} s"):
+        alidade.open(replace(whole, error_cov=_spoilt(covariance, 4, 0, 1)), method="los")
+
+
+@pytest.mark.parametrize("window", [-1, 0.0, float("nan"), float("inf"), "50kf"])
+def test_a_window_that_is_none_is_refused(simulated: alidade.Simulated, window: Any, tmp_path: Path) -> None:
+    """-1 once gave a calibration, and a text a TypeError after all of the graph had been prepared."""
+    with pytest.raises(alidade.InputError, match=f"^window: {window!r}; seconds above zero are needed, or None for"):
+        alidade.open(simulated).calibrate("incremental", window=window)
+    with pytest.raises(alidade.InputError, match=f"^window: {window!r}; seconds"):
+        alidade.follow(tmp_path / "none.mcap", window=window, patience=0.0)
+
+
+def test_keys_are_no_config_and_a_seed_is_no_negative_number(simulated: alidade.Simulated) -> None:
+    config: Any = {"noise": {"gyro_density": 1e-4}}
+    with pytest.raises(alidade.InputError, match=r"^config: a file or an alidade.Config is needed, not dict; alidade"):
+        alidade.open(simulated, config=config)
+    nothing: Any = 3
+    with pytest.raises(alidade.InputError, match="takes a recording, simulated data or arrays by name, not int"):
+        alidade.open(nothing, method="head")
+    for seed in (-1, 0.5):
+        unusable: Any = seed
+        with pytest.raises(alidade.InputError, match=f"^seed: {seed} is no whole number from zero on"):
+            alidade.simulate("head", HEAD, seed=unusable)
+
+
+def test_arrays_do_not_say_their_method(simulated: alidade.Simulated) -> None:
+    with pytest.raises(
+        alidade.InputError, match=r"arrays do not say which method they are for: open\(..., method=...\)"
+    ):
+        alidade.open(simulated.data)
+    with pytest.raises(alidade.InputError, match="arrays: los takes LosData, not HeadData"):
+        alidade.open(simulated.data, method="los")
+
+
+def test_a_list_is_the_files_of_one_recording(tmp_path: Path) -> None:
+    (tmp_path / "s.yaml").write_text("{duration_s: 5, gyro_rate_hz: 100}")
+    write("head", str(tmp_path / "s.yaml"), 1, tmp_path / "s.mcap")
+    bag = split(tmp_path / "s.mcap", tmp_path / "bag")
+    parts = sorted(bag.glob("*.mcap"))
+    whole, listed, two = (alidade.open(source).data for source in (bag, [*map(str, parts)], parts[:2]))
+    np.testing.assert_array_equal(listed.head_gyro, whole.head_gyro)
+    assert 0 < len(two.head_t) < len(whole.head_t)
+    with pytest.raises(alidade.InputError, match="takes the files of one recording"):
+        alidade.open([whole])
+    with pytest.raises(alidade.InputError, match="a recording of no files"):
+        alidade.open([])
+
+
+def test_a_misspelt_solver_is_refused_and_a_text_is_no_list(tmp_path: Path) -> None:
+    """`calibrate(path, ["bacth"])` once ran batch, and `calibrate(path, "batch")` solved five times."""
+    (tmp_path / "s.yaml").write_text("{duration_s: 5, gyro_rate_hz: 100}")
+    write("head", str(tmp_path / "s.yaml"), 1, tmp_path / "s.mcap")
+    with pytest.raises(alidade.InputError, match="no solver 'bacth'; there are batch, incremental, published"):
+        calibrate(tmp_path / "s.mcap", ["bacth"])
+    with pytest.raises(alidade.InputError, match="a list of names is needed, not the text 'batch'"):
+        calibrate(tmp_path / "s.mcap", "batch")
+    with pytest.raises(alidade.InputError, match="no solver 'bacth'"):
+        alidade.calibrate(tmp_path / "s.mcap", "bacth")

@@ -1,0 +1,202 @@
+"""Topics found by what they measured: which gyro with which attitude, delays, inverses; what a command makes of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from alidade.pipelines.applications.discovery import suggestions, unused, with_suggested
+from alidade.pipelines.applications.session import Session
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.methods import simulate
+from alidade.pipelines.methods.head.recording import read_head
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.pairing import pair
+from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.recording.sources import inverted
+from alidade.pipelines.recording.writing import write_session
+from tests.support import forms
+from tests.support.command import Command
+
+NONE = load_config(None)
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("discovery") / "head.mcap"
+    simulate("head", "head_mounts", 3, path)
+    return path
+
+
+def renamed(source: Path, path: Path, invert: bool = False, late_ns: int = 0) -> Recording:
+    """The recording under a tracker's and drivers' names, without config."""
+    whole = open_recording(source)
+    poses = whole.poses("/vision/attitude")
+    late = series.PoseSeries(poses.t_ns + late_ns, poses.wxyz, poses.position, poses.cov)
+    write_session(
+        path,
+        {
+            "/xsens/data": whole.imu("/head/imu"),
+            "/tracker/pose": inverted(late) if invert else late,
+            "/vehicle/imu": whole.imu("/platform/imu"),
+        },
+    )
+    return open_recording(path)
+
+
+@pytest.mark.parametrize("invert", [False, True])
+def test_the_gyro_that_turns_with_an_attitude_is_found(invert: bool, simulated: Path, tmp_path: Path) -> None:
+    recording = renamed(simulated, tmp_path / "s.mcap", invert, 40_000_000)
+    poses = recording.poses("/tracker/pose")
+    names = ("/xsens/data", "/vehicle/imu")
+    gyros = [(imu.t_ns, imu.gyro) for imu in map(recording.imu, names)]
+    ours, other = (pair(*gyro, poses.t_ns, poses.wxyz, [carrier]) for gyro, carrier in (gyros, gyros[::-1]))
+    assert ours is not None
+    assert ours.correlation > 0.85
+    assert ours.inverted == invert
+    assert other is None or other.correlation < 0.5
+    # The scenario's camera is stamped 12 ms late.
+    assert ours.offset_s == pytest.approx(-0.04 + 0.012, abs=0.001)
+    alone = pair(*gyros[0], poses.t_ns, poses.wxyz)
+    assert alone is not None
+    # What the platform turns meanwhile passes for a delay where nothing tells it.
+    assert alone.offset_s == pytest.approx(ours.offset_s, abs=0.006)
+
+
+def test_nothing_is_said_of_sensors_at_rest() -> None:
+    rng = np.random.default_rng(1)
+    t_ns = 10_000_000 * np.arange(3000)
+    wxyz = np.tile([1.0, 0.0, 0.0, 0.0], (3000, 1))
+    assert pair(t_ns, 1e-3 * rng.normal(size=(3000, 3)), t_ns, wxyz) is None
+    assert pair(t_ns[:5], np.ones((5, 3)), t_ns, wxyz) is None
+    assert pair(t_ns[:0], np.ones((0, 3)), t_ns, wxyz) is None
+
+
+def test_what_is_suggested_reads_as_the_recording_did_under_its_own_names(simulated: Path, tmp_path: Path) -> None:
+    recording = renamed(simulated, tmp_path / "s.mcap", invert=True)
+    (head,) = (found for found in suggestions(recording, NONE) if found.method == "head")
+    assert head.missing == ()
+    assert head.yaml.split("\n") == [
+        "topics:",
+        "  head_imu: /xsens/data",
+        "  vision_attitude: {topic: /tracker/pose, invert: true}",
+        "  platform_imu: /vehicle/imu",
+    ]
+    assert "as the inverse of the attitude meant" in head.reasons[0]
+    assert unused(recording, NONE) == ("/tracker/pose", "/vehicle/imu", "/xsens/data")
+    assert load_config(head.yaml.encode()).topics == head.topics
+    config = with_suggested(recording, NONE)
+    assert config.method == "head"
+    assert recording.notes[0].startswith("topics taken as suggested for head: /tracker/pose turns with /xsens/data")
+    data, expected = read_head(recording, config), read_head(open_recording(simulated), NONE)
+    np.testing.assert_array_equal(data.head_gyro, expected.head_gyro)
+    np.testing.assert_allclose(data.vision_wxyz, expected.vision_wxyz, atol=1e-15)
+    assert unused(recording, config) == ()
+
+
+def test_the_pair_of_frames_that_turns_with_a_gyro_is_found(simulated: Path, tmp_path: Path) -> None:
+    """Among others: one at rest, one of something else that turns, told of child before parent."""
+    whole = open_recording(simulated)
+    poses = whole.poses("/vision/attitude")
+    back = inverted(poses)
+    noise = np.random.default_rng(1).normal(size=(len(poses), 4))
+    other = noise / np.linalg.norm(noise, axis=1, keepdims=True)
+    still = np.tile([1.0, 0.0, 0.0, 0.0], (len(poses), 1))
+    frames = [("map", "base", still), ("map", "drone", other), ("helmet", "camera", back.wxyz)]
+    types = forms.ROS2.types
+
+    def transform(t_ns: int, parent: str, child: str, w: float, x: float, y: float, z: float) -> Any:
+        nowhere = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
+        turn = types["geometry_msgs/msg/Transform"](nowhere, types["geometry_msgs/msg/Quaternion"](x, y, z, w))
+        return types["geometry_msgs/msg/TransformStamped"](forms.header(t_ns, parent), child, turn)
+
+    tf = [
+        (t, types["tf2_msgs/msg/TFMessage"]([transform(t, a, b, *wxyz[i].tolist()) for a, b, wxyz in frames]))
+        for i, t in enumerate(poses.t_ns[:400].tolist())
+    ]
+    imu = [
+        (t, forms.ROS2.deserialize_cdr(data, kind))
+        for topic, kind, t, data in forms.raw_messages(simulated)
+        if topic == "/head/imu" and t < poses.t_ns[400]
+    ]
+    path = forms.ros2_recording(tmp_path / "tf.mcap", {"/tf": tf, "/xsens": imu})
+    (head,) = (found for found in suggestions(open_recording(path), NONE) if found.method == "head")
+    assert head.missing == ()
+    assert head.yaml.split("\n") == [
+        "topics:",
+        "  head_imu: /xsens",
+        "  vision_attitude: {topic: /tf, frames: [helmet, camera], invert: true}",
+    ]
+    assert "/tf (helmet to camera) turns with /xsens" in head.reasons[0]
+    config = load_config(head.yaml.encode())
+    recording = open_recording(path)
+    recording.use(config.topics.values(), config.columns)
+    data, expected = read_head(recording, config), read_head(open_recording(simulated), NONE)
+    np.testing.assert_allclose(data.vision_wxyz, expected.vision_wxyz[: len(data.vision_wxyz)], atol=1e-12)
+
+
+def test_a_sensor_that_is_there_but_not_used_is_told(simulated: Path, tmp_path: Path) -> None:
+    """A second gyro beside the head's, which the platform's could be."""
+    whole = open_recording(simulated)
+    topics = {"/head/imu": whole.imu("/head/imu"), "/vision/attitude": whole.poses("/vision/attitude")}
+    write_session(tmp_path / "s.mcap", {**topics, "/vehicle/imu": whole.imu("/platform/imu")})
+    session = Session.read(open_recording(tmp_path / "s.mcap"), "head", None)
+    told = "/vehicle/imu (Imu): not used; is it the platform_imu? `topics: {platform_imu: /vehicle/imu}`"
+    assert session.facts.notes == (told,)
+    config = load_config(b"topics: {platform_imu: /vehicle/imu}")
+    assert Session.read(open_recording(tmp_path / "s.mcap"), "head", config).facts.notes == ()
+    write_session(tmp_path / "t.mcap", topics)
+    assert Session.read(open_recording(tmp_path / "t.mcap"), "head", None).facts.notes == ()
+
+
+def test_a_topic_without_messages_counts_as_not_recorded(simulated: Path, tmp_path: Path) -> None:
+    """A recorder makes a channel of every topic that somebody might send to. A platform's gyro has to be there."""
+    whole = open_recording(simulated)
+    imus = {name: whole.imu(name) for name in ("/head/imu", "/platform/imu")}
+    none = series.QuaternionSeries(np.empty(0, np.int64), np.empty((0, 4)))
+    there = {**imus, "/vision/attitude": whole.poses("/vision/attitude"), "/truth/attitude": none}
+    write_session(tmp_path / "s.mcap", there)
+    recording = open_recording(tmp_path / "s.mcap")
+    assert "/truth/attitude" in recording.topics
+    assert Session.read(recording, "head", None).data.truth_t is None
+    assert "topic /truth/attitude has no messages: it counts as not recorded" in recording.notes
+    of_none = series.ImuSeries(none.t_ns, *np.empty((2, 0, 3)))
+    write_session(tmp_path / "s.mcap", {**there, "/platform/imu": of_none})
+    with pytest.raises(InputError, match="topic /platform/imu has no messages"):
+        Session.read(open_recording(tmp_path / "s.mcap"), "head", None)
+
+
+def test_a_recording_that_is_served_is_left_alone(simulated: Path) -> None:
+    recording = open_recording(simulated)
+    assert with_suggested(recording, NONE) == NONE
+    assert "head" not in {found.method for found in suggestions(recording, NONE)}
+
+
+def test_the_commands_suggest_and_say_what_is_nearest(simulated: Path, tmp_path: Path, alidade: Command) -> None:
+    path = tmp_path / "s.mcap"
+    renamed(simulated, path)
+    shown = alidade("info", path, "--quiet").out
+    assert shown.index("head: with these topics") < shown.index("head_imu: /xsens/data") < shown.index("los: no")
+    assert "used by no method: /tracker/pose, /vehicle/imu, /xsens/data" in shown
+    told = json.loads(alidade("info", path, "--json").out)
+    assert told["schema"] == "alidade.info/1"
+    assert told["methods"]["head"]["suggested"]["platform_imu"] == "/vehicle/imu"
+    assert told["methods"]["head"]["still_missing"] == []
+    assert not told["methods"]["los"]["served"]
+    for method in ([], ["--method", "head"]):
+        refused = alidade("calibrate", path, *method)
+        assert refused.code == 2
+        assert "nearest is for head: /tracker/pose turns with /xsens/data" in refused.err
+        assert "`topics: {head_imu: /xsens/data, vision_attitude: /tracker/pose" in refused.err
+
+
+def test_a_recording_without_anything_is_one_line(tmp_path: Path) -> None:
+    write_session(tmp_path / "s.mcap", {"/v": series.VectorSeries(np.arange(5), np.zeros((5, 3)))})
+    named = r"/v \(Vector3Stamped, 5 messages\) can serve as head_imu.*still lacking: /vision"
+    with pytest.raises(InputError, match=named):
+        with_suggested(open_recording(tmp_path / "s.mcap"), NONE)

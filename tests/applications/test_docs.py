@@ -1,0 +1,154 @@
+"""README and docs are walked as they stand; their links lead somewhere; figures in them are the code's."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import textwrap
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import alidade as door
+from alidade.pipelines.config import load_config
+from alidade.pipelines.settings import DEFAULT_NOISE
+from tests.install.walk import Step, difference, steps
+from tests.support.browser import DESKTOP, PHONE, look, needs_browser, running
+from tests.support.command import Command, Run
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+EXAMPLE = DOCS / "examples" / "gyro_pair"
+PAGES = [ROOT / "README.md", *sorted(p for p in DOCS.rglob("*.md") if EXAMPLE not in p.parents)]
+_CODE = re.compile(r"^```python file=(\S+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
+_LINK = re.compile(r"\]\((?!https?://)([^)#]+)")
+
+# Its Python needs the scheduler of a cluster.
+_CLUSTER = "docs/fleet.md"
+# Their commands need a process of their own.
+_APART = ("docs/fleet.md", "docs/write-your-own-method.md")
+# Their commands are those of other tests, on longer recordings; `make dist` walks all tutorials.
+_TUTORIALS = ("docs/tutorials/cube.md", "docs/tutorials/indexer.md", "docs/tutorials/los.md")
+_LONG = (*_APART, *_TUTORIALS, "docs/cube.md", "docs/over-time.md", "docs/trust.md")
+
+
+def _name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(p, marks=[pytest.mark.slow] * (_name(p) in _LONG), id=_name(p)) for p in PAGES if steps(p)],
+)
+def test_page_works(
+    page: Path,
+    tmp_path: Path,
+    alidade: Command,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
+) -> None:
+    """The commands run in this process, which imports once, wherever they can."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+    path = [str(ROOT)]
+    if page.name == "write-your-own-method.md":
+        path.append(str(request.getfixturevalue("example_site")))
+    program: dict[str, Any] = {"__name__": "__main__"}
+    for step in steps(page):
+        if step.kind == "yaml":
+            Path(step.file).write_text(step.text, encoding="utf-8")
+            load_config(None, Path(step.file))
+        elif step.kind == "python" and _name(page) != _CLUSTER:
+            capsys.readouterr()
+            exec(compile(step.text, page.name, "exec"), program)
+            assert not difference(step.output or "", capsys.readouterr().out)
+        elif step.kind == "sh":
+            here = step.words[0] == "alidade" and _name(page) not in _APART
+            run = alidade(*step.words[1:]) if here else _apart(step, path)
+            assert run.code == step.exit_code, f"{step.text}\n{run.out}{run.err}"
+            assert not (wrong := difference(step.output or "", run.out)), f"{step.text}\n{wrong}"
+
+
+def _apart(step: Step, path: list[str]) -> Run:
+    words = step.words
+    command = [sys.executable, "-m", "alidade", *words[1:]] if words[0] == "alidade" else words
+    environment = {"PYTHONPATH": os.pathsep.join(path), "PATH": "/usr/bin:/bin", "COLUMNS": "100"}
+    run = subprocess.run(command, env=environment, capture_output=True, text=True)
+    return Run(run.returncode, run.stdout, run.stderr)
+
+
+@pytest.mark.parametrize(
+    ("documented", "printed", "agree"),
+    [
+        ("a 1.00 b\n...\nd 2", "a 1.01 b c\nd  2.03", True),
+        ("theta  12 ±3\n", " theta │ 12 ±3 ", True),
+        ("a 1.00", "a 1.03", False),
+        ("a 1", "b 1", False),
+        ("b\n...\na", "a b", False),
+        ("-0.5 deg", "0.5 deg", False),
+    ],
+)
+def test_outputs_are_compared(documented: str, printed: str, agree: bool) -> None:
+    assert (difference(documented, printed) == "") is agree
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "datasets" / "README.md"], ids=_name)
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in _LINK.findall(page.read_text(encoding="utf-8")):
+        assert (page.parent / target).exists(), target
+
+
+def test_the_reference_has_every_name_of_the_public_door() -> None:
+    page = (DOCS / "reference" / "api.md").read_text(encoding="utf-8")
+    for name in set(door.__all__) - {"__version__"}:
+        assert re.search(rf"^\.\. auto\w+:: alidade\.{name}\b", page, re.MULTILINE), name
+
+
+def test_code_of_the_example_is_that_of_its_files() -> None:
+    page = (DOCS / "write-your-own-method.md").read_text(encoding="utf-8")
+    blocks = _CODE.findall(page)
+    assert blocks
+    for file, text in blocks:
+        source = (EXAMPLE / file).read_text(encoding="utf-8")
+        # Pages are formatted: a block starts at the margin wherever its code stands.
+        assert any(textwrap.indent(text, " " * depth) in source for depth in (0, 4, 8)), f"{file}:\n{text}"
+
+
+def test_defaults_of_the_noise_are_those_of_the_program() -> None:
+    table = (DOCS / "config.md").read_text(encoding="utf-8").split("## Noise")[1].split("## Priors")[0]
+    rows = re.findall(r"^\| (`\w+`(?:, `\w+`)*) \| .* \| ([-\d., e]+) \|", table, re.MULTILINE)
+    told = {
+        key.strip("`"): float(value)
+        for keys, values in rows
+        for key, value in zip(keys.split(", "), values.split(", "), strict=True)
+    }
+    assert told == DEFAULT_NOISE.model_dump()
+
+
+def test_every_dependency_is_named() -> None:
+    """The Dependencies section and pyproject.toml say the same, but for what only development needs."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    section = (DOCS / "limits.md").read_text(encoding="utf-8").split("## Dependencies")[1]
+    extras = {name: needed for name, needed in project["optional-dependencies"].items() if name != "dev"}
+    assert set(re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE)) == extras.keys()
+    for requirement in [*project["dependencies"], *(each for needed in extras.values() for each in needed)]:
+        assert re.split(r"[\[<>=]", requirement)[0] in section
+
+
+@pytest.mark.slow
+@needs_browser
+def test_the_site_is_built_and_its_pages_fit(tmp_path: Path) -> None:
+    folders = ("-d", tmp_path / "doctrees", DOCS, tmp_path / "site")
+    subprocess.run([sys.executable, "-m", "sphinx", "-q", "-W", *map(str, folders)], check=True, cwd=ROOT)
+    pages = sorted(p for p in (tmp_path / "site").rglob("*.html") if "_static" not in p.parts)
+    assert len(pages) > 30
+    tab = running()
+    for page in pages:
+        for width in (DESKTOP, PHONE):
+            look(tab, page, width)
+            assert tab.value("document.documentElement.scrollWidth <= innerWidth"), f"{page.name} at {width} px"

@@ -1,0 +1,130 @@
+"""Whether an earlier calibration holds on a recording: verdict, what changed, errors found and expected."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alidade import calibrate, simulate
+from alidade import open as opened
+from alidade.pipelines.applications.sharing import device_belief, walks
+from alidade.pipelines.belief import Belief
+from alidade.pipelines.config import load_config
+from alidade.pipelines.diagnostics.calibration_check import Holding, holding
+from alidade.pipelines.diagnostics.device_changes import LEVEL
+from alidade.pipelines.estimation.problem import Quantity, Told
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.indexer.recording import write_indexer
+from alidade.pipelines.reports.known import load_known
+from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.solvers.batch import solve_batch
+from tests.support.browser import fits
+from tests.support.command import Command
+from tests.support.short_problems import COARSE
+
+MOVED_ARCSEC = 0.5
+# As many samples as it takes; those of the usual rates take four times as long.
+
+
+def written(path: Path, simulated: Simulated) -> Path:
+    write_indexer(path, simulated.data, simulated.truth, simulated.config)
+    return path
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("first")
+    calibrate(simulate("indexer", COARSE, seed=1)).write(folder)
+    return folder
+
+
+def simulated(arcsec: float) -> Simulated:
+    return simulate("indexer", {**COARSE, "mounting_deg": [0.5, -0.3 + arcsec / 3600.0, 0.4]}, seed=2)
+
+
+@pytest.mark.parametrize("file", ["calibration.yaml", "result.json"])
+def test_it_holds_with_another_bias(calibrated: Path, file: str, tmp_path: Path, alidade: Command) -> None:
+    """The bias is the recording's own: that it is another one is no change of the device."""
+    recording = written(tmp_path / "june.mcap", simulated(0.0))
+    done = alidade("validate", recording, "--calibration", calibrated / file, "--json")
+    found = json.loads(done.out)
+    assert (done.code, found["verdict"]) == (0, "holds")
+    assert [p["name"] for p in found["parameters"]] == ["theta_x", "theta_y", "theta_z"]
+    (error,) = found["validations"]
+    assert error["rms"]["expected"] < 1.1 * error["rms"]["device"] < 1.5 * error["rms"]["expected"]
+
+
+def test_it_does_not_hold_after_a_knock(calibrated: Path, tmp_path: Path, alidade: Command) -> None:
+    recording = written(tmp_path / "june.mcap", simulated(MOVED_ARCSEC))
+    done = alidade("validate", recording, "--calibration", calibrated / "calibration.yaml")
+    assert done.code == 4
+    assert "The calibration does not hold: theta_y changed by 0." in done.out
+    assert "That is less than what is required of them." in done.out
+    page = (tmp_path / "june-validation" / "validation.html").read_text()
+    fits(page, tmp_path)
+    assert "The calibration does not hold" in page
+
+
+def one(value: float, sigma: float, shift: float, rng: np.random.Generator) -> Holding:
+    """A number known to sigma, and a recording that says as much of it, shifted."""
+    quantity = Quantity("mount", "rad", 0.1, 0.1, 1e-2)
+    own = Quantity("bias", "rad/s", 0.1, 0.1, 1e-2)
+    known = Belief(("mount",), np.array([value + sigma * rng.standard_normal()]), np.array([[sigma**2]]), "march")
+    R = np.array([[1.0 / sigma, 0.3 / sigma], [0.0, 1.0 / sigma]])
+    truth = np.array([value + shift, 0.02])
+    prior = np.array([[10.0, 0.0]])
+    told = Told(("mount", "bias"), truth, R, rng.standard_normal(2), prior, -prior @ truth, np.array([0.1, 0.1]))
+    return holding(known, told, (quantity, own), {})
+
+
+def test_verdicts_are_as_sure_as_stated() -> None:
+    """False alarms at the level; a shift of three of its own sigmas is noticed in as many cases as chance allows."""
+    rng = np.random.default_rng(0)
+    still = [one(0.01, 1e-3, 0.0, rng) for _ in range(400)]
+    step = still[0].steps[0]
+    assert step.sigma == pytest.approx(2.0**0.5 * 1e-3, rel=0.1)
+    alarms = sum(each.verdict == "changed" for each in still)
+    assert abs(alarms - 400 * LEVEL) < 3.0 * (400 * LEVEL) ** 0.5
+    noticed = [one(0.01, 1e-3, 3.0 * step.sigma, rng).verdict == "changed" for _ in range(150)]
+    assert np.mean(noticed) > 0.75
+    surely = [one(0.01, 1e-3, 4.5 * step.sigma, rng).verdict == "changed" for _ in range(150)]
+    assert np.mean(surely) > 0.97
+
+
+def test_a_recording_that_says_nothing_gives_no_verdict() -> None:
+    quantity = Quantity("mount", "rad", 0.1, 0.1, 1e-2)
+    known = Belief(("mount",), np.zeros(1), np.array([[1e-6]]), "march")
+    nothing = Told(("mount",), np.zeros(1), np.empty((0, 1)), np.empty(0), np.eye(1) * 10.0, np.zeros(1), np.ones(1))
+    assert holding(known, nothing, (quantity,), {}).verdict == "unknown"
+
+
+def test_head_mounts_that_turned_are_noticed(tmp_path: Path) -> None:
+    """A helmet mount that turned by 0.3 deg, with everything else of the head's estimated too."""
+    rates = {"gyro_rate_hz": 100.0, "platform_gyro_rate_hz": 100.0, "vision_rate_hz": 15.0}
+    scenario = method("head").settings("head_mounts").model_dump() | rates
+    mount = scenario["helmet_mount_deg"]
+    first = simulate("head", scenario, seed=1)
+    opened(first).calibrate().write(tmp_path)
+    turned = {**scenario, "helmet_mount_deg": (mount[0], mount[1] + 0.3, mount[2])}
+    verdicts = []
+    for shape in (scenario, turned):
+        session = opened(simulate("head", shape, seed=2))
+        problem = session.problem()
+        device = walks(session.method, session.config, [q.name for q in problem.quantities])
+        belief = device_belief(load_known(tmp_path / "result.json"), session.method, session.config, "another", 0)
+        estimate = solve_batch(problem, device=device)
+        assert estimate.told is not None
+        verdicts.append(holding(belief, estimate.told, problem.quantities, {}))
+    assert [each.verdict for each in verdicts] == ["holds", "changed"]
+    assert any(s.name == "helmet_mount_y" and abs(np.rad2deg(s.size) - 0.3) < 0.12 for s in verdicts[1].changes.found)
+
+
+def test_an_own_config_that_shares_the_bias_asks_for_it(calibrated: Path) -> None:
+    shared = load_config(b"share: {'gyro_bias_*': device}")
+    session = opened(simulated(0.0), config=shared, prior=calibrated / "result.json")
+    priors = {q.name: q.prior_sigma for q in session.problem().quantities}
+    assert priors["gyro_bias_x"] is not None
+    assert priors["gyro_bias_x"] < 1e-6

@@ -1,0 +1,223 @@
+"""A calibration that changes while it is recorded is found, with the time; one that does not raises no alarm."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import alidade
+from alidade.factors import so3
+from alidade.pipelines.applications.follow.guidance import View, Watch
+from alidade.pipelines.diagnostics.change_test import Moved, Stability, stability
+from alidade.pipelines.diagnostics.cross_validation import Halves
+from alidade.pipelines.diagnostics.observability import assess
+from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.problem import Course, Estimate, Quantity
+from alidade.pipelines.settings import Config
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, Run
+
+IDEAL = Config.model_validate({"sensors": "ideal"})
+HEAD = {"duration_s": 60.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 20.0}
+
+
+def session(seed: int, slip_deg: float, config: Config | None = None, **scenario: float) -> alidade.Session:
+    """A minute of head motion; half way the markers slip on the helmet."""
+    simulated = alidade.simulate("head", HEAD | scenario, seed)
+    wxyz = simulated.data.vision_wxyz.copy()
+    late = simulated.data.vision_t > 30.0
+    wxyz[late] = so3.multiply(wxyz[late], so3.exp(np.deg2rad([slip_deg, 0.0, 0.0])))
+    return alidade.open(replace(simulated, data=replace(simulated.data, vision_wxyz=wxyz)), config=config)
+
+
+def watched(session: alidade.Session) -> tuple[Run, list[tuple[float, float]]]:
+    """A run that is watched, and each time at which it was seen to have changed, with when it changed, s."""
+    problem = session.problem()
+    run, watch, alarms = Run(problem, DEFAULT_WINDOW), Watch(), []
+    for step in problem.steps(1):
+        run.add_step(step)
+        watch.look(run)
+        if watch.change is not None:
+            alarms.append((step.time, watch.change.time_s))
+    return run, alarms
+
+
+def walk(rng: np.random.Generator, change: float = 0.0, n: int = 40) -> tuple[Estimate, tuple[Quantity, ...]]:
+    """Means of the first k of n unit normal vectors, shifted by `change` in the second half."""
+    z = rng.standard_normal((n, 2))
+    z[n // 2 :, 0] += change
+    k = np.arange(1, n + 1)
+    values = np.cumsum(z, axis=0) / k[:, None]
+    P = np.eye(2) / k[:, None, None]
+    course = Course(k.astype(float), values, P, np.array([True, True]))
+    quantities = tuple(Quantity(name, "rad", 10.0, 10.0, 1.0) for name in "ab")
+    return Estimate("batch", ("a", "b"), values[-1], P[-1], True, "", course=course), quantities
+
+
+def test_the_level_is_what_it_says() -> None:
+    """Levels of recordings in which nothing changes are spread evenly between 0 and 1."""
+    rng = np.random.default_rng(0)
+    levels = np.sort([found.level for _ in range(60) if (found := stability(*walk(rng)))])
+    assert len(levels) == 60
+    # Kolmogorov and Smirnov's bound, 99.9 %.
+    assert np.abs(levels - (np.arange(60) + 0.5) / 60).max() < 1.95 / np.sqrt(60)
+
+
+def test_a_change_is_found_where_it_is() -> None:
+    found = stability(*walk(np.random.default_rng(1), change=3.0))
+    assert found is not None
+    assert found.changed
+    assert found.time_s == pytest.approx(20.0, abs=2.0)
+    assert next(iter(found.departures)) == "a"
+
+
+def test_a_value_far_beyond_its_prior_is_no_change() -> None:
+    """The mean of readings of 10, with a prior of 0 +- 1: as precise as one of them."""
+    rng = np.random.default_rng(2)
+    n = 40
+    k = np.arange(1, n + 1)
+    values = np.cumsum(rng.normal(10.0, 1.0, n)) / (k + 1)
+    P = np.asarray(1.0 / (k + 1.0), dtype=float)
+    course = Course(k.astype(float), values[:, None], P[:, None, None], np.array([True]))
+    estimate = Estimate("batch", ("a",), values[-1:], np.array([[P[-1]]]), True, "", course=course)
+    found = stability(estimate, [Quantity("a", "rad", 1.0, 1.0, 1.0)])
+    assert found is not None
+    assert not found.changed
+    taken_for_true = stability(estimate, [Quantity("a", "rad", None, 1.0, 1.0)])
+    assert taken_for_true is not None
+    assert taken_for_true.changed
+
+
+def test_numbers_whose_sum_is_known_far_better_are_inflated_alike() -> None:
+    """Inflated each by its own factor, the sum would no longer be what is known."""
+    estimate, quantities = walk(np.random.default_rng(4))
+    course = estimate.course
+    assert course is not None
+    mix = np.array([[1.0, 1e-3], [-1.0, 1e-3]])
+    mixed = replace(course, values=course.values @ mix.T, covariance=mix @ course.covariance @ mix.T)
+    last = {"values": mixed.values[-1], "covariance": mixed.covariance[-1], "course": mixed}
+    found = stability(replace(estimate, **last, inflation=np.array([1.0, 2.0])), quantities)
+    assert found is not None
+    assert not found.changed
+
+
+def test_what_is_hardly_better_known_than_before_cannot_be_seen_to_change() -> None:
+    estimate, quantities = walk(np.random.default_rng(1), change=3.0)
+    narrow = replace(quantities[0], prior_sigma=1.5 * float(estimate.sigmas[0]))
+    found = stability(estimate, (narrow, quantities[1]))
+    assert found is not None
+    assert not found.changed
+    assert set(found.departures) == {"b"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_minutes_at_which_nothing_changes_raise_no_alarm(seed: int) -> None:
+    """What a camera's scale of 0.999 of its prior's sigma is moved by, noise of the states, passed for 9 sigmas."""
+    rates = {"duration_s": 240.0, "gyro_rate_hz": 100.0, "gimbal_rate_hz": 100.0}
+    found = alidade.open(alidade.simulate("los", rates, seed)).calibrate().stability
+    assert found is not None
+    assert not found.changed
+
+
+def test_what_walks_or_is_fixed_may_change() -> None:
+    estimate, quantities = walk(np.random.default_rng(1), change=3.0)
+    course = estimate.course
+    assert course is not None
+    walking = replace(estimate, course=replace(course, steady=np.array([False, True])))
+    found = stability(walking, quantities)
+    assert found is not None
+    assert not found.changed
+    assert stability(estimate, [replace(q, prior_sigma=0.0) for q in quantities]) is None
+    assert stability(replace(estimate, course=None), quantities) is None
+
+
+def test_a_mount_that_slips_is_inconsistent_with_the_time_and_the_step() -> None:
+    """A slip of 0.5 deg once went through as calibrated, 14 sigmas off."""
+    calibration = session(0, 0.5).calibrate()
+    assert calibration.status == "inconsistent"
+    assert calibration.stability is not None
+    assert calibration.stability.time_s == pytest.approx(30.0, abs=5.0)
+    assert "Something changed at about 3" in calibration.headline
+    step = calibration.headline.split("From before to after: helmet_mount_x by ")[1]
+    assert float(step.split(" ")[0]) == pytest.approx(0.5, abs=0.2)
+
+
+def test_a_small_step_is_told_and_widens_the_sigmas() -> None:
+    """Less than half of what is required does no harm, if it is not forgotten."""
+    quantities = (Quantity("a", "rad", 1.0, 1.0, 1.0), Quantity("b", "rad", 1.0, 1.0, 1.0))
+    moved = Moved({"a": Halves(0.0, 0.05, 0.4, 0.05), "b": Halves(0.0, 0.05, 0.1, 0.05)})
+    assert list(moved.steps) == ["a"]
+    assert moved.small(quantities)
+    estimate = Estimate("batch", ("a", "b"), np.zeros(2), 0.01 * np.eye(2), True, "")
+    np.testing.assert_allclose(moved.widened(estimate, quantities), np.diag([0.17, 0.01]))
+    large = Moved({"a": Halves(0.0, 0.05, 0.6, 0.05)})
+    assert not large.small(quantities)
+    np.testing.assert_allclose(large.widened(estimate, quantities), 0.01 * np.eye(2))
+    assert not Moved({}).small(quantities)
+
+
+def test_a_mount_that_stays_is_calibrated() -> None:
+    calibration = session(0, 0.0).calibrate()
+    assert calibration.status == "calibrated"
+    assert calibration.stability is not None
+    assert not calibration.stability.changed
+
+
+def test_a_slip_is_seen_while_it_is_recorded() -> None:
+    """With the estimate still young, and the same when the run has gone on from a Gaussian."""
+    run, alarms = watched(session(0, 0.8, IDEAL, vision_rate_hz=4.0))
+    assert run.way.rows.array[-1, 0] > 55.0
+    assert alarms
+    told, when = alarms[0]
+    assert told < 46.0
+    assert when == pytest.approx(30.0, abs=6.0)
+    found = stability(run.finish(0.0), run.problem.quantities)
+    assert found is not None
+    assert found.changed
+    assert next(iter(found.departures)) == "helmet_mount_x"
+
+
+def test_the_person_is_told_what_moved_and_when() -> None:
+    change = Stability(7.0, 0.0, 31.0, {"helmet_mount_x": -8.0})
+    quantities = (Quantity("helmet_mount_x", "rad", 0.1, 0.1, 1e-3),)
+    assessment = assess(quantities, np.eye(1) * 1e-8, None, lambda _: Motion(""))
+    view = View(40.0, 43_200 * 10**9, quantities, np.zeros(1), assessment, (), change)
+    assert not view.done
+    assert view.headline.startswith("Something changed at about 31 s: helmet_mount_x")
+    assert "12:00:31 UTC" in view.headline
+    assert replace(view, change=None).done
+
+
+@pytest.mark.slow
+def test_the_incremental_solver_finds_slips_and_raises_no_false_alarms() -> None:
+    for seed in range(4):
+        calibration = session(seed, 0.5).calibrate("incremental")
+        assert calibration.status == "inconsistent"
+        assert calibration.stability is not None
+        assert calibration.stability.time_s == pytest.approx(30.0, abs=5.0)
+    for seed in range(12):
+        run, alarms = watched(session(seed, 0.0))
+        assert not alarms
+        found = stability(run.finish(0.0), run.problem.quantities)
+        assert found is not None
+        assert not found.changed
+
+
+@pytest.mark.slow
+def test_slips_are_found_at_all_seeds_and_false_alarms_are_rare() -> None:
+    for seed in range(12):
+        slipped = session(seed, 0.5)
+        found = stability(solve_batch(slipped.problem()), slipped.problem().quantities)
+        assert found is not None
+        assert found.changed
+        assert found.time_s == pytest.approx(30.0, abs=5.0)
+    alarms = 0
+    for seed in range(40):
+        clean = session(seed, 0.0)
+        found = stability(solve_batch(clean.problem()), clean.problem().quantities)
+        assert found is not None
+        alarms += found.changed
+    assert alarms <= 1

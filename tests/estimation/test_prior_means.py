@@ -1,0 +1,269 @@
+"""Priors with means: by hand, of an earlier calibration, and yesterday's result with today's recording."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import alidade
+from alidade import Config
+from alidade.pipelines.applications.cli import app
+from alidade.pipelines.applications.sharing import walks
+from alidade.pipelines.belief import Belief, independent
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.believing import believing
+from alidade.pipelines.estimation.problem import Problem
+from alidade.pipelines.methods import method
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import solve_incremental
+from tests.support.one_graph import one_graph
+from tests.support.short_problems import COARSE, FOUR_POSITIONS, head_problem
+
+KNOWN = "noise_known: 0\n"
+# Sigma by hand, and of what the recording says: about equal, so that both count.
+MOUNT, SIGMA = np.array([0.06, -0.08, 0.03]), 1e-3
+
+
+def believed(problem: Problem, sigma: float = SIGMA) -> Problem:
+    names = [f"helmet_mount_{axis}" for axis in "xyz"]
+    return believing(problem, [independent(names, MOUNT.tolist(), [sigma] * 3)])
+
+
+def test_a_prior_with_a_mean_is_a_measurement_of_it() -> None:
+    """The posterior is that without the default prior, with another measurement: to first order the closed form."""
+    wide = believing(head_problem(), [independent([f"helmet_mount_{a}" for a in "xyz"], [0.0] * 3, [1e2] * 3)])
+    alone, both = solve_batch(wide), solve_batch(believed(head_problem()))
+    rows = [alone.names.index(f"helmet_mount_{axis}") for axis in "xyz"]
+    # Where it agrees, nothing moves but the sigmas.
+    agreeing = solve_batch(
+        believing(
+            head_problem(), [independent([alone.names[i] for i in rows], alone.values[rows].tolist(), [SIGMA] * 3)]
+        )
+    )
+    expected = np.linalg.inv(np.linalg.inv(alone.covariance[np.ix_(rows, rows)]) + np.eye(3) / SIGMA**2)
+    np.testing.assert_allclose(agreeing.values, alone.values, atol=1e-3 * alone.sigmas.min())
+    np.testing.assert_allclose(agreeing.covariance[np.ix_(rows, rows)], expected, rtol=2e-3, atol=1e-12)
+    assert (np.abs(both.values[rows] - MOUNT) < np.abs(alone.values[rows] - MOUNT)).all()
+
+
+def test_a_sigma_of_zero_fixes_a_parameter_where_it_is_said_to_be() -> None:
+    estimate = solve_batch(believed(head_problem(), 0.0))
+    rows = [estimate.names.index(f"helmet_mount_{axis}") for axis in "xyz"]
+    np.testing.assert_allclose(estimate.values[rows], MOUNT, atol=1e-7)
+    assert (estimate.sigmas[rows] == 0.0).all()
+
+
+def test_incremental_takes_the_same_prior() -> None:
+    simulated = alidade.simulate("indexer", FOUR_POSITIONS, seed=1)
+    problem, truth = alidade.open(simulated).problem(), simulated.truth["theta_y"]
+    problem = believing(problem, [independent(["theta_y"], [truth + 3e-6], [1e-7])])
+    batch, incremental = (solve(problem) for solve in (solve_batch, solve_incremental))
+    row = batch.names.index("theta_y")
+    assert abs(batch.values[row] - truth) > 2e-6  # the prior counts
+    assert abs(incremental.values[row] - batch.values[row]) < 0.1 * batch.sigmas[row]
+    assert incremental.sigmas[row] == pytest.approx(batch.sigmas[row], rel=0.05)
+
+
+def test_the_rest_of_a_prior_of_several_numbers_stays() -> None:
+    """time_offset shares its variable with clock skew and vision's scale, whose priors are as they were."""
+    problem = believing(head_problem(), [independent(["time_offset"], [0.004], [1e-6])])
+    before, after = solve_batch(head_problem()), solve_batch(problem)
+    at = {name: i for i, name in enumerate(after.names)}
+    assert after.values[at["time_offset"]] == pytest.approx(0.004, abs=3e-6)
+    for name in ("vision_scale", "clock_skew"):
+        assert after.sigmas[at[name]] <= before.sigmas[at[name]] * (1.0 + 1e-9)
+        assert after.sigmas[at[name]] > 0.3 * before.sigmas[at[name]]
+
+
+def test_what_is_fixed_today_stays_fixed_and_tells_of_the_others() -> None:
+    """Believed together with another number: that one follows, as the belief conditioned on what is fixed."""
+    names = ("helmet_mount_x", "camera_mount_x")
+    tight = Belief(names, np.array([0.06, 0.02]), 1e-8 * np.array([[1.0, 0.99], [0.99, 1.0]]), "yesterday's")
+    fixed = Config.model_validate({"priors": {"camera_mount_x": 0.0}})
+    simulated = alidade.simulate("head", {"duration_s": 10.0}, seed=1)
+    session = alidade.open(simulated, config=fixed)
+    estimate = solve_batch(believing(session.problem(), [tight]))
+    value = dict(zip(estimate.names, estimate.values.tolist(), strict=True))
+    assert value["camera_mount_x"] == pytest.approx(0.0, abs=1e-9)
+
+
+CASES: dict[str, tuple[dict[str, Any] | None, str, float]] = {
+    "indexer": (COARSE, "sensors: ideal", 1e-6),
+    "head": (None, "sensors: ideal", 1e-6),
+    "indexer assumptions": (COARSE, "", 1e-3),
+}
+
+
+@pytest.mark.parametrize("case", [pytest.param(case, marks=[pytest.mark.slow] * (case == "indexer")) for case in CASES])
+def test_yesterdays_result_with_todays_recording_is_both_together(case: str, tmp_path: Path) -> None:
+    """Against both in one graph, whose only difference is where the first recording is linearised."""
+    name = case.split()[0]
+    scenario, more, tolerance = CASES[case]
+    config = load_config((KNOWN + more).encode())
+    first, second = (alidade.open(alidade.simulate(name, scenario, seed=seed), config=config) for seed in (1, 2))
+    shared = walks(first.method, first.config, [q.name for q in first.problem().quantities])
+    both = solve_batch(one_graph([first.problem(), second.problem()], shared))
+    first.calibrate().write(tmp_path)
+    recursive = second.beginning_from(tmp_path / "result.json").calibrate().estimate
+    for i, known in enumerate(recursive.names):
+        of = both.names.index(known if known in shared else f"{known}@1")
+        if recursive.sigmas[i] > 0.0:
+            assert abs(recursive.values[i] - both.values[of]) < tolerance * both.sigmas[of], known
+            assert recursive.sigmas[i] == pytest.approx(both.sigmas[of], rel=max(tolerance, 1e-6)), known
+
+
+@pytest.fixture(scope="module")
+def earlier(tmp_path_factory: pytest.TempPathFactory) -> tuple[Calibration, Path]:
+    folder = tmp_path_factory.mktemp("earlier")
+    found = alidade.calibrate(alidade.simulate("indexer", COARSE, seed=1))
+    found.write(folder)
+    return found, folder
+
+
+@pytest.fixture(scope="module")
+def today(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("today")
+    recording, scenario = folder / "today.mcap", folder / "coarse.yaml"
+    scenario.write_text(json.dumps(COARSE))
+    arguments = ["--scenario", str(scenario), "--seed", "2", "--out", str(recording)]
+    CliRunner().invoke(app, ["simulate", "indexer", *arguments])
+    return recording
+
+
+@pytest.mark.parametrize("file", ["result.json", "calibration.yaml"])
+def test_the_command_begins_from_an_earlier_calibration(
+    earlier: tuple[Calibration, Path], today: Path, file: str, tmp_path: Path
+) -> None:
+    arguments = ["calibrate", str(today), "--prior", str(earlier[1] / file), "--json", "--out", str(tmp_path / "o")]
+    ended = CliRunner().invoke(app, arguments)
+    assert ended.exit_code == 0, ended.output
+    result = json.loads(ended.stdout)
+    found = {p["name"]: p for p in result["parameters"]}
+    before = earlier[0].parameters
+    assert found["theta_y"]["prior_mean"] == pytest.approx(before["theta_y"].value, rel=1e-11)
+    assert found["theta_y"]["prior_sigma"] == pytest.approx(before["theta_y"].sigma, rel=1e-6)
+    assert found["theta_y"]["sigma"] < 0.9 * before["theta_y"].sigma
+    assert found["gyro_bias_x"]["prior_sigma"] == 1e-3  # the recording's own
+    assert f"is that of {file}, of 2026-" in result["headline"]
+
+
+def test_what_walks_is_known_less_well_after_a_while(earlier: tuple[Calibration, Path]) -> None:
+    simulated = alidade.simulate("indexer", COARSE, seed=2)
+    rate = 1e-5
+    config = load_config(simulated.config.encode(), load_config(f"share: {{theta_*: {rate}}}".encode()))
+    session = alidade.open(simulated, config=config)
+    # A hundred days later.
+    later = replace(session.data, epoch_ns=session.data.epoch_ns + 8_640_000 * 10**9)
+    session = alidade.open(later, method="indexer", config=config, prior=earlier[1] / "result.json")
+    prior = next(q.prior_sigma for q in session.problem().quantities if q.name == "theta_y")
+    assert prior == pytest.approx(np.hypot(earlier[0].parameters["theta_y"].sigma, 10.0 * rate), rel=1e-6)
+
+
+def test_how_far_it_walks_is_not_told_by_one_recording(earlier: tuple[Calibration, Path]) -> None:
+    config = load_config(b"share: {theta_*: walks}")
+    with pytest.raises(InputError, match="how far theta_x walks, only several recordings together tell"):
+        alidade.open(alidade.simulate("indexer", COARSE, seed=2), config=config, prior=earlier[1] / "result.json")
+
+
+def test_what_the_config_says_of_a_prior_goes_before_an_earlier_calibration(earlier: tuple[Calibration, Path]) -> None:
+    config = load_config(b"priors: {theta_y: 0.1, theta_z: {mean: 0.001, sigma: 0.01}}")
+    session = alidade.open(alidade.simulate("indexer", COARSE, seed=2), config=config, prior=earlier[1] / "result.json")
+    priors = {q.name: (q.prior_mean, q.prior_sigma) for q in session.problem().quantities}
+    assert priors["theta_y"] == (0.0, 0.1)
+    assert priors["theta_z"] == (0.001, 0.01)
+    assert priors["theta_x"][1] == pytest.approx(earlier[0].parameters["theta_x"].sigma)
+
+
+def test_unusable_priors_are_told_in_one_line(earlier: tuple[Calibration, Path], tmp_path: Path) -> None:
+    again = alidade.simulate("indexer", COARSE, seed=1)
+    with pytest.raises(InputError, match="was made of this very recording"):
+        alidade.open(again, prior=earlier[1] / "result.json")
+    with pytest.raises(InputError, match="is a calibration of indexer, not of head"):
+        alidade.open(alidade.simulate("head", {"duration_s": 5.0}), prior=earlier[1] / "calibration.yaml")
+    with pytest.raises(InputError, match="cannot be opened"):
+        alidade.open(again, prior=tmp_path / "none.json")
+    broken = json.loads((earlier[1] / "result.json").read_text())
+    broken["covariance"]["matrix"][0][0] *= -1.0
+    (tmp_path / "broken.json").write_text(json.dumps(broken))
+    with pytest.raises(InputError, match="its covariance is none"):
+        alidade.open(again, prior=tmp_path / "broken.json")
+    (tmp_path / "other.json").write_text("{}")
+    with pytest.raises(InputError, match=r"not a result\.json: schema"):
+        alidade.open(again, prior=tmp_path / "other.json")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("priors: {theta_x: {mean: 0.1}}", r"priors\.theta_x\.sigma: is missing"),
+        (
+            "priors: {theta_x: {meen: 0.1, sigma: 1}}",
+            r"unknown key priors\.theta_x\.meen; the nearest known key is mean",
+        ),
+        ("share: {theta_x: often}", r"share\.theta_x: must be device, recording, walks, or how far it walks"),
+        ("share: {theta_x: -1}", r"share\.theta_x: must be device"),
+    ],
+)
+def test_priors_and_shares_that_mean_nothing(text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        load_config(text.encode())
+
+
+def test_a_mean_for_what_the_graph_leaves_out_is_refused() -> None:
+    config = load_config(b"priors: {axis_nonperpendicularity: {mean: 1.0e-4, sigma: 0}}")
+    with pytest.raises(InputError, match=r"priors\.axis_nonperpendicularity: where it is fixed"):
+        alidade.open(alidade.simulate("indexer", COARSE, seed=1), config=config).problem()
+
+
+def test_methods_say_what_belongs_to_a_recording() -> None:
+    own = {
+        "los": {"gyro_bias_x", "time_offset", "target_rate_x"},
+        "indexer": {"gyro_bias_z"},
+        "head": {"gyro_bias_y", "time_offset", "platform_bias_x"},
+        "cube": {"gyro_b1", "field_n"},
+    }
+    for name, recordings in own.items():
+        names = [*recordings, "theta_x", "camera_mount_y", "gyro_k11", "delta_px"]
+        assert set(names) - walks(method(name), Config(), names).keys() == recordings, name
+    names = ["gyro_bias_x", "gyro_bias_y"]
+    assert walks(method("head"), load_config(b"share: {'gyro_bias_*': device, gyro_bias_y: 0.1}"), names) == {
+        "gyro_bias_x": 0.0,
+        "gyro_bias_y": 0.1,
+    }
+    with pytest.raises(InputError, match=r"unknown key share\.gyro_bia; the nearest known key is gyro_bias"):
+        walks(method("head"), load_config(b"share: {gyro_bia: device}"), names)
+
+
+def test_compare_and_follow_begin_from_an_earlier_calibration(tmp_path: Path) -> None:
+    (tmp_path / "short.yaml").write_text("duration_s: 3.0\nsensors: ideal\n")
+    for seed, name in enumerate(("before", "today")):
+        scenario = ["--scenario", str(tmp_path / "short.yaml"), "--out", str(tmp_path / f"{name}.mcap")]
+        CliRunner().invoke(app, ["simulate", "head", "--seed", str(seed), *scenario])
+    CliRunner().invoke(app, ["calibrate", str(tmp_path / "before.mcap"), "--out", str(tmp_path / "before")])
+    prior = tmp_path / "before" / "result.json"
+    earlier = {p["name"]: p for p in json.loads(prior.read_text())["parameters"]}["helmet_mount_x"]
+
+    def found(*arguments: object) -> list[dict[str, float]]:
+        ended = CliRunner().invoke(app, [*map(str, arguments), "--prior", str(prior), "--json"])
+        said = json.loads(ended.stdout)
+        return [
+            next(p for p in each["parameters"] if p["name"] == "helmet_mount_x")
+            for each in (said if isinstance(said, list) else [said])
+            if each["solver"] != "published"
+        ]
+
+    today = tmp_path / "today.mcap"
+    followed = found("follow", today, "--no-check", "--out", tmp_path / "out")
+    for p in [*found("compare", today), *followed]:
+        assert p["prior_mean"] == pytest.approx(earlier["value"], rel=1e-11)
+        assert p["sigma"] < 0.9 * earlier["sigma"]
+    ended = CliRunner().invoke(app, ["follow", str(today), "--prior", str(tmp_path / "none.json")])
+    assert "none.json: cannot be opened" in str(ended.exception)

@@ -1,0 +1,311 @@
+"""Properties of the los factors: the model itself, Jacobians, batches, compression."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from alidade.factors import so3
+from alidade.factors.gimbal import GimbalPath, LocalMotion, command
+from alidade.factors.los import SIGHT_ERRORS, LosDirectionFactor, LosRateFactor, Surroundings, rate_matrix, roll_rate
+from alidade.factors.model import Array
+from alidade.factors.testing import assert_jacobians
+from alidade.factors.vectorized import Ensemble
+from tests.support.numerics import assert_rows_are_independent
+
+N = 12
+TIMES = np.linspace(0.5, 5.0, N)
+CORE = ("delta_px", "delta_gx", "delta_gy", "delta_z")
+ALL = (
+    *("delta_px", "delta_gx", "delta_gy", "delta_pz", "delta_gz"),
+    *("camera_roll", "collimation", "axis_nonperpendicularity"),
+)
+
+
+def _rates(t: Array) -> Array:
+    return np.asarray(0.8 * np.sin(np.array([1.1, 0.7, 1.9]) * t[:, None] + np.array([0.0, 1.0, 2.0])))
+
+
+def _gimbal(t: Array) -> Array:
+    return np.stack([0.4 * np.sin(1.3 * t), 0.5 + 0.2 * np.cos(0.9 * t)], axis=1)
+
+
+STAMPS = np.arange(0.0, 6.0, 0.005)
+FORCE = np.array([0.5, -1.0, 9.7])
+FORESEEN = 0.02 * np.random.default_rng(4).normal(size=(N, 2))
+MOVED = 0.003 * np.random.default_rng(5).normal(size=N)
+GIMBAL = GimbalPath(STAMPS, _gimbal(STAMPS))
+WARMTH = (2.0 * STAMPS)[:, None]
+# What moves the gyro's readings, by how many numbers its errors are.
+_FORCES = np.tile(FORCE, (len(STAMPS), 1))
+DRIVERS = {0: None, 6: None, 9: WARMTH, 15: _FORCES, 18: np.column_stack([_FORCES, WARMTH])}
+MOTIONS = {n: LocalMotion.around(TIMES, STAMPS, _rates(STAMPS), GIMBAL, each) for n, each in DRIVERS.items()}
+MOTION = MOTIONS[15]
+
+
+def _passive(axis: int, angle: float) -> Array:
+    return so3.matrix(so3.exp(-angle * np.eye(3)[axis]))
+
+
+def _blocks(
+    names: tuple[str, ...], size: float, off: float, sight: float | None = None, gyro_errors: int = 0
+) -> list[Array]:
+    """Attitudes that see the target within `off` rad of the line of sight at mounting angles of `size` rad."""
+    rng = np.random.default_rng(2)
+    angles = np.broadcast_to(size * rng.normal(size=len(names)), (N, len(names)))
+    level = LosDirectionFactor(TIMES, np.zeros((N, 3)), np.tile(np.eye(3), (N, 1, 1)), GIMBAL.at(TIMES), names)
+    tRm = so3.multiply(so3.exp(off * rng.normal(size=(N, 3))), level.camera(angles))
+    if sight is None:
+        return [tRm, angles]
+    shared = np.broadcast_to(sight * rng.normal(size=len(SIGHT_ERRORS)), (N, len(SIGHT_ERRORS)))
+    errors = np.broadcast_to(0.01 * rng.normal(size=gyro_errors), (N, gyro_errors))
+    return [tRm, angles, rng.normal(scale=0.02, size=(N, 3)), shared, *([errors] if gyro_errors else [])]
+
+
+def _factor(
+    rows: np.ndarray, names: tuple[str, ...], width: int, sight: bool = False, gyro_errors: int = 0
+) -> LosDirectionFactor:
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(N, width, width)) + 3 * np.eye(width)
+    measured = 0.05 * rng.normal(size=(N, width))
+    around = Surroundings(MOTIONS[gyro_errors], TIMES, TIMES - 0.2, FORESEEN, MOVED)[rows] if sight else None
+    return LosDirectionFactor(
+        TIMES[rows], measured[rows], root[rows], GIMBAL.at(TIMES)[rows], names, around, gyro_errors
+    )
+
+
+@pytest.mark.parametrize("names", [CORE, ALL], ids=["core", "all"])
+@pytest.mark.parametrize("width", [2, 3], ids=["without roll", "with roll"])
+@pytest.mark.parametrize("size", [0.5, 1e-6], ids=["large angles", "near zero"])
+@pytest.mark.parametrize("off", [0.3, 1e-7], ids=["off axis", "on axis"])
+@pytest.mark.parametrize(("sight", "gyro"), [(None, 0), (0.0, 15), (0.01, 0), (0.01, 6), (0.01, 9), (-0.02, 18)])
+def test_direction_jacobians(
+    names: tuple[str, ...], width: int, size: float, off: float, sight: float | None, gyro: int
+) -> None:
+    blocks = _blocks(names, size, off, sight, gyro)
+    steps = [1e-5, 1e-5, *([] if sight is None else [1e-4, 1e-6, *([1e-4] if gyro else [])])]
+    model = _factor(np.arange(N), names, width, sight is not None, gyro)
+    assert_jacobians(model, blocks, steps)
+
+
+@pytest.mark.parametrize("sight", [None, 0.01])
+def test_direction_rows_are_independent(sight: float | None) -> None:
+    gyro = 0 if sight is None else 15
+    blocks = _blocks(ALL, 0.3, 0.2, sight, gyro)
+    assert_rows_are_independent(lambda rows: _factor(rows, ALL, 3, sight is not None, gyro), blocks)
+
+
+@pytest.mark.parametrize("name", SIGHT_ERRORS)
+def test_an_error_does_what_its_definition_says(name: str) -> None:
+    """Each alone, written out: the picture of a target seen through an axis, a clock or a lens with that error."""
+    size = {"target_rate_x": 0.02, "target_rate_z": 0.02, "clock_skew": 2e-3}.get(name, 5e-3)
+    tRm, angles, bias, _, errors = _blocks(CORE, 0.1, 0.05, 0.0, 15)
+    sight = np.zeros((N, len(SIGHT_ERRORS)))
+    sight[:, SIGHT_ERRORS.index(name)] = size
+    model = _factor(np.arange(N), CORE, 3, True, 15)
+    root_inverse = np.linalg.inv(model.sqrt_information)
+    picture = model.measured - np.einsum("nij,nj->ni", root_inverse, model(tRm, angles, bias, sight, errors)[0])
+
+    late = {"time_offset": size + 0.0 * TIMES, "clock_skew": -size * TIMES}.get(name, 0.0 * TIMES) - MOVED
+    gimbal = _gimbal(TIMES + late - (size if name == "encoder_delay" else 0.0))
+    read = _gimbal(TIMES + late)
+    for i, joint in enumerate(("azimuth", "elevation")):
+        for part, function in (("sin", np.sin), ("cos", np.cos)):
+            if name == f"{joint} {part}":
+                # What is read is angle + size f(angle): here the angle that is read as `read`.
+                for _ in range(50):
+                    gimbal[:, i] = read[:, i] - size * function(gimbal[:, i])
+    x, y, z, xy, xz, yz = errors[0, :6]
+    gain = np.eye(3) + [[x, xy, xz], [xy, y, yz], [xz, yz, z]]
+    G = errors[0, 6:].reshape(3, 3)
+    middle = _rates(TIMES + 0.5 * late)
+    true = (middle - bias - G @ FORCE) @ np.linalg.inv(gain).T
+    target = np.zeros((N, 3))
+    for i, axis in enumerate("xz"):
+        if name == f"target_rate_{axis}":
+            target[:, 2 * i] = size * (TIMES - 0.2)
+    seen = so3.compose(so3.exp(-target), tRm, so3.exp(true * late[:, None]))
+    level = LosDirectionFactor(TIMES, model.measured, model.sqrt_information, gimbal, CORE)
+    expected = level.predict(seen, angles)
+    if name == "los_scale":
+        expected[:, :2] += size * FORESEEN
+    np.testing.assert_allclose(picture, expected, atol=3e-6)
+
+
+def test_prediction_is_the_published_chain() -> None:
+    """d_l = Rx(eps + px) Rz(eta + pz) d_b, the gyro turned by Ry(gy) Rx(gx) Rz(gz), written out."""
+    blocks = _blocks(ALL, 0.1, 0.05)
+    px, gx, gy, pz, gz, roll, collimation, skew = blocks[1][0]
+    model = _factor(np.arange(N), ALL, 3)
+    for k, (azimuth, elevation) in enumerate(model.gimbal):
+        mRb = _passive(1, gy) @ _passive(0, gx) @ _passive(2, gz)
+        gimbal = _passive(0, elevation + px) @ _passive(1, skew) @ _passive(2, azimuth + pz)
+        cRm = _passive(1, roll) @ _passive(2, collimation) @ gimbal @ mRb.T
+        x, y, z = cRm @ so3.matrix(blocks[0][k]).T @ np.array([0.0, 1.0, 0.0])
+        expected = [-np.arctan2(z, y), np.arctan2(x, y)]
+        np.testing.assert_allclose(model.predict(blocks[0], blocks[1])[k, :2], expected, atol=1e-14)
+
+
+def test_only_the_difference_of_pz_and_gz_counts() -> None:
+    blocks = _blocks(ALL, 0.1, 0.05)
+    model = _factor(np.arange(N), ALL, 3)
+    turned = blocks[1] + 0.2 * np.array([name in ("delta_pz", "delta_gz") for name in ALL])
+    np.testing.assert_allclose(model(blocks[0], turned)[0], model(*blocks)[0], atol=1e-12)
+
+
+@pytest.mark.parametrize("off", [0.0, 0.05])
+def test_roll_is_right_handed_and_the_turn_of_the_picture(off: float) -> None:
+    """A small patch of the target, projected point by point: its best similarity turns by minus the camera's roll."""
+    roll = 0.3
+    model = LosDirectionFactor(np.zeros(1), np.zeros((1, 3)), np.eye(3)[None], np.zeros((1, 2)), ("camera_roll",))
+    tRm = so3.exp(np.array([[off, 0.0, -off]]))
+    predicted = model.predict(tRm, np.array([[roll]]))[0]
+    cRt = _passive(1, roll) @ so3.matrix(tRm[0]).T
+    patch = 1e-6 * np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    seen = (np.array([0.0, 1.0, 0.0]) + patch) @ cRt.T
+    points = seen[:, [0, 2]] / seen[:, [1]]
+    ahead = cRt[:, 1]
+    shift = points - ahead[[0, 2]] / ahead[1]
+    # Best rotation of (x, z) patch onto its picture; x towards z is left-handed about y.
+    cosine = (patch[:, [0, 2]] * shift).sum()
+    sine = (patch[:, 0] * shift[:, 1] - patch[:, 2] * shift[:, 0]).sum()
+    assert predicted[2] == pytest.approx(np.arctan2(sine, cosine), abs=1e-8)
+    assert predicted[2] == pytest.approx(roll, abs=1e-12 if off == 0.0 else 2e-3)
+
+
+def _cubics(seed: int) -> tuple[Array, list[np.poly1d]]:
+    rng = np.random.default_rng(seed)
+    return np.sort(rng.uniform(0, 2, 80)), [np.poly1d(rng.normal(size=4)) for _ in range(2)]
+
+
+def test_gimbal_path_is_exact_for_cubics() -> None:
+    t, angles = _cubics(4)
+    path = GimbalPath(t, np.stack([p(t) for p in angles], axis=1))
+    at = np.concatenate([t, np.random.default_rng(8).uniform(t[0], t[-1], 50)])
+    np.testing.assert_allclose(path.at(at), np.stack([p(at) for p in angles], axis=1), atol=1e-9)
+
+
+def test_local_motion_is_that_of_smooth_paths() -> None:
+    rates, step = _rates(TIMES), 1e-4
+    np.testing.assert_allclose(MOTION.rate, rates, atol=1e-4)
+    np.testing.assert_allclose(MOTION.acceleration, (_rates(TIMES + step) - rates) / step, atol=3e-2)
+    np.testing.assert_allclose(MOTION.gimbal, _gimbal(TIMES), atol=5e-5)
+    ahead, back = _gimbal(TIMES + step), _gimbal(TIMES - step)
+    np.testing.assert_allclose(MOTION.gimbal_rate, (ahead - back) / (2.0 * step), atol=2e-4)
+    second = (ahead - 2.0 * _gimbal(TIMES) + back) / step**2
+    np.testing.assert_allclose(MOTION.gimbal_acceleration, second, atol=3e-2)
+    assert MOTION.drivers is not None
+    np.testing.assert_allclose(MOTION.drivers, np.tile(FORCE, (N, 1)))
+
+
+def test_the_noise_that_a_gimbal_follows_is_no_motion_of_the_line_of_sight() -> None:
+    """A gimbal driven by a noisy gyro: its smoothed rate is the command at the gyro's smoothed rate."""
+    gyro = 0.2 * _rates(STAMPS) + 0.01 * np.random.default_rng(11).normal(size=(len(STAMPS), 3))
+    angles = np.zeros((len(STAMPS), 2))
+    for k, rate in enumerate(0.5 * (gyro[1:] + gyro[:-1])):
+        middle = angles[k] + 0.0025 * command(rate[None], angles[k : k + 1])[0]
+        angles[k + 1] = angles[k] + 0.005 * command(rate[None], middle[None])[0]
+    gimbal = GimbalPath(STAMPS, angles)
+    motion = LocalMotion.around(TIMES, STAMPS, gyro, gimbal)
+    left = motion.gimbal_rate - command(motion.rate, gimbal.at(TIMES))
+    assert np.abs(motion.rate - 0.2 * _rates(TIMES)).max() > 2e-3
+    assert np.abs(left).max() < 1e-4
+
+
+def _los_rate(X: Array, gimbal: Array, w_b: Array) -> tuple[Array, float]:
+    """The publication's eq. (2), pz = dz and gz = 0: inertial rates of the LOS frame about x and z, and about y."""
+    px, gx, gy, dz = X
+    azimuth, elevation = gimbal
+    w_m = _passive(1, gy) @ _passive(0, gx) @ w_b
+    s, c = np.sin(azimuth), np.cos(azimuth)
+    command_x = -c * w_m[0] - s * w_m[1]
+    command_z = np.tan(elevation) * (c * w_m[1] - s * w_m[0]) - w_m[2]
+    outer = _passive(2, azimuth + dz) @ w_b + np.array([0.0, 0.0, command_z])
+    w_l = _passive(0, elevation + px) @ outer + np.array([command_x, 0.0, 0.0])
+    return np.array([w_l[0], w_l[2]]), float(w_l[1])
+
+
+def test_exact_rate_matrix_is_the_derivative_of_the_kinematics() -> None:
+    rng = np.random.default_rng(5)
+    gimbal, rate = rng.uniform(-1, 1, size=(N, 2)), rng.normal(size=(N, 3))
+    exact, published = rate_matrix(gimbal, rate), rate_matrix(gimbal, rate, exact=False)
+    for k in range(N):
+        steps = 1e-6 * np.eye(4)
+        numeric = [(_los_rate(d, gimbal[k], rate[k])[0] - _los_rate(-d, gimbal[k], rate[k])[0]) / 2e-6 for d in steps]
+        np.testing.assert_allclose(exact[k], np.array(numeric).T, atol=1e-8)
+        assert roll_rate(gimbal, rate)[k] == pytest.approx(_los_rate(np.zeros(4), gimbal[k], rate[k])[1], abs=1e-12)
+    np.testing.assert_array_equal(exact[:, :, 1:], published[:, :, 1:])
+    # What the publication leaves out of H2,1: Rx(eps + px) turns the azimuth rate too.
+    s, c = np.sin(gimbal[:, 0]), np.cos(gimbal[:, 0])
+    azimuth_rate = np.tan(gimbal[:, 1]) * (c * rate[:, 1] - s * rate[:, 0]) - rate[:, 2]
+    np.testing.assert_allclose(exact[:, 1, 0] - published[:, 1, 0], -np.sin(gimbal[:, 1]) * azimuth_rate, atol=1e-12)
+
+
+def _rate_factor(rows: np.ndarray) -> LosRateFactor:
+    rng = np.random.default_rng(6)
+    H = rate_matrix(rng.uniform(-1, 1, size=(N, 2)), rng.normal(size=(N, 3)))
+    return LosRateFactor(TIMES[rows], rng.normal(size=(N, 2))[rows], H[rows], np.linspace(0.5, 2.0, N)[rows])
+
+
+def test_rate_jacobians_and_rows() -> None:
+    blocks = [np.broadcast_to(np.random.default_rng(7).normal(size=4), (N, 4))]
+    assert_jacobians(_rate_factor(np.arange(N)), blocks)
+    assert_rows_are_independent(_rate_factor, blocks)
+
+
+def test_compressed_rate_factor_solves_least_squares() -> None:
+    model = _rate_factor(np.arange(N))
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(model.on(0, compress=True).factor)
+    values = gtsam.Values()
+    values.insert(0, np.array([0.1, -0.2, 0.3, 0.0]))
+    solution = gtsam.GaussNewtonOptimizer(graph, values).optimize()
+    A = (model.H / model.sigma[:, None, None]).reshape(-1, 4)
+    b = (model.measured / model.sigma[:, None]).ravel()
+    np.testing.assert_allclose(solution.atVector(0), np.linalg.lstsq(A, b)[0], atol=1e-12)
+    np.testing.assert_allclose(gtsam.Marginals(graph, solution).marginalCovariance(0), np.linalg.inv(A.T @ A))
+
+
+@pytest.mark.parametrize("sigmas", [(2e-5, 2e-5, 2e-4), (2e-5, 6e-5, 2e-4)])
+def test_mixed_second_derivatives_by_roll(sigmas: tuple[float, float, float]) -> None:
+    """What residuals add to the Hessian by roll and others: exact where noise is as large either way, else near it.
+
+    The gradient is what it is; the excess is what the Hessian by roll alone has too much.
+    """
+    tRm, angles = _blocks(ALL, 0.02, 0.01)
+    rng = np.random.default_rng(7)
+    level = LosDirectionFactor(TIMES, np.zeros((N, 3)), np.tile(np.eye(3), (N, 1, 1)), GIMBAL.at(TIMES), ALL)
+    noise = 30.0 * rng.normal(size=(N, 3)) * sigmas
+    root = np.tile(np.diag(1.0 / np.array(sigmas)), (N, 1, 1))
+    model = LosDirectionFactor(TIMES, level.predict(tRm, angles) + noise, root, GIMBAL.at(TIMES), ALL)
+    factor, shared, roll = model.on(list(range(N)), 100), 100, ALL.index("camera_roll")
+    values = gtsam.Values()
+    for k in range(N):
+        values.insert(k, so3.to_gtsam(tRm[k]))
+    values.insert(shared, angles[0])
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(factor.factor)
+    keys = [*range(N), shared]
+
+    def gradient(by: Array, mixed: bool = False) -> tuple[Array, Array]:
+        move = gtsam.VectorValues()
+        move.insert(shared, by)
+        with Ensemble([factor]).at(there := values.retract(move), mixed=mixed):
+            H, g = graph.linearize(there).hessian(gtsam.Ordering(keys))
+        return np.asarray(H), -np.asarray(g)
+
+    still, step = np.zeros(len(ALL)), 1e-6 * np.eye(len(ALL))[roll]
+    exact = (gradient(step)[1] - gradient(-step)[1]) / 2e-6
+    (H, g), (bent, same) = gradient(still), gradient(still, mixed=True)
+    np.testing.assert_allclose(same, g, atol=1e-12 * np.abs(g).max())
+    own = 3 * N + roll
+    states, left_out = slice(0, 3 * N), np.abs(exact - H[own])[: 3 * N].max()
+    near = 0.03 if sigmas[0] == sigmas[1] else 0.7
+    assert np.abs(exact - bent[own])[states].max() < near * left_out
+    ensemble = Ensemble([factor])
+    with ensemble.at(values):
+        (excess,) = ensemble.excess()
+    assert excess[:2] == (shared, roll)
+    assert excess[2][0] == pytest.approx(np.square(noise[:, :2] / sigmas[:2]).sum(), rel=1e-6)
+    assert bent[own, own] - excess[2].sum() == pytest.approx(exact[own], rel=0.01 if sigmas[0] == sigmas[1] else 0.5)

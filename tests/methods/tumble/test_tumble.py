@@ -1,0 +1,571 @@
+"""The tumble method: magnetometer and accelerometer with nothing beside them, simulated and real."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from alidade.factors import so3
+from alidade.factors.chi_square import quantile
+from alidade.factors.ellipsoid import DipFactor, StrengthFactor, sagitta
+from alidade.factors.preintegration import GyroPath
+from alidade.factors.testing import assert_jacobians
+from alidade.factors.turned import FieldFactor, UpFactor
+from alidade.pipelines.applications.planning import make_plan
+from alidade.pipelines.applications.session import Session, resolve_method
+from alidade.pipelines.config import load_config
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.problem import Estimate
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.triads import triad_names, triad_of
+from alidade.pipelines.methods.tumble.model import prepare
+from alidade.pipelines.methods.tumble.recording import TumbleData, read_tumble, write_tumble
+from alidade.pipelines.methods.tumble.scenario import (
+    TumbledAccelerometer,
+    TumbledGyro,
+    TumbledMagnetometer,
+    TumbleScenario,
+)
+from alidade.pipelines.methods.tumble.unturned import unturned
+from alidade.pipelines.recording import series
+from alidade.pipelines.recording.checks import nanoseconds
+from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.writing import write_session
+from alidade.pipelines.settings import Config
+from alidade.pipelines.simulation.simulated import Simulated
+from alidade.pipelines.simulation.temperature import Warming
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import solve_incremental
+from tests.support.command import Command
+
+SHARED = Path(__file__).parents[4] / "shared" / "data"
+TUMBLE = method("tumble")
+N = 7
+T0 = 1_700_000_000_000_000_000
+# Few attitudes, gone through quickly, at a low rate: what takes long is the number of samples.
+BRIEF = TumbleScenario(attitudes=25, magnetometer=TumbledMagnetometer(rate_hz=20.0))
+TURNING = TumbleScenario(
+    attitudes=25,
+    magnetometer=TumbledMagnetometer(rate_hz=20.0),
+    accelerometer=TumbledAccelerometer(rate_hz=50.0),
+    gyro=TumbledGyro(rate_hz=50.0),
+)
+RESTING = TumbleScenario(attitudes=25, rest_s=1.5, accelerometer=TumbledAccelerometer(rate_hz=50.0))
+
+
+def replace_scenario(scenario: TumbleScenario, **changes: Any) -> TumbleScenario:
+    """With other values, sensors by their own keys."""
+    content = scenario.model_dump()
+    for key, value in changes.items():
+        content[key] = {**content[key], **value} if isinstance(value, dict) else value
+    return TumbleScenario.model_validate(content)
+
+
+def _shared(name: str) -> Path:
+    path = SHARED / name
+    if not path.exists():
+        pytest.skip(f"{path} is not there")
+    return path
+
+
+def _simulated(scenario: TumbleScenario, seed: int) -> Simulated:
+    return TUMBLE.simulate(scenario, seed)
+
+
+def _solved(simulated: Simulated) -> Estimate:
+    session = Session.of(TUMBLE, simulated)
+    return solve_batch(session.problem())
+
+
+def _errors(estimate: Estimate, truth: dict[str, float] | Any) -> tuple[np.ndarray, np.ndarray]:
+    """Errors of what is free, and their covariance."""
+    free = np.diag(estimate.covariance) > 0.0
+    error = estimate.values - np.array([truth[name] for name in estimate.names])
+    return error[free], estimate.covariance[np.ix_(free, free)]
+
+
+def _nees(scenario: TumbleScenario, seeds: Sequence[int]) -> tuple[float, float]:
+    """Sum over the seeds of the NEES, and of its degrees of freedom."""
+    total, dof = 0.0, 0
+    for seed in seeds:
+        simulated = _simulated(scenario, seed)
+        error, covariance = _errors(_solved(simulated), simulated.truth)
+        total += float(error @ np.linalg.solve(covariance, error))
+        dof += len(error)
+    return total, dof
+
+
+def _assert_consistent(scenario: TumbleScenario, seeds: Sequence[int]) -> None:
+    total, dof = _nees(scenario, seeds)
+    assert quantile(0.005, dof) < total < quantile(0.995, dof), f"NEES {total:.1f} for {dof}"
+
+
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_jacobians(symmetric: bool) -> None:
+    rng = np.random.default_rng(0)
+    time, sigma, raw = np.arange(float(N)), rng.uniform(0.5, 2.0, N), rng.normal(size=(N, 3))
+
+    def triads(d: int) -> np.ndarray:
+        near = [1, 0, 0, 1, 0, 1] if d == 9 else np.eye(3).ravel().tolist()
+        return np.array([*near, 0.0, 0.0, 0.0]) + 0.2 * rng.normal(size=(N, d))
+
+    d = 9 if symmetric else 12
+    strength = StrengthFactor(time, raw, sigma, 0.01 * sigma, symmetric)
+    assert_jacobians(strength, [triads(d), rng.uniform(0.5, 2.0, (N, 1))])
+    dip = DipFactor(time, rng.normal(size=(N, 3)), raw, sigma, (True, symmetric))
+    assert_jacobians(dip, [triads(9), triads(d), rng.uniform(-1.0, 1.0, (N, 1))])
+    warmth, slope = rng.uniform(-2.0, 8.0, N), 0.02 * rng.normal(size=(N, 3))
+    assert_jacobians(replace(strength, warmth=warmth), [triads(d), rng.uniform(0.5, 2.0, (N, 1)), slope])
+    assert_jacobians(replace(dip, warmth=warmth), [triads(9), triads(d), rng.uniform(-1.0, 1.0, (N, 1)), slope])
+
+
+@pytest.mark.parametrize("errors", [0, 6, 9, 15, 18])
+def test_jacobians_beside_a_gyro(errors: int) -> None:
+    rng, t = np.random.default_rng(errors), np.arange(0.0, 2.0, 0.01)
+    rate = np.stack([np.sin(3.0 * t), np.cos(2.0 * t), 0.5 * np.sin(t + 1.0)], axis=1)
+    force, warmth = np.cos(rate) + [0.0, 3.0, 9.0], (5.0 * np.sin(t))[:, None]
+    drivers = {0: None, 6: None, 9: warmth, 15: force, 18: np.column_stack([force, warmth])}
+    gyro = GyroPath(t, rate, [0.01, 0.02, -0.01], drivers[errors])
+    anchor = rng.uniform(0.3, 1.5, N)
+    time, sigma, raw = anchor + rng.uniform(-0.05, 0.05, N), rng.uniform(0.5, 2.0, N), rng.normal(size=(N, 3))
+    aRb, aRn = so3.exp(rng.normal(size=(N, 3))), so3.exp(rng.normal(size=(N, 3)))
+    triads = np.append(np.eye(3), np.zeros(3)) + 0.2 * rng.normal(size=(N, 12))
+    bias, strength = 0.02 * rng.normal(size=(N, 3)), rng.uniform(0.5, 2.0, (N, 1))
+    own = [1e-2 * rng.normal(size=(N, errors))] if errors else []
+    field = FieldFactor(time, anchor, raw, sigma, aRn, gyro, errors)
+    dip, delay = rng.uniform(-1.0, 1.0, (N, 1)), 0.01 * rng.normal(size=(N, 1))
+    # Errors are taken to be constant over the way from the anchor, to which they are corrected to first order.
+    assert_jacobians(field, [aRb, bias, triads, strength, dip, delay, *own], rtol=5e-5)
+    at_rest = UpFactor(time, anchor, raw, sigma, aRn, gyro, errors)
+    assert_jacobians(at_rest, [aRb, bias, triads, strength, *own], rtol=5e-5)
+    swung = replace(at_rest, unit=9.8)
+    assert_jacobians(swung, [aRb, bias, triads, strength, *own, rng.normal(size=(N, 3))], rtol=5e-5)
+    warm = replace(swung, warmth=rng.uniform(-2.0, 8.0, N))
+    arm, slope = rng.normal(size=(N, 3)), 0.02 * rng.normal(size=(N, 3))
+    assert_jacobians(warm, [aRb, bias, triads, strength, *own, arm, slope], rtol=5e-5)
+    assert_jacobians(replace(warm, unit=None), [aRb, bias, triads, strength, *own, slope], rtol=5e-5)
+
+
+def test_without_noise_there_is_no_error() -> None:
+    quiet = replace_scenario(
+        RESTING,
+        magnetometer={"density": 1e-13},
+        accelerometer={"density": 1e-9, "arm": 0.0},
+        field_error=0.0,
+    )
+    simulated = _simulated(quiet, 0)
+    estimate = _solved(simulated)
+    for name, value in zip(estimate.names, estimate.values, strict=True):
+        assert value == pytest.approx(simulated.truth[name], rel=2e-6, abs=1e-11), name
+
+
+def test_a_magnetometer_alone_is_consistent() -> None:
+    _assert_consistent(BRIEF, range(12))
+
+
+def test_a_magnetometer_of_unknown_place_is_consistent() -> None:
+    _assert_consistent(replace_scenario(BRIEF, latitude_deg=None), range(6))
+
+
+def test_both_sensors_are_consistent() -> None:
+    _assert_consistent(RESTING, range(6))
+
+
+def test_continuous_tumbling_with_a_gyro_is_consistent() -> None:
+    """Never at rest: sensors turned against each other, a late magnetometer, a gyro that is off and feels force."""
+    _assert_consistent(TURNING, range(2))
+
+
+@pytest.mark.slow
+def test_tumbling_with_rests_and_a_gyro_is_consistent_over_many_seeds() -> None:
+    _assert_consistent(replace_scenario(TURNING, rest_s=1.5), range(24))
+
+
+@pytest.mark.slow
+def test_offsets_that_follow_the_temperature_are_consistent() -> None:
+    """Of the accelerometer and of the gyro beside it."""
+    warming = TURNING.model_copy(update={"temperature": Warming(rise_k=15.0, time_constant_s=30.0)})
+    _assert_consistent(replace_scenario(warming, rest_s=1.5), range(24))
+
+
+def test_a_gyro_makes_few_attitudes_enough() -> None:
+    """Within 10 deg of level the field's length tells K to 17 %, its direction beside a gyro to 1.3 %."""
+    narrow = replace_scenario(TURNING, tilt_deg=10.0, accelerometer=None)
+    simulated = _simulated(narrow, 1)
+    beside, alone = (
+        solve_batch(TUMBLE.problem(data, load_config(simulated.config.encode())))
+        for data in (simulated.data, replace(simulated.data, gyro_t=None, gyro=None))
+    )
+    sigmas = [dict(zip(each.names, each.sigmas, strict=True))["mag_k33"] for each in (beside, alone)]
+    assert sigmas[0] < 0.15 * sigmas[1]
+    error, covariance = _errors(beside, simulated.truth)
+    assert np.abs(error / np.sqrt(np.diag(covariance))).max() < 4.0
+
+
+@pytest.mark.slow
+def test_the_incremental_solver_agrees_beside_a_gyro() -> None:
+    session = Session.of(TUMBLE, _simulated(replace_scenario(TURNING, attitudes=12), 3))
+    batch, step_by_step = solve_batch(session.problem()), solve_incremental(session.problem(), 1.0)
+    assert np.abs((step_by_step.values - batch.values) / np.maximum(batch.sigmas, 1e-15)).max() < 1.0
+
+
+def test_without_a_position_the_gyro_is_not_used_and_that_is_told() -> None:
+    simulated = _simulated(TURNING, 0)
+    problem = TUMBLE.problem(replace(simulated.data, latitude=None, longitude=None), Config())
+    assert "gyro is not used: that needs latitude_deg" in " ".join(problem.premises)
+    assert "gyro_bias_x" not in {q.name for q in problem.quantities}
+
+
+def test_a_gyro_that_does_not_turn_with_the_field_is_not_used() -> None:
+    simulated = _simulated(replace_scenario(TURNING, accelerometer=None), 0)
+    assert simulated.data.gyro is not None
+    backwards = replace(simulated.data, gyro=simulated.data.gyro[::-1])
+    assert "does not turn as the field does" in " ".join(TUMBLE.problem(backwards, Config()).premises)
+
+
+def test_a_gyro_in_degrees_is_not_used_and_that_is_told(tmp_path: Path) -> None:
+    simulated = _simulated(TURNING, 0)
+    assert simulated.data.gyro is not None
+    write_tumble(tmp_path / "s.mcap", replace(simulated, data=replace(simulated.data, gyro=57.3 * simulated.data.gyro)))
+    session = Session.read(open_recording(tmp_path / "s.mcap"), "tumble", None)
+    assert "is it in deg/s, or in counts?" in " ".join(session.problem().premises)
+
+
+def test_left_handed_axes_are_told_beside_a_gyro() -> None:
+    simulated = _simulated(replace_scenario(TURNING, rest_s=1.5), 2)
+    assert simulated.data.mag is not None
+    mirrored = replace(simulated.data, mag=simulated.data.mag * np.array([1.0, 1.0, -1.0]))
+    problem = TUMBLE.problem(mirrored, load_config(simulated.config.encode()))
+    assert "left-handed" in " ".join(problem.premises)
+    estimate = solve_batch(problem)
+    values = dict(zip(estimate.names, estimate.values.tolist(), strict=True))
+    assert values["mag_k33"] == pytest.approx(-simulated.truth["mag_k33"], abs=0.02)
+
+
+def test_much_noise_biases_an_algebraic_ellipsoid_and_not_the_graph() -> None:
+    # 4 % of the field in each sample: what the mean length has too much is 0.16 % of it.
+    loud = replace_scenario(
+        BRIEF,
+        magnetometer={"density": 5e-7, "rate_hz": 20.0},
+        field_error=0.0,
+        attitudes=60,
+        priors={"field_strength": 0.0},
+    )
+    sums = {"graph": 0.0, "published": 0.0}
+    sigma = 0.0
+    for seed in range(8):
+        simulated = _simulated(loud, seed)
+        session = Session.of(TUMBLE, simulated)
+        problem = session.problem()
+        found = {
+            "graph": solve_batch(problem),
+            "published": TUMBLE.published(session.data, session.config, problem),
+        }
+        for name, estimate in found.items():
+            gains = dict(zip(estimate.names, estimate.values, strict=True))
+            true = sum(simulated.truth[f"mag_k{i}{i}"] for i in "123")
+            sums[name] += sum(gains[f"mag_k{i}{i}"] for i in "123") / true - 1.0
+        graph = found["graph"]
+        rows = [graph.names.index(f"mag_k{i}{i}") for i in "123"]
+        sigma += float(graph.covariance[np.ix_(rows, rows)].sum()) / 9.0
+    assert abs(sums["graph"]) < 3.0 * sigma**0.5
+    assert sums["published"] < -10.0 * sigma**0.5
+
+
+def test_few_directions_are_told_and_not_guessed() -> None:
+    """A device that stays within 20 deg of level sees a strip of the ellipsoid."""
+    narrow = replace_scenario(BRIEF, tilt_deg=20.0)
+    simulated = _simulated(narrow, 1)
+    calibration = Session.of(TUMBLE, simulated).calibrate()
+    assert calibration.status in ("weak", "unobservable")
+    error = calibration.estimate.values - np.array([simulated.truth[n] for n in calibration.estimate.names])
+    assert np.abs(error / calibration.estimate.sigmas).max() < 4.0
+    (row,) = calibration.findings["coverage"]
+    assert "turn it there too" in str(row["says"])
+
+
+def test_the_incremental_solver_agrees() -> None:
+    session = Session.of(TUMBLE, _simulated(BRIEF, 3))
+    batch, step_by_step = solve_batch(session.problem()), solve_incremental(session.problem(), 1.0)
+    assert np.abs((step_by_step.values - batch.values) / batch.sigmas).max() < 0.3
+    np.testing.assert_allclose(step_by_step.sigmas, batch.sigmas, rtol=0.1)
+
+
+def test_a_recording_gives_the_data_back(tmp_path: Path) -> None:
+    simulated = _simulated(RESTING, 0)
+    write_tumble(tmp_path / "s.mcap", simulated)
+    data: TumbleData = read_tumble(open_recording(tmp_path / "s.mcap"), Config())
+    for name in ("mag_t", "mag", "accel", "latitude", "longitude"):
+        np.testing.assert_allclose(getattr(data, name), getattr(simulated.data, name), rtol=1e-12, atol=1e-15)
+    assert data.mag_density == pytest.approx(simulated.data.mag_density, rel=1e-6)
+
+
+def test_left_handed_axes_are_told() -> None:
+    simulated = _simulated(RESTING, 2)
+    mirrored = replace(simulated.data, mag=simulated.data.mag * np.array([1.0, 1.0, -1.0]))
+    calibration = Session.of(TUMBLE, replace(simulated, data=mirrored)).calibrate()
+    assert "left-handed" in calibration.headline + " ".join(calibration.notes)
+    values = dict(zip(calibration.estimate.names, calibration.estimate.values, strict=True))
+    for i in "123":
+        error = values[f"mag_k{i}3"] + simulated.truth[f"mag_k{i}3"]
+        assert abs(error) < 4.0 * calibration.parameters[f"mag_k{i}3"].sigma
+
+
+def test_a_magnetometer_on_other_axes_is_turned_into_those_of_the_accelerometer() -> None:
+    simulated = _simulated(RESTING, 4)
+    turned = so3.exp(np.array([np.pi, 0.0, 0.0]))
+    calibration = Session.of(
+        TUMBLE, replace(simulated, data=replace(simulated.data, mag=so3.rotate(turned, simulated.data.mag)))
+    ).calibrate()
+    assert calibration.status == "calibrated"
+    K = np.array([[calibration.parameters[f"mag_k{i}{j}"].value for j in "123"] for i in "123"])
+    true = np.array([[simulated.truth[f"mag_k{i}{j}"] for j in "123"] for i in "123"]) @ so3.matrix(turned).T
+    np.testing.assert_allclose(K, true, atol=0.01)
+
+
+def _write(path: Path, data: TumbleData, mag: bool = True, accel: bool = True) -> None:
+    topics: dict[str, series.Topic] = {}
+    if mag and data.mag is not None and data.mag_t is not None:
+        topics["/mag"] = series.MagneticSeries(nanoseconds(data.mag_t, data.epoch_ns), data.mag)
+    if accel and data.accel is not None and data.accel_t is not None:
+        still = np.zeros((len(data.accel_t), 3))
+        topics["/imu"] = series.ImuSeries(nanoseconds(data.accel_t, data.epoch_ns), still, data.accel)
+    write_session(path, topics, {})
+
+
+def test_the_command_finds_it_by_itself_and_says_what_there_is(tmp_path: Path, alidade: Command) -> None:
+    _write(tmp_path / "phone.mcap", _simulated(RESTING, 1).data)
+    assert "tumble: yes" in alidade("info", tmp_path / "phone.mcap").out
+    run = alidade("calibrate", tmp_path / "phone.mcap", "--out", tmp_path / "out")
+    assert run.code == 0
+    assert "field's strength is unknown and called 1" in run.out.replace("\n", " ")
+    yaml = (tmp_path / "out" / "calibration.yaml").read_text()
+    assert "hard iron" in yaml
+    assert "* mag + [mag_b1, mag_b2, mag_b3]" in yaml
+    assert (tmp_path / "out" / "report.html").read_text().count("Directions covered by the") == 2
+
+
+def test_an_accelerometer_alone_if_asked_for(tmp_path: Path) -> None:
+    simulated = _simulated(RESTING, 5)
+    _write(tmp_path / "s.mcap", simulated.data, mag=False)
+    with pytest.raises(InputError, match="no usable topics for any method"):
+        Session.read(open_recording(tmp_path / "s.mcap"), None, None)
+    calibration = Session.read(open_recording(tmp_path / "s.mcap"), "tumble", None).calibrate()
+    for name, parameter in calibration.parameters.items():
+        if name.startswith("accel"):
+            assert abs(parameter.value - simulated.truth[name]) < 4.0 * parameter.sigma, name
+            # Gravity is known to 2e-3 where the latitude is not.
+            assert parameter.sigma > 1e-3 or not name.endswith(("11", "22", "33"))
+
+
+@pytest.mark.parametrize("stated", [5e-8, 5e-7, None])
+def test_a_magnetometer_that_did_not_turn_is_refused(stated: float | None) -> None:
+    data: TumbleData = _simulated(BRIEF, 0).data
+    assert data.mag is not None
+    rest = [2e-5, 0.0, -4e-5] + 1e-7 * np.random.default_rng(0).standard_normal(data.mag.shape)
+    with pytest.raises(InputError, match=r"topic /mag: the device did not turn, .*; turn it slowly through all"):
+        TUMBLE.problem(replace(data, mag=rest, mag_density=stated), Config())
+
+
+def test_turns_within_the_noise_that_is_stated_are_none() -> None:
+    """Readings of many attitudes become one where messages state ten times as much noise as these are apart."""
+    data: TumbleData = _simulated(BRIEF, 0).data
+    assert data.mag is not None
+    nearly = data.mag.mean(axis=0) + 0.05 * (data.mag - data.mag.mean(axis=0))
+    with pytest.raises(InputError, match="topic /mag: the device did not turn"):
+        TUMBLE.problem(replace(data, mag=nearly, mag_density=5e-6), Config())
+
+
+@pytest.mark.parametrize("scenario", [RESTING, TURNING])
+def test_an_accelerometer_that_did_not_turn_is_refused(scenario: TumbleScenario) -> None:
+    data: TumbleData = _simulated(scenario, 0).data
+    assert data.accel is not None
+    rest = [0.0, 0.0, 9.81] + 1e-2 * np.random.default_rng(0).standard_normal(data.accel.shape)
+    with pytest.raises(InputError, match="topic /imu: the device did not turn"):
+        TUMBLE.problem(replace(data, accel=rest), Config())
+
+
+def test_other_methods_go_first(tmp_path: Path) -> None:
+    t = T0 + np.arange(0, 10**9, 10**7)
+    still, zeros = np.zeros((100, 3)), np.zeros((100, 2))
+    topics: dict[str, series.Topic] = {"/mag": series.MagneticSeries(t, still)}
+    write_session(tmp_path / "alone.mcap", topics, {})
+    assert resolve_method(None, open_recording(tmp_path / "alone.mcap"), Config()) == "tumble"
+    topics["/imu"] = series.ImuSeries(t, still)
+    topics["/indexer/joint_states"] = series.JointSeries(t, zeros, ("outer_x", "inner_z"))
+    write_session(tmp_path / "turns.mcap", topics, {})
+    assert resolve_method(None, open_recording(tmp_path / "turns.mcap"), Config(latitude_deg=40.0)) == "indexer"
+
+
+def test_whoever_turns_it_is_told_where_to() -> None:
+    narrow = _simulated(replace_scenario(RESTING, tilt_deg=60.0), 0)
+    items = {item.what: item for item in TUMBLE.checklist(narrow.data, Config())}
+    # Up never came near -z.
+    assert re.match(r"rest it with this side up: -z", items["sides up"].wanted)
+    whole = _simulated(replace_scenario(BRIEF, attitudes=60), 0)
+    assert [item.wanted for item in TUMBLE.checklist(whole.data, Config())] == [""]
+
+
+def test_a_plan_that_falls_short_turns_it_upside_down(tmp_path: Path) -> None:
+    (tmp_path / "narrow.yaml").write_text("{attitudes: 20, tilt_deg: 25.0, magnetometer: {rate_hz: 10.0}}")
+    plan = make_plan("tumble", str(tmp_path / "narrow.yaml"), most_steps=1)
+    assert plan.now.missing
+    assert [step.change for step in plan.steps] == ["turned upside down too"]
+    assert not plan.best.missing
+
+
+def test_too_little_is_an_input_error(tmp_path: Path) -> None:
+    data = _simulated(BRIEF, 0).data
+    few = replace(data, mag_t=data.mag_t[:8], mag=data.mag[:8])
+    with pytest.raises(InputError, match="mag: 8 readings, at least 12"):
+        TUMBLE.problem(few, Config())
+    write_session(tmp_path / "n.mcap", {"/other": series.MagneticSeries(np.arange(9), np.ones((9, 3)))}, {})
+    with pytest.raises(InputError, match="neither /mag"):
+        Session.read(open_recording(tmp_path / "n.mcap"), "tumble", None)
+
+
+def test_the_mean_of_points_of_an_ellipsoid_lies_inside_it() -> None:
+    rng = np.random.default_rng(5)
+    K, b = np.eye(3) + 0.2 * rng.normal(size=(3, 3)), 0.1 * rng.normal(size=3)
+    numbers = np.concatenate([K.ravel(), b])
+    about = rng.normal(size=(20, 1, 3)) + 0.05 * rng.normal(size=(20, 400, 3))
+    points = np.linalg.solve(K, (about / np.linalg.norm(about, axis=-1, keepdims=True) - b)[..., None])[..., 0]
+    means = points.mean(axis=1)
+    apart = points - means[:, None]
+    scatter = np.einsum("nki,nkj->nij", apart, apart) / 400
+    distance = StrengthFactor(np.arange(20.0), means, np.ones(20), np.zeros(20), symmetric=False)
+    inside = -distance(np.tile(numbers, (20, 1)), np.ones((20, 1)))[0][:, 0]
+    np.testing.assert_allclose(sagitta(means, scatter, numbers), inside, rtol=0.03)
+
+
+def test_a_rest_counts_as_one_attitude() -> None:
+    data = _simulated(TumbleScenario(attitudes=4, rest_s=3.0), 1).data
+    (sensor,) = prepare(data, Config.model_validate({"noise": {"mag_density": 5e-8}})).sensors
+    means = unturned(sensor)
+    assert len(means.raw) < 0.1 * len(sensor.raw)
+    # ... and no sample counts for more or less than before.
+    assert (means.sigma**-2.0).sum() == pytest.approx((sensor.sigma**-2.0).sum())
+    # An outlier stays alone, and does not pull the others with it.
+    rest = int(np.argmax(means.sigma**-2.0))
+    row = int(np.searchsorted(sensor.time, means.time[rest]))
+    raw = sensor.raw.copy()
+    raw[row] += 0.2 * sensor.radius
+    spoiled = unturned(replace(sensor, raw=raw))
+    assert spoiled.sigma[np.flatnonzero(spoiled.time == sensor.time[row])] == pytest.approx(sensor.sigma[row])
+    # Where nobody states the noise, what scatters may be motion.
+    (sensor,) = prepare(replace(data, mag_density=None), Config()).sensors
+    assert unturned(sensor) is sensor
+
+
+def test_the_figures_of_a_published_example(tmp_path: Path) -> None:
+    """MATLAB's reference page of magcal: points on an ellipsoid of which it says a field strength of 31.0723."""
+    centre, axes = np.array([-50.0, 20.0, 100.0]), np.array([30.0, 20.0, 50.0])
+    around, up = np.meshgrid(np.linspace(-np.pi, np.pi, 21), np.linspace(-0.5 * np.pi, 0.5 * np.pi, 21))
+    unit = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=-1).reshape(-1, 3)
+    rows = [f"{0.02 * k:.2f},{x!r},{y!r},{z!r}" for k, (x, y, z) in enumerate((centre + axes * unit).tolist())]
+    (tmp_path / "mag.csv").write_text("\n".join(["t,x,y,z", *rows]))
+    config = Config.model_validate({"columns": {"/mag": {"time": "t", "field": ["x", "y", "z"]}}})
+    estimate = Session.read(open_recording(tmp_path / "mag.csv"), None, config).calibrate().estimate
+    K, b, _ = _centre_with_sigmas(estimate)
+    assert np.linalg.det(K) ** (-1.0 / 3.0) == pytest.approx(31.0723, abs=5e-5)
+    np.testing.assert_allclose(-np.linalg.solve(K, b), centre, atol=1e-4)
+    np.testing.assert_allclose(np.linalg.inv(K), np.diag(axes), atol=1e-4)
+
+
+def test_a_real_magnetometer_alone(tmp_path: Path) -> None:
+    """ICM-20948 counts, tumbled by hand indoors: the published centre to 0.2 % of the field, and within its sigmas."""
+    counts = np.loadtxt(_shared("icm20948") / "mag3_raw.csv", delimiter=",")
+    rows = [f"{0.2 * k:.1f},{x:g},{y:g},{z:g}" for k, (x, y, z) in enumerate(counts)]
+    (tmp_path / "mag.csv").write_text("\n".join(["t,x,y,z", *rows]))
+    config = Config.model_validate({"columns": {"/mag": {"time": "t", "field": ["x", "y", "z"]}}})
+    calibration = Session.read(open_recording(tmp_path / "mag.csv"), None, config).calibrate()
+    assert calibration.method.name == "tumble"
+    K, b, spread = _centre_with_sigmas(calibration.estimate)
+    centre = -np.linalg.solve(K, b)
+    published = np.array([9955.15, -7948.26, 8511.80])
+    radius = np.linalg.det(K) ** (-1.0 / 3.0)
+    assert np.linalg.norm(centre - published) < 2e-3 * radius
+    assert np.all(np.abs(centre - published) < 3.0 * spread)
+    # Soft iron as published, for a sphere of 1000, within sigmas and to 0.2 %.
+    soft = np.array([[0.25060, 0.02942, -0.02955], [0.02942, 0.31692, 0.00789], [-0.02955, 0.00789, 0.30592]])
+    np.testing.assert_allclose(1e3 * K, soft, atol=7e-4)
+
+
+def _centre_with_sigmas(estimate: Estimate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """K, b, and the sigmas of the centre -K^-1 b, by differences."""
+    names = triad_names("mag", symmetric=True)
+    rows = [estimate.names.index(name) for name in names]
+    values = estimate.values[rows]
+
+    def centre(numbers: np.ndarray) -> np.ndarray:
+        K, b = triad_of("mag", dict(zip(names, numbers.tolist(), strict=True)))
+        return -np.linalg.solve(K, b)
+
+    steps = 1e-3 * np.diag(estimate.sigmas[rows])
+    J = np.array([(centre(values + s) - centre(values - s)) / (2.0 * s.max()) for s in steps]).T
+    spread = np.sqrt(np.diag(J @ estimate.covariance[np.ix_(rows, rows)] @ J.T))
+    return *triad_of("mag", dict(zip(names, values.tolist(), strict=True))), spread
+
+
+def test_a_real_pair_of_accelerometer_and_magnetometer(tmp_path: Path) -> None:
+    """The same device's other take: its data sheet says that the magnetometer's y and z are opposite."""
+    folder = _shared("icm20948")
+    accel, mag = (np.loadtxt(folder / name, delimiter=",") for name in ("acc.csv", "mag.csv"))
+    stamps = 200_000_000 * np.arange(len(mag))
+    topics: dict[str, series.Topic] = {
+        "/imu": series.ImuSeries(stamps, np.zeros_like(accel), accel),
+        "/mag": series.MagneticSeries(stamps, mag),
+    }
+    write_session(tmp_path / "s.mcap", topics, {})
+    calibration = Session.read(open_recording(tmp_path / "s.mcap"), None, None).calibrate()
+    K = np.array([[calibration.parameters[f"mag_k{i}{j}"].value for j in "123"] for i in "123"])
+    K /= np.cbrt(abs(np.linalg.det(K)))
+    np.testing.assert_allclose(K, np.diag([1.0, -1.0, -1.0]), atol=0.04)
+    # 16384 counts a g by the data sheet, whose scale is good to 2.5 % or so.
+    for i in "123":
+        assert calibration.parameters[f"accel_k{i}{i}"].value * 16384.0 == pytest.approx(9.80665, rel=0.03)
+
+
+def test_a_real_accelerometer_alone() -> None:
+    """38 static poses of an ADXL355 against the published calibration, in the axes in which that K is symmetric."""
+    path = _shared("openaxes_imu9") / "adxl.mcap"
+    calibration = Session.read(open_recording(path), "tumble", Config(latitude_deg=52.38)).calibrate()
+    scale = 9.8126 / 9.81744
+    K = scale * np.array([[0.96276, 0.0015751, -0.00018891], [0.0, 0.96732, 0.000859], [0.0, 0.0, 0.97079]])
+    squares, axes = np.linalg.eigh(K.T @ K)
+    symmetric = (axes * np.sqrt(squares)) @ axes.T
+    b = symmetric @ np.linalg.solve(K, -scale * np.array([0.064447, 0.011034, 0.034253]))
+    published = [*symmetric[np.triu_indices(3)], *b]
+    for name, value in zip(triad_names("accel", symmetric=True), published, strict=True):
+        assert abs(calibration.parameters[name].value - value) < 3.0 * calibration.parameters[name].sigma, name
+
+
+@pytest.mark.parametrize("beside", ["", "accel", pytest.param("accel gyro", marks=pytest.mark.slow)])
+def test_a_cube_recording_without_all_the_rest(beside: str, tmp_path: Path) -> None:
+    """K of the cube's truth up to the rotation that nothing tells here: K'K and the offset of the raw numbers."""
+    source = _shared("contract") / "cube_nominal.mcap"
+    recording = open_recording(source)
+    field = recording.magnetic("/mag")
+    topics: dict[str, series.Topic] = {"/mag": series.MagneticSeries(field.t_ns, field.field)}
+    if beside:
+        imu = recording.imu("/imu")
+        gyro = imu.gyro if "gyro" in beside else np.zeros_like(imu.gyro)
+        topics["/imu"] = series.ImuSeries(imu.t_ns, gyro, imu.accel)
+    write_session(tmp_path / "mag.mcap", topics, {})
+    at = {"latitude_deg": 40.0, "longitude_deg": 116.3, "altitude_m": 50.0, "date": "2026-11-20"}
+    place = Config.model_validate(at)
+    calibration = Session.read(open_recording(tmp_path / "mag.mcap"), None, place).calibrate()
+    truth = json.loads((_shared("contract") / "cube_nominal.truth.json").read_text())
+    values = dict(zip(calibration.estimate.names, calibration.estimate.values.tolist(), strict=True))
+    for name in ("accel", "mag") if beside else ("mag",):
+        (K, b), (true_K, true_b) = triad_of(name, values), triad_of(name, truth)
+        np.testing.assert_allclose(np.linalg.solve(K, b), np.linalg.solve(true_K, true_b), atol=0.01 * abs(b).max())
+        np.testing.assert_allclose(K.T @ K, true_K.T @ true_K, atol=0.012)
+    assert ("gyro_bias_x" in values) == ("gyro" in beside)

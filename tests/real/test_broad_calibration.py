@@ -1,0 +1,73 @@
+"""The head method on real recordings: three BROAD trials, scored against what was held back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alidade.pipelines.applications.session import calibrate
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.reports.write import write_results
+from datasets.broad import Score, read_trial, score_results
+from tests.support.broad_trials import TRIALS, converted
+
+
+@pytest.fixture(scope="module", params=[1, pytest.param(len(TRIALS), marks=pytest.mark.slow)], ids=["one", "all"])
+def scored(
+    request: pytest.FixtureRequest, shared_data: Path, tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, tuple[Calibration, Score]]:
+    """The batch calibration of each trial, through the files that it writes."""
+    out = {}
+    for name in list(TRIALS)[: request.param]:
+        trial_file = shared_data / "broad" / f"{name}.mat"
+        folder = tmp_path_factory.mktemp(name)
+        converted(trial_file, folder / "s.mcap")
+        (calibration,) = calibrate(folder / "s.mcap", ["batch"])
+        write_results(folder / "results", calibration)
+        out[name] = calibration, score_results(read_trial(trial_file), folder / "results")
+    return out
+
+
+def test_attitude_is_better_than_a_quarter_degree(scored: dict[str, tuple[Calibration, Score]]) -> None:
+    """Vision alone is 0.865 deg off."""
+    for _, score in scored.values():
+        assert np.rad2deg(score.attitude_rms) < 0.25
+
+
+def test_gyro_bias_is_the_mean_rate_at_rest(scored: dict[str, tuple[Calibration, Score]]) -> None:
+    for _, score in scored.values():
+        assert np.rad2deg(np.abs(score.bias_error)).max() < 0.06
+
+
+def test_time_offset_is_found_and_agrees(scored: dict[str, tuple[Calibration, Score]]) -> None:
+    """About 4.1 ms, later than stamped; the slow trial knows it to 0.16 ms only."""
+    found = []
+    for calibration, score in scored.values():
+        sigma = calibration.parameters["time_offset"].sigma
+        assert score.time_offset == pytest.approx(4.1e-3, abs=3.0 * sigma + 0.15e-3)
+        found.append((score.time_offset, sigma))
+    for a, sigma_a in found:
+        for b, sigma_b in found:
+            assert abs(a - b) < 3.0 * np.hypot(sigma_a, sigma_b)
+
+
+def test_chi_square_fits_the_stated_noise(scored: dict[str, tuple[Calibration, Score]]) -> None:
+    for calibration, _ in scored.values():
+        assert calibration.assessment.status == "calibrated", calibration.assessment.headline
+
+
+@pytest.mark.slow
+def test_wrong_noise_is_said_plainly_and_changes_nothing(
+    scored: dict[str, tuple[Calibration, Score]], tmp_path: Path, shared_data: Path
+) -> None:
+    name = next(iter(TRIALS))
+    converted(shared_data / "broad" / f"{name}.mat", tmp_path / "s.mcap")
+    (tmp_path / "noise.yaml").write_text("noise: {vision_attitude: 0.004}\n")
+    (calibration,) = calibrate(tmp_path / "s.mcap", ["batch"], config_file=tmp_path / "noise.yaml")
+    right = scored[name][0]
+    assert calibration.status == right.status == "calibrated"
+    assert "vision_attitude: 0.00" in calibration.headline
+    assert "times what the config states" in calibration.headline
+    np.testing.assert_allclose(calibration.estimate.sigmas, right.estimate.sigmas, rtol=0.1)

@@ -1,0 +1,50 @@
+"""Real sensors whose noise nobody states: the numbers are right, and their sigmas honest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alidade.pipelines.applications.session import calibrate
+from alidade.pipelines.reports.write import write_results
+from datasets.broad import read_trial, score_results
+from tests.support.broad_trials import TRIALS, converted
+
+# An accelerometer turned by hand, as its authors published it (OpenAXES imu9), scaled to gravity as it is here.
+_GRAVITY = 9.8126 / 9.81744
+ACCEL_K = _GRAVITY * np.array([[0.96276, 0.0015751, -0.00018891], [0.0, 0.96732, 0.000859], [0.0, 0.0, 0.97079]])
+ACCEL_B = -_GRAVITY * np.array([0.064447, 0.011034, 0.034253])
+
+
+def test_a_cube_turned_by_hand_without_a_word_about_noise(shared_data: Path, tmp_path: Path) -> None:
+    (tmp_path / "c.yaml").write_text("latitude_deg: 52.38\n")
+    (found,) = calibrate(shared_data / "openaxes_imu9" / "adxl.mcap", ["batch"], "cube", tmp_path / "c.yaml")
+    assert found.status in ("calibrated", "weak"), found.headline
+    rows = [(f"accel_k{i + 1}{j + 1}", ACCEL_K[i, j]) for i in range(3) for j in range(i, 3)]
+    rows += [(f"accel_b{i + 1}", ACCEL_B[i]) for i in range(3)]
+    for name, published in rows:
+        p = found.parameters[name]
+        assert abs(p.value - published) < 3.0 * p.sigma, name
+        assert p.sigma < 3e-3
+    # All 38 poses, and a pause of a second on the way.
+    assert len(found.findings["static_poses"]) == 39
+    used = {noise.name: noise.used for noise in found.noises}
+    # Poses repeat to millimetres a second squared, which white noise over their duration does not say.
+    assert 1e-3 < used["accel_repeatability"] < 8e-3
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if i else []) for i, name in enumerate(TRIALS)]
+)
+def test_a_helmet_without_a_word_about_noise(name: str, shared_data: Path, tmp_path: Path) -> None:
+    trial = shared_data / "broad" / f"{name}.mat"
+    converted(trial, tmp_path / "s.mcap")
+    (tmp_path / "c.yaml").write_text("noise: {gyro_density: null, vision_attitude: null, gyro_bias_walk: null}\n")
+    (found,) = calibrate(tmp_path / "s.mcap", ["batch"], config_file=tmp_path / "c.yaml")
+    assert found.status == "calibrated", found.headline
+    write_results(tmp_path / "results", found)
+    score = score_results(read_trial(trial), tmp_path / "results")
+    sigmas = [found.parameters[f"gyro_bias_{axis}"].sigma for axis in "xyz"]
+    assert (np.abs(score.bias_error) < 3.0 * np.array(sigmas)).all()

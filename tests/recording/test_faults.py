@@ -1,0 +1,251 @@
+"""Faults of sensors in otherwise good recordings: dropped and counted, or refused in one line; never a wrong answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from alidade.pipelines.config import load_config
+from alidade.pipelines.diagnostics.observability import assess
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.problem import Array, Estimate, Problem
+from alidade.pipelines.methods import method
+from alidade.pipelines.methods.head import graph as head
+from alidade.pipelines.methods.head.recording import read_head, write_head
+from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from alidade.pipelines.methods.los import graph as los
+from alidade.pipelines.methods.los.recording import read_los, write_los
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.methods.tumble.scenario import TumbledAccelerometer
+from alidade.pipelines.recording.faults import drop_faults
+from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.settings import Config
+from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.solvers.batch import solve_batch
+from tests.support.builders import make_calibration
+
+SWAY = EulerMotion(
+    yaw=[Swing(amplitude_deg=20, frequency_hz=0.15)],
+    pitch=[Swing(amplitude_deg=8, frequency_hz=0.31)],
+    roll=[Swing(amplitude_deg=12, frequency_hz=0.21)],
+)
+LOS = LosScenario(duration_s=30.0, carrier=SWAY, image_rate_hz=20.0, gyro_rate_hz=200.0, gimbal_rate_hz=100.0)
+HEAD = HeadScenario(
+    duration_s=30.0, platform=SWAY, helmet_mount_deg=(3.0, -4.0, 2.0), gyro_rate_hz=200.0, vision_rate_hz=20.0
+)
+_RNG = np.random.default_rng(5)
+
+
+def _frozen(t: Array, rate: Array) -> tuple[Array, Array]:
+    rate = rate.copy()
+    rate[2301:2501] = rate[2300]
+    return t, rate
+
+
+def _one_axis_frozen(t: Array, rate: Array) -> tuple[Array, Array]:
+    rate = rate.copy()
+    rate[2301:2501, 1] = rate[2300, 1]
+    return t, rate
+
+
+def _clipped(t: Array, rate: Array) -> tuple[Array, Array]:
+    most = 0.93 * np.abs(rate).max(axis=0)
+    return t, np.clip(rate, -most, most)
+
+
+def _spiky(t: Array, rate: Array) -> tuple[Array, Array]:
+    rate = rate.copy()
+    rows = 7 + 60 * np.arange(len(t) // 60)
+    rate[rows, np.arange(len(rows)) % 3] = 300.0 * (-1.0) ** np.arange(len(rows))
+    return t, rate
+
+
+def _gappy(t: Array, rate: Array) -> tuple[Array, Array]:
+    keep = np.ones(len(t), dtype=bool)
+    keep[2000:2100] = False  # half a second
+    keep[_RNG.choice(len(t), len(t) // 20, replace=False)] = False  # and one sample in twenty
+    keep[[0, -1]] = True
+    return t[keep], rate[keep]
+
+
+def _half_the_rate(t: Array, rate: Array) -> tuple[Array, Array]:
+    half = len(t) // 2 // 2 * 2
+    paired = rate[half:][: (len(t) - half) // 2 * 2].reshape(-1, 2, 3).mean(axis=1)
+    times = t[half:][: 2 * len(paired)].reshape(-1, 2).mean(axis=1)
+    return np.concatenate([t[:half], times]), np.concatenate([rate[:half], paired])
+
+
+def _not_numbers(t: Array, rate: Array) -> tuple[Array, Array]:
+    rate = rate.copy()
+    rate[100:140] = np.nan
+    rate[900, 2] = np.inf
+    return t, rate
+
+
+Fault = Callable[[Array, Array], tuple[Array, Array]]
+FAULTS: dict[Fault, str] = {
+    _frozen: "frozen",
+    _one_axis_frozen: "frozen",
+    _clipped: "end of the sensor's range",
+    _spiky: "spike",
+    _gappy: "",
+    _half_the_rate: "",
+    _not_numbers: "not a finite number",
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A good session and how its gyro is spoilt: the fields of its stamps and rates."""
+
+    data: Any
+    truth: dict[str, float]
+    config: str
+    gyro: tuple[str, str]
+    write: Callable[..., None]
+    read: Callable[[Recording, Config], Any]
+    problem: Callable[[Any, Config], Problem]
+
+    @cached_property
+    def clean(self) -> Estimate:
+        return solve_batch(self.problem(self.data, load_config(self.config.encode())))
+
+
+@pytest.fixture(scope="module")
+def cases() -> dict[str, Case]:
+    # What a fault does to the gyro's samples it does not do to the accelerometer's: without them.
+    data, truth = simulate_head(HEAD, 3)
+    head_case = replace(data, head_force=None), truth, head_config(HEAD)
+    los_data, los_truth = simulate_los(LOS, 3)
+    los_case = replace(los_data, force=None), los_truth, los_config(LOS)
+    return {
+        "los": Case(*los_case, ("gyro_t", "gyro"), write_los, read_los, los.problem),
+        "head": Case(*head_case, ("head_t", "head_gyro"), write_head, read_head, head.problem),
+    }
+
+
+@pytest.mark.parametrize(
+    ("name", "fault"),
+    [
+        *(("los", fault) for fault in FAULTS),
+        *(pytest.param("head", f, marks=[pytest.mark.slow] * (f not in (_frozen, _gappy))) for f in FAULTS),
+    ],
+)
+def test_a_faulty_gyro_moves_no_parameter(name: str, fault: Fault, tmp_path: Path, cases: dict[str, Case]) -> None:
+    case = cases[name]
+    fields = case.gyro
+    spoilt = dict(zip(fields, fault(*(getattr(case.data, field) for field in fields)), strict=True))
+    case.write(tmp_path / "s.mcap", replace(case.data, **spoilt), case.truth, case.config)
+    config = load_config(case.config.encode())
+    read = case.read(open_recording(tmp_path / "s.mcap"), config)
+    assert any(FAULTS[fault] in reason for reason in read.dropped) or not FAULTS[fault]
+    problem = case.problem(read, config)
+    estimate = solve_batch(problem)
+    judged = assess(problem.quantities, estimate.covariance, estimate.chi_square, problem.advice)
+    assert judged.status == "calibrated"
+    error = np.abs(estimate.values - [case.truth.get(name, 0.0) for name in estimate.names]) / estimate.sigmas
+    assert error.max() < 4.0
+    assert (estimate.sigmas > 0.99 * case.clean.sigmas).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "rates", "brief"),
+    [
+        ("los", "gyro", {"duration_s": 20.0, "gyro_rate_hz": 100.0, "gimbal_rate_hz": 50.0, "image_rate_hz": 5.0}),
+        ("head", "head_gyro", {"duration_s": 20.0, "gyro_rate_hz": 100.0}),
+        ("indexer", "gyro", {}),
+        ("cube", "gyro", {"poses": 3, "static_s": 2.0, "camera": None}),
+        ("cube", "accel", {"poses": 3, "static_s": 2.0, "camera": None}),
+    ],
+)
+def test_saturated_samples_are_left_out_and_reported_by_every_method(
+    name: str, rates: str, brief: dict[str, Any], tmp_path: Path
+) -> None:
+    chosen = method(name)
+    simulated = chosen.simulate(chosen.settings().model_copy(update=brief), 3)
+    whole = getattr(simulated.data, rates)
+    most = np.sort(np.abs(whole), axis=0)[-len(whole) // 40]
+    clipped = replace(simulated.data, **{rates: np.clip(whole, -most, most)})
+    chosen.write(tmp_path / "s.mcap", replace(simulated, data=clipped))
+    recording = open_recording(tmp_path / "s.mcap")
+    found = chosen.read(recording, load_config(recording.attachment("alidade.yaml")))
+    ((what, count),) = ((what, n) for what, n in found.dropped.items() if what.endswith("end of the sensor's range"))
+    # Fewer than three in a row may be what there was.
+    assert count > 0.1 * np.count_nonzero((np.abs(getattr(clipped, rates)) == most).any(axis=1))
+    told = make_calibration()
+    told = replace(told, problem=replace(told.problem, dropped=found.dropped))
+    assert f"{what}: {count} samples left out" in told.notes
+
+
+def test_what_is_dropped_is_what_was_spoilt(cases: dict[str, Case]) -> None:
+    data = cases["los"].data
+    for fault in (_frozen, _clipped, _spiky):
+        t, rate = fault(data.gyro_t, data.gyro)
+        spoilt = np.flatnonzero((rate != data.gyro).any(axis=1))
+        lost = np.setdiff1d(np.arange(len(t)), drop_faults("/imu", t, rate, {}, "rad/s"))
+        # A reading clipped alone or in pairs cannot be told from the peak that it is.
+        assert np.isin(lost, spoilt).all()
+        assert len(lost) > 0.8 * len(spoilt)
+    assert len(drop_faults("/imu", data.gyro_t, data.gyro, {}, "rad/s")) == len(data.gyro)
+
+
+def test_a_quantised_sensor_at_rest_is_sound() -> None:
+    t = np.arange(20_000) / 100.0
+    moving = (np.maximum(-np.sin(0.05 * np.pi * t), 0.0) ** 2 * np.sin(3.0 * t))[:, None] * [1.0, -0.5, 2.0]
+    counts = np.round((moving + 0.3e-3 * np.random.default_rng(0).standard_normal((len(t), 3))) / 1e-3) * 1e-3
+    assert len(drop_faults("/imu", t, counts, {}, "rad/s")) == len(t)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda g: g * [1.0, 1.0, 0.0], "topic /imu: axis z reads 0 throughout while the others move"),
+        (lambda g: g * 0.0 + [0.0, 0.0, 9.8], r"topic /imu: all axes read the same throughout, \(0, 0, 9.8\) rad/s; "),
+        (lambda g: np.clip(g, -0.05, 0.05), r"topic /imu: \d+ % of the samples cannot be used: at the end of the"),
+    ],
+)
+def test_a_useless_sensor_is_refused(spoil: Callable[[Array], Array], message: str, cases: dict[str, Case]) -> None:
+    data = cases["los"].data
+    with pytest.raises(InputError, match=message):
+        drop_faults("/imu", data.gyro_t, spoil(data.gyro), {}, "rad/s")
+
+
+@pytest.mark.parametrize(
+    ("name", "readings", "brief"),
+    [
+        ("los", "gyro", {"duration_s": 5.0}),
+        ("head", "head_gyro", {"duration_s": 5.0}),
+        ("indexer", "gyro", {}),
+        *(("cube", readings, {"poses": 3, "static_s": 2.0, "camera": None}) for readings in ("gyro", "accel", "mag")),
+        *(("tumble", sensor, {"attitudes": 5, "accelerometer": TumbledAccelerometer()}) for sensor in ("mag", "accel")),
+    ],
+)
+def test_a_sensor_that_measures_nothing_is_refused_by_every_method(
+    name: str, readings: str, brief: dict[str, Any], tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=r"topic /.*: all axes read the same throughout") as caught:
+        _read_standing(name, readings, brief, tmp_path / "s.mcap")
+    assert "\n" not in str(caught.value)
+
+
+def test_the_gyro_of_a_parked_platform_may_read_zero(tmp_path: Path) -> None:
+    assert not _read_standing("head", "platform_gyro", {"duration_s": 5.0}, tmp_path / "s.mcap").platform_gyro.any()
+
+
+def _read_standing(name: str, readings: str, brief: dict[str, Any], path: Path) -> Any:
+    """A simulated recording one of whose sensors reads the same throughout, as its method reads it.
+
+    That is zero, but for an accelerometer, which is none if it reads zero.
+    """
+    chosen = method(name)
+    simulated = chosen.simulate(chosen.settings().model_copy(update=brief), 3)
+    same = np.full_like(getattr(simulated.data, readings), 9.8 if readings == "accel" else 0.0)
+    chosen.write(path, replace(simulated, data=replace(simulated.data, **{readings: same})))
+    recording = open_recording(path)
+    return chosen.read(recording, load_config(recording.attachment("alidade.yaml")))

@@ -1,0 +1,67 @@
+"""Files that grow: what is read of them by pieces is what is read of them at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording.growing import Growing
+from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.recording.writing import write_session
+from tests.support.live import messages, write
+from tests.support.recorded import session
+
+
+@pytest.mark.parametrize(("chunk_size", "count"), [(1, 60), (3_000, 300), (1 << 20, 300)])
+def test_what_grew_by_pieces_is_the_whole(tmp_path: Path, chunk_size: int, count: int) -> None:
+    write_session(tmp_path / "s.mcap", session(count))
+    with (tmp_path / "whole.mcap").open("wb") as out:
+        write(messages(tmp_path / "s.mcap"), out, chunk_size)
+    content = (tmp_path / "whole.mcap").read_bytes()
+    whole = open_recording(tmp_path / "whole.mcap")
+    path, growing = tmp_path / "grows.mcap", Growing()
+    ends = np.sort(np.random.default_rng(chunk_size).integers(9, len(content), 12)).tolist()
+    seen = 0
+    for end in [*ends, len(content)]:
+        path.write_bytes(content[:end])
+        try:
+            recording = Recording(growing.look([path], None), whole.epoch_ns)
+            imu = recording.imu("/imu")
+        except InputError:
+            assert seen == 0, "it could be read before"
+            continue
+        assert len(imu) >= seen
+        seen = len(imu)
+        for name in ("t_ns", "gyro", "accel"):
+            np.testing.assert_array_equal(getattr(imu, name), getattr(whole.imu("/imu"), name)[:seen])
+    assert seen == len(whole.imu("/imu"))
+
+
+def test_the_end_alone(tmp_path: Path) -> None:
+    write_session(tmp_path / "s.mcap", session(500))
+    with (tmp_path / "whole.mcap").open("wb") as out:
+        write(messages(tmp_path / "s.mcap"), out, 2_000)
+    whole, growing = open_recording(tmp_path / "whole.mcap"), Growing()
+    imu = whole.imu("/imu")
+    for since in (imu.t_ns[len(imu) // 3], imu.t_ns[-10]):
+        late = Recording(growing.look([tmp_path / "whole.mcap"], int(since)), whole.epoch_ns)
+        end = late.imu("/imu")
+        assert len(imu) > len(end) >= np.count_nonzero(imu.t_ns >= since)
+        np.testing.assert_array_equal(end.gyro, imu.gyro[-len(end) :])
+        assert late.epoch_ns == whole.epoch_ns
+
+
+def test_a_damaged_chunk_is_left_out(tmp_path: Path) -> None:
+    write_session(tmp_path / "s.mcap", session(500))
+    with (tmp_path / "whole.mcap").open("wb") as out:
+        write(messages(tmp_path / "s.mcap"), out, 2_000)
+    content = bytearray((tmp_path / "whole.mcap").read_bytes())
+    content[len(content) // 2 : len(content) // 2 + 4] = b"\xff\xff\xff\xff"
+    (tmp_path / "whole.mcap").write_bytes(content)
+    late = Recording(Growing().look([tmp_path / "whole.mcap"], None)).imu("/imu")
+    wanted = open_recording(tmp_path / "whole.mcap").imu("/imu")
+    np.testing.assert_array_equal(late.t_ns, wanted.t_ns)
+    np.testing.assert_array_equal(late.gyro, wanted.gyro)

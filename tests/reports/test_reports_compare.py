@@ -1,0 +1,74 @@
+"""compare.html: the solvers side by side."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alidade.pipelines.diagnostics.cross_validation import Halves
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.reports.compare import compare_html, write_compare
+from alidade.pipelines.reports.plots import common_plots
+from alidade.pipelines.reports.result import Calibration
+from tests.support.browser import drawn, needs_browser
+from tests.support.builders import make_calibration
+from tests.support.pages import Page
+
+
+def solvers(truth: dict[str, object] | None = None) -> list[Calibration]:
+    """A batch result, and one that is two of its sigmas off."""
+    batch = make_calibration(truth=truth)
+    batch = replace(batch, estimate=replace(batch.estimate, solver="batch"))
+    off = batch.estimate.values + 2.0 * batch.estimate.sigmas
+    return [batch, replace(batch, estimate=replace(batch.estimate, solver="incremental", values=off))]
+
+
+def test_differences_are_in_sigmas_of_batch() -> None:
+    page = Page(compare_html(solvers(), {}, {}))
+    assert page.loaded == []
+    estimated = [q for q in solvers()[0].problem.quantities if q.prior_sigma != 0.0]
+    assert page.text.count("+2.0") == len(estimated)
+    assert "error of" not in page.text
+    assert "cannot say Neither half determines a parameter" in page.text
+
+
+def test_truth_halves_and_held_out_measurements_are_told() -> None:
+    halves = {"time_offset": Halves(0.010, 0.003, 0.020, 0.004)}
+    page = Page(compare_html(solvers({"time_offset": 0.0125}), halves, {"vision": 1.06}))
+    assert "error of batch, σ" in page.text
+    assert "Does the recording agree with itself? yes Its two halves" in page.text
+    assert "10.0 ± 3.0 20.0 ± 4.0 +2.0" in page.text
+    assert "1.06 sigmas (vision)" in page.text
+
+
+def test_halves_that_differ_by_more_than_chance_are_told() -> None:
+    halves = {"time_offset": Halves(0.010, 0.003, 0.040, 0.004), "gyro_bias_x": Halves(0.0, 1e-3, 1e-4, 1e-3)}
+    page = Page(compare_html(solvers(), halves, {}))
+    assert "Does the recording agree with itself? no" in page.text
+    assert "time_offset (+6.0)" in page.text
+
+
+def test_ellipses_are_drawn_of_correlated_pairs_only() -> None:
+    def titles(correlation: float) -> list[str]:
+        covariance = np.diag([1e-6, 1e-6, 1e-6, 1e-8, 1e-8, 0.0])
+        covariance[0, 1] = covariance[1, 0] = correlation * 1e-6
+        return [plot.title for plot in common_plots(make_calibration(covariance=covariance))]
+
+    assert "Parameters that trade against each other" in titles(0.9)
+    assert "Parameters that trade against each other" not in titles(0.1)
+
+
+def test_what_cannot_be_written_is_bad_input(tmp_path: Path) -> None:
+    assert write_compare(tmp_path / "new", solvers(), {}, {}).read_text().startswith("<!doctype html>")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="no folder to write results to"):
+        write_compare(tmp_path / "file", solvers(), {}, {})
+
+
+@needs_browser
+def test_a_browser_draws_it_without_complaint(tmp_path: Path) -> None:
+    text = compare_html(solvers(), {"time_offset": Halves(0.010, 0.003, 0.020, 0.004)}, {"vision": 1.06})
+    assert drawn(text, tmp_path) == text.count('class="plot"') >= 2

@@ -1,0 +1,122 @@
+"""At rest what is known is a curve: the joint covariance has to cover it, not its tangent alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from alidade.pipelines.estimation.problem import Array, Estimate, Problem
+from alidade.pipelines.settings import Sensors
+from alidade.pipelines.solvers import batch, curvature
+from alidade.pipelines.solvers.batch import solve_batch
+from benchmarks.young import CASES, LOS, beginning, drawn_los, followed, made, nees
+from tests.support.builders import IDEAL
+
+
+def recording(seed: int, rest_s: float, duration_s: float, sensors: Sensors = IDEAL) -> tuple[Problem, Array]:
+    """A carrier that is at rest first; mounting angles and errors of the sensors are drawn from their priors."""
+    carrier = beginning(LOS.carrier, dict.fromkeys(("yaw", "pitch", "roll"), rest_s))
+    return made("los", drawn_los(seed, duration_s=duration_s, carrier=carrier, sensors=sensors), seed)
+
+
+def solved(problem: Problem, monkeypatch: pytest.MonkeyPatch | None = None) -> Estimate:
+    """By batch; with a patch, as the linear system has it alone."""
+    if monkeypatch is None:
+        return solve_batch(problem)
+    with monkeypatch.context() as patch:
+        patch.setattr(batch, "second_order", lambda *_: None)
+        return solve_batch(problem)
+
+
+def test_the_joint_covariance_at_rest_covers_the_valley(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Summed over six recordings; the tangent alone is refuted."""
+    bent, flat, numbers = 0.0, 0.0, 0
+    for seed in range(6):
+        problem, truth = recording(seed, 10.0, 6.0)
+        curved, linear = solved(problem), solved(problem, monkeypatch)
+        np.testing.assert_allclose(curved.sigmas, linear.sigmas, rtol=0.15)
+        size, dof = nees(curved.values, curved.covariance, truth)
+        bent, numbers = bent + size, numbers + dof
+        flat += nees(linear.values, linear.covariance, truth)[0]
+    assert bent < chi2.ppf(0.999, numbers), (bent, numbers)
+    assert flat > chi2.ppf(1.0 - 1e-5, numbers)
+
+
+def test_what_is_determined_needs_no_second_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem, _ = recording(1, 0.0, 15.0)
+    np.testing.assert_array_equal(solved(problem).covariance, solved(problem, monkeypatch).covariance)
+
+
+@pytest.mark.slow
+def test_joint_errors_fit_at_rest_and_when_motion_begins() -> None:
+    moments = np.array([2.0, 5.0, 8.0, 12.0, 15.0, 20.0])
+    found = [followed(*recording(seed, 10.0, 21.0, Sensors()), moments) for seed in range(4)]
+    sums = np.sum([each.nees for each in found], axis=0)
+    assert (sums < chi2.ppf(0.999, 4 * found[0].numbers)).all(), sums / 4.0
+
+
+def test_the_ways_that_bend_are_found_and_balanced() -> None:
+    """Two of five, or the one that bends most where none does by much."""
+    generator = np.random.default_rng(0)
+    true = np.linalg.qr(generator.standard_normal((5, 2)))[0].T
+    along = curvature._bending(np.array([np.outer(np.eye(5)[0], way) for way in true]), np.full(5, 0.01))
+    np.testing.assert_allclose(along.T @ along, true.T @ true, atol=1e-12)
+    draws = along @ curvature._balanced(along, np.eye(5), generator)
+    np.testing.assert_allclose(draws @ draws.T / draws.shape[1], np.eye(2), atol=1e-12)
+    slight = curvature._bending(1e-4 * generator.standard_normal((3, 5, 5)), np.ones(5))
+    np.testing.assert_allclose(slight @ slight.T, np.eye(1), atol=1e-12)
+
+
+def test_draws_do_not_depend_on_how_directions_are_told() -> None:
+    """Else sigmas would be what rounding makes of them, and others on another machine."""
+    generator = np.random.default_rng(0)
+    along = np.linalg.qr(generator.standard_normal((5, 2)))[0].T
+    axes = np.linalg.qr(generator.standard_normal((5, 5)))[0]
+    mixed = np.linalg.qr(generator.standard_normal((2, 2)))[0]
+    draws = curvature._balanced(along, np.eye(5), np.random.default_rng(1))
+    told = curvature._balanced(mixed @ along @ axes.T, axes, np.random.default_rng(1))
+    np.testing.assert_allclose(told, axes @ draws, atol=1e-12)
+
+
+def test_other_draws_tell_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sixteen at random would differ by a half."""
+    problem, _ = recording(0, 10.0, 6.0)
+    linear, covariance = solved(problem, monkeypatch).covariance, []
+    for seed in range(4):
+        default = np.random.default_rng
+        monkeypatch.setattr(np.random, "default_rng", lambda _, default=default, seed=seed: default(seed))
+        covariance.append(solve_batch(problem).covariance)
+        monkeypatch.undo()
+    scale = np.sqrt(np.diag(linear))
+    axes = np.linalg.eigh(linear / np.outer(scale, scale))[1] / scale[:, None]
+    best = [axes[:, 0] @ each @ axes[:, 0] for each in covariance]
+    assert min(best) > 100.0 * (axes[:, 0] @ linear @ axes[:, 0])
+    assert max(best) < 1.2 * min(best)
+
+
+def test_numbers_that_measurements_are_not_linear_in_are_covered() -> None:
+    """Turns about one axis: gains about the others stay unknown, and with them b = -K c, however well c is known.
+
+    Along the tangent of K and b alone it is 5,400.
+    """
+    settings, _ = CASES["cube"]["one axis"](1000)
+    problem, truth = made("cube", settings, 1000)
+    estimate = solve_batch(problem)
+    size, dof = nees(estimate.values, estimate.covariance, truth)
+    assert size < chi2.ppf(0.999, dof), (size, dof)
+
+
+def test_a_mount_that_nobody_knows_is_covered_before_the_second_axis_turns() -> None:
+    """Here and there known to a few hundredths of what mounts may be, which bend what is known a thousand times better.
+
+    Along the tangent alone it is 560. The mounts are of 90, 120 and 180 deg, against which no sign can be checked.
+    """
+    sums = np.zeros(2)
+    for number in (3001, 3002, 3003):
+        settings, shares = CASES["indexer"]["mount"](number)
+        problem, truth = made("indexer", settings, number)
+        last = [step.time for step in problem.steps(1)][-1]
+        found = followed(problem, truth, last * shares[:5])
+        sums += max(found.nees), found.numbers
+    assert sums[0] < chi2.ppf(0.999, sums[1]), sums

@@ -1,0 +1,73 @@
+"""Several minima: a deeper one is taken, one that is nearly as deep is told."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alidade.pipelines import methods
+from alidade.pipelines.applications.session import Session
+from alidade.pipelines.estimation.problem import Problem, Step
+from alidade.pipelines.methods.tumble.scenario import TumbledAccelerometer, TumbledMagnetometer, TumbleScenario
+from alidade.pipelines.solvers.assembly import CHUNK, Assembly
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.minima import CLOSE
+from alidade.pipelines.solvers.system import System
+
+# Iron by which one axis of the magnetometer says little.
+STRONG = TumbleScenario(magnetometer=TumbledMagnetometer(soft_iron=0.2))
+
+
+def tumbled(scenario: TumbleScenario, seed: int) -> Session:
+    method = methods.method("tumble")
+    return Session.of(method, method.simulate(scenario, seed))
+
+
+def test_mirrored_values_explain_all_measurements_alike() -> None:
+    both = TumbleScenario(attitudes=12, rest_s=2.0, accelerometer=TumbledAccelerometer())
+    problem = tumbled(both, 0).problem()
+    assert problem.elsewhere is not None
+    whole = Assembly.of(problem.steps(CHUNK))
+    measured = [f for f in whole.factors if f.measurement is not None]
+    system = System.of(measured, whole.shared(problem), None)
+    errors = [system.error(values) for values in problem.elsewhere(whole.initial)]
+    assert len(errors) == 7
+    np.testing.assert_allclose(errors, system.error(whole.initial), rtol=1e-9)
+
+
+def test_a_solution_nearly_as_likely_is_told(tmp_path: Path) -> None:
+    calibration = tumbled(STRONG, 1).calibrate()
+    calibration.write(tmp_path)
+    found = json.loads((tmp_path / "result.json").read_text())
+    assert found["status"] == "calibrated"
+    second = found["second_best"]
+    assert 0.0 < second["chi_square"] < CLOSE
+    assert abs(second["parameters"]["mag_k33"] - calibration.parameters["mag_k33"].value) > 0.3
+    sentence = f"its chi-square {second['chi_square']:.1f} higher"
+    assert sentence in found["headline"]
+    assert sentence in (tmp_path / "report.html").read_text()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_nominal_recordings_have_one_solution(seed: int) -> None:
+    session = tumbled(methods.method("tumble").settings(), seed)
+    assert solve_batch(session.problem()).second is None
+
+
+def test_the_deepest_minimum_is_found_from_another() -> None:
+    problem = tumbled(STRONG, 1).problem()
+    assert problem.elsewhere is not None
+    best = solve_batch(problem)
+    (first, *rest) = problem.steps(CHUNK)
+    others = list(problem.elsewhere(first.initial))
+    alone = []
+    for other in others:
+        begun: list[Step] = [replace(first, initial=other), *rest]
+        lost: Problem = replace(problem, steps=lambda _, begun=begun: iter(begun))  # type: ignore[misc]
+        np.testing.assert_allclose(solve_batch(lost).values, best.values, rtol=1e-3, atol=1e-7)
+        alone.append(solve_batch(replace(lost, elsewhere=None)).values)
+    assert any(np.abs(values - best.values).max() > 0.1 for values in alone)

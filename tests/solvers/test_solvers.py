@@ -1,0 +1,298 @@
+"""Batch and incremental on linear Gaussian problems, whose answers have closed forms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from alidade.factors.loss import TruncatedLoss
+from alidade.factors.model import Model, Residuals
+from alidade.pipelines.config import load_config
+from alidade.pipelines.diagnostics.observability import assess
+from alidade.pipelines.estimation.problem import Array, Estimate, Factor, Parameter, Problem, Quantity, Step
+from alidade.pipelines.methods.los import graph as los
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.solvers import gauss_newton
+from alidade.pipelines.solvers.assembly import CHUNK, Assembly
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.gauss_newton import minimize
+from alidade.pipelines.solvers.incremental import solve_incremental
+from alidade.pipelines.solvers.marginals import IndeterminateError, joint_information, reported_covariance
+from alidade.pipelines.solvers.system import System
+from alidade.pipelines.solvers.weighing import optimize
+from alidade.pipelines.solvers.window import Keyframes
+from tests.support import chain
+from tests.support.chain import INTERVAL, PARAMETER, PRIOR, Walk
+from tests.support.short_problems import los_problem
+
+# Slopes of a gyro's bias, rad/s/K.
+WARMING = (1.5e-4, -2e-4, 2.5e-4)
+
+
+def assert_same(estimate: Estimate, value: Array, covariance: Array, tolerance: float = 1e-8) -> None:
+    np.testing.assert_allclose(estimate.values, value, atol=tolerance)
+    np.testing.assert_allclose(estimate.covariance, covariance, rtol=1e3 * tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_batch_is_the_closed_form(seed: int) -> None:
+    walk, _ = Walk.random(seed)
+    estimate = solve_batch(walk.problem())
+    value, covariance, square = walk.closed_form()
+    assert_same(estimate, value, covariance)
+    assert estimate.converged
+    assert estimate.chi_square is not None
+    assert estimate.chi_square.value == pytest.approx(square, rel=1e-9)
+
+
+@pytest.mark.parametrize("runs", [50, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("h_of", [lambda rng: rng.standard_normal((30, 2)), lambda rng: 0.02 * rng.random((30, 2))])
+def test_degrees_of_freedom_are_the_expected_sum_of_squares(
+    h_of: Callable[[np.random.Generator], Array], runs: int
+) -> None:
+    """Also where priors decide as much as the data do (the second, weak one)."""
+    h = h_of(np.random.default_rng(9))
+    found = [solve_batch(Walk.random(seed, h)[0].problem()).chi_square for seed in range(runs)]
+    value, dof = (np.array([getattr(c, what) for c in found]) for what in ("value", "dof"))
+    assert np.ptp(dof) < 1e-6
+    # Standard deviation of the mean: sqrt(2 dof / runs).
+    assert abs(value.mean() - dof[0]) < 3.5 * np.sqrt(2.0 * dof[0] / len(dof))
+    for family in ("seen", "walk"):
+        squares, expected = (np.array([c.families[family][i] for c in found if c]) for i in (0, 1))
+        assert squares.mean() == pytest.approx(expected.mean(), rel=0.15)
+
+
+def test_families_share_the_freedoms_of_a_tight_process_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the normal equations have lost their digits: never a whole that goes to the first family."""
+    monkeypatch.setattr(chain, "WALK", 1e-10)
+    walk, _ = Walk.random(1)
+    summary = solve_batch(walk.problem()).chi_square
+    assert summary is not None
+    # A walk this tight is no measurement of anything: its rows take as many unknowns away as they are.
+    assert summary.families["walk"][1] == pytest.approx(0.0, abs=1e-3)
+    assert summary.families["seen"][1] == pytest.approx(57.0, abs=1.0)
+
+
+def test_errors_are_as_large_as_the_covariance_says() -> None:
+    nees = []
+    for seed in range(200):
+        walk, truth = Walk.random(seed, n=20)
+        estimate = solve_batch(walk.problem())
+        error = estimate.values - truth
+        nees.append(error @ np.linalg.solve(estimate.covariance, error))
+    # 400 degrees of freedom, 99 %.
+    assert 330.9 < sum(nees) < 476.6
+
+
+@pytest.mark.parametrize("solve", [solve_batch, solve_incremental])
+def test_unknown_direction_is_named_not_raised(solve: Callable[[Problem], Estimate]) -> None:
+    """Both slopes act alike, their difference is free: a null prior makes the system singular."""
+    walk, truth = Walk.random(1, np.repeat(np.random.default_rng(2).standard_normal((40, 1)), 2, axis=1))
+    walk = replace(walk, prior=None)
+    problem = walk.problem()
+    estimate = solve(problem)
+    assert np.isfinite(estimate.values).all()
+    assert estimate.values.sum() == pytest.approx(truth.sum(), abs=0.5)
+    assessment = assess(problem.quantities, estimate.covariance, estimate.chi_square, None)
+    assert assessment.status == "unobservable"
+    (direction,) = assessment.directions
+    first, second = direction.weights.values()
+    assert set(direction.weights) == {"slope_0", "slope_1"}
+    assert (first, second) == pytest.approx((2**-0.5, -(2**-0.5)), abs=1e-6)
+    # The sum is known as well as a single slope with that row would be.
+    A, _, _ = Walk(walk.h[:, :1], walk.z, prior=None).whitened()
+    of_sum = float(np.ones(2) @ estimate.covariance @ np.ones(2))
+    assert of_sum == pytest.approx(np.linalg.inv(A.T @ A)[0, 0], rel=1e-3)
+
+
+@dataclass(frozen=True)
+class HalfSeen(Model):
+    """Sees the first of two components of a state."""
+
+    time: Array
+    rows: int = 1
+    blocks = (2, 2)
+
+    def __call__(self, s: Array, p: Array) -> Residuals:
+        first = np.tile([[[1.0, 0.0]]], (len(s), 1, 1))
+        return s[:, :1] + p[:, :1], lambda: (first, np.tile([[[1.0, 0.0]]], (len(s), 1, 1)))
+
+
+def test_undetermined_state_is_named() -> None:
+    walk, _ = Walk.random(1)
+
+    def steps(chunk: int) -> Iterator[Step]:
+        yield from walk.steps(chunk, None)
+        initial = gtsam.Values()
+        initial.insert(gtsam.symbol("q", 7), np.zeros(2))
+        half = HalfSeen(np.array([9.0])).on(gtsam.symbol("q", 7), PARAMETER)
+        yield Step(9.0, initial, [Factor.of("half", half)])
+
+    with pytest.raises(IndeterminateError, match="state q7"):
+        solve_batch(replace(walk.problem(), steps=steps))
+
+
+@pytest.mark.parametrize("window", [0.35, 1.0, Keyframes(3), None])
+def test_incremental_is_batch(window: float | None) -> None:
+    """A linear problem loses nothing when states are marginalised out of the window."""
+    walk, _ = Walk.random(4)
+    batch, incremental = solve_batch(walk.problem()), solve_incremental(walk.problem(), window)
+    assert_same(incremental, batch.values, batch.covariance, 1e-7)
+
+
+@pytest.mark.parametrize("window", [1.0, None])
+def test_history_is_what_batch_finds_on_the_data_so_far(window: float | None) -> None:
+    walk, _ = Walk.random(5)
+    history = solve_incremental(walk.problem(), window).history
+    assert history is not None
+    for time, value, sigma in list(zip(history.time, history.values, history.sigmas, strict=True))[3::7]:
+        n = round(time / INTERVAL) + 1
+        so_far, covariance, _ = Walk(walk.h[:n], walk.z[:n]).closed_form()
+        np.testing.assert_allclose(value, so_far, atol=1e-7)
+        np.testing.assert_allclose(sigma, np.sqrt(np.diag(covariance)), rtol=1e-5)
+
+
+@pytest.mark.parametrize("runs", [5, pytest.param(20, marks=pytest.mark.slow)])
+def test_innovations_are_white(runs: int) -> None:
+    """Their squares have the mean of their dimension."""
+    squares = []
+    for seed in range(runs):
+        residuals = solve_incremental(Walk.random(seed)[0].problem(), None).residuals["seen"]
+        late = residuals.time > 2.05  # innovations proper; what came before was solved in batch
+        squares.append(residuals.whitened[late] ** 2)
+    n = sum(map(len, squares))
+    assert abs(np.concatenate(squares).mean() - 1.0) < 3.5 * np.sqrt(2.0 / n)
+
+
+@pytest.mark.parametrize("solve", [solve_batch, solve_incremental])
+def test_outliers_are_left_out_and_cost_nothing(solve: Callable[[Problem], Estimate]) -> None:
+    """As good as if the bad measurements had not been made."""
+    walk, _ = Walk.random(6)
+    bad = np.array([13, 30, 44])
+    spoilt = replace(walk, z=walk.z + 40.0 * np.isin(np.arange(60), bad))
+    estimate = solve(spoilt.problem(TruncatedLoss(4.0)))
+    assert estimate.rejected == {"seen": 3}
+    A, b, _ = walk.whitened()
+    good = np.ones(len(b), dtype=bool)
+    good[len(b) - 60 + bad] = False
+    covariance = np.asarray(np.linalg.inv(A[good].T @ A[good]), dtype=float)
+    value = covariance @ A[good].T @ b[good]
+    assert_same(estimate, value[:2], covariance[:2, :2], 1e-7)
+
+
+def test_nothing_is_known_but_the_prior() -> None:
+    walk, _ = Walk.random(7, np.zeros((20, 2)))
+    estimate = solve_batch(walk.problem())
+    assert_same(estimate, np.zeros(2), PRIOR**2 * np.eye(2))
+    assert estimate.chi_square is not None
+    assert estimate.chi_square.dof == pytest.approx(20.0, abs=1e-6)
+
+
+def test_fixed_quantities_cost_the_others_no_digits() -> None:
+    """A pinned number has some 1e16 times the information of a weak one; the others' covariance stays exact."""
+    rng = np.random.default_rng(3)
+    A = rng.normal(size=(8, 4)) * [1.0, 1e-4, 1e8, 1.0]
+    quantities = [Quantity(f"q{i}", "", 0.0 if i == 2 else 1.0, 1.0, 0.1) for i in range(4)]
+    values = gtsam.Values()
+    values.insert(0, np.zeros(4))
+    covariance = reported_covariance([Parameter(0, tuple(quantities))], A.T @ A, values, [0])
+    free = [0, 1, 3]
+    expected = np.linalg.inv(A[:, free].T @ A[:, free])
+    np.testing.assert_allclose(covariance[np.ix_(free, free)], expected, rtol=1e-6)
+    assert not covariance[2].any()
+    assert not covariance[:, 2].any()
+
+
+def test_the_states_alone_go_to_the_floor() -> None:
+    """Shared variables stay where they are, and a step from there on has only to do with these."""
+    problem = los_problem()
+    whole = Assembly.of(problem.steps(CHUNK))
+    system = System.of(whole.factors, whole.shared(problem), None)
+    values, falls = whole.initial, []
+    for _ in range(3):
+        move = system.linearized(values).states_alone()
+        assert all(not move.at(key).any() for key in system.shared)
+        before, values = system.error(values), values.retract(move)
+        falls.append(before - system.error(values))
+    assert falls[0] > 0.1 * system.error(values)
+    assert abs(falls[2]) < 1e-3
+
+
+@pytest.mark.parametrize("pictures_hz", [5.0, 10.0])
+def test_where_measurements_do_not_fit_steps_get_the_right_length(
+    pictures_hz: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A gyro warms up and nobody says so: residuals are tens of sigmas, and bend the error as much as Jacobians do.
+
+    With full steps alone 57 iterations and more, most of them for the same share of what is left.
+    """
+    scenario = LosScenario.model_validate(
+        {"duration_s": 30.0, "image_rate_hz": pictures_hz, "gyro_rate_hz": 100.0, "gimbal_rate_hz": 100.0}
+        | {"temperature": {"rise_k": 20.0, "time_constant_s": 10.0}}
+        | {"effects": {f"gyro_temperature_{axis}": slope for axis, slope in zip("xyz", WARMING, strict=True)}}
+    )
+    data = replace(simulate_los(scenario, 1)[0], temperature=None)
+    problem = los.problem(data, load_config(los_config(scenario).encode()))
+    whole = Assembly.of(problem.steps(CHUNK))
+    system = System.of(whole.factors, whole.shared(problem), None)
+    found = minimize(system, whole.initial)
+    assert found.converged
+    assert found.iterations < 30
+    error = system.error(found.values)
+    assert error > 10.0 * system.measured
+    monkeypatch.setattr(gauss_newton, "_ERROR_TOLERANCE", 1e-9)
+    least = system.error(minimize(system, found.values, 1e-9).values)
+    # Of a sigma as large as the residuals say, 0.02.
+    assert error - least < 0.5 * 0.02**2 * 2.0 * error / system.measured
+
+
+def test_a_step_goes_without_the_excess() -> None:
+    """It is that of the normal equations with mixed second derivatives, less what these have too much."""
+    problem = los_problem()
+    whole = Assembly.of(problem.steps(CHUNK))
+    system = System.of(whole.factors, whole.shared(problem), None)
+    values = minimize(system, whole.initial, 1.0).values
+    linear = system.linearized(values, mixed=True)
+    assert linear.excess is not None
+    (((key, number), excess),) = linear.excess.items()
+    assert excess[0] == pytest.approx(2 * 300, rel=0.2)
+    H, g = linear.graph.hessian(system.ordering)
+    keys = [system.ordering.at(i) for i in range(system.ordering.size())]
+    sizes = [values.dims()[k] for k in keys]
+    row, scale = sum(sizes[: keys.index(key)]) + number, np.sqrt(np.diag(H))
+
+    def solved(too_much: float) -> Array:
+        scaled = H / np.outer(scale, scale)
+        scaled[row, row] -= too_much / scale[row] ** 2
+        return np.asarray(np.linalg.solve(scaled, g.ravel() / scale) / scale)
+
+    for on_floor, too_much in ((False, excess[0]), (True, excess.sum())):
+        delta, foreseen = linear.step(on_floor)
+        expected = solved(too_much)
+        np.testing.assert_allclose(delta.vector(keys), expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())
+        assert foreseen == pytest.approx(0.5 * g.ravel() @ expected, rel=1e-6)
+        # Else the roll would move less.
+        assert abs(expected[row]) > 1.02 * abs(solved(0.0)[row])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_roll_that_pictures_do_not_tell_does_not_swing(seed: int) -> None:
+    """Ten minutes of los with all assumptions: fewer steps than by Gauss-Newton, and the answer as good."""
+    scenario = LosScenario(duration_s=600.0, gyro_rate_hz=200.0, image_rate_hz=50.0)
+    problem = los.problem(simulate_los(scenario, seed)[0], load_config(los_config(scenario).encode()))
+    whole = Assembly.of(problem.steps(CHUNK))
+    shared = whole.shared(problem)
+    found = optimize(whole.factors, whole.initial, shared, problem.loss)
+    # Three and five; without mixed second derivatives six and eight.
+    assert found.iterations < 6
+    system = found.system.without_rejected(found.values)
+    last = minimize(system, found.values, 1e-12)
+    linear = system.linearized(last.values)
+    sigmas = np.sqrt(np.diag(np.linalg.inv(joint_information(linear.graph, system.ordering, shared))))
+    off = last.values.localCoordinates(found.values)
+    assert np.abs(np.concatenate([off.at(key) for key in shared]) / sigmas).max() < 0.01
