@@ -121,8 +121,16 @@ def _version(wanted: bool) -> None:
 _Version = Annotated[bool, typer.Option("--version", "-V", callback=_version, is_eager=True, help="Print it.")]
 
 
+_Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say what is tried and fails, with tracebacks.")]
+
+
 @app.callback()
-def _options(version: _Version = False) -> None: ...
+def _options(version: _Version = False, verbose: _Verbose = False) -> None:  # noqa: ARG001
+    if verbose:
+        import logging
+
+        logging.basicConfig(level=logging.WARNING, format="%(message)s")
+        logging.getLogger("alidade").setLevel(logging.DEBUG)
 
 
 @app.command()
@@ -202,24 +210,29 @@ def compare(
     quiet: Quiet = False,
 ) -> None:
     """The published, batch and incremental solvers side by side, with errors where the truth is known."""
+    import time
+
     from alidade.pipelines import parallel, progress
-    from alidade.pipelines.applications.session import calibrate as run
-    from alidade.pipelines.applications.session import self_agreement
+    from alidade.pipelines.applications.session import Session
+    from alidade.pipelines.recording.reading import open_recording
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.compare import write_compare
     from alidade.pipelines.reports.whole import require_room
 
     require_room(out)
-    solvers = ["published", "batch", "incremental"]
+    kept, start = parse_window(window), time.perf_counter()
     with progress.shown(quiet or as_json), parallel.processes(jobs):
-        calibrations = run(session, solvers, method, config, parse_window(window), strict, auto_topics, prior=prior)
+        with progress.doing("reading"):
+            opened = Session.read(open_recording(session, strict), method, config, auto_topics, prior)
+        seconds = {"read": time.perf_counter() - start}
+        calibrations = opened.calibrations(["published", "batch", "incremental"], kept, seconds)
     if as_json:
         terminal.show_json(calibrations)
     else:
         terminal.show(calibrations)
     if out is not None:
         with progress.shown(quiet), parallel.processes(jobs), progress.doing("solving parts of the recording"):
-            written = write_compare(out, calibrations, *self_agreement(session, method, config))
+            written = write_compare(out, calibrations, *opened.cross_validate())
         if not as_json:
             terminal.say(f"Comparison in {written}")
 
@@ -391,7 +404,7 @@ def plan(
             terminal.say(f"The better motion is in {out}")
         if page is not None:
             terminal.say(f"The page is {page}")
-    raise typer.Exit(exit_codes.OF_STATUS[planned.now.assessment.status])
+    raise typer.Exit(exit_codes.OF_STATUS[planned.now.status])
 
 
 @app.command()
@@ -624,7 +637,7 @@ def _tell(calibration: "Calibration", folder: Path, written: Sequence[Path], as_
     else:
         terminal.show([calibration])
         terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
-    raise typer.Exit(exit_codes.OF_STATUS[calibration.assessment.status])
+    raise typer.Exit(exit_codes.OF_STATUS[calibration.status])
 
 
 def _interrupted(error: BaseException | None) -> bool:

@@ -10,8 +10,8 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import cache, cached_property, partial
+from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -21,16 +21,17 @@ from alidade.pipelines import methods, progress
 from alidade.pipelines.applications.discovery import empty, idle, nearest_suggestion, suggestions, with_suggested
 from alidade.pipelines.applications.sharing import device_belief, walks
 from alidade.pipelines.config import load_config, recorded_config
-from alidade.pipelines.diagnostics import noise_levels
-from alidade.pipelines.diagnostics.change_test import Moved, Stability, stability
-from alidade.pipelines.diagnostics.cross_validation import Halves, held_out, span, split_at, split_halves
-from alidade.pipelines.diagnostics.explanation import Causes, explained, told_steps
-from alidade.pipelines.diagnostics.hypothesis_tests import find_causes
-from alidade.pipelines.diagnostics.observability import assess
-from alidade.pipelines.diagnostics.second import other_solution
-from alidade.pipelines.diagnostics.self_check import SelfCheck
+from alidade.pipelines.diagnostics.change_test import Stability, change_finding, stability, with_change
+from alidade.pipelines.diagnostics.cross_validation import SplitHalf, solve_segments, split_halves
+from alidade.pipelines.diagnostics.diagnose import diagnose, is_suspect
+from alidade.pipelines.diagnostics.fault_models import FaultModel
+from alidade.pipelines.diagnostics.goodness_of_fit import SolverDifference, solver_difference
+from alidade.pipelines.diagnostics.hypothesis_tests import find_hypotheses
+from alidade.pipelines.diagnostics.observability import finite_covariance
+from alidade.pipelines.diagnostics.trial_fit import held_out_residuals
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Estimate, Problem, Step, Told
+from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
+from alidade.pipelines.estimation.problem import Estimate, Problem, Quantity, Step, Told
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.info import SessionFacts, facts_of, lacking
 from alidade.pipelines.recording.message_reader import ENCODING
@@ -43,6 +44,8 @@ from alidade.pipelines.simulation.simulated import Simulated
 from alidade.pipelines.solvers.window import check_window
 
 SOLVERS = ("batch", "incremental", "published")
+# Difference between incremental and batch that is worth a note, in sigmas.
+_NOTABLE_DIFFERENCE = 1.0
 
 
 class Origin(Protocol):
@@ -129,7 +132,7 @@ class Arrays:
 
     def facts(self, _: Config) -> SessionFacts:
         """Length of the data; there are no topics."""
-        start, stop = span(self.method, self.data)
+        start, stop = self.method.hypotheses().span(self.data)
         return SessionFacts(self.epoch_ns, stop - start, (), (), {self.method.name: ()})
 
     def truth(self) -> dict[str, object] | None:
@@ -268,39 +271,29 @@ class Session:
         """
         # The facts before anything is solved, so that the stamps need not be kept meanwhile.
         sha256, truth, facts = self.origin.sha256(), self.origin.truth(), self.facts
-        found, causes = [], Causes(partial(find_causes, self.method, self.data, self.config))
+        found, published = [], None
         for estimate, problem in solved:
             quantities = tuple(q for q in problem.quantities if q.name in estimate.names)
-            # The published solvers stand beside as they are.
-            ours = estimate.solver != "published"
-            change = stability(estimate, quantities) if ours and estimate.converged else None
-            moved = self._moved(change) if change is not None and change.changed else None
-            assessment = assess(
-                quantities,
-                estimate.covariance if moved is None else moved.widened(estimate, quantities),
-                estimate.chi_square,
-                problem.advice,
-                decides=not noise_levels.asked(estimate.levels),
-            )
-            if ours:
-                assessment = explained(assessment, estimate, quantities, causes)
-            if moved is not None and change is not None:
-                sentence = f"{change.sentence}{told_steps(moved, quantities)}"
-                small = moved.small(quantities)
-                assessment = assessment.remarked(sentence) if small else assessment.misfit(sentence)
-            checked = None
-            if check and estimate.solver == "incremental":
-                checked = SelfCheck.of(estimate, self._batch_beside())
-                assessment = assessment.remarked(checked.sentence if checked else "")
-            if ours:
-                assessment = assessment.remarked(other_solution(estimate, quantities))
-                assessment = assessment.remarked(*noise_levels.remarks(estimate.levels), *problem.premises)
+            estimate = replace(estimate, covariance=finite_covariance(quantities, estimate.covariance))
+            if estimate.solver == "published":
+                published = estimate
+            elif report and estimate.solver == "incremental" and published is None:
+                published = self._published()
+            stable, change = self._change(estimate, quantities)
+            if change is not None and change.severity == Severity.NOTE:
+                estimate = with_change(estimate, change)
+            difference = self._difference(estimate) if check else None
             found.append(
                 Calibration(
                     method=self.method,
                     problem=problem,
                     estimate=estimate,
-                    assessment=assessment,
+                    findings=by_severity(
+                        [
+                            *self._findings(problem, estimate, quantities, change),
+                            *_remarks(problem, estimate, difference),
+                        ]
+                    ),
                     recording=self.origin.name,
                     sha256=sha256,
                     facts=facts,
@@ -308,20 +301,56 @@ class Session:
                     truth=truth,
                     seconds=seconds,
                     plots=partial(self.method.figures, self.data),
-                    beside=cache(self._published) if estimate.solver == "incremental" else None,
-                    stability=change,
-                    self_check=checked,
-                    findings=self.method.findings(self.data, self.config, estimate) if report else {},
+                    beside=published if estimate.solver == "incremental" else None,
+                    stability=stable,
+                    solver_difference=difference,
+                    tables=self.method.findings(self.data, self.config, estimate) if report else {},
                 )
             )
         return found
 
-    def _moved(self, change: Stability) -> Moved:
-        """What the two sides of a change say."""
-        if not self.method.hypotheses().cut:
-            return Moved({})
-        with progress.doing("looking at both sides of a change"):
-            return Moved(split_at(self.method, self.data, self.config, change.time_s))
+    @property
+    def faults(self) -> FaultModel:
+        """What can be wrong with the data."""
+        return self.method.hypotheses()
+
+    def cross_validate(self) -> tuple[dict[str, SplitHalf], dict[str, float]]:
+        """The parameters of either half of the recording, and held-out measurements' residuals by family."""
+        halves = split_halves(self.method.graph, self.faults, self.data, self.config)
+        return halves, held_out_residuals(self.problem())
+
+    def _findings(
+        self, problem: Problem, estimate: Estimate, quantities: Sequence[Quantity], change: Finding | None
+    ) -> tuple[Finding, ...]:
+        """The findings on an estimate; hypotheses are tested where it is suspect."""
+        findings = diagnose(estimate, quantities, problem.advice, change)
+        if not is_suspect(estimate, findings):
+            return findings
+        with progress.doing("testing hypotheses"):
+            hypotheses = find_hypotheses(self.method.graph, self.faults, self.data, self.config, estimate)
+        return diagnose(estimate, quantities, problem.advice, change, hypotheses)
+
+    def _change(self, estimate: Estimate, quantities: Sequence[Quantity]) -> tuple[Stability | None, Finding | None]:
+        """The test for a change, and the finding where there is one, with the steps between its two sides."""
+        if estimate.solver == "published" or not estimate.converged:
+            return None, None
+        stable = stability(estimate, quantities)
+        if stable is None or not stable.changed:
+            return stable, None
+        parts: Mapping[str, SplitHalf] = {}
+        if self.faults.cut:
+            with progress.doing("solving both sides of a change"):
+                parts = solve_segments(self.method.graph, self.faults, self.data, self.config, stable.time_s)
+        return stable, change_finding(stable, parts, quantities)
+
+    def _difference(self, estimate: Estimate) -> SolverDifference | None:
+        """An incremental estimate compared with batch's, which has nothing of what a report needs."""
+        if estimate.solver != "incremental":
+            return None
+        from alidade.pipelines.solvers.batch import solve_batch
+
+        with progress.doing("solving"):
+            return solver_difference(estimate, solve_batch(self.problem()))
 
     def _solve(
         self,
@@ -356,13 +385,6 @@ class Session:
             except InputError:  # on the edge of what can be used, a step farther than the recording itself
                 continue
             yield exact.name, problem
-
-    def _batch_beside(self) -> Estimate:
-        """Batch's estimate to compare with: without what its own report would tell of it."""
-        from alidade.pipelines.solvers.batch import solve_batch
-
-        with progress.doing("solving"):
-            return solve_batch(self.problem())
 
     def _published(self) -> Estimate | None:
         """The published solver's estimate, where it can serve the recording: it needs more than the graphs."""
@@ -406,14 +428,6 @@ def calibrate(
     with progress.doing("reading"):
         session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics, prior)
     return session.calibrations(solvers, window, {"read": time.perf_counter() - start}, check, report)
-
-
-def self_agreement(
-    path: Path, method_name: str | None = None, config_file: Path | None = None
-) -> tuple[dict[str, Halves], dict[str, float]]:
-    """What either half of a recording says, and how well held-out measurements are predicted (arguments as above)."""
-    session = Session.read(open_recording(path), method_name, config_file)
-    return split_halves(session.method, session.data, session.config), held_out(session.problem())
 
 
 def session_facts(recording: Recording, config: Config) -> SessionFacts:
@@ -472,6 +486,14 @@ def _check_sheets(method: Method, config: Config) -> None:
         used = [f"sensors.{name}.{each}" for each in figures] or [f"sensors.{each}" for each in method.sheets]
         useful = ", ".join(used) or "no data sheet"
         raise InputError(f"{where}: method {method.name} has no use for it; it uses {useful}")
+
+
+def _remarks(problem: Problem, estimate: Estimate, difference: SolverDifference | None) -> Iterator[Finding]:
+    """Findings beside those on the estimate: a difference from batch, and the premises of the method."""
+    if difference is not None and abs(difference.z) >= _NOTABLE_DIFFERENCE:
+        yield Finding("solver_difference", Severity.NOTE, asdict(difference))
+    for premise in problem.premises if estimate.solver != "published" else ():
+        yield Finding("remark", Severity.NOTE, {"text": premise})
 
 
 def _shown(problem: Problem, duration: float, chunk: int) -> Iterator[Step]:

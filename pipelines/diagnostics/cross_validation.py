@@ -1,46 +1,23 @@
-"""Whether a recording agrees with itself: either half by itself, and measurements held out."""
+"""Cross-validation: a recording's segments solved by themselves, and the errors before and after compensation."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from alidade.pipelines import parallel
-from alidade.pipelines.diagnostics.outcome import at_once, outcome, times_of
-from alidade.pipelines.estimation.problem import Array, Problem, Quantity
-from alidade.pipelines.estimation.robust import robust_sigma
+from alidade.pipelines.diagnostics.fault_models import FaultModel
+from alidade.pipelines.diagnostics.trial_fit import Build, max_concurrent, solve_trial
+from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.settings import Config
-
-if TYPE_CHECKING:
-    from alidade.pipelines.diagnostics.fault_models import Hypotheses
-    from alidade.pipelines.methods import Method
-
-# One chunk in so many is held out.
-_HELD_OUT = 5
-
-
-def cut(hypotheses: Hypotheses, data: Any, start: float, stop: float) -> Any:
-    """The data of [start, stop), s; times stay as they are."""
-    changes: dict[str, Array] = {}
-    for stamps, fields in hypotheses.streams.items():
-        time = getattr(data, stamps)
-        if time is None:
-            continue
-        # Times increase: the samples are a view of those that there are.
-        inside = slice(*np.searchsorted(time, [start, stop]).tolist())
-        for name in (stamps, *fields):
-            values = getattr(data, name)
-            if values is not None:
-                changes[name] = values[inside]
-    return replace(data, **changes)
 
 
 @dataclass(frozen=True)
-class Halves:
-    """A parameter from either half of a recording: values and sigmas, SI."""
+class SplitHalf:
+    """A parameter from either segment of a recording: values and sigmas, SI."""
 
     first: float
     first_sigma: float
@@ -48,70 +25,54 @@ class Halves:
     second_sigma: float
 
     @property
-    def difference_sigmas(self) -> float:
-        """Second less first, over the sigma of that difference."""
-        return (self.second - self.first) / float(np.hypot(self.first_sigma, self.second_sigma))
+    def step(self) -> float:
+        """Second less first."""
+        return self.second - self.first
+
+    @property
+    def step_sigma(self) -> float:
+        """One standard deviation of the step."""
+        return float(np.hypot(self.first_sigma, self.second_sigma))
+
+    @property
+    def z(self) -> float:
+        """The step over its sigma."""
+        return self.step / self.step_sigma
 
 
-def split_halves(method: Method, data: Any, config: Config) -> dict[str, Halves]:
-    """What either half of a recording determines by itself, see `split_at`."""
-    start, stop = span(method, data)
-    return split_at(method, data, config, 0.5 * (start + stop))
+def split_halves(build: Build, faults: FaultModel, data: Any, config: Config) -> dict[str, SplitHalf]:
+    """Solve either half of a recording by itself, see `solve_segments`."""
+    start, stop = faults.span(data)
+    return solve_segments(build, faults, data, config, 0.5 * (start + stop))
 
 
-def split_at(method: Method, data: Any, config: Config, middle: float) -> dict[str, Halves]:
-    """The parameters that a recording determines both before and after a time (s); none when a part cannot be solved.
+def solve_segments(build: Build, faults: FaultModel, data: Any, config: Config, middle: float) -> dict[str, SplitHalf]:
+    """The parameters that a recording determines both before and after a time (s); none when a part has no solution.
 
-    Those that a prior holds in either part are left out: they would agree whatever was recorded. A bias that walks
-    differs between the parts by its walk too.
+    Parameters that a prior determines in either part are left out: they would agree whatever was recorded. A bias that
+    walks differs between the parts by its walk too.
     """
-    start, stop = span(method, data)
-    sides = [partial(_side, method, data, config, *part) for part in ((start, middle), (middle, stop + 1.0))]
-    first, second = parallel.done(sides, "either side", at_once(method, data))
+    start, stop = faults.span(data)
+    parts = [partial(_solved, build, faults, data, config, *part) for part in ((start, middle), (middle, stop + 1.0))]
+    first, second = parallel.done(parts, "either side", max_concurrent(faults.times(data)))
     both = {name: (first[name], second[name]) for name in first if name in second}
     return {
-        name: Halves(value, sigma, other, its_sigma)
-        for name, ((quantity, value, sigma), (_, other, its_sigma)) in both.items()
-        if quantity.determined(max(sigma, its_sigma))
+        name: SplitHalf(value, sigma, other, other_sigma)
+        for name, ((quantity, value, sigma), (_, other, other_sigma)) in both.items()
+        if quantity.determined(max(sigma, other_sigma))
     }
 
 
-# A number with its value and sigma.
+# A quantity with its value and sigma.
 _Number = tuple[Quantity, float, float]
 
 
-def _side(method: Method, data: Any, config: Config, start: float, stop: float) -> dict[str, _Number]:
-    """What [start, stop), s, of a recording determines by itself; nothing when it cannot be solved."""
-    found = outcome(method, cut(method.hypotheses(), data, start, stop), config)
+def _solved(
+    build: Build, faults: FaultModel, data: Any, config: Config, start: float, stop: float
+) -> dict[str, _Number]:
+    """The numbers of [start, stop), s, of a recording by itself; none when it has no solution."""
+    found = solve_trial(build, faults.segment(data, start, stop), config, f"{start:.0f} to {stop:.0f} s")
     if found is None:
         return {}
     numbers = zip(found.quantities, found.estimate.values.tolist(), found.estimate.sigmas.tolist(), strict=True)
     return {number[0].name: number for number in numbers}
-
-
-def span(method: Method, data: Any) -> tuple[float, float]:
-    """First and last stamp of a method's data, s; zeros where there is none."""
-    times = [time for time in times_of(method, data) if len(time)]
-    return float(min((t[0] for t in times), default=0.0)), float(max((t[-1] for t in times), default=0.0))
-
-
-def held_out(problem: Problem) -> dict[str, float]:
-    """Family -> typical size of measurements that took no part in the solution, in sigmas of their own noise.
-
-    One chunk in five is held out. 1 is as good as the noise; a little more is the uncertainty of the prediction.
-    """
-    from alidade.pipelines.solvers.assembly import CHUNK, Assembly
-    from alidade.pipelines.solvers.system import residuals_of
-    from alidade.pipelines.solvers.weighing import optimize
-
-    steps = list(problem.steps(CHUNK))
-    whole = Assembly.of(steps)
-    out = [f for step in steps[_HELD_OUT - 1 :: _HELD_OUT] for f in step.factors if f.measurement is not None]
-    left = {id(f) for f in out}
-    kept = [f for f in whole.factors if id(f) not in left]
-    if not any(f.measurement is not None for f in kept):
-        return {}
-    solution = optimize(kept, whole.initial, whole.shared(problem), problem.loss, held=problem.assumed)
-    if not solution.converged:
-        return {}
-    return {family: robust_sigma(r.whitened) for family, r in residuals_of(out, solution.values).items()}

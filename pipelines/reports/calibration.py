@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
 
 from alidade.factors import so3
-from alidade.pipelines.diagnostics.observability import Status, Verdict
+from alidade.pipelines.diagnostics.observability import Verdict
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.finding import Status
 from alidade.pipelines.estimation.problem import Array, rotation_vector_coordinates
 from alidade.pipelines.methods.formula import Formula, apply
 from alidade.pipelines.reports.result import Calibration
@@ -87,7 +88,10 @@ class SavedCalibration(_Record):
     parameters: dict[str, SavedParameter]
     rotations: dict[str, SavedRotation] = {}
     transforms: dict[str, SavedTransform] = {}
-    findings: dict[str, list[dict[str, object]]] = {}
+    # The method's own tables, which result.json has as `tables`.
+    findings: dict[str, list[dict[str, object]]] = Field(
+        default={}, validation_alias=AliasChoices("findings", "tables")
+    )
     formulas: list[str] = []
     constants: dict[str, float] = {}
     _config: Config = PrivateAttr(default_factory=Config)
@@ -167,12 +171,12 @@ def saved(calibration: Calibration) -> SavedCalibration:
     return SavedCalibration(
         method=method,
         solver=calibration.estimate.solver,
-        status=calibration.assessment.status,
+        status=calibration.status,
         recording=SavedRecording(file=calibration.recording, sha256=calibration.sha256, start=calibration.start),
         parameters=parameters,
         rotations=_rotations(calibration),
         transforms=_transforms(calibration),
-        findings={name: [_plain(row) for row in rows] for name, rows in calibration.findings.items()},
+        findings={name: [_plain(row) for row in rows] for name, rows in calibration.tables.items()},
         formulas=[formula.text for formula in calibration.formulas],
         constants=dict(calibration.problem.constants),
     )

@@ -14,8 +14,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from alidade.pipelines.belief import Belief, independent
-from alidade.pipelines.diagnostics.observability import Status
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.finding import Status
 from alidade.pipelines.reports.calibration import SavedCalibration, SavedParameter, SavedRecording, load_calibration
 
 # A covariance is symmetric, and none of its eigenvalues negative, to this share.

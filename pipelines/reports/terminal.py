@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.applications.discovery import Suggestion
     from alidade.pipelines.applications.noise import NoiseStudy
     from alidade.pipelines.applications.planning import Plan
+    from alidade.pipelines.estimation.finding import Finding
     from alidade.pipelines.recording.info import SessionFacts
     from alidade.pipelines.reports.result import Calibration, ParameterResult
 
@@ -61,7 +62,7 @@ def show(calibrations: Sequence[Calibration]) -> None:
 
     alone = len(calibrations) == 1
     errors = [truth_errors(c) for c in calibrations]
-    found = [c.parameters for c in calibrations]
+    found, verdicts = [c.parameters for c in calibrations], calibrations[0].verdicts
     table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
     table.add_column("parameter", no_wrap=True)
     table.add_column("unit", no_wrap=True)
@@ -82,7 +83,7 @@ def show(calibrations: Sequence[Calibration]) -> None:
             error = known[q.name].error_sigmas if q.name in known else None
             row.append(_cell(parameters[q.name], factor, error, alone) if q.name in parameters else "-")
         if alone and q.name in found[0]:
-            verdict = calibrations[0].assessment.verdicts[q.name]
+            verdict = verdicts[q.name]
             row.append(f"[{COLOURS[verdict]}]{verdict}[/]")
         table.add_row(*row)
     console.print(table)
@@ -189,17 +190,16 @@ def show_plan(plan: Plan) -> None:
         table.add_column(column, justify="right", no_wrap=True)
     table.add_column("verdict", no_wrap=True)
     table.add_column("limited by")
-    now, best = plan.now.sigmas, plan.best.sigmas
+    now, best, verdicts = plan.now.sigmas, plan.best.sigmas, plan.now.verdicts
     for q in filter(lambda q: q.judged, plan.now.quantities):
         unit, factor = human_unit(q)
         cells = [rounded(factor * sigma) for sigma in (q.require, now[q.name], best[q.name])]
-        verdict = plan.now.assessment.verdicts[q.name]
+        verdict = verdicts[q.name]
         most = limited[q.name].parts[0] if q.name in limited else ("", 0.0)
         limit = f"{most[0]}, {100.0 * most[1]:.0f} %" if most[0] else ""
         table.add_row(q.name, unit, *cells[: 3 if plan.steps else 2], f"[{COLOURS[verdict]}]{verdict}[/]", limit)
     console.print(table)
-    for direction in plan.now.assessment.directions:
-        say(f"  {direction.verdict}: {direction.label}: {direction.advice}")
+    _say_directions(plan.now.directions)
     if not plan.now.missing:
         say(f"This motion, {plan.now.duration:.0f} s of it, determines everything as accurately as required.")
         return
@@ -248,17 +248,23 @@ def _cell(parameter: ParameterResult, factor: float, error_sigmas: float | None,
 
 
 def _verdict(calibration: Calibration, name: bool) -> None:
-    assessment = calibration.assessment
     published = calibration.estimate.solver == "published"
     solver = f"{calibration.estimate.solver}: " if name else ""
-    colour = COLOURS[assessment.status]
-    headline = assessment.headline
-    if published and assessment.directions:
-        # What a recording lacks is told by the graph's solvers; these know their own model only.
+    headline, status = calibration.headline, calibration.status
+    if published and calibration.directions:
+        # The published solvers know their own model only, so they give no advice.
         short = [p.name for p in calibration.parameters.values() if p.observability in ("weak", "unobservable")]
         headline = f"By its own sigmas less accurate than required: {', '.join(short)}."
-    console.print(f"{solver}[bold {colour}]{assessment.status}.[/] {escape(headline)}", soft_wrap=True)
-    for direction in () if published else assessment.directions:
-        say(f"  {direction.verdict}: {direction.label}: {direction.advice}")
+    console.print(f"{solver}[bold {COLOURS[status]}]{status}.[/] {escape(headline)}", soft_wrap=True)
+    _say_directions(() if published else calibration.directions)
     for note in calibration.notes:
         say(f"  note: {note}")
+
+
+def _say_directions(directions: Sequence[Finding]) -> None:
+    """A line a direction: verdict, parameters, advice."""
+    from alidade.pipelines.reports.sentences import label
+
+    for direction in directions:
+        e = direction.evidence
+        say(f"  {direction.severity.name.lower()}: {label(e['weights'])}: {e['advice']}")

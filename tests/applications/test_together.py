@@ -241,7 +241,10 @@ def test_recordings_that_are_of_another_device_are_told() -> None:
     opened.append(alidade.open(moved, config=load_config(EXACT.encode())))
     found = jointly(opened)
     assert found.status == "inconsistent"
-    assert "The device is not the same in all recordings. theta_y changed by -" in found.headline
+    (step,) = [finding.evidence for finding in found.findings if finding.kind == "device_change"]
+    assert step["parameter"] == "theta_y"
+    assert step["step"] < -4.0 * step["sigma"]
+    assert "Change of the device between arrays and arrays: theta_y by -" in found.headline
 
 
 def test_a_list_of_sources_is_calibrated_together() -> None:
@@ -308,8 +311,8 @@ def test_real_trials_agree_or_are_named(shared_data: Path, tmp_path: Path) -> No
     paths = [tmp_path / f"{name[:2]}.mcap" for name in TRIALS]
     both = alidade.calibrate(paths, config=load_config(b"share: {time_offset: device}"))
     assert both.status == "inconsistent"
-    assert "helmet_mount" in both.headline
-    assert "between 01.mcap and 07.mcap" in both.headline
+    steps = [finding.evidence for finding in both.findings if finding.kind == "device_change"]
+    assert any("helmet_mount" in e["parameter"] and e["recordings"] == ("01.mcap", "07.mcap") for e in steps)
     assert both.parameters["time_offset"].value == pytest.approx(4.2e-3, abs=0.1e-3)
     agreeing = alidade.calibrate(paths[1:], config=load_config(b"share: {time_offset: device}"))
     assert not [step for step in agreeing.changes.found if "mount" in step.name or step.name == "time_offset"]  # type: ignore[union-attr]

@@ -152,7 +152,7 @@ def test_the_command_begins_from_an_earlier_calibration(
     assert found["theta_y"]["prior_sigma"] == pytest.approx(before["theta_y"].sigma, rel=1e-6)
     assert found["theta_y"]["sigma"] < 0.9 * before["theta_y"].sigma
     assert found["gyro_bias_x"]["prior_sigma"] == 1e-3  # the recording's own
-    assert f"is that of {file}, of 2026-" in result["headline"]
+    assert any(f"is that of {file}, of 2026-" in note for note in result["notes"])
 
 
 def test_what_walks_is_known_less_well_after_a_while(earlier: tuple[Calibration, Path]) -> None:

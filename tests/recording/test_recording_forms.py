@@ -923,7 +923,7 @@ def test_log_times_in_place_of_stamps_stand_in_the_sigma_of_the_delay(
     offset = found.parameters[delay]
     assert abs(simulated.truth.get(delay, 0.0) - offset.value) == pytest.approx(8e-3, abs=2e-3)
     assert 0.01 < offset.sigma < 0.012
-    assert found.assessment.status in ("calibrated", "weak"), found.headline
+    assert found.status in ("calibrated", "weak"), found.headline
     assert any("no stamp; the log times stand in" in note for note in found.notes)
 
 
@@ -956,7 +956,7 @@ def test_the_same_calibration_out_of_another_form(tmp_path: Path) -> None:
     config.write_bytes(open_recording(tmp_path / "s.mcap").attachment("alidade.yaml") or b"")
     bag = forms.rosbag1(tmp_path / "s.mcap", tmp_path / "s.bag")
     ours, theirs = (calibrate(path, ["batch"], None, config)[0] for path in (tmp_path / "s.mcap", bag))
-    assert ours.assessment.status == theirs.assessment.status == "calibrated"
+    assert ours.status == theirs.status == "calibrated"
     np.testing.assert_equal(ours.estimate.values, theirs.estimate.values)
     np.testing.assert_array_equal(ours.estimate.covariance, theirs.estimate.covariance)
 
@@ -971,6 +971,6 @@ def test_the_same_calibration_of_every_method_out_of_other_forms(name: str, tmp_
     for form in ("rosbag2 sqlite", "ros 1 bz2", "mcap protobuf"):
         (tmp_path / form).mkdir()
         theirs = calibrate(forms.FORMS[form](tmp_path / "s.mcap", tmp_path / form), ["batch"], name, config)[0]
-        assert theirs.assessment.status == ours.assessment.status
+        assert theirs.status == ours.status
         np.testing.assert_equal(theirs.estimate.values, ours.estimate.values)
         np.testing.assert_array_equal(theirs.estimate.covariance, ours.estimate.covariance)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from alidade.factors import so3
-from alidade.pipelines.diagnostics.observability import assess
+from alidade.pipelines.diagnostics.diagnose import diagnose
 from alidade.pipelines.estimation.problem import (
     Attitudes,
     ChiSquare,
@@ -77,7 +77,7 @@ def make_calibration(**changes: object) -> Calibration:
         method=method("head"),
         problem=problem,
         estimate=estimate,
-        assessment=assess(quantities_of(problem, estimate), estimate.covariance, estimate.chi_square, None),
+        findings=diagnose(estimate, quantities_of(problem, estimate)),
         recording="ride.mcap",
         sha256="ab" * 32,
         facts=SessionFacts(

@@ -153,7 +153,7 @@ class LivePage:
 
     def end(self, calibration: Calibration) -> None:
         """What came out."""
-        self._end(calibration.assessment.status, calibration.assessment.headline)
+        self._end(calibration.status, calibration.headline)
 
     # -- the state
 
@@ -196,12 +196,12 @@ class LivePage:
                 "unit": unit.replace("^2", "²").strip("1"),
                 "require": to_digits_of(require, require),
             }
-            if view.values is not None and view.assessment is not None and view.sigmas is not None:
+            if view.values is not None and view.sigmas is not None:
                 sigma = float(view.sigmas[i])
                 one |= {
                     "value": to_digits_of(factor * float(view.values[i]), factor * sigma),
                     "sigma": to_digits_of(factor * sigma, factor * sigma),
-                    "verdict": view.assessment.verdicts[q.name],
+                    "verdict": view.verdicts[q.name],
                     "history": self._histories.get(q.name, []),
                 }
             found.append(one)

@@ -83,7 +83,7 @@ class LiveServer:
     def show(self, view: View) -> None:
         """Send a view to whoever is connected; its log time is that of the recording."""
         at = view.epoch_ns + round(view.time * 1e9)
-        if view.values is not None and view.sigmas is not None and view.assessment is not None:
+        if view.values is not None and view.sigmas is not None:
             for q, value, sigma in zip(view.quantities, view.values.tolist(), view.sigmas.tolist(), strict=True):
                 message = {
                     "value": value,
@@ -92,7 +92,7 @@ class LiveServer:
                     "upper": value + sigma,
                 }
                 if q.judged:
-                    message |= {"require": q.require, "verdict": view.assessment.verdicts[q.name]}
+                    message |= {"require": q.require, "verdict": view.verdicts[q.name]}
                 self._log(f"/estimate/{q.name}", _ESTIMATE, {"unit": q.unit}, message, at)
         self._log("/status", _STATUS, {}, view.summary, at)
 
