@@ -5,8 +5,10 @@ A model knows nothing of gtsam; `on` ties it to the variables of a graph.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import fields, replace
 from enum import Enum
+from itertools import chain
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -155,6 +157,42 @@ def check(model: Model) -> None:
                 f"{name} declares block {i} as {block!r}: its Jacobian must have shape {(n, m, dimension(block))}, "
                 f"not {np.shape(jacobian)}"
             )
+
+
+def stacking_key(model: Model) -> Hashable:
+    """Equal for models that `stack_models` can make one of: all but what is `stacked` is alike."""
+    stacked = getattr(model, "stacked", None)
+    if stacked is None:
+        return id(model)
+    declared: Any = model
+    alike = tuple(_hashable(getattr(model, f.name)) for f in fields(declared) if f.name not in stacked)
+    absent = tuple(getattr(model, name) is None for name in stacked)
+    return type(model), alike, absent, model.rows, model.blocks
+
+
+def stack_models(parts: Sequence[Any]) -> Any:
+    """One model, array or list of several, their `stacked` fields one after the other."""
+    first = parts[0]
+    if first is None or len(parts) == 1:
+        return first
+    if isinstance(first, np.ndarray):
+        return np.concatenate(parts)
+    if isinstance(first, list):
+        return list(chain.from_iterable(parts))
+    return replace(first, **{name: stack_models([getattr(part, name) for part in parts]) for name in first.stacked})
+
+
+def select_rows(whole: Any, rows: NDArray[np.intp]) -> Any:
+    """A model, array or list of some measurements."""
+    if whole is None or isinstance(whole, np.ndarray):
+        return whole if whole is None else whole[rows]
+    if isinstance(whole, list):
+        return [whole[row] for row in rows]
+    return replace(whole, **{name: select_rows(getattr(whole, name), rows) for name in whole.stacked})
+
+
+def _hashable(value: Any) -> Hashable:
+    return (value.shape, value.tobytes()) if isinstance(value, np.ndarray) else value
 
 
 def _origin(block: Block, n: int) -> Array:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
 from typing import Any
@@ -21,7 +21,21 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.answers import Answers, Evaluation, Places, counting, laid_out, places_of, squares_of
 from alidade.factors.loss import TruncatedLoss
-from alidade.factors.model import POSE3, ROT3, Array, Block, Keys, Model, Residuals, check, dimension, width
+from alidade.factors.model import (
+    POSE3,
+    ROT3,
+    Array,
+    Block,
+    Keys,
+    Model,
+    Residuals,
+    check,
+    dimension,
+    select_rows,
+    stack_models,
+    stacking_key,
+    width,
+)
 
 # Models of these types, rows and blocks were seen to give what they declare.
 _CHECKED: set[Hashable] = set()
@@ -143,7 +157,7 @@ class VectorizedFactor:
         rows = np.flatnonzero(kept)
         tied = [column if isinstance(column, int) else [column[i] for i in rows] for column in self.columns]
         weights = None if self.weights is None else self.weights[rows]
-        return VectorizedFactor(_take(self.model, rows), tied, self.loss, noise=self.noise, weights=weights)
+        return VectorizedFactor(select_rows(self.model, rows), tied, self.loss, noise=self.noise, weights=weights)
 
     @property
     def divisible(self) -> bool:
@@ -288,7 +302,7 @@ class _Group:
 
     def __init__(self, factors: Sequence[VectorizedFactor], places: dict[Block, dict[int, int]]) -> None:
         self._factors = factors
-        self._model = _stack([f.model for f in factors])
+        self._model = stack_models([f.model for f in factors])
         self._columns = [self._column(i, places.setdefault(block, {})) for i, block in enumerate(factors[0].blocks)]
         self._whole: Evaluation | None = None
 
@@ -390,38 +404,9 @@ class _Whitened(Model):
 
 def _kind(factor: VectorizedFactor) -> Hashable:
     """Equal for factors whose models can be evaluated as one."""
-    stacked = getattr(factor.model, "stacked", None)
-    if stacked is None:
+    if getattr(factor.model, "stacked", None) is None:
         return id(factor)
-    model: Any = factor.model
-    shared = tuple(_hashable(getattr(model, f.name)) for f in fields(model) if f.name not in stacked)
-    absent = tuple(getattr(model, name) is None for name in stacked)
-    return type(model), shared, absent, model.rows, model.blocks, factor.loss is None, factor.compress
-
-
-def _hashable(value: Any) -> Hashable:
-    return (value.shape, value.tobytes()) if isinstance(value, np.ndarray) else value
-
-
-def _stack(parts: Sequence[Any]) -> Any:
-    """One array, list or dataclass of several, their `stacked` fields one after the other."""
-    first = parts[0]
-    if first is None or len(parts) == 1:
-        return first
-    if isinstance(first, np.ndarray):
-        return np.concatenate(parts)
-    if isinstance(first, list):
-        return list(chain.from_iterable(parts))
-    return replace(first, **{name: _stack([getattr(part, name) for part in parts]) for name in first.stacked})
-
-
-def _take(whole: Any, rows: NDArray[np.intp]) -> Any:
-    """An array, list or dataclass of some measurements."""
-    if whole is None or isinstance(whole, np.ndarray):
-        return whole if whole is None else whole[rows]
-    if isinstance(whole, list):
-        return [whole[row] for row in rows]
-    return replace(whole, **{name: _take(getattr(whole, name), rows) for name in whole.stacked})
+    return stacking_key(factor.model), factor.loss is None, factor.compress
 
 
 def _read(values: gtsam.Values, keys: Sequence[int], block: Block) -> list[Any]:

@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.attitude import ahrs_factors
 from alidade.factors.gyro import GyroIncrementFactor, carried, corrected, platform_errors
 from alidade.factors.preintegration import GyroPath, Increments
-from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Step
-from alidade.pipelines.estimation.walking_bias import WalkingBias
+from alidade.pipelines.estimation.problem import Array, ChainLayout, Factor, Parameter, Step
+from alidade.pipelines.estimation.walking_bias import NODES, WalkingBias
+
+# Of a problem whose states are a gyro chain's attitudes.
+LAYOUT = ChainLayout(states="x", nodes=NODES)
 
 
 @lru_cache(maxsize=1000)
@@ -211,12 +213,9 @@ class GyroChain:
         return range(first, now + 1), range(max(first - 1, 1), now + 1 if last else now)
 
     def _increments(self, after: NDArray[np.intp]) -> list[Factor]:
-        """Those that lead to keyframes: gtsam's native factors where all that they depend on is the bias."""
+        """Those that lead to keyframes."""
         states = [self.state(k - 1) for k in after], [self.state(k) for k in after]
         bias, turns, variance = self.bias_keys(after), self.turns[as_slice(after - 1)], self.variance[after - 1]
-        if self.errors is None and self.platform is None:
-            native = ahrs_factors(*states, bias, turns, self.gyro.bias_hat, variance)
-            return [Factor("gyro", f) for f in native]
         carrying = None if self.platform_turns is None else self.platform_turns[as_slice(after - 1)]
         model = GyroIncrementFactor(
             self.time[as_slice(after)], turns, self.gyro, np.sqrt(variance), carrying, self.platform

@@ -1,19 +1,57 @@
-"""Linear factors between vector variables, whitened when they are built."""
+"""Linear measurements between vector variables, whitened when they are built: sum of A_i x_i = right side."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar
 
-import gtsam
 import numpy as np
 
+from alidade.factors.model import Block, Model, Residuals
+from alidade.factors.vectorized import VectorizedFactor
 from alidade.pipelines.estimation.problem import Array
 
 
-def linear_factor(
-    blocks: Mapping[int, Array], origin: Mapping[int, Array], sigma: float
-) -> gtsam.LinearContainerFactor:
+@dataclass(frozen=True)
+class LinearModel(Model):
+    """n measurements of m whitened rows each, linear in one to three vectors. Blocks: the vectors.
+
+    Attributes:
+        time: (n,) s; 0 of what is known beforehand.
+        right: (n, m) right side.
+        first, second, third: (n, m, d) coefficients of each vector; None: there are fewer vectors.
+    """
+
+    time: Array
+    right: Array
+    first: Array
+    second: Array | None = None
+    third: Array | None = None
+    stacked: ClassVar = ("time", "right", "first", "second", "third")
+
+    @property
+    def coefficients(self) -> tuple[Array, ...]:
+        """(n, m, d) of each vector."""
+        return tuple(each for each in (self.first, self.second, self.third) if each is not None)
+
+    @property
+    def rows(self) -> int:
+        """m."""
+        return int(self.right.shape[1])
+
+    @property
+    def blocks(self) -> tuple[Block, ...]:
+        """The vectors' sizes."""
+        return tuple(int(each.shape[2]) for each in self.coefficients)
+
+    def __call__(self, *vectors: Array) -> Residuals:
+        """Residual sum of A_i x_i less the right side, (n, m)."""
+        parts = [np.einsum("nij,nj->ni", A, x) for A, x in zip(self.coefficients, vectors, strict=True)]
+        return sum(parts, start=-self.right), lambda: self.coefficients
+
+
+def linear_factor(blocks: Mapping[int, Array], origin: Mapping[int, Array], sigma: float) -> VectorizedFactor:
     """The measurement 0 = sum of blocks[key] (x[key] - origin[key]), with `sigma` in each of its m rows.
 
     The rows are divided by sigma here. With a noise model beside them gtsam's elimination would take any row whose
@@ -24,28 +62,6 @@ def linear_factor(
         origin: variable -> (d,).
         sigma: of each row, in the unit of the rows.
     """
-    terms = [part for key, block in blocks.items() for part in (key, block / sigma)]
-    rows = len(next(iter(blocks.values())))
-    values = gtsam.Values()
-    for key in blocks:
-        values.insert(key, origin[key])
-    return _container(terms, np.zeros(rows), values)
-
-
-def rescaled(factor: gtsam.LinearContainerFactor, scale: float) -> gtsam.LinearContainerFactor:
-    """A factor of linear_factor, between variables of one size, with the sigma of its rows times `scale`."""
-    keys = list(factor.keys())
-    size = factor.toJacobian().getA().shape[1] // len(keys)
-    zero = gtsam.Values()
-    for key in keys:
-        zero.insert(key, np.zeros(size))
-    linear: Any = factor.linearize(zero)
-    A, b = linear.getA() / scale, linear.getb() / scale
-    terms = [part for i, key in enumerate(keys) for part in (key, A[:, size * i : size * (i + 1)])]
-    return _container(terms, b, zero)
-
-
-def _container(terms: Sequence[Any], b: Array, values: gtsam.Values) -> gtsam.LinearContainerFactor:
-    """Whitened rows about the values: keys and blocks by turns, and the right side."""
-    jacobian: Any = gtsam.JacobianFactor  # its stubs cannot be called with as many blocks as there are
-    return gtsam.LinearContainerFactor(jacobian(*terms, b, gtsam.noiseModel.Unit.Create(len(b))), values)
+    coefficients = [block[None] / sigma for block in blocks.values()]
+    right = sum(A @ origin[key] for key, A in zip(blocks, coefficients, strict=True))
+    return LinearModel(np.zeros(1), np.asarray(right), *coefficients).on(*blocks)

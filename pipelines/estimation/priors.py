@@ -1,11 +1,15 @@
-"""Priors of calibration parameters as factors."""
+"""Priors of variables as measurements of them: whitened rows about a vector or a rotation."""
 
 from __future__ import annotations
 
-import gtsam
+from dataclasses import dataclass
+from typing import ClassVar
+
 import numpy as np
 
 from alidade.factors import so3
+from alidade.factors.model import ROT3, Block, Model, Residuals
+from alidade.pipelines.estimation.linear import LinearModel
 from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity
 
 # A fixed quantity is held by a prior this much tighter than the accuracy wanted of it.
@@ -13,6 +17,32 @@ _PINNED = 1e-6
 # A free quantity is held by a prior this much wider than the default one. It adds next to no information, but without
 # it a smoother could not even begin where the data do not determine the quantity, or not yet.
 _FREE = 10.0
+
+
+@dataclass(frozen=True)
+class RotationPrior(Model):
+    """What is known of rotations beforehand: R Log(mean^-1 x) is white noise. Block: a rotation.
+
+    Attributes:
+        time: (n,) s.
+        mean: (n, 4) w x y z.
+        sqrt_information: (n, 3, 3), in the frame that the rotation turns.
+    """
+
+    time: Array
+    mean: Array
+    sqrt_information: Array
+    rows: int = 3
+    blocks: tuple[Block, ...] = (ROT3,)
+    stacked: ClassVar = ("time", "mean", "sqrt_information")
+
+    def __call__(self, rotation: Array) -> Residuals:
+        """Residual (n, 3)."""
+        error = so3.log(so3.multiply(so3.inverse(self.mean), rotation))
+        return (
+            np.einsum("nij,nj->ni", self.sqrt_information, error),
+            lambda: (self.sqrt_information @ so3.right_jacobian_inverse(error),),
+        )
 
 
 def prior_sigmas(parameter: Parameter) -> Array:
@@ -29,11 +59,20 @@ def pinned(quantity: Quantity) -> float:
 
 def vector_prior(parameter: Parameter, mean: Array) -> Factor:
     """Prior on a vector parameter about `mean`, in its own units."""
-    noise = gtsam.noiseModel.Diagonal.Precisions(prior_sigmas(parameter) ** -2)
-    return Factor("prior", gtsam.PriorFactorVector(parameter.key, mean, noise))
+    return vector_about(parameter.key, mean, prior_sigmas(parameter))
 
 
 def rotation_prior(parameter: Parameter) -> Factor:
     """Prior on a Rot3 parameter about the identity, sigmas per component of the rotation vector, rad."""
-    noise = gtsam.noiseModel.Diagonal.Precisions(prior_sigmas(parameter) ** -2)
-    return Factor("prior", gtsam.PriorFactorRot3(parameter.key, so3.to_gtsam(so3.identity()), noise))
+    return rotation_about(parameter.key, so3.identity(), np.diag(1.0 / prior_sigmas(parameter)))
+
+
+def vector_about(key: int, mean: Array, sigmas: Array | float, family: str = "prior") -> Factor:
+    """Prior on a vector variable (d,) about `mean`, with sigmas in its own units."""
+    R = np.diag(1.0 / np.broadcast_to(np.asarray(sigmas, dtype=float), mean.shape))
+    return Factor.process_of(family, LinearModel(np.zeros(1), (R @ mean)[None], R[None]).on(key))
+
+
+def rotation_about(key: int, mean: Array, sqrt_information: Array, family: str = "prior") -> Factor:
+    """Prior on a Rot3 variable about `mean` (4,), with the square root (3, 3) of its information in its own frame."""
+    return Factor.process_of(family, RotationPrior(np.zeros(1), mean[None], sqrt_information[None]).on(key))

@@ -115,7 +115,7 @@ class Factor:
 
     Attributes:
         family: "vision", "gyro", "prior", ...
-        factor: a gtsam factor.
+        native: a gtsam factor; None: it is a vectorised one.
         measurement: the vectorised factor behind it when it is a measurement that may be an outlier: the incremental
             solver gates its innovation, reports plot its residuals.
         process: the vectorised factor behind it when it is none.
@@ -123,7 +123,7 @@ class Factor:
     """
 
     family: str
-    factor: gtsam.NonlinearFactor
+    native: gtsam.NonlinearFactor | None = None
     measurement: VectorizedFactor | None = None
     process: VectorizedFactor | None = None
     beside: Array | None = None
@@ -131,12 +131,26 @@ class Factor:
     @classmethod
     def of(cls, family: str, measurement: VectorizedFactor, beside: Array | None = None) -> Factor:
         """A measurement that may be an outlier."""
-        return cls(family, measurement.factor, measurement, beside=beside)
+        return cls(family, measurement=measurement, beside=beside)
 
     @classmethod
     def process_of(cls, family: str, process: VectorizedFactor, beside: Array | None = None) -> Factor:
         """What joins variables and is no outlier."""
-        return cls(family, process.factor, process=process, beside=beside)
+        return cls(family, process=process, beside=beside)
+
+    @property
+    def factor(self) -> gtsam.NonlinearFactor:
+        """For a gtsam graph; of a vectorised factor a new one at every call."""
+        if self.native is not None:
+            return self.native
+        vectorized = self.vectorized
+        assert vectorized is not None
+        return vectorized.factor
+
+    @property
+    def keys(self) -> list[int]:
+        """The variables."""
+        return list(self.native.keys()) if self.vectorized is None else self.vectorized.keys
 
     @property
     def vectorized(self) -> VectorizedFactor | None:
@@ -180,6 +194,23 @@ class Step:
 
 
 @dataclass(frozen=True)
+class ChainLayout:
+    """Which variables of a problem are a chain, by the letters of their symbols; all others are shared by all rows.
+
+    Every measurement depends on the states of one keyframe or of two successive ones, on the bias node in force there
+    and on shared variables. A factor of few rows may join the states of many keyframes.
+
+    Attributes:
+        states: letters of the variables, one a keyframe, of which its state is made; not all need be there.
+        nodes: letter of the nodes of a bias that walks and, where there is one, of its running means. The first node is
+            a shared variable, the mean up to its end too; the later ones are deviations from it.
+    """
+
+    states: str = ""
+    nodes: str = ""
+
+
+@dataclass(frozen=True)
 class Attitudes:
     """A trajectory: times (n,), s from the session's start, and quaternions (n, 4), w x y z."""
 
@@ -214,6 +245,7 @@ class Problem:
         keyframes: where they stand; None: there are no pictures with a clock that is estimated.
         elsewhere: of a solution, values that explain the measurements as well in another way, near which there may be
             other minima. None: the method has no such.
+        layout: how its variables are a chain; None: they are none, and gtsam eliminates them.
     """
 
     method: str
@@ -232,6 +264,7 @@ class Problem:
     constants: Mapping[str, float] = field(default_factory=dict)
     keyframes: Keyframes | None = None
     elsewhere: Callable[[gtsam.Values], Iterator[gtsam.Values]] | None = None
+    layout: ChainLayout | None = None
 
     def numbers(self, estimate: Estimate) -> dict[str, float]:
         """What formulas need, by name: an estimate's values and the constants."""

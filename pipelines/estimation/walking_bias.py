@@ -31,6 +31,10 @@ _MEAN_SLACK = 1e-2
 FIRST = int(gtsam.symbol("b", 0))
 
 
+# Letters of the symbols of nodes and of running means.
+NODES = "bm"
+
+
 @dataclass(frozen=True)
 class WalkingBias:
     """Nodes of a bias over [0, duration].
@@ -112,15 +116,16 @@ class WalkingBias:
         """Joins a node to the one before it."""
         spacing = 0.5 * (self.edges[node + 1] - self.edges[node - 1])
         step = self.walk * np.sqrt(spacing)
-        noise = gtsam.noiseModel.Isotropic.Sigma(3, float(np.hypot(step, _SLACK * self._unknown(spacing))))
-        return Factor("bias walk", gtsam.BetweenFactorVector(self.key(node - 1), self.key(node), np.zeros(3), noise))
+        sigma = float(np.hypot(step, _SLACK * self._unknown(spacing)))
+        blocks = {self.key(node - 1): -np.eye(3), self.key(node): np.eye(3)}
+        return Factor.process_of("bias walk", linear_factor(blocks, dict.fromkeys(blocks, np.zeros(3)), sigma))
 
     def _unknown(self, stretch: float) -> float:
         """Sigma that gyro noise leaves to the bias of a stretch (s), rad/s."""
         return self.density / float(np.sqrt(stretch))
 
     def _mean_factor(self, node: int) -> Factor:
-        """Defines the mean at the end of a node's stretch from the one before and the node (native, linear)."""
+        """Defines the mean at the end of a node's stretch from the one before and the node."""
         end = self.stop if node == self.nodes - 1 else self.edges[node + 1]
         whole, stretch = end - self.edges[0], end - self.edges[node]
         share = float(stretch / whole)
@@ -131,4 +136,4 @@ class WalkingBias:
         factor = linear_factor(
             {key: scale * np.eye(3) for key, scale in blocks.items()}, dict.fromkeys(blocks, np.zeros(3)), sigma
         )
-        return Factor("definition", factor)
+        return Factor.process_of("definition", factor)

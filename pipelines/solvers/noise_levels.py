@@ -21,7 +21,6 @@ import gtsam
 import numpy as np
 
 from alidade.factors.vectorized import VectorizedFactor
-from alidade.pipelines.estimation.linear import rescaled
 from alidade.pipelines.estimation.noise import Level, Noise
 from alidade.pipelines.estimation.problem import Array, Factor
 from alidade.pipelines.estimation.robust import robust_sigma
@@ -75,8 +74,6 @@ def _at_level(factor: Factor, level: Level) -> Factor:
             weights[:, _rows(level.noise, weights.shape[1])] /= level.scale
         weighed, of = vectorized.weighed(weights), Factor.process_of if factor.measurement is None else Factor.of
         return of(factor.family, weighed, factor.beside)
-    if isinstance(factor.factor, gtsam.LinearContainerFactor):
-        return Factor(factor.family, rescaled(factor.factor, level.scale))
     native = cast(gtsam.NoiseModelFactor, factor.factor)
     stated = cast(gtsam.noiseModel.Gaussian, native.noiseModel())
     noise = gtsam.noiseModel.Gaussian.Information(stated.information() / level.scale**2)

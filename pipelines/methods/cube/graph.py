@@ -21,7 +21,8 @@ import numpy as np
 from alidade.factors import so3
 from alidade.factors.turns import Samples, Turns
 from alidade.pipelines.estimation.believing import believing
-from alidade.pipelines.estimation.problem import Attitudes, Factor, Problem, Step
+from alidade.pipelines.estimation.priors import rotation_about, vector_about
+from alidade.pipelines.estimation.problem import Attitudes, ChainLayout, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.cube.advice import advice
 from alidade.pipelines.methods.cube.data import CubeData
@@ -37,7 +38,7 @@ from alidade.pipelines.methods.cube.model import Model, prepare
 from alidade.pipelines.methods.cube.noises import noises
 from alidade.pipelines.methods.cube.parameters import SENSITIVITY_KEY, SLOPE_KEYS, TRIAD_KEYS, first_priors
 from alidade.pipelines.methods.cube.tag_places import layout_belief
-from alidade.pipelines.methods.cube.wandering import deviation_key
+from alidade.pipelines.methods.cube.wandering import deviation_key, sum_key
 from alidade.pipelines.settings import Config
 
 _NO_FIELD = (
@@ -69,6 +70,7 @@ def problem(data: CubeData, config: Config) -> Problem:
         premises=(_NO_FIELD,) if model.poses.mag is not None and model.field is None else (),
         noises=tuple(noises(data, config).values()),
         constants=temperature.constants(temperature.reference(data.temperature)),
+        layout=ChainLayout(states="xdepR" if model.reference.moves else "xdep"),
     )
     return graph if layout is None or data.camera is None else believing(graph, [layout])
 
@@ -89,18 +91,17 @@ def _step(model: Model, k: int) -> Step:
         factors += first_priors(model.parameters)
     initial.insert(pose_key(k), so3.to_gtsam(model.initial[k]))
     initial.insert(deviation_key(k), np.zeros(3))
+    initial.insert(sum_key(k), np.zeros(3))
     factors += [*model.deviation.factors(k), *_process(model, k)]
     seen = model.poses.tags[k]
     if seen is not None:
         initial.insert(place_key(k), seen.pose.position)
-        prior = gtsam.noiseModel.Isotropic.Sigma(3, _POSITION_PRIOR_SIGMA)
-        factors.append(Factor("prior", gtsam.PriorFactorVector(place_key(k), seen.pose.position, prior)))
+        factors.append(vector_about(place_key(k), seen.pose.position, _POSITION_PRIOR_SIGMA))
     if model.data.camera is not None and (seen is not None if model.reference.moves else k == 0):
         initial.insert(reference_key(k), so3.to_gtsam(model.reference.nRB[k]))
         if model.reference.covariance is not None:
-            measured = so3.to_gtsam(model.reference.nRB[k])
-            noise = gtsam.noiseModel.Gaussian.Covariance(model.reference.covariance[k])
-            factors.append(Factor("reference", gtsam.PriorFactorRot3(reference_key(k), measured, noise)))
+            R = np.linalg.cholesky(np.linalg.inv(model.reference.covariance[k])).T
+            factors.append(rotation_about(reference_key(k), model.reference.nRB[k], R, "reference"))
     factors += sensor_factors(model, k)
     if seen is not None:
         factors.append(tag_factor(model, k, seen))
@@ -123,9 +124,7 @@ def _process(model: Model, k: int) -> list[Factor]:
     """What leads to the attitude of pose k: the turn before it, or nothing."""
     if k > 0 and model.samples(k).whole:
         return [turn_factor(model, k)]
-    attitude = so3.to_gtsam(model.initial[k])
-    prior = gtsam.noiseModel.Isotropic.Sigma(3, _ATTITUDE_PRIOR_SIGMA)
-    return [Factor("prior", gtsam.PriorFactorRot3(pose_key(k), attitude, prior))]
+    return [rotation_about(pose_key(k), model.initial[k], np.eye(3) / _ATTITUDE_PRIOR_SIGMA)]
 
 
 def _predict(model: Model, k: int, initial: gtsam.Values, current: gtsam.Values) -> gtsam.Values:

@@ -138,7 +138,7 @@ def first_priors(parameters: Parameters) -> list[Factor]:
     factors = []
     for name, parameter in parameters.triads.items():
         prior = TriadPriorFactor(np.zeros(1), mean[None], parameters.priors[name][None])
-        factors.append(Factor("prior", prior.on(parameter.key).factor))
+        factors.append(Factor.process_of("prior", prior.on(parameter.key)))
     factors += [rotation_prior(p) for p in parameters.rotations]
     factors += [vector_prior(p, np.zeros(len(p.quantities))) for p in parameters.zeros]
     if parameters.field is not None and parameters.field_model is not None:
@@ -155,7 +155,7 @@ def _strength(key: int, model: Array) -> Factor:
     Not for a field that is farther off: what a building does to it, it does to its strength too.
     """
     along = (model / np.linalg.norm(model))[None]
-    return Factor("prior", linear_factor({key: along}, {key: model}, STRENGTH_SIGMA))
+    return Factor.process_of("prior", linear_factor({key: along}, {key: model}, STRENGTH_SIGMA))
 
 
 def cube_parameters(

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from alidade.factors.triad import WeightedSumFactor
 from alidade.pipelines.estimation.linear import linear_factor
+from alidade.pipelines.estimation.priors import vector_about
 from alidade.pipelines.estimation.problem import Array, Factor
 from alidade.pipelines.methods.cube.poses import StaticPoses
 
@@ -19,6 +19,11 @@ _STEADY = 1e-8
 def deviation_key(k: int) -> int:
     """Variable of how far the offset is from its mean in pose k, (3,) in nominal units."""
     return int(gtsam.symbol("d", k))
+
+
+def sum_key(k: int) -> int:
+    """Variable of the sum of deviations up to pose k, each with its share of the session, (3,) in nominal units."""
+    return int(gtsam.symbol("e", k))
 
 
 @dataclass(frozen=True)
@@ -32,13 +37,11 @@ class GaussMarkovDeviation:
         sigma: (P,) of each pose's deviation, given the one before it; of the first alone.
         correlation: (P,) with the one before it; 0 for the first.
         weights: (P,) share of the session that a pose stands for.
-        end: of the last pose, s.
     """
 
     sigma: Array
     correlation: Array
     weights: Array
-    end: float
 
     @classmethod
     def over(cls, poses: StaticPoses, walk: float) -> GaussMarkovDeviation:
@@ -49,17 +52,22 @@ class GaussMarkovDeviation:
         stationary = max(walk * float(np.sqrt(length / 6.0)), _STEADY)
         correlation = np.append(0.0, np.exp(-np.diff(middle) / (length / 3.0)))
         edges = np.concatenate([start[:1], 0.5 * (middle[1:] + middle[:-1]), stop[-1:]])
-        return cls(stationary * np.sqrt(1.0 - correlation**2), correlation, np.diff(edges) / length, float(stop[-1]))
+        return cls(stationary * np.sqrt(1.0 - correlation**2), correlation, np.diff(edges) / length)
 
     def factors(self, k: int) -> list[Factor]:
-        """How the offset came to where it is in pose k; after the last, that c is its mean over the session."""
-        key, sigma = deviation_key(k), float(self.sigma[k])
-        if k == 0:
-            noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
-            return [Factor("bias walk", gtsam.PriorFactorVector(key, np.zeros(3), noise))]
-        blocks = {key: np.eye(3), deviation_key(k - 1): -self.correlation[k] * np.eye(3)}
-        found = [Factor("bias walk", linear_factor(blocks, dict.fromkeys(blocks, np.zeros(3)), sigma))]
-        if k == len(self.weights) - 1:
-            mean = WeightedSumFactor(np.array([self.end]), self.weights, _STEADY)
-            found.append(Factor("definition", mean.on(*(deviation_key(i) for i in range(k + 1))).factor))
+        """How the offset came to where it is in pose k, and its mean so far; after the last, that c is the mean.
+
+        The mean of the session is zero to `_STEADY`, in variance half by the steps of the sum and half by its end.
+        """
+        key, share, count = deviation_key(k), self.weights[k], len(self.weights)
+        first, none = k == 0, np.zeros(3)
+        before = {} if first else {deviation_key(k - 1): -self.correlation[k] * np.eye(3)}
+        blocks = {key: np.eye(3), **before}
+        walk = linear_factor(blocks, dict.fromkeys(blocks, none), float(self.sigma[k]))
+        summed = {} if first else {sum_key(k - 1): -np.eye(3)}
+        blocks = {sum_key(k): np.eye(3), key: -share * np.eye(3), **summed}
+        step = linear_factor(blocks, dict.fromkeys(blocks, none), _STEADY / float(np.sqrt(2.0 * count)))
+        found = [Factor.process_of("bias walk", walk), Factor.process_of("definition", step)]
+        if k == count - 1:
+            found.append(vector_about(sum_key(k), none, _STEADY / float(np.sqrt(2.0)), "definition"))
         return found

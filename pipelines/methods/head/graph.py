@@ -24,7 +24,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.assumptions import acting
 from alidade.pipelines.estimation.camera_clock import Clock, Keyframes
-from alidade.pipelines.estimation.gyro_chain import ROOT, GyroChain, Trunk, shared_keyframes
+from alidade.pipelines.estimation.gyro_chain import LAYOUT, ROOT, GyroChain, Trunk, shared_keyframes
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.priors import rotation_prior, vector_prior
 from alidade.pipelines.estimation.problem import Array, Attitudes, Factor, Problem, Step
@@ -96,6 +96,7 @@ def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
         noises=tuple(model.noises.values()),
         constants=temperature.constants(model.reference),
         keyframes=Keyframes(model.clock, _NEAR),
+        layout=LAYOUT,
     )
 
 

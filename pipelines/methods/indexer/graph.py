@@ -24,10 +24,10 @@ from alidade.factors.indexer import ENCODER_ERRORS, IndexerAverageFactor, Option
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.noise import Level, Noise
-from alidade.pipelines.estimation.priors import prior_sigmas, vector_prior
-from alidade.pipelines.estimation.problem import Array, Attitudes, Factor, Parameter, Problem, Step
+from alidade.pipelines.estimation.priors import prior_sigmas, vector_about, vector_prior
+from alidade.pipelines.estimation.problem import Array, Attitudes, ChainLayout, Factor, Parameter, Problem, Step
 from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
-from alidade.pipelines.estimation.walking_bias import WalkingBias
+from alidade.pipelines.estimation.walking_bias import NODES, WalkingBias
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.indexer.attitude import carrier, frames
 from alidade.pipelines.methods.indexer.groups import KINDS, Group, groups_of
@@ -103,6 +103,7 @@ def problem(data: IndexerData, config: Config) -> Problem:
         dropped=dropped,
         noises=model.noises,
         constants=temperature.constants(temperature.reference(data.temperature)),
+        layout=ChainLayout(nodes=NODES),
     )
 
 
@@ -200,8 +201,7 @@ def _begin(model: _Model, step: Step) -> None:
         size = len(parameter.quantities)
         if parameter.key == KEYS["theta"]:
             step.initial.insert(parameter.key, model.theta_guess / THETA_UNIT)
-            noise = gtsam.noiseModel.Diagonal.Precisions((prior_sigmas(parameter) / THETA_UNIT) ** -2)
-            step.factors.append(Factor("prior", gtsam.PriorFactorVector(parameter.key, np.zeros(size), noise)))
+            step.factors.append(vector_about(parameter.key, np.zeros(size), prior_sigmas(parameter) / THETA_UNIT))
             continue
         if parameter.key != FIRST_BIAS:
             step.initial.insert(parameter.key, np.zeros(size))
@@ -230,8 +230,7 @@ def _add_measurement(model: _Model, i: int, seen: set[tuple[str, int]], step: St
         if group.position not in seen:
             seen.add(group.position)
             step.initial.insert(key, np.zeros(3))
-            noise = gtsam.noiseModel.Isotropic.Sigma(3, model.slow)
-            step.factors.append(Factor("prior", gtsam.PriorFactorVector(key, np.zeros(3), noise)))
+            step.factors.append(vector_about(key, np.zeros(3), model.slow))
         options, columns = (*options, "tilt"), [*columns, key]
     wander = model.slow if group.kind == "move" else 0.0
     # A resting encoder repeats its slow errors from edge to edge, a turning one need not (quantisation).

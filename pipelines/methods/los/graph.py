@@ -25,9 +25,9 @@ from alidade.pipelines.display.drawing import swaying
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.assumptions import acting
 from alidade.pipelines.estimation.camera_clock import Clock, Keyframes
-from alidade.pipelines.estimation.gyro_chain import ROOT, GyroChain, Trunk, as_slice
+from alidade.pipelines.estimation.gyro_chain import LAYOUT, ROOT, GyroChain, Trunk, as_slice
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.priors import vector_prior
+from alidade.pipelines.estimation.priors import rotation_about, vector_prior
 from alidade.pipelines.estimation.problem import Array, Factor, Problem, Step
 from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
 from alidade.pipelines.methods import temperature
@@ -94,6 +94,7 @@ def _problem(config: Config, data: LosData, model: _Model, dropped: Mapping[str,
         noises=tuple(model.noises.values()),
         constants=temperature.constants(model.reference),
         keyframes=None if model.parameters.sight is None else Keyframes(model.clock, _NEAR),
+        layout=LAYOUT,
     )
 
 
@@ -313,8 +314,7 @@ def _start_factor(model: _Model, k: int) -> Factor:
     rolls = np.isfinite(model.measured[:, 2]).any()
     sigmas = np.array([_WIDE, _WIDE if rolls else _HELD, _WIDE])
     initial = model.chain.initial[k]
-    noise = gtsam.noiseModel.Gaussian.SqrtInformation(so3.matrix(initial) / sigmas[:, None], False)
-    return Factor("prior", gtsam.PriorFactorRot3(model.chain.state(k), so3.to_gtsam(initial), noise))
+    return rotation_about(model.chain.state(k), initial, so3.matrix(initial) / sigmas[:, None])
 
 
 def _picture_factors(model: _Model, keyframes: range) -> list[Factor]:

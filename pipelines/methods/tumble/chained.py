@@ -15,8 +15,9 @@ from alidade.factors.loss import TruncatedLoss
 from alidade.factors.turned import FieldFactor, UpFactor
 from alidade.pipelines.display.drawing import swaying
 from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.gyro_chain import LAYOUT
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.priors import vector_prior
+from alidade.pipelines.estimation.priors import rotation_about, vector_prior
 from alidade.pipelines.estimation.problem import Array, Attitudes, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.tumble.model import Model, Sensor
@@ -68,6 +69,7 @@ def chained(data: TumbleData, config: Config, model: Model, shared: tuple[Variab
         premises=model.premises,
         noises=(*(Level(sensor.noise) for sensor in model.sensors), *turned.levels),
         constants=temperature.constants(temperature.reference(data.temperature)),
+        layout=LAYOUT,
     )
 
 
@@ -108,9 +110,8 @@ def _begin(graph: _Graph, step: Step) -> None:
         zeros = np.zeros(len(parameter.quantities))
         step.initial.insert(parameter.key, zeros)
         step.factors.append(vector_prior(parameter, zeros))
-    noise = gtsam.noiseModel.Isotropic.Sigma(3, _ANY_ATTITUDE)
-    first = so3.to_gtsam(turned.chain.initial[0])
-    step.factors.append(Factor("prior", gtsam.PriorFactorRot3(turned.chain.state(0), first, noise)))
+    chain = turned.chain
+    step.factors.append(rotation_about(chain.state(0), chain.initial[0], np.eye(3) / _ANY_ATTITUDE))
 
 
 def _field(graph: _Graph, keyframes: range) -> list[Factor]:

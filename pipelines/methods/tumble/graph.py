@@ -21,7 +21,7 @@ from alidade.factors.chi_square import gate
 from alidade.factors.ellipsoid import DipFactor, StrengthFactor, entries
 from alidade.factors.loss import TruncatedLoss
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.problem import Array, Factor, Problem, Step
+from alidade.pipelines.estimation.problem import Array, ChainLayout, Factor, Problem, Step
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.tumble.chained import FAMILIES, advice, chained
 from alidade.pipelines.methods.tumble.model import Model, Moments, Sensor, prepare
@@ -70,6 +70,7 @@ def problem(data: TumbleData, config: Config) -> Problem:
         noises=tuple(noises),
         elsewhere=partial(_mirrored, model),
         constants=temperature.constants(temperature.reference(data.temperature)),
+        layout=ChainLayout(),
     )
 
 

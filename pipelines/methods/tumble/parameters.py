@@ -12,7 +12,7 @@ import numpy as np
 
 from alidade.factors.ellipsoid import entries
 from alidade.pipelines.estimation.assumptions import quantities
-from alidade.pipelines.estimation.priors import prior_sigmas
+from alidade.pipelines.estimation.priors import prior_sigmas, vector_about
 from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quantity
 from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.methods.tumble.model import Model, Sensor, nearest_axes
@@ -47,8 +47,7 @@ class Variable:
     @property
     def prior(self) -> Factor:
         """Its prior factor."""
-        noise = gtsam.noiseModel.Diagonal.Precisions(self.sigma**-2.0)
-        return Factor("prior", gtsam.PriorFactorVector(self.parameter.key, self.mean, noise))
+        return vector_about(self.parameter.key, self.mean, self.sigma)
 
 
 def variables(model: Model, config: Config) -> tuple[Variable, ...]:

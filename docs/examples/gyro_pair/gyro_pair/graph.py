@@ -22,6 +22,7 @@ from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.priors import rotation_prior, vector_prior
 from alidade.pipelines.estimation.problem import (
     Array,
+    ChainLayout,
     Factor,
     Parameter,
     Problem,
@@ -73,6 +74,7 @@ def problem(data: GyroPairData, config: Config) -> Problem:
         advice=_advice,
         dropped=data.dropped,
         noises=(Level(stated("gyro_density", config, data.a_density, ("increment",))),),
+        layout=ChainLayout(),
     )
 
 

@@ -1,0 +1,307 @@
+"""Square-root elimination of a chain of small states with shared unknowns, all segments of the chain at once.
+
+The linear system of a calibration is a block-bidiagonal arrowhead: states x_0 ... x_{N-1} (attitudes, d numbers each)
+joined to their neighbours, measurements of single states, and s unknowns that every row may hold (mounts, biases,
+scales). A bias that walks is a coarser chain above: node z_j (c numbers) is in force over a piece of the chain.
+
+    rows about state k                [x_k | z_j | shared | right side]             (N, m, d + c + s + 1)
+    rows that join k to k - 1         [x_k | x_k-1 | z_j | shared | right side]     (N, b, 2 d + c + s + 1)
+
+The chain is cut into segments that are eliminated in lockstep from their last states backward, one numpy.linalg.qr for
+one state of each. A segment leaves rows about its last state, that of the segment before and the border (z_j, shared):
+a chain again. Once a piece is one segment its node joins the state: (attitude at the cut, bias). The last few dozen
+states go in time order, so that what is known after each of them is at hand.
+
+Nothing is squared: R's diagonal gives the determinant, its last column the minimum. Golub, Plemmons, "Large-scale
+geodetic least-squares adjustment by dissection and orthogonal decomposition", Lin. Alg. Appl. 34 (1980).
+
+Limits: rank is tested state by state (`RANK_TOLERANCE`); two states that are undetermined only together end in a pivot
+of the size of rounding. Shared unknowns without a prior may make `root` singular, and `solve` then raises
+numpy.linalg.LinAlgError.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+# Chains of at most so many states are eliminated in time order.
+SEQUENTIAL_STATES = 96
+# A pivot below this share of its column's norm counts as zero: the state is not determined.
+RANK_TOLERANCE = 1e-13
+
+
+class IndeterminateStateError(Exception):
+    """A state is determined neither by measurements nor by its neighbours."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChainSystem:
+    """Whitened rows A x = b of a chain, b as their last column.
+
+    Attributes:
+        measured: (N, m, d + c + s + 1) rows about state k; rows that a state has no need of are zero.
+        between: (N, b, 2 d + c + s + 1) rows that join state k to k - 1: zero across a break, and of the first state
+            zero in the columns of its predecessor.
+        beside: (N, q, c + s + 1) rows without a state that come after k - 1 and before k, or with it.
+        shared: (r, s + 1) rows about the shared unknowns that come first: priors.
+        d: numbers of a state.
+        piece: (N,) index j, not decreasing, of the node in force from k - 1 to k and at k; every node is in force at
+            one state at least. None: no nodes.
+        walk: (J, w, 2 c + 1) rows [z_j | z_j-1 | right side]; of the first node zero in its predecessor's columns.
+    """
+
+    measured: Array
+    between: Array
+    beside: Array
+    shared: Array
+    d: int
+    piece: Index | None = None
+    walk: Array | None = None
+
+    @property
+    def c(self) -> int:
+        """Numbers of a node; 0 without nodes."""
+        return 0 if self.walk is None else int(self.walk.shape[2]) // 2
+
+    @property
+    def border(self) -> int:
+        """Columns beside the states', right side included: c + s + 1."""
+        return int(self.measured.shape[2]) - self.d
+
+    def segments(self) -> Index:
+        """(B,) last states of segments, none of which spans two pieces."""
+        n = len(self.measured)
+        index, length = np.arange(n), max(2, int(np.ceil(n / max((2.0 * n) ** 0.5, SEQUENTIAL_STATES / 2.0))))
+        if self.piece is None:
+            return np.flatnonzero((n - 1 - index) % length == 0)
+        last = np.flatnonzero(np.diff(self.piece, append=self.piece[-1] + 1) > 0)
+        return np.flatnonzero((last[np.searchsorted(last, index)] - index) % length == 0)
+
+    def with_nodes_as_states(self) -> ChainSystem:
+        """The same where every piece is one state: states (x_j, z_j) and no nodes."""
+        assert self.walk is not None
+        d, c, (n, b, _), beside = self.d, self.c, self.between.shape, _triangle(self.beside)
+        x, z, rest = np.arange(d), np.arange(d, d + c), np.arange(2 * (d + c), 2 * (d + c) + self.border - c)
+        out = np.zeros((n, b + c + self.walk.shape[1], rest[-1] + 1))
+        out[:, :b][..., np.r_[x, x + d + c, z, rest]] = self.between
+        out[:, b : b + len(beside[0, :c])][..., np.r_[z, rest]] = beside[:, :c]
+        out[:, b + c :][..., np.r_[z, z + d + c, rest[-1]]] = self.walk
+        return ChainSystem(self.measured, out, beside[:, c:, c:], self.shared, d + c)
+
+
+@dataclass(frozen=True, eq=False)
+class _Level:
+    """Segments whose inner states are eliminated, the longest first.
+
+    Attributes:
+        ends, order: (B,) the segments' last states, and which of the segments in time order these are.
+        active: (L + 1,) number of segments that are longer than k.
+        rows: (N, d, 3 d + border) R of the inner states: columns x_k, x_k-1, last state of the segment, border.
+        piece: (B,) of the segments; None: no nodes.
+    """
+
+    ends: Index
+    order: Index
+    active: Index
+    rows: Array
+    piece: Index | None
+
+    @classmethod
+    def eliminate(cls, chain: ChainSystem) -> tuple[_Level, ChainSystem, Index]:
+        """The level, the chain of the segments' last states that it leaves, and which these are."""
+        lasts, d, w, b = chain.segments(), chain.d, chain.border, chain.between.shape[1]
+        lengths = np.diff(lasts, prepend=-1)
+        order = np.argsort(-lengths, kind="stable")
+        ends, active = lasts[order], np.array([np.count_nonzero(lengths > k) for k in range(lengths.max() + 1)])
+        rows = np.zeros((len(chain.measured), d, 3 * d + w))
+        R, kept = _swapped(chain.between[ends], d), max(d, b)  # columns: state before, last state, border
+        carried, piles = np.pad(R, ((0, 0), (0, kept - b), (0, 0))), [chain.beside[ends]]
+        for k in range(1, len(active) - 1):
+            state, ended = ends[: active[k]] - k, slice(active[k + 1], active[k])
+            rows[state], R, rest = _step(R[: active[k]], chain.measured[state], chain.between[state], d, d)
+            carried[ended, :d], carried[ended, d:] = R[ended], 0.0
+            piles += [rest, chain.beside[state]]
+        left, in_time = _reduced(piles, d + w), np.argsort(order)
+        own = np.concatenate([left[:, :d, :d], np.zeros((len(ends), d, d)), left[:, :d, d:]], axis=2)
+        between = np.concatenate([_swapped(carried, d), own], axis=1)[in_time]
+        piece, beside = None if chain.piece is None else chain.piece[lasts], left[in_time, d:, d:]
+        coarse = ChainSystem(chain.measured[lasts], between, beside, chain.shared, d, piece, chain.walk)
+        return cls(ends, order, active, rows, None if piece is None else piece[order]), coarse, lasts
+
+    def back(self, last: Array, border: Array, generator: np.random.Generator | None) -> Array:
+        """States (N, d, n) given the segments' last ones (B, d, n) and the border (B or 1, c + s + 1, n)."""
+        (N, d, _), last = self.rows.shape, last[self.order]
+        x = np.zeros((N + 1, d, last.shape[2]))  # one more than there are stands before the first
+        x[self.ends] = last
+        for k in range(len(self.active) - 2, 0, -1):
+            some, state = slice(self.active[k]), self.ends[: self.active[k]] - k
+            R = self.rows[state]
+            right = R[..., d : 2 * d] @ x[state - 1] + R[..., 2 * d : 3 * d] @ last[some]
+            right += R[..., 3 * d :] @ (border if len(border) == 1 else border[some])
+            x[state] = _solved(R[..., :d], right, generator)
+        return x[:-1]
+
+
+@dataclass(frozen=True, eq=False)
+class ChainFactorization:
+    """R of a chain's system and what follows from it: states are (N, d, n), nodes (J, c, n), for n columns.
+
+    Attributes:
+        root: (c + s + 1, c + s + 1) R of the last node, the shared unknowns and the right side.
+    """
+
+    d: int
+    c: int
+    root: Array
+    _levels: list[_Level | None]  # None: from there on nodes are part of the states
+    # Of the last few dozen states: keyframe, R, rows about it by itself and all before it, rows left about shared.
+    _keyframes: Index
+    _rows: list[Array]
+    _heads: list[Array]
+    _piles: list[Array]
+
+    @classmethod
+    def of(cls, chain: ChainSystem) -> ChainFactorization:
+        """Eliminate all but the shared unknowns and the last node. Raises IndeterminateStateError."""
+        own, tail, levels, keyframes = chain.d, chain.c, list[_Level | None](), np.arange(len(chain.measured))
+        while chain.walk is not None or len(chain.measured) > SEQUENTIAL_STATES:
+            if chain.walk is not None and len(chain.measured) == len(chain.walk):
+                chain = chain.with_nodes_as_states()
+                levels.append(None)
+            else:
+                level, chain, lasts = _Level.eliminate(chain)
+                levels.append(level)
+                keyframes = keyframes[lasts]
+        d, w, carried = chain.d, chain.border, np.zeros((1, 0, chain.d + chain.border))
+        alone = np.delete(chain.between[0], np.s_[d : 2 * d], axis=1)
+        rows, heads, piles = list[Array](), list[Array](), [np.concatenate([chain.shared, chain.beside[0]])]
+        for k, measured in enumerate(chain.measured):
+            heads.append(np.concatenate([alone if k == 0 else carried[0], measured]))
+            if k < len(chain.measured) - 1:
+                ahead = _swapped(chain.between[k + 1], d)
+                (R,), carried, (rest,) = _step(heads[-1][None], measured[None, :0], ahead[None], d, 0)
+                rows.append(R)
+                piles.append(np.concatenate([rest, chain.beside[k + 1]]))
+        R = _root([heads[-1], *piles], d + w)
+        rows.append(_determined(R[None, :own])[0])
+        return cls(own, tail, R[own:, own:], levels, keyframes, rows, heads, piles)
+
+    @property
+    def minimum(self) -> float:
+        """Sum of squares of the rows at the solution."""
+        return float(self.root[-1, -1] ** 2)
+
+    @property
+    def log_determinant(self) -> float:
+        """Of the information A'A."""
+        parts = [each.rows for each in self._levels if each is not None] + [
+            R[None] for R in (*self._rows, self.root[:-1])
+        ]
+        pivots = np.abs(np.concatenate([np.diagonal(R, axis1=1, axis2=2).ravel() for R in parts]))
+        return 2.0 * float(np.log(pivots[pivots > 0.0]).sum())  # rows of the segments' last states are empty
+
+    def solve(self) -> tuple[Array, Array, Array]:
+        """States (N, d), nodes (J, c) and shared unknowns (s,) of the least squares."""
+        last = np.asarray(np.linalg.solve(self.root[:-1, :-1], self.root[:-1, -1]), dtype=float)
+        states, nodes = self.given(last[:, None])
+        return states[..., 0], nodes[..., 0], last[self.c :]
+
+    def given(self, last: Array) -> tuple[Array, Array]:
+        """States and nodes of the least squares for given last node and shared unknowns (c + s, n)."""
+        return self._back(last, -1.0)
+
+    def propagate(self, last: Array) -> tuple[Array, Array]:
+        """Moves of states and nodes that go with moves of the last node and the shared unknowns (c + s, n)."""
+        return self._back(last, 0.0)
+
+    def sample(self, count: int, generator: np.random.Generator) -> tuple[Array, Array, Array]:
+        """Draws from the posterior, as deviations from its mean: states, nodes, shared unknowns (s, n)."""
+        last = _solved(self.root[:-1, :-1], np.zeros((len(self.root) - 1, count)), generator)
+        return *self._back(last, 0.0, generator), last[self.c :]
+
+    def prefix_roots(self) -> tuple[Index, list[Array]]:
+        """(M,) keyframes, and R of (their node, shared, right side) by all until then; few rows at first."""
+        roots, known = list[Array](), np.zeros((0, 1))
+        for head, pile in zip(self._heads, self._piles, strict=True):
+            known = _root([known, pile], pile.shape[1])
+            roots.append(_root([head, known], head.shape[1])[self.d :, self.d :])
+        return self._keyframes, roots
+
+    def _back(self, last: Array, right: float, generator: np.random.Generator | None = None) -> tuple[Array, Array]:
+        n, own, d, last = last.shape[1], self.d, self.d + self.c, np.pad(last, ((0, 1), (0, 0)), constant_values=right)
+        shared, x, nodes = last[self.c :], np.zeros((len(self._rows), d, n)), np.zeros((0, self.c, n))
+        x[-1, own:] = last[: self.c]
+        x[-1, :own] = _solved(self._rows[-1][:, :own], self._rows[-1][:, own:] @ last, generator)
+        for k in range(len(self._rows) - 2, -1, -1):
+            R = self._rows[k]
+            x[k] = _solved(R[:, :d], R[:, d : 2 * d] @ x[k + 1] + R[:, 2 * d :] @ shared, generator)
+        for level in reversed(self._levels):
+            if level is None:
+                x, nodes = x[:, :own], x[:, own:]
+            elif level.piece is None:
+                x = level.back(x, shared[None], generator)
+            else:
+                of = nodes[level.piece]
+                x = level.back(x, np.concatenate([of, np.repeat(shared[None], len(of), axis=0)], axis=1), generator)
+        return x, nodes
+
+
+def _swapped(rows: Array, d: int) -> Array:
+    """Rows with the columns of the first two states swapped."""
+    return np.concatenate([rows[..., d : 2 * d], rows[..., :d], rows[..., 2 * d :]], axis=-1)
+
+
+def _step(carried: Array, measured: Array, between: Array, d: int, gap: int) -> tuple[Array, Array, Array]:
+    """Eliminate a state of each of B segments: its rows of R, d rows carried to the next one, the rows about neither.
+
+    `carried` (B, ., d + gap + border) are rows from before, `gap` columns of them of the segments' first states.
+    """
+    p, m, b = carried.shape[1], measured.shape[1], between.shape[1]
+    stack = np.zeros((len(carried), max(p + m + b, 2 * d), between.shape[2] + gap))
+    before, own, after = stack[:, :p], stack[:, p : p + m], stack[:, p + m : p + m + b]
+    before[..., :d], before[..., 2 * d :] = carried[..., :d], carried[..., d:]
+    own[..., :d], own[..., 2 * d + gap :] = measured[..., :d], measured[..., d:]
+    after[..., : 2 * d], after[..., 2 * d + gap :] = between[..., : 2 * d], between[..., 2 * d :]
+    R = _triangle(stack)
+    return _determined(R[:, :d]), R[:, d : 2 * d, d:], R[:, 2 * d :, 2 * d :]
+
+
+def _reduced(piles: list[Array], columns: int) -> Array:
+    """R (B, columns, columns) of rows of the first so many segments each, about the last columns."""
+    ends = np.cumsum([0, *(each.shape[1] for each in piles)])
+    whole = np.zeros((len(piles[0]), max(int(ends[-1]), columns), columns))
+    for each, begin, end in zip(piles, ends, ends[1:], strict=False):
+        whole[: len(each), begin:end, columns - each.shape[2] :] = each
+    return _triangle(whole)
+
+
+def _triangle(rows: Array) -> Array:
+    """R (..., r, columns) of rows (..., m, columns), without the copies that numpy's mode "r" makes."""
+    R: Array = np.swapaxes(np.linalg.qr(rows, mode="raw")[0], -1, -2)[..., : min(rows.shape[-2:]), :]
+    return R * np.tri(*R.shape[:-3:-1]).T
+
+
+def _root(rows: list[Array], columns: int) -> Array:
+    """R of several rows, of which those with fewer columns are about the last ones."""
+    return _triangle(np.concatenate([np.pad(each, ((0, 0), (columns - each.shape[1], 0))) for each in rows]))
+
+
+def _solved(R: Array, right: Array, generator: np.random.Generator | None) -> Array:
+    """x with R x + right = noise, white if there is a generator, else zero."""
+    noise = 0.0 if generator is None else generator.standard_normal(right.shape)
+    return np.asarray(-np.linalg.solve(R, right + noise), dtype=float)
+
+
+def _determined(R: Array) -> Array:
+    """Rows R (B, d, .) of states. Raises IndeterminateStateError unless the triangles (B, d, d) are of full rank."""
+    triangle = R[..., : R.shape[1]]
+    pivots = np.abs(np.diagonal(triangle, axis1=1, axis2=2))
+    if not (pivots > RANK_TOLERANCE * np.linalg.norm(triangle, axis=1)).all():
+        raise IndeterminateStateError("a state is not determined: no measurement and no process constrains it")
+    return R

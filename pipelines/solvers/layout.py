@@ -1,0 +1,267 @@
+"""Where the variables of a problem stand: in arrays of values, and among the unknowns of a chain.
+
+    layout, values = Layout.of(problem.layout, initial)      # from a problem's ChainLayout and gtsam values
+    moved = layout.retract(values, Tangent(*factorization.solve()))
+    J = layout.root_columns(key)                             # tangent of a reported variable by (last node, shared)
+
+A bias that walks is b_j = b_0 + delta_j and its running mean m_j = b_0 + mu_j: both have the shared columns of b_0 and
+those of node z_j = (delta_j, mu_j), z_0 = 0. Variables of a state that a keyframe does not have are absent there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.factors import so3
+from alidade.factors.model import POSE3, ROT3, Block, dimension, retract
+from alidade.pipelines.estimation.problem import ChainLayout
+from alidade.pipelines.solvers.chain import Array, Index
+
+if TYPE_CHECKING:
+    import gtsam
+
+
+class NotAChainError(Exception):
+    """A problem's factors are not rows of a chain; says which and why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Values:
+    """Values of all variables.
+
+    Attributes:
+        arrays: kind of variable -> (count, width), rows as `Layout` has them.
+    """
+
+    arrays: Mapping[Block, Array]
+
+
+@dataclass(frozen=True, eq=False)
+class Tangent:
+    """Tangent vectors of all unknowns, or n of them side by side: states (N, d), nodes (J, c), shared (s,) [, n]."""
+
+    states: Array
+    nodes: Array
+    shared: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """Where the variables of a problem stand.
+
+    Attributes:
+        key: (V,) the variables, increasing.
+        block: (V,) what each is: index into `blocks`.
+        blocks: kinds of variables.
+        row: (V,) row of each in the array of its kind.
+        keyframe: (V,) of a state; -1: no state.
+        offset: (V,) first of its numbers in the state.
+        shared: (V,) first of its columns among the shared unknowns; -1: none.
+        node: (V,) of a node; -1: none. The first node has 0, though nothing of it deviates from itself.
+        part: (V,) first of its numbers in the node.
+        sizes: N keyframes, d numbers of a state, J nodes, c numbers of a node, s shared unknowns.
+        kept: (N, d), (J, c) which numbers of states and nodes are variables.
+    """
+
+    key: Index
+    block: Index
+    blocks: tuple[Block, ...]
+    row: Index
+    keyframe: Index
+    offset: Index
+    shared: Index
+    node: Index
+    part: Index
+    sizes: tuple[int, int, int, int, int]
+    kept: tuple[NDArray[np.bool_], NDArray[np.bool_]]
+
+    @classmethod
+    def of(cls, layout: ChainLayout, initial: gtsam.Values) -> tuple[Layout, Values]:
+        """The layout of the variables of some values, and these."""
+        key = np.array(initial.keys(), dtype=np.uint64).astype(np.intp)
+        letter, index = key >> 56, key & ((1 << 56) - 1)
+        code = np.zeros((8, len(key)), dtype=np.intp)
+        kind, row, keyframe, offset, shared, node, part, size = code
+        code[2:7] = -1
+        offset[:], part[:] = 0, 0
+        blocks: list[Block] = []
+        parts: dict[Block, list[Array]] = {}
+        for some in _alike(initial, key, letter):
+            block, values = _read(initial, key[some])
+            if block not in blocks:
+                blocks.append(block)
+            own = parts.setdefault(block, [])
+            kind[some], size[some] = blocks.index(block), dimension(block)
+            row[some] = sum(map(len, own)) + np.arange(len(values))
+            own.append(values)
+        is_state = np.isin(letter, [ord(c) for c in layout.states])
+        frames, keyframe[is_state] = np.unique(index[is_state], return_inverse=True)
+        d = 0
+        for c in layout.states:
+            some = letter == ord(c)
+            offset[some] = d
+            d += int(size[some].max(initial=0))
+        is_node = np.isin(letter, [ord(c) for c in layout.nodes])
+        first, count, c = _nodes(layout, letter, index, is_node, node, part, size)
+        own = ~is_state & (~is_node | (np.arange(len(key)) == first))
+        shared[own] = np.cumsum(size[own]) - size[own]
+        if first >= 0:
+            shared[is_node] = shared[first]
+        n = len(frames) if len(frames) else count
+        kept = _kept((n, d), keyframe, offset, size), _kept((count if c else 0, c), node, part, size)
+        if c:
+            kept[1][0] = False
+        sizes = n, d, count if c else 0, c, int(size[own].sum())
+        if not c:
+            node[:] = -1
+        out = cls(key, kind, tuple(blocks), row, keyframe, offset, shared, node, part, sizes, kept)
+        return out, Values({block: np.concatenate(each) for block, each in parts.items()})
+
+    def at(self, keys: Sequence[int] | Index) -> Index:
+        """Positions of variables among `key`. Raises NotAChainError for one that has no value."""
+        wanted = np.asarray(keys, dtype=np.intp)
+        found = np.minimum(np.searchsorted(self.key, wanted), len(self.key) - 1)
+        if (self.key[found] != wanted).any():
+            raise NotAChainError("a factor is about a variable without a first value")
+        return found
+
+    def roles(self, columns: Sequence[int | list[int]]) -> tuple[tuple[bool, bool, bool], ...]:
+        """Whether each block of a factor is one variable that all measurements share, whether a state, whether a node."""
+        at = self.at([column if isinstance(column, int) else column[0] for column in columns])
+        of = zip(columns, self.keyframe[at] >= 0, self.node[at] >= 0, strict=True)
+        return tuple((isinstance(column, int), bool(state), bool(node)) for column, state, node in of)
+
+    def flat(self, some: Index) -> tuple[Index, Index]:
+        """Columns of variables of one kind in (states, nodes, shared, 0) laid flat, twice: of a node b_0 and its own.
+
+        What is not there is the zero at the end.
+        """
+        N, d, J, c, s = self.sizes
+        span, end = np.arange(dimension(self.blocks[self.block[some[0]]])), N * d + J * c + s
+        at_state = (self.keyframe[some] * d + self.offset[some])[:, None] + span
+        at_shared = (N * d + J * c + self.shared[some])[:, None] + span
+        at_node = (N * d + self.node[some] * c + self.part[some])[:, None] + span
+        one = np.where((self.keyframe[some] >= 0)[:, None], at_state, at_shared)
+        return one, np.where((self.node[some] >= 0)[:, None], at_node, end)
+
+    def tangents(self, step: Tangent) -> Array:
+        """A step laid flat, zero at the end: (unknowns + 1, ...)."""
+        tail = step.shared.shape[1:]
+        parts = [step.states.reshape(-1, *tail), step.nodes.reshape(-1, *tail), step.shared, np.zeros((1, *tail))]
+        return np.concatenate(parts)
+
+    def retract(self, values: Values, step: Tangent) -> Values:
+        """Values moved by a step."""
+        flat, moved = self.tangents(step), {}
+        for i, block in enumerate(self.blocks):
+            some = np.flatnonzero(self.block == i)
+            one, two = self.flat(some)
+            delta = np.empty((len(some), one.shape[1]))
+            delta[self.row[some]] = flat[one] + flat[two]
+            moved[block] = retract(values.arrays[block], block, delta)
+        return Values(moved)
+
+    def of_key(self, values: Values, key: int) -> Array:
+        """Value (width,) of a variable."""
+        (at,) = self.at([key])
+        return values.arrays[self.blocks[self.block[at]]][self.row[at]]
+
+    def to_gtsam(self, values: Values, keys: Iterable[int] | None = None) -> gtsam.Values:
+        """Values of some variables, or of all."""
+        import gtsam
+
+        out = gtsam.Values()
+        some = np.arange(len(self.key)) if keys is None else self.at(sorted(set(keys)))
+        for at in some.tolist():
+            block = self.blocks[self.block[at]]
+            insert_value(out, int(self.key[at]), block, values.arrays[block][self.row[at]])
+        return out
+
+    def root_columns(self, key: int) -> Array:
+        """(d, c + s) by which a variable's tangent follows from the last node and the shared unknowns.
+
+        Raises NotAChainError for a state, or a node that is not the last.
+        """
+        (at,) = self.at([key])
+        *_, J, c, s = self.sizes
+        if self.keyframe[at] >= 0 or self.node[at] not in (-1, 0, J - 1):
+            raise NotAChainError("a reported variable must be shared by all rows, or belong to the last node")
+        size = dimension(self.blocks[self.block[at]])
+        out = np.zeros((size, c + s))
+        out[:, c + self.shared[at] : c + self.shared[at] + size] = np.eye(size)
+        if self.node[at] > 0:
+            out[:, self.part[at] : self.part[at] + size] += np.eye(size)
+        return out
+
+
+def _alike(values: gtsam.Values, key: Index, letter: Index) -> list[Index]:
+    """Variables of one letter, or single ones where letters do not tell what they are."""
+    dims = values.dims()
+    dim = np.array([dims[k] for k in key.tolist()])
+    groups: list[Index] = []
+    for c in np.unique(letter):
+        some = np.flatnonzero(letter == c)
+        groups += [some] if c and (dim[some] == dim[some[0]]).all() else [some[i : i + 1] for i in range(len(some))]
+    return groups
+
+
+def _read(values: gtsam.Values, keys: Index) -> tuple[Block, Array]:
+    """What variables of one kind are, and their values (n, width). Raises NotAChainError for other kinds."""
+    first = int(keys[0])
+    for block, read in ((None, values.atVector), (ROT3, values.atRot3), (POSE3, values.atPose3)):
+        try:
+            read(first)
+        except RuntimeError:
+            continue
+        found: list[Any] = [read(k) for k in keys.tolist()]
+        if block is None:
+            return len(found[0]), np.array(found)
+        if block is ROT3:
+            return ROT3, so3.from_gtsam(found)
+        rotations = so3.from_gtsam([pose.rotation() for pose in found])
+        return POSE3, np.concatenate([rotations, [pose.translation() for pose in found]], axis=1)
+    raise NotAChainError("variables are vectors, Rot3 or Pose3")
+
+
+def insert_value(values: gtsam.Values, key: int, block: Block, value: Array) -> None:
+    """Insert a variable's value (width,) into gtsam's values."""
+    import gtsam
+
+    if block is ROT3:
+        values.insert(key, so3.to_gtsam(value))
+    elif block is POSE3:
+        values.insert(key, gtsam.Pose3(so3.to_gtsam(value[:4]), value[4:]))
+    else:
+        values.insert(key, value)
+
+
+def _nodes(
+    layout: ChainLayout, letter: Index, index: Index, is_node: NDArray[np.bool_], node: Index, part: Index, size: Index
+) -> tuple[int, int, int]:
+    """Place nodes and means; the position of the first node, -1 without any, the number of nodes, their numbers."""
+    if not is_node.any():
+        return -1, 1, 0
+    biases = np.flatnonzero(letter == ord(layout.nodes[0]))
+    if not len(biases):
+        raise NotAChainError("the nodes of a bias that walks are not there")
+    begin, count = int(index[biases[0]]), int(np.ptp(index[biases])) + 1
+    node[is_node] = index[is_node] - begin
+    width = int(size[biases[0]])
+    for i, c in enumerate(layout.nodes):
+        part[letter == ord(c)] = i * width
+    return int(biases[0]), count, len(layout.nodes) * width if count > 1 else 0
+
+
+def _kept(shape: tuple[int, int], place: Index, offset: Index, size: Index) -> NDArray[np.bool_]:
+    """Which numbers of states, or nodes, variables have."""
+    out = np.zeros(shape, dtype=bool)
+    if out.size:
+        for begin, width in {*zip(offset[place >= 0].tolist(), size[place >= 0].tolist(), strict=True)}:
+            some = (place >= 0) & (offset == begin) & (size == width)
+            out[place[some], begin : begin + width] = True
+    return out

@@ -1,0 +1,445 @@
+"""A problem's measurements evaluated as arrays: values in, the chain's whitened rows out, gtsam not involved.
+
+    linearization = Linearization.of(factors, layout)       # models of one kind stacked: `groups`
+    system, cost = linearization.at(values)                 # ChainSystem under the loss and weights in force
+    cost = linearization.cost(values)                       # without Jacobians
+    linearization.under(loss)                               # another loss (None: every measurement in full)
+    rows, cost = group.rows(values, width)                  # (n, m, width) of one kind, on the columns of its target
+
+An evaluation is one call a kind. Rows are written under the robust loss and the noise weights:
+
+    residuals r (n, m), Jacobian J;  w = weights, v = sqrt(loss weight of |w r|^2)  ->  rows [v w J | -v w r]
+
+so that half the negative gradient of the cost, the sum of twice the losses, is A'b. Rows about nodes of a walking bias
+alone hold no column of b_0, which cancels in them.
+
+Limits: all rows of a keyframe stand below one another, padded to the most that any keyframe has. A native gtsam factor
+is linearised one at a time, by gtsam; one with a robust or constrained noise model is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from alidade.factors.loss import TruncatedLoss
+from alidade.factors.model import (
+    Block,
+    Model,
+    Residuals,
+    dimension,
+    stack_models,
+    stacking_key,
+)
+from alidade.factors.vectorized import VectorizedFactor
+from alidade.pipelines.estimation.problem import Factor
+from alidade.pipelines.solvers.chain import Array, ChainSystem, Index
+from alidade.pipelines.solvers.layout import Layout, NotAChainError, Values, insert_value
+
+if TYPE_CHECKING:
+    import gtsam
+
+# The shared variables of a row about nodes alone cancel to this share of its largest coefficient.
+CANCELLED = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class NativeModel(Model):
+    """A native gtsam factor as a model of one measurement, linearised by gtsam.
+
+    Attributes:
+        factor: of which `blocks` are the variables.
+        time: (1,) s.
+        rows, blocks: as every model has.
+    """
+
+    factor: gtsam.NonlinearFactor
+    time: Array
+    rows: int
+    blocks: tuple[Block, ...]
+
+    def __call__(self, *blocks: Array) -> Residuals:
+        """Whitened residuals (1, m) and their Jacobians, (1, m, d) each."""
+        import gtsam
+
+        values = gtsam.Values()
+        for key, block, value in zip(self.factor.keys(), self.blocks, blocks, strict=True):
+            insert_value(values, key, block, value[0])
+        linear: Any = self.factor.linearize(values)
+        A, b = linear.jacobian()
+        ends = np.cumsum([dimension(block) for block in self.blocks])[:-1]
+        return -b[None], lambda: tuple(each[None] for each in np.split(A, ends, axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Measurements of one kind, evaluated together, and where their rows and columns stand.
+
+    Attributes:
+        family: of them all.
+        model: of n measurements of m rows.
+        loss: None: every measurement counts in full.
+        weights: (n, m) by which whitened residuals are multiplied beside the loss; None: 1.
+        factors: (n,) position of the factor of each in the problem's factors.
+        is_measurement: whether they may be outliers, and not processes or priors.
+        beside: (n,) what a unit of the noise beside their own adds to whitened residuals, or None.
+        gather: for each block its kind and the rows (n or 1,) of its variables in that kind's array.
+        target: "state": rows about one keyframe; "pair": rows that join it to the one before; "walk": rows about nodes
+            alone; "shared": rows about shared unknowns.
+        place: (n,) keyframe, of "walk" the node.
+        row: (n,) first row of each among those of its place.
+        columns: for each block, of (n or 1, dim) columns each, those that its Jacobian is added to.
+    """
+
+    family: str
+    model: Model
+    loss: TruncatedLoss | None
+    weights: Array | None
+    factors: Index
+    is_measurement: bool
+    beside: Array | None
+    gather: list[tuple[Block, Index]]
+    target: str
+    place: Index
+    row: Index
+    columns: list[list[Index]]
+
+    def evaluate(self, values: Values) -> Residuals:
+        """Whitened residuals (n, m), unweighted, and their Jacobians on demand."""
+        n = len(self.model.time)
+        blocks = []
+        for block, rows in self.gather:
+            array = values.arrays[block][rows]
+            blocks.append(np.broadcast_to(array, (n, array.shape[1])))
+        return self.model(*blocks)
+
+    def weighted(self, residuals: Array) -> Array:
+        """Residuals with the noise weights."""
+        return residuals if self.weights is None else self.weights * residuals
+
+    def cost(self, residuals: Array) -> float:
+        """Twice the sum of the losses of whitened residuals, unweighted."""
+        squares = np.einsum("nm,nm->n", *(2 * [self.weighted(residuals)]))
+        return float((squares if self.loss is None else self.loss.cost(squares)).sum())
+
+    def used(self, residuals: Array) -> Array:
+        """(n,) the loss's weights of measurements with these whitened residuals, unweighted."""
+        if self.loss is None:
+            return np.ones(len(residuals))
+        return self.loss.weight(np.einsum("nm,nm->n", *(2 * [self.weighted(residuals)])))
+
+    def rows(self, values: Values, width: int) -> tuple[Array, float]:
+        """(n, m, width) rows on the columns of their target, right side last, and the cost."""
+        residuals, linearize = self.evaluate(values)
+        n, m = residuals.shape
+        factor = np.broadcast_to(np.sqrt(self.used(residuals))[:, None], (n, m))
+        if self.weights is not None:
+            factor = factor * self.weights
+        out = np.zeros((n, m, width))
+        out[..., -1] = -factor * residuals
+        plain = self.weights is None and self.loss is None
+        for places, jacobian in zip(self.columns, linearize(), strict=True):
+            weighted = jacobian if plain else factor[..., None] * jacobian
+            for columns in places:
+                _add(out, columns, weighted)
+        return out, self.cost(residuals)
+
+
+def _add(out: Array, columns: Index, jacobian: Array) -> None:
+    """Add Jacobians (n, m, d) to columns (n or 1, d) of rows (n, m, width)."""
+    if len(columns) == 1:
+        begin = int(columns[0, 0])
+        out[..., begin : begin + columns.shape[1]] += jacobian
+        return
+    out[np.arange(len(out))[:, None, None], np.arange(out.shape[1])[:, None], columns[:, None]] += jacobian
+
+
+@dataclass(frozen=True, eq=False)
+class Linearization:
+    """A problem's factors, ready to be evaluated.
+
+    Attributes:
+        layout: of its variables.
+        groups: of its factors.
+        piece: (N,) node in force from the keyframe before to each and at it.
+        sizes: rows m of a keyframe and b between two.
+    """
+
+    layout: Layout
+    groups: Sequence[Group]
+    piece: Index
+    sizes: tuple[int, int]
+
+    @classmethod
+    def of(cls, factors: Sequence[Factor], layout: Layout) -> Linearization:
+        """Compile factors. Raises NotAChainError where they do not fit the chain."""
+        kinds: dict[Hashable, list[tuple[int, Factor, VectorizedFactor]]] = {}
+        for i, factor in enumerate(factors):
+            v = factor.vectorized or _native(factor, layout)
+            key = stacking_key(v.model), layout.roles(v.columns), factor.family, factor.measurement is None
+            kinds.setdefault((*key, v.loss is None, factor.beside is None), []).append((i, factor, v))
+        drafts = [_Draft.of(kind, layout) for kind in kinds.values()]
+        piece = _pieces(drafts, layout)
+        used = np.zeros((2, layout.sizes[0]), dtype=np.intp)
+        groups = [draft.placed(layout, piece, used) for draft in drafts]
+        absent = int((~layout.kept[0]).sum(axis=1).max(initial=0))
+        return cls(layout, groups, piece, (int(used[0].max()) + absent, int(used[1].max())))
+
+    def at(self, values: Values) -> tuple[ChainSystem, float]:
+        """The system about the values, and its cost: twice the sum of the losses."""
+        (N, d, J, c, s), (m, b) = self.layout.sizes, self.sizes
+        measured, between = np.zeros((N, m, d + c + s + 1)), np.zeros((N, b, 2 * d + c + s + 1))
+        shared, cost = list[Array](), 0.0
+        walk: list[list[Array]] = [[] for _ in range(J)]
+        widths = {"state": d + c + s + 1, "pair": 2 * d + c + s + 1, "walk": 2 * c + s + 1, "shared": s + 1}
+        for group in self.groups:
+            rows, square = group.rows(values, widths[group.target])
+            cost += square
+            if group.target == "shared":
+                shared.append(rows.reshape(-1, s + 1))
+            elif group.target == "walk":
+                _require_cancelled(rows, c, group.family)
+                for node, each in zip(group.place.tolist(), np.delete(rows, np.s_[2 * c : -1], axis=2), strict=True):
+                    walk[node].append(each)
+            else:
+                _put(measured if group.target == "state" else between, group.place, group.row, rows)
+        self._complete(measured)
+        prior = np.concatenate([np.zeros((0, s + 1)), *shared])
+        beside = np.zeros((N, 0, c + s + 1))
+        if not c:
+            return ChainSystem(measured, between, beside, prior, d), cost
+        return ChainSystem(measured, between, beside, prior, d, self.piece, self._walk(walk)), cost
+
+    def cost(self, values: Values) -> float:
+        """Twice the sum of the losses."""
+        return sum(group.cost(group.evaluate(values)[0]) for group in self.groups)
+
+    def residuals(self, values: Values) -> list[Array]:
+        """(n, m) weighted whitened residuals of each group, outliers included."""
+        return [group.weighted(group.evaluate(values)[0]) for group in self.groups]
+
+    def under(self, loss: TruncatedLoss | None) -> Linearization:
+        """The same with another loss for measurements that have one."""
+        return replace(self, groups=[g if g.loss is None else replace(g, loss=loss) for g in self.groups])
+
+    def _complete(self, measured: Array) -> None:
+        """Unit rows for the numbers of states that no variable has."""
+        absent = ~self.layout.kept[0]
+        if absent.any():
+            keyframe, number = np.nonzero(absent)
+            measured[keyframe, -1 - (np.cumsum(absent, axis=1) - 1)[keyframe, number], number] = 1.0
+
+    def _walk(self, rows: list[list[Array]]) -> Array:
+        """(J, w, 2 c + 1) rows about nodes; unit rows for what no variable has, as the first node's deviation."""
+        c, absent = self.layout.sizes[3], ~self.layout.kept[1]
+        units = [np.eye(2 * c + 1)[np.flatnonzero(each)] for each in absent]
+        whole = [np.concatenate([unit, *each]) for unit, each in zip(units, rows, strict=True)]
+        out = np.zeros((len(whole), max(map(len, whole)), 2 * c + 1))
+        for each, own in zip(out, whole, strict=True):
+            each[: len(own)] = own
+        return out
+
+
+def _put(rows: Array, place: Index, begin: Index, new: Array) -> None:
+    """Write rows (n, m, width) below others of their place."""
+    rows[place[:, None], begin[:, None] + np.arange(new.shape[1])] = new
+
+
+def _require_cancelled(rows: Array, c: int, family: str) -> None:
+    """Raise NotAChainError unless rows [z_j | z_j-1 | shared | right side] are about the nodes alone."""
+    shared, largest = np.abs(rows[..., 2 * c : -1]).max(initial=0.0), np.abs(rows[..., :-1]).max(initial=0.0)
+    if shared > CANCELLED * largest:
+        raise NotAChainError(f"{family}: rows join bias nodes and shared variables, and no keyframe")
+
+
+def _native(factor: Factor, layout: Layout) -> VectorizedFactor:
+    """A native gtsam factor as a measurement. Raises NotAChainError where it may reject measurements by itself."""
+    import gtsam
+
+    native = factor.native
+    assert native is not None
+    noise = getattr(native, "noiseModel", lambda: None)()
+    if isinstance(noise, gtsam.noiseModel.Robust | gtsam.noiseModel.Constrained):
+        raise NotAChainError(f"{factor.family}: a native factor with a robust or a constrained noise model")
+    keys = list(native.keys())
+    blocks = tuple(layout.blocks[i] for i in layout.block[layout.at(keys)].tolist())
+    return NativeModel(native, np.zeros(1), native.dim(), blocks).on(*keys)
+
+
+@dataclass(eq=False)
+class _Draft:
+    """A group before its rows have places.
+
+    Attributes:
+        at: for each block the positions (n or 1,) of its variables in the layout.
+        last, count: (n,) the last keyframe of each measurement, -1: none, and how many it joins, at most two.
+        node: (n,) the node that each takes, -1: none; `pair`: whether it joins that to the one before.
+        whole: for each block whether it is the first node as the bias as a whole, wherever the measurement is.
+    """
+
+    family: str
+    model: Model
+    loss: TruncatedLoss | None
+    weights: Array | None
+    factors: Index
+    is_measurement: bool
+    beside: Array | None
+    at: list[Index]
+    last: Index
+    count: Index
+    node: Index
+    pair: bool
+    whole: list[bool]
+
+    @classmethod
+    def of(cls, kind: Sequence[tuple[int, Factor, VectorizedFactor]], layout: Layout) -> _Draft:
+        _, first, v = kind[0]
+        model, lengths = stack_models([each.model for *_, each in kind]), [len(each.model.time) for *_, each in kind]
+        n = sum(lengths)
+        at = [_positions([each.columns[i] for *_, each in kind], lengths, layout) for i in range(len(v.columns))]
+        weights = None
+        if any(each.weights is not None for *_, each in kind):
+            shapes = [(length, model.rows) for length in lengths]
+            known = [np.ones(s) if e.weights is None else e.weights for (*_, e), s in zip(kind, shapes, strict=True)]
+            weights = np.concatenate(known)
+        beside = None
+        if first.beside is not None:
+            beside = np.concatenate(
+                [np.broadcast_to(np.asarray(f.beside), length) for (_, f, _), length in zip(kind, lengths, strict=True)]
+            )
+        frames = [np.broadcast_to(layout.keyframe[each], n) for each in at if (layout.keyframe[each] >= 0).any()]
+        # At keyframes the first node, given by one key for all measurements, is the bias as a whole.
+        whole = [
+            bool(frames) and isinstance(column, int) and bool((layout.node[each] == 0).all())
+            for column, each in zip(v.columns, at, strict=True)
+        ]
+        nodes = [
+            np.broadcast_to(layout.node[each], n)
+            for each, alone in zip(at, whole, strict=True)
+            if not alone and (layout.node[each] >= 0).any()
+        ]
+        last = np.max(frames, axis=0) if frames else np.full(n, -1)
+        span = last - np.min(frames, axis=0) if frames else np.zeros(n, dtype=np.intp)
+        node = np.max(nodes, axis=0) if nodes else np.full(n, -1)
+        reach = node - np.min(nodes, axis=0) if nodes else np.zeros(n, dtype=np.intp)
+        if span.max(initial=0) > 1 or (frames and np.min(frames) < 0):
+            raise NotAChainError(f"{first.family}: a factor joins keyframes that are not neighbours")
+        if reach.max(initial=0) > (0 if frames else 1):
+            raise NotAChainError(f"{first.family}: a factor joins bias nodes that are not neighbours")
+        return cls(
+            family=first.family,
+            model=model,
+            loss=v.loss,
+            weights=weights,
+            factors=np.repeat([i for i, *_ in kind], lengths),
+            is_measurement=first.measurement is not None,
+            beside=beside,
+            at=at,
+            last=last,
+            count=span + 1,
+            node=node,
+            pair=bool(reach.any()),
+            whole=whole,
+        )
+
+    def placed(self, layout: Layout, piece: Index, used: Index) -> Group:
+        """The group, its rows below those of others that are already there."""
+        c, n = layout.sizes[3], len(self.model.time)
+        target, place, row = "shared", np.full(n, -1), np.zeros(n, dtype=np.intp)
+        if self.last.max(initial=-1) >= 0:
+            target, place = ("pair" if (self.count > 1).any() else "state"), self.last
+        elif c and self._is_walk(layout):
+            target, place = "walk", self.node
+        elif c and self.node.max(initial=-1) >= 0:
+            if self.pair:
+                raise NotAChainError(f"{self.family}: a factor joins two bias nodes and shared variables")
+            target, place = "state", np.searchsorted(piece, np.maximum(self.node, 0), side="right") - 1
+        if target in ("state", "pair"):
+            row = _below(place, self.model.rows, used[int(target == "pair")])
+        return Group(
+            family=self.family,
+            model=self.model,
+            loss=self.loss,
+            weights=self.weights,
+            factors=self.factors,
+            is_measurement=self.is_measurement,
+            beside=self.beside,
+            gather=[(layout.blocks[layout.block[each[0]]], layout.row[each]) for each in self.at],
+            target=target,
+            place=place,
+            row=row,
+            columns=[self._columns(i, layout, target, piece) for i in range(len(self.at))],
+        )
+
+    def _is_walk(self, layout: Layout) -> bool:
+        """Whether every measurement is about differences of nodes and means alone."""
+        return self.pair and all((layout.node[each] >= 0).all() for each in self.at)
+
+    def _columns(self, i: int, layout: Layout, target: str, piece: Index) -> list[Index]:
+        """Those of a block, on its target; see Group."""
+        d, c = layout.sizes[1], layout.sizes[3]
+        at = self.at[i]
+        span = np.arange(dimension(layout.blocks[layout.block[at[0]]]))
+        begin = {"shared": 0, "walk": 2 * c, "state": d + c, "pair": 2 * d + c}[target]
+        if layout.keyframe[at[0]] >= 0:
+            before = (layout.keyframe[at] < self.last).astype(np.intp)
+            return [_single(layout.offset[at] + d * before)[:, None] + span]
+        out = [_single(begin + layout.shared[at])[:, None] + span]
+        if c and not self.whole[i] and target != "shared" and (layout.node[at] >= 0).any():
+            if target == "walk":
+                first = layout.part[at] + c * (layout.node[at] < self.node)
+            else:
+                first = begin - c + layout.part[at]
+                if (piece[self.last] != self.node)[self.last >= 0].any():
+                    raise NotAChainError(f"{self.family}: a factor takes another bias node than its keyframe's others")
+            out.append(_single(first)[:, None] + span)
+        return out
+
+
+def _single(columns: Index) -> Index:
+    """(1,) if all are one."""
+    return columns[:1] if (columns == columns[:1]).all() else columns
+
+
+def _positions(columns: Sequence[int | list[int]], lengths: Sequence[int], layout: Layout) -> Index:
+    """(n or 1,) positions of a block's variables."""
+    if isinstance(columns[0], int):
+        at = layout.at([int(column) for column in columns if isinstance(column, int)])
+        return at[:1] if (at == at[0]).all() else np.repeat(at, lengths)
+    return _single(layout.at(np.concatenate([np.asarray(column, dtype=np.intp) for column in columns])))
+
+
+def _below(place: Index, rows: int, used: Index) -> Index:
+    """(n,) first row of each measurement among those of its place; `used` (N,) rows there grow."""
+    order = np.argsort(place, kind="stable")
+    begins = np.flatnonzero(np.diff(place[order], prepend=-1))
+    counts = np.diff(begins, append=len(order))
+    out = np.empty(len(place), dtype=np.intp)
+    out[order] = np.arange(len(order)) - np.repeat(begins, counts)
+    out = used[place] + rows * out
+    used[place[order][begins]] += rows * counts
+    return out
+
+
+def _pieces(drafts: Sequence[_Draft], layout: Layout) -> Index:
+    """(N,) node in force at each keyframe, such that every node is in force at one."""
+    N, d, J, c, _ = layout.sizes
+    if not c:
+        return np.zeros(N, dtype=np.intp)
+    if not d:
+        return np.arange(N)
+    known = np.full(N, -1)
+    known[0] = 0
+    for draft in drafts:
+        some = (draft.last >= 0) & (draft.node >= 0)
+        known[draft.last[some]] = draft.node[some]
+    out, unknown = known.copy(), np.flatnonzero(known < 0)
+    for run in np.split(unknown, np.flatnonzero(np.diff(unknown) > 1) + 1) if len(unknown) else ():
+        after = known[run[-1] + 1] if run[-1] + 1 < N else J
+        out[run] = np.maximum(out[run[0] - 1], after - len(run) + np.arange(len(run)))
+    if (np.diff(out) < 0).any() or (np.diff(out) > 1).any() or out[-1] != J - 1:
+        raise NotAChainError("the nodes of a bias that walks do not follow one another over the keyframes")
+    return out

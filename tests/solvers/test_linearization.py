@@ -1,0 +1,62 @@
+"""The chain's system of every method against gtsam's linearisation of the same factors, solved densely."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from alidade.pipelines.estimation.problem import Factor
+from alidade.pipelines.solvers.chain import ChainFactorization
+from alidade.pipelines.solvers.layout import Layout, Tangent, Values
+from alidade.pipelines.solvers.linearization import Linearization
+from tests.support.problems import SCENARIOS, problem
+
+
+def parts(name: str) -> tuple[gtsam.Values, list[Factor], list[int], Layout, Values]:
+    """Initial values, factors and variables that hold the parameters of a problem; its layout and values."""
+    made, initial, factors, current = problem(name), gtsam.Values(), list[Factor](), dict[int, int]()
+    for step in made.steps(10**9):
+        initial.insert(step.initial)
+        factors += step.factors
+        current.update(step.current_keys)
+    assert made.layout is not None
+    layout, values = Layout.of(made.layout, initial)
+    return initial, factors, [current.get(p.key, p.key) for p in made.parameters], layout, values
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_step_covariance_and_minimum_are_those_of_gtsams_linearisation(name: str) -> None:
+    initial, factors, reported, layout, values = parts(name)
+    linearization = Linearization.of(factors, layout).under(None)
+    system, cost = linearization.at(values)
+    found = ChainFactorization.of(system)
+
+    graph, error = gtsam.GaussianFactorGraph(), 0.0
+    for f in factors:
+        native = f.factor if f.vectorized is None else f.vectorized.under(None).factor
+        graph.add(native.linearize(initial))
+        error += 2.0 * native.error(initial)
+    others = sorted(set(layout.key.tolist()) - set(reported))
+    ordering = gtsam.Ordering()
+    for key in [*others, *reported]:
+        ordering.push_back(key)
+    A, b = graph.jacobian(ordering)
+    R = np.linalg.qr(np.column_stack([A, b]), mode="r")
+    inverse = np.linalg.inv(R[:-1, :-1])
+    sigma, step = np.linalg.norm(inverse, axis=1), inverse @ R[:-1, -1]
+
+    flat = layout.tangents(Tangent(*found.solve()))
+    moves = []
+    for key in [*others, *reported]:
+        one, two = layout.flat(layout.at([key]))
+        moves.append(flat[one[0]] + flat[two[0]])
+    assert np.abs((np.concatenate(moves) - step) / sigma).max() < 1e-8
+    to_reported = np.vstack([layout.root_columns(key) for key in reported])
+    root = np.linalg.inv(found.root[:-1, :-1])
+    n = len(to_reported)
+    covariance, scale = to_reported @ root @ root.T @ to_reported.T, np.outer(sigma[-n:], sigma[-n:])
+    assert np.abs((covariance - inverse[-n:] @ inverse[-n:].T) / scale).max() < 1e-8
+    assert found.minimum == pytest.approx(R[-1, -1] ** 2, rel=1e-9)
+    assert cost == pytest.approx(error, rel=1e-9)
+    assert linearization.cost(values) == pytest.approx(cost, rel=1e-12)
