@@ -19,6 +19,8 @@ MAX_NORM_ERROR = 1e-3
 # The best sensors there are have more noise, rad/s/sqrt(Hz), m/s^2/sqrt(Hz) and T/sqrt(Hz). Drivers that know nothing
 # write a variance of 1e-12, say.
 LEAST_GYRO, LEAST_ACCEL, LEAST_MAG = 2e-7, 1e-6, 1e-12
+# Steps that tell in which unit of time stamps are, and the shortest of a sensor: of 40 kHz, s.
+_FEWEST_STEPS, _SHORTEST_STEP_S = 10, 2.5e-5
 # A few stamps out of place are a recorder's hiccup, more are a broken time base.
 MAX_BAD_STAMPS = 0.01
 
@@ -54,6 +56,23 @@ def clean(
     if len(keep) < least:
         raise InputError(f"topic {topic}: {len(keep)} usable messages, at least {least} are needed")
     return seconds(t_ns[keep], epoch_ns), keep
+
+
+def likely_time_unit(t_ns: NDArray[np.int64], slowest_s: float) -> float | None:
+    """What stamps, ns, have to be multiplied with (1e-3, 1e3, ...) for their usual step to be a sensor's; None: by 1.
+
+    Args:
+        t_ns: (N,), in order or not.
+        slowest_s: the longest usual step of such a sensor, s.
+    """
+    if len(t_ns) < _FEWEST_STEPS:
+        return None
+    step = float(np.median(np.abs(np.diff(t_ns.astype(float))))) * 1e-9
+    if step > slowest_s:
+        return next((factor for factor in (1e-3, 1e-6, 1e-9) if step * factor <= slowest_s), None)
+    if 0.0 < step < _SHORTEST_STEP_S:
+        return next((factor for factor in (1e3, 1e6, 1e9) if step * factor >= _SHORTEST_STEP_S), None)
+    return None
 
 
 def taken(values: Array, rows: NDArray[np.int64]) -> Array:
