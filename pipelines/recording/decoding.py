@@ -19,6 +19,10 @@ Order = Callable[[Any], Sequence[int] | None]
 # Stamps and log times, ns, in the file's order.
 Times = tuple[NDArray[np.int64], NDArray[np.int64]]
 
+Stamps = NDArray[np.int64]
+
+# Up to so many messages of a topic without a stamp are left out; of more the log times are taken.
+_FEW_UNSTAMPED = 0.1
 # What every message with a header starts with: CDR encapsulation, in ROS 1 a sequence number; then the stamp.
 _STAMP = {
     order: np.dtype([("kind", "u1", 2), ("options", "u1", 2), ("sec", f"{order}i4"), ("nanosec", f"{order}u4")])
@@ -66,15 +70,20 @@ class Table:
         """Messages taken up so far: rows beyond them are those of damaged chunks."""
         return self._next
 
+    def drop_unstamped(self) -> int:
+        """Let go of the rows without a stamp where they are few; returns how many they are."""
+        few = few_unstamped(self._t_ns[: self._next], self._log_ns[: self._next])
+        self.filled[: self._next] &= ~few
+        return int(np.count_nonzero(few))
+
     def times(self, filled: bool = True) -> Times:
         """Stamps, log times where there are none, and log times of the rows that were filled, or of all taken up."""
         rows: Any = self.filled if filled and not self.filled.all() else slice(self._next)
-        t_ns, log_ns = self._t_ns[rows], self._log_ns[rows]
-        return (t_ns if t_ns.all() else np.where(t_ns == 0, log_ns, t_ns)), log_ns
+        return with_log_times(self._t_ns[rows], self._log_ns[rows])
 
     def sorted(self) -> tuple[NDArray[np.int64], int, dict[str, Any]]:
         """Stamps, how many of them are log times, and the columns, of the rows that were filled, by log time."""
-        by_log = (self._t_ns == 0) & self.filled
+        by_log = is_unstamped(self._t_ns, self._log_ns) & self.filled
         t_ns = np.where(by_log, self._log_ns, self._t_ns)
         keep: Any = slice(None)
         if not self.filled.all() or (np.diff(self._log_ns) < 0).any():
@@ -188,6 +197,24 @@ def logged_at(log_ns: int) -> Iterator[None]:
     except MessageError as error:
         error.log_ns = log_ns
         raise
+
+
+def is_unstamped(stamps: Stamps, log_ns: Stamps) -> NDArray[np.bool_]:
+    """Which messages have no stamp: zero, but for those that were logged at zero, too, as rows of a table are."""
+    return np.asarray((stamps == 0) & (log_ns != 0))
+
+
+def few_unstamped(stamps: Stamps, log_ns: Stamps) -> NDArray[np.bool_]:
+    """The messages without a stamp where they are few among others: sent before a clock was there. Otherwise none."""
+    without = is_unstamped(stamps, log_ns)
+    return without & (np.count_nonzero(without) <= _FEW_UNSTAMPED * len(without))
+
+
+def with_log_times(stamps: Stamps, log_ns: Stamps) -> Times:
+    """Stamps and log times: these stand in for stamps that are not there; where those are few they are left out."""
+    kept: Any = ~few if (few := few_unstamped(stamps, log_ns)).any() else slice(None)
+    stamps, log_ns = stamps[kept], log_ns[kept]
+    return (stamps if stamps.all() else np.where(stamps == 0, log_ns, stamps)), log_ns
 
 
 def header_stamps(has_header: bool, rows: Rows, wire: Wire) -> NDArray[np.int64]:

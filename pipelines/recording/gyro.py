@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.recording.checks import LEAST_GYRO, check_gyro, clean, count, density, taken
+from alidade.pipelines.recording.checks import LEAST_GYRO, SLOWEST_GYRO_S, check_gyro, clean, count, density, taken
 from alidade.pipelines.recording.faults import drop_faults
 from alidade.pipelines.recording.reading import Recording
 from alidade.pipelines.recording.series import ImuSeries
@@ -50,7 +50,7 @@ def usable(
     Raises InputError as alidade.pipelines.recording.checks and alidade.pipelines.recording.faults do.
     """
     count(dropped, f"{topic}: stamped by log time (kept)", imu.stamped_by_log)
-    t, keep = clean(topic, imu.t_ns, epoch_ns, imu.gyro, dropped, least)
+    t, keep = clean(topic, imu.t_ns, epoch_ns, imu.gyro, dropped, least, SLOWEST_GYRO_S)
     sound = drop_faults(topic, t, taken(imu.gyro, keep), dropped, "rad/s", may_stand)
     t, keep = taken(t, sound), keep[sound]
     check_gyro(topic, t, taken(imu.gyro, keep))

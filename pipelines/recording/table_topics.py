@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.arrays import ArrayContainer
+from alidade.pipelines.recording.checks import SLOWEST_GYRO_S, SLOWEST_S
 from alidade.pipelines.recording.container import Container, sha256_of, sha256_together
 from alidade.pipelines.recording.parts import Parts
 from alidade.pipelines.recording.table_times import check_steps, nanoseconds, of_rate
@@ -42,8 +43,7 @@ _KINDS: dict[str, type[series.Series]] = {
 }
 # Quantities along the axes of a device.
 _VECTORS = ("gyro", "accel", "field")
-# A gyro is read more often than once in so many s; another sensor than in so many. What is slow is as slow as it likes.
-_SLOWEST_GYRO_S, _SLOWEST_S = 0.5, 5.0
+# What may be as slow as it likes.
 _SLOW = ("latitude_deg", "celsius", "video")
 Axis = Literal["x", "y", "z", "+x", "+y", "+z", "-x", "-y", "-z"]
 
@@ -131,7 +131,7 @@ class TableTopic(BaseModel):
         values = {name: one[filled] for name, one in values.items()}
         t_ns, values = _without_erased(path, t_ns, values, notes)
         if not self._is_slow and self.time is not None:
-            check_steps(path, topic, t_ns, unit, _SLOWEST_GYRO_S if self.gyro else _SLOWEST_S)
+            check_steps(path, topic, t_ns, unit, SLOWEST_GYRO_S if self.gyro else SLOWEST_S)
         scales = {name: self._scale(name, form, path, notes) for name in values}
         values = {name: self._along_axes(name, one) * scales[name] for name, one in values.items()}
         if self.video is not None:

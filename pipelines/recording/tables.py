@@ -88,6 +88,8 @@ def read_table(path: Path, data: Path) -> ArrayContainer:
         data: the file to read.
     """
     form = table_form(path, data)
+    if not form.width:
+        raise InputError(f"{path}: not a table, nor any other recording that is known: no line of numbers in it")
     if _is_trajectory(path, data, form):
         return ArrayContainer(path, {"/trajectory": _trajectory(path, data, form)})
     columns = ", ".join(form.names[:40])

@@ -18,6 +18,7 @@ from alidade.pipelines.recording.checks import (
     LEAST_ACCEL,
     LEAST_GYRO,
     LEAST_MAG,
+    SLOWEST_GYRO_S,
     believed,
     check_overlap,
     clean,
@@ -50,7 +51,7 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
     name = config.topic(IMU)
     imu = recording.imu(name)
     count(dropped, f"{name}: stamped by log time (kept)", imu.stamped_by_log)
-    imu_t, keep = clean(name, imu.t_ns, epoch, np.hstack([imu.gyro, imu.accel]), dropped, least=3)
+    imu_t, keep = clean(name, imu.t_ns, epoch, np.hstack([imu.gyro, imu.accel]), dropped, 3, SLOWEST_GYRO_S)
     sound = np.intersect1d(
         drop_faults(name, imu_t, imu.gyro[keep], dropped, "rad/s"),
         drop_faults(name, imu_t, imu.accel[keep], dropped, "m/s^2"),
