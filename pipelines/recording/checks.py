@@ -179,37 +179,6 @@ def check_overlap(spans: Mapping[str, Array]) -> None:
         raise InputError(f"no stretch of time is covered by all of: {described}; are the clocks the same?")
 
 
-def density(topic: str, t: Array, covariance: Array, least: float, dropped: dict[str, int]) -> float | None:
-    """Noise density, per sqrt(Hz), from the covariances (N, 3, 3) of samples: sigma/sqrt(rate); None if unknown.
-
-    Unknown is what the messages say with zero, with -1, or with less than `least`, a density that no sensor has; the
-    last two are counted in `dropped`.
-    """
-    step = float(np.median(np.diff(t)))
-    covariance = believed(topic, covariance, least**2 / step, dropped)
-    variance = float(np.trace(covariance.mean(axis=0))) / 3.0
-    return float(np.sqrt(variance * step)) if np.isfinite(variance) and variance > 0.0 else None
-
-
-def believed(topic: str, covariance: Array, least: float, dropped: dict[str, int]) -> Array:
-    """Covariances (N, 3, 3), zero in place of those that start with -1 or have a smaller mean variance than `least`.
-
-    Both are what drivers write that know nothing; they are counted in `dropped`.
-    """
-    # Those that never change are one in memory.
-    alike = len(covariance) if len(covariance) and covariance.strides[0] == 0 else 1
-    own = covariance[:1] if alike > 1 else covariance
-    absent = own[:, 0, 0] == -1.0
-    variance = np.trace(own, axis1=1, axis2=2) / 3.0
-    tiny = ~absent & (variance > 0.0) & (variance < least)
-    for mask, what in ((absent, "of -1"), (tiny, "too small for any sensor")):
-        count(dropped, f"{topic}: covariance {what}, not believed (kept)", alike * int(np.count_nonzero(mask)))
-    unknown = absent | tiny
-    return (
-        np.broadcast_to(np.where(unknown[:, None, None], 0.0, own), covariance.shape) if unknown.any() else covariance
-    )
-
-
 def count(dropped: dict[str, int], reason: str, number: int) -> None:
     """Add to a tally; nothing for zero."""
     if number:

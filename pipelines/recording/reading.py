@@ -28,6 +28,7 @@ from alidade.pipelines.recording.decoding import Times
 from alidade.pipelines.recording.message_reader import TIMED, MessageReader, Topic
 from alidade.pipelines.recording.netpbm import netpbm
 from alidade.pipelines.recording.opening import Where, open_container
+from alidade.pipelines.recording.plausibility import to_signed, wrapped_bits
 from alidade.pipelines.recording.sources import TopicSource, inverted, joined
 from alidade.pipelines.recording.stamps import jitter_ns
 from alidade.pipelines.recording.table_topics import TableTopic, described
@@ -37,6 +38,13 @@ _MOST_PAIRS = 30
 
 # How late messages usually are when they are logged, s.
 _LATE = 0.01
+
+# Quantities that may be counts.
+_COUNTED: Mapping[type, tuple[str, ...]] = {
+    series.ImuSeries: ("gyro", "accel"),
+    series.MagneticSeries: ("field",),
+    series.VectorSeries: ("vector",),
+}
 
 AnySeries = TypeVar("AnySeries", bound=series.Series)
 
@@ -79,8 +87,9 @@ class Recording:
         return {**recorded, **made}
 
     def remark(self, sentence: str) -> None:
-        """Note something that was assumed about the recording."""
-        self._container.remarks = (*self._container.remarks, sentence)
+        """Note something that was assumed about the recording, once."""
+        if sentence not in self._container.remarks:
+            self._container.remarks = (*self._container.remarks, sentence)
 
     def use(self, sources: Iterable[TopicSource], columns: Mapping[str, TableTopic]) -> None:
         """Take what the config says of topics that are made of others, and of the columns of tables.
@@ -389,6 +398,13 @@ class Recording:
             check_clock(topic, *table.times(), self.epoch_ns)
         t_ns, by_log, columns = table.sorted()
         self._tell_unstamped(topic, t_ns, by_log)
+        for name in _COUNTED.get(kind, ()):
+            if bits := wrapped_bits(columns[name]):
+                columns[name] = to_signed(columns[name], bits)
+                self.remark(
+                    f"topic {topic}: {name} jumps by {1 << bits}: counts of a signed {bits} bit sensor that were "
+                    "written as unsigned, read as signed"
+                )
         return kind(t_ns, stamped_by_log=by_log, **columns)
 
     def _tell_unstamped(self, topic: str, t_ns: NDArray[np.int64], by_log: int) -> None:
@@ -402,8 +418,7 @@ class Recording:
             f"late by a delay that nobody knows (taken for {1e3 * _LATE:.0f} ms, one sigma) and jitter by "
             f"{jitter * 1e-6:.2g} ms (sigma)"
         )
-        if sentence not in self._container.remarks:
-            self.remark(sentence)
+        self.remark(sentence)
 
 
 def _series_of_transforms(rows: Sequence[tuple[int, bool, Any]]) -> series.PoseSeries:

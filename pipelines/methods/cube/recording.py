@@ -19,14 +19,13 @@ from alidade.pipelines.recording.checks import (
     LEAST_GYRO,
     LEAST_MAG,
     SLOWEST_GYRO_S,
-    believed,
     check_overlap,
     clean,
     count,
-    density,
     unit_quaternions,
 )
 from alidade.pipelines.recording.faults import drop_faults
+from alidade.pipelines.recording.placeholders import believed, density, measured_once
 from alidade.pipelines.recording.reading import Recording
 from alidade.pipelines.recording.topics import IMAGE, IMU, MAG, wanted
 from alidade.pipelines.settings import Config
@@ -60,8 +59,8 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
     gyro, accel = imu.gyro[keep], imu.accel[keep]
     raw = config.section(CubeConfig).raw
     sensors = [Readings(name, imu_t, accel, raw.accel), Readings(name, imu_t, gyro, raw.gyro)]
-    gyro_density = density(name, imu_t, imu.gyro_cov[keep], LEAST_GYRO, dropped)
-    accel_density = density(name, imu_t, imu.accel_cov[keep], LEAST_ACCEL, dropped)
+    gyro_density = density(name, "gyro", imu_t, imu.gyro_cov[keep], LEAST_GYRO, dropped)
+    accel_density = density(name, "accel", imu_t, imu.accel_cov[keep], LEAST_ACCEL, dropped)
     spans = {name: imu_t}
 
     mag_t = mag = mag_density = None
@@ -70,8 +69,9 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
         field_ = recording.magnetic(name)
         mag_t, keep = clean(name, field_.t_ns, epoch, field_.field, dropped)
         sound = drop_faults(name, mag_t, field_.field[keep], dropped, "T")
+        sound = sound[measured_once(name, field_.field[keep[sound]], dropped)]
         mag_t, keep = mag_t[sound], keep[sound]
-        mag, mag_density = field_.field[keep], density(name, mag_t, field_.field_cov[keep], LEAST_MAG, dropped)
+        mag, mag_density = field_.field[keep], density(name, "mag", mag_t, field_.field_cov[keep], LEAST_MAG, dropped)
         sensors.append(Readings(name, mag_t, mag, raw.mag))
         spans[name] = mag_t
     check_units(*sensors)
@@ -127,6 +127,6 @@ def _reference(
         )
     t, keep = clean(topic, imu.t_ns, epoch_ns, imu.wxyz, dropped, least=1)
     wxyz, cov = unit_quaternions(topic, t, imu.wxyz[keep]), imu.wxyz_cov[keep]
-    cov = believed(topic, cov, _LEAST_VARIANCE, dropped)
+    cov = believed(topic, "attitude", cov, _LEAST_VARIANCE, dropped)
     known = (np.linalg.eigvalsh(0.5 * (cov + cov.swapaxes(1, 2)))[:, 0] > 0.0).all()
     return t, wxyz, cov if known else None

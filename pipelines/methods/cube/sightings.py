@@ -108,7 +108,7 @@ def _pictures(recording: Recording, config: Config, data: CubeData, dropped: dic
             "blurred, or the tags of another family?"
         )
     t, keep = clean(
-        topic, np.array(stamps, dtype=np.int64), epoch_ns, np.arange(len(stamps))[:, None], dropped, least=1
+        topic, np.array(stamps, dtype=np.int64), epoch_ns, np.arange(float(len(stamps)))[:, None], dropped, least=1
     )
     place = np.full(len(stamps), -1)
     place[keep] = np.arange(len(keep))
