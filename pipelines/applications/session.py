@@ -428,6 +428,10 @@ def checked_facts(recording: Recording, config: Config) -> SessionFacts:
     Pictures are not looked at.
     """
     facts = session_facts(recording, config)
+    by_name = {name: config.model_copy(update={"method": name}) for name, lacks in facts.missing.items() if lacks}
+    asked = {name for name, own in by_name.items() if not missing_for(name, recording, own)}
+    said = {name: (f"`--method {name}`, by which it has to be asked for",) for name in asked}
+    facts = replace(facts, missing={**facts.missing, **said})
     refused = {name: said for name in facts.methods if (said := _refused(methods.method(name), recording, config))}
     return replace(facts, missing={**facts.missing, **{name: (said,) for name, said in refused.items()}})
 

@@ -28,6 +28,9 @@ _MEANT = {1e-3: "ms", 1e-6: "us", 1e-9: "ns", 1e3: "s or ms", 1e6: "s", 1e9: "s"
 # Messages overtake each other by at most so many usual steps; sorted, so many of their steps are within so much of it.
 _OVERTAKING_STEPS, _EVEN_SHARE, _EVEN = 20.0, 0.9, 0.5
 _ADVICE = {"out of order": ": sort the recording by header stamps", "duplicate": ", written with all their digits"}
+# With so many stamps twice, of different readings, two devices are likelier than a recorder's mistake.
+_TWO_DEVICES = 0.2
+_MIXED = "; are two devices on one topic? choose one by `frame:` under `topics`, of a table by `where:` under `columns`"
 # A few stamps out of place are a recorder's hiccup, more are a broken time base.
 MAX_BAD_STAMPS = 0.01
 
@@ -76,10 +79,11 @@ def clean(
     overtaken = backward and _is_overtaking(in_file, stamps[first])
     for what, number in (("out of order", 0 if overtaken else backward), ("duplicate", duplicate)):
         if number > MAX_BAD_STAMPS * len(in_file):
+            mixed = "" if number < _TWO_DEVICES * len(in_file) or what != "duplicate" else _MIXED
             at = _first_bad(in_file if what == "out of order" else stamps, epoch_ns, what)
             raise InputError(
                 f"topic {topic}: {number} of {len(in_file)} stamps are {what} (the first at {at:.6f} s from the "
-                f"start); the stamps have to be those of the measurements{_ADVICE[what]}"
+                f"start); the stamps have to be those of the measurements{_ADVICE[what]}{mixed}"
             )
     count(dropped, f"{topic}: stamp out of order (sorted, kept)", backward)
     count(dropped, f"{topic}: duplicate stamp", duplicate)
@@ -153,6 +157,15 @@ def too_fast(topic: str, t: Array, gyro: Array) -> str:
         f"topic {topic}: rate of {rate[worst]:.4g} at {t[worst]:.6f} s, beyond {MAX_RATE_RAD_S:g} rad/s; "
         "is the gyro in deg/s? angular_velocity has to be in rad/s"
     )
+
+
+def tracked(topic: str, wxyz: Array, dropped: dict[str, int]) -> Array:
+    """Quaternions (N, 4), NaN in place of those that are all zero: a tracker that lost the body; counted."""
+    lost = ~wxyz.any(axis=1)
+    if lost.all() or not lost.any():
+        return wxyz
+    count(dropped, f"{topic}: a quaternion of zeros, as of a body that was not seen", int(lost.sum()))
+    return np.where(lost[:, None], np.nan, wxyz)
 
 
 def unit_quaternions(topic: str, t: Array, wxyz: Array) -> Array:

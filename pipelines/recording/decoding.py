@@ -43,6 +43,8 @@ class Table:
         self._t_ns = np.zeros(rows, dtype=np.int64)
         self._log_ns = np.zeros(rows, dtype=np.int64)
         self._shapes = shapes
+        self._frame = np.zeros(rows, dtype=np.int32)
+        self._frames: dict[str, int] = {}
         self._constant: dict[str, Array] = {}
         self._full: dict[str, Array] = {}
         self._next = 0
@@ -56,14 +58,24 @@ class Table:
             self.filled[new] = True
         return np.arange(new.start, new.stop)
 
-    def put(self, rows: NDArray[np.int64], values: Mapping[str, NDArray[Any]]) -> None:
-        """Fill these rows, in order: (rows, numbers) for every column. Raises KeyError at another width."""
+    def put(self, rows: NDArray[np.int64], values: Mapping[str, NDArray[Any]], frame: str = "") -> None:
+        """Fill these rows, in order: (rows, numbers) for every column, all of one frame. KeyError at another width."""
         # Rows that follow each other are written in half the time.
         first, last = int(rows[0]), int(rows[-1])
         where = slice(first, last + 1) if last - first == len(rows) - 1 else rows
         for name, column in values.items():
             self._put(name, where, column)
         self.filled[where] = True
+        self._frame[where] = self._frames.setdefault(frame, len(self._frames))
+
+    def frames(self) -> dict[str, NDArray[np.bool_]]:
+        """Frames of the messages and the rows, of those filled, that have them; where they are mixed, more than one."""
+        found = {name: self.filled & (self._frame == i) for name, i in self._frames.items()}
+        return {name: rows for name, rows in found.items() if rows.any()}
+
+    def keep(self, rows: NDArray[np.bool_]) -> None:
+        """Let go of all other rows."""
+        self.filled &= rows
 
     @property
     def taken(self) -> int:
@@ -117,6 +129,7 @@ class _Plan(NamedTuple):
 
     layout: Layout | None
     fields: dict[str, tuple[Leaf, Any]]
+    frame: str = ""
 
 
 class Decoder:
@@ -148,9 +161,10 @@ class Decoder:
             left = left[~self._append_alike(self._plans[-1], rows, left, table, into)]
         for i in left.tolist():
             with logged_at(int(rows.log_ns[i])):
-                values = self._one(self._definition.decode(rows.message(i)))
+                message = self._definition.decode(rows.message(i))
+                values = self._one(message)
             if values is not None:
-                table.put(into[i : i + 1], values)
+                table.put(into[i : i + 1], values, _frame_of(message))
 
     def _plan(self, data: bytes) -> _Plan:
         """Work out the layout of a message and where in it the fields are."""
@@ -161,7 +175,8 @@ class Decoder:
         orders = {name: order(message) if order else slice(None) for name, (_, order) in self._fields.items()}
         if None in orders.values():
             return _Plan(None, {})
-        return _Plan(layout, {name: (layout.run(path), orders[name]) for name, (path, _) in self._fields.items()})
+        runs = {name: (layout.run(path), orders[name]) for name, (path, _) in self._fields.items()}
+        return _Plan(layout, runs, _frame_of(message))
 
     def _append_alike(
         self, plan: _Plan, rows: Rows, left: NDArray[np.int64], table: Table, into: NDArray[np.int64]
@@ -176,7 +191,8 @@ class Decoder:
         alike[alike] = agrees
         data = data if agrees.all() else data[agrees]
         if len(data):
-            table.put(into[left[alike]], {name: run.of(data)[:, order] for name, (run, order) in plan.fields.items()})
+            values = {name: run.of(data)[:, order] for name, (run, order) in plan.fields.items()}
+            table.put(into[left[alike]], values, plan.frame)
         return alike
 
     def _one(self, message: Any) -> dict[str, NDArray[Any]] | None:
@@ -187,6 +203,11 @@ class Decoder:
                 return None
             values[name] = self._definition.numbers(at(message, path))[None, chosen]
         return values
+
+
+def _frame_of(message: Any) -> str:
+    """The frame in a message's header, empty where it has none."""
+    return str(getattr(getattr(message, "header", None), "frame_id", "")).lstrip("/")
 
 
 @contextmanager

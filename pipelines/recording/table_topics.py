@@ -24,6 +24,7 @@ from alidade.pipelines.recording.arrays import ArrayContainer
 from alidade.pipelines.recording.checks import SLOWEST_GYRO_S, SLOWEST_S
 from alidade.pipelines.recording.container import Container, sha256_of, sha256_together
 from alidade.pipelines.recording.parts import Parts
+from alidade.pipelines.recording.sources import Axes, along
 from alidade.pipelines.recording.table_times import check_steps, nanoseconds, of_rate
 from alidade.pipelines.recording.table_units import COMPATIBLE, TIME_UNITS, UNITS, unit_of
 from alidade.pipelines.recording.tables import CsvFile, TableForm, numbers, numbers_or_times, read_columns, table_form
@@ -45,7 +46,6 @@ _KINDS: dict[str, type[series.Series]] = {
 _VECTORS = ("gyro", "accel", "field")
 # What may be as slow as it likes.
 _SLOW = ("latitude_deg", "celsius", "video")
-Axis = Literal["x", "y", "z", "+x", "+y", "+z", "-x", "-y", "-z"]
 
 
 class TableTopic(BaseModel):
@@ -88,7 +88,7 @@ class TableTopic(BaseModel):
     joints: dict[str, str] | None = None
     video: str | None = None
     units: dict[str, str] = {}
-    axes: Annotated[tuple[Axis, Axis, Axis], Field(strict=False)] | None = None
+    axes: Axes | None = None
     where: dict[str, str | float | int] = {}
 
     @model_validator(mode="after")
@@ -102,8 +102,8 @@ class TableTopic(BaseModel):
         for name, unit in self.units.items():
             if name not in TableTopic.model_fields or unit not in UNITS:
                 raise ValueError(f"units.{name}: {unit} is not one of {', '.join(UNITS)}")
-        if self.axes and (len({axis[-1] for axis in self.axes}) < 3 or not {*kinds} <= {*_VECTORS}):
-            raise ValueError("axes: each of x, y and z once, of gyro, accel or field")
+        if self.axes and not {*kinds} <= {*_VECTORS}:
+            raise ValueError("axes go with gyro, accel or field")
         return self
 
     def read(self, path: Path, data: Path, topic: str = "") -> tuple[series.Topic, list[str]]:
@@ -133,7 +133,9 @@ class TableTopic(BaseModel):
         if not self._is_slow and self.time is not None:
             check_steps(path, topic, t_ns, unit, SLOWEST_GYRO_S if self.gyro else SLOWEST_S)
         scales = {name: self._scale(name, form, path, notes) for name in values}
-        values = {name: self._along_axes(name, one) * scales[name] for name, one in values.items()}
+        values = {
+            name: (along(self.axes, one) if name in _VECTORS else one) * scales[name] for name, one in values.items()
+        }
         if self.video is not None:
             pictures = VideoFile(path.with_name(Path(self.video).name), len(t_ns))
             return series.ImageSeries(t_ns, pictures, "netpbm"), notes
@@ -162,12 +164,6 @@ class TableTopic(BaseModel):
                 there = ", ".join(dict.fromkeys(columns[name].tolist()[:1000]))
                 raise InputError(f"{path}: where: no row has {name} {value}; its values: {there[:200]}")
         return rows
-
-    def _along_axes(self, name: str, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        if self.axes is None or name not in _VECTORS:
-            return values
-        signs = [-1.0 if axis.startswith("-") else 1.0 for axis in self.axes]
-        return np.asarray(values[:, ["xyz".index(axis[-1]) for axis in self.axes]] * signs)
 
     def _columns(self, name: str) -> list[str]:
         value = getattr(self, name)

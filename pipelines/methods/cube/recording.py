@@ -22,6 +22,7 @@ from alidade.pipelines.recording.checks import (
     check_overlap,
     clean,
     count,
+    tracked,
     unit_quaternions,
 )
 from alidade.pipelines.recording.faults import drop_faults
@@ -125,8 +126,9 @@ def _reference(
             f"topic {topic}: orientation_covariance starts with -1, so there is no attitude in it; the "
             "reference has to put out its attitude in East-North-Up"
         )
-    t, keep = clean(topic, imu.t_ns, epoch_ns, imu.wxyz, dropped, least=1)
-    wxyz, cov = unit_quaternions(topic, t, imu.wxyz[keep]), imu.wxyz_cov[keep]
+    given = tracked(topic, imu.wxyz, dropped)
+    t, keep = clean(topic, imu.t_ns, epoch_ns, given, dropped, least=1)
+    wxyz, cov = unit_quaternions(topic, t, given[keep]), imu.wxyz_cov[keep]
     cov = believed(topic, "attitude", cov, _LEAST_VARIANCE, dropped)
     known = (np.linalg.eigvalsh(0.5 * (cov + cov.swapaxes(1, 2)))[:, 0] > 0.0).all()
     return t, wxyz, cov if known else None

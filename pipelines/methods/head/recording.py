@@ -19,6 +19,7 @@ from alidade.pipelines.recording.checks import (
     clean,
     count,
     nanoseconds,
+    tracked,
     unit_quaternions,
 )
 from alidade.pipelines.recording.gyro import read_gyro, read_imu
@@ -188,8 +189,9 @@ def _vision(
 ) -> tuple[Array, Array, Array | None]:
     poses = recording.poses(topic)
     count(dropped, f"{topic}: stamped by log time (kept)", poses.stamped_by_log)
-    t, keep = clean(topic, poses.t_ns, epoch_ns, poses.wxyz, dropped)
-    wxyz = unit_quaternions(topic, t, poses.wxyz[keep])
+    given = tracked(topic, poses.wxyz, dropped)
+    t, keep = clean(topic, poses.t_ns, epoch_ns, given, dropped)
+    wxyz = unit_quaternions(topic, t, given[keep])
     cov = poses.cov[keep][:, _ROTATION, _ROTATION]
     cov = believed(topic, "attitude", cov, _LEAST_VARIANCE, dropped)
     known = np.abs(cov).max(axis=(1, 2)) > 0.0
