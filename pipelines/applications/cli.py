@@ -418,7 +418,7 @@ def info(
     """What can be calibrated from a recording, with which topics, what is missing, and what is in it."""
     from alidade.pipelines import progress
     from alidade.pipelines.applications.discovery import suggestions, unused
-    from alidade.pipelines.applications.session import session_facts
+    from alidade.pipelines.applications.session import checked_facts
     from alidade.pipelines.config import recorded_config
     from alidade.pipelines.recording.reading import open_recording
     from alidade.pipelines.reports import terminal
@@ -426,7 +426,7 @@ def info(
     with progress.shown(quiet), progress.doing("reading"):
         recording = open_recording(session, strict)
         settings = recorded_config(recording, config)
-        facts = session_facts(recording, settings)
+        facts = checked_facts(recording, settings)
         found, left = suggestions(recording, settings), unused(recording, settings)
     if as_json:
         print(terminal.facts_json(facts, found, left))

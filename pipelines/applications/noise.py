@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -19,12 +19,16 @@ from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.checks import clean
 from alidade.pipelines.recording.even import even_pieces
 from alidade.pipelines.recording.faults import drop_faults
+from alidade.pipelines.recording.placeholders import is_there
+from alidade.pipelines.recording.plausibility import implausible
 from alidade.pipelines.recording.reading import Recording, open_recording
 
 Array = NDArray[np.float64]
 
 # Pieces shorter than this many samples are left out.
 _SHORTEST = 16
+# No gyro at rest has more white noise, rad/s/sqrt(Hz): cheap consumer parts have .05 deg/s/sqrt(Hz), 9e-4.
+_MOST_GYRO_DENSITY = 3e-3
 _UNITS = {"gyro": "rad/s", "accel": "m/s^2", "mag": "T"}
 
 
@@ -135,6 +139,7 @@ def _topic_noise(recording: Recording, name: str, notes: list[str]) -> Iterator[
     together = np.hstack(list(device.sensors.values()))
     t, keep = clean(name, device.t_ns, recording.epoch_ns, together, dropped, least=3)
     samples = {kind: values[keep] for kind, values in device.sensors.items()}
+    _check_units(name, t, samples)
     rests = stretches_at_rest(t, list(samples.values()), samples.get("gyro"))
     if not len(rests):
         raise InputError(
@@ -161,6 +166,25 @@ def _topic_noise(recording: Recording, name: str, notes: list[str]) -> Iterator[
     notes += [f"{reason}: {number}" for reason, number in dropped.items()]
 
 
+def _check_units(name: str, t: Array, samples: Mapping[str, Array]) -> None:
+    """Raise InputError for sensors that are not in SI, all of them named."""
+    wrong = [said for kind, values in samples.items() if (said := implausible(kind, values))]
+    if "gyro" in samples:
+        # Where it is quietest: of differences of white noise a tenth is below this share of a sample's sigma.
+        steps = np.quantile(np.abs(np.diff(samples["gyro"], axis=0)), 0.1, axis=0) / (0.1257 * 2.0**0.5)
+        density = float(np.median(steps)) * float(np.median(np.diff(t))) ** 0.5
+        if density > _MOST_GYRO_DENSITY:
+            wrong.append(
+                f"rates scatter by {density:.2g} rad/s/sqrt(Hz), more than any gyro's ({_MOST_GYRO_DENSITY:g}); is it "
+                "in deg/s?"
+            )
+    if wrong:
+        raise InputError(
+            f"topic {name}: {'; '.join(wrong)} The message has to be in rad/s and m/s^2, T; of a table "
+            "`units:` says what its columns are in"
+        )
+
+
 def _device(recording: Recording, name: str) -> _Device:
     if recording.topics[name].type == messages.MAGNETIC_FIELD:
         field = recording.magnetic(name)
@@ -168,10 +192,8 @@ def _device(recording: Recording, name: str) -> _Device:
     else:
         imu = recording.imu(name)
         sensors, t_ns = {"gyro": imu.gyro, "accel": imu.accel}, imu.t_ns
-        if imu.gyro_cov[0, 0, 0] == -1.0:
-            del sensors["gyro"]
-        if imu.accel_cov[0, 0, 0] == -1.0:
-            del sensors["accel"]
+        covariances = {"gyro": imu.gyro_cov, "accel": imu.accel_cov}
+        sensors = {kind: values for kind, values in sensors.items() if is_there(kind, values, covariances[kind])}
     # A field of the message that nobody filled in is no sensor.
     return _Device(t_ns, {kind: values for kind, values in sensors.items() if np.any(np.nan_to_num(values))})
 

@@ -37,6 +37,7 @@ from alidade.pipelines.recording.info import SessionFacts, facts_of, lacking
 from alidade.pipelines.recording.message_reader import ENCODING
 from alidade.pipelines.recording.opening import Where
 from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, wanted
 from alidade.pipelines.reports.known import load_known
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import TRUTH, Config
@@ -433,6 +434,39 @@ def calibrate(
 def session_facts(recording: Recording, config: Config) -> SessionFacts:
     """Facts about all topics of a recording, and what it lacks for each method."""
     return facts_of(recording, config, {name: methods.method(name).needs for name in methods.names()})
+
+
+def checked_facts(recording: Recording, config: Config) -> SessionFacts:
+    """As `session_facts`; of a method that lacks nothing, what `calibrate` would refuse the recording for.
+
+    Pictures are not looked at.
+    """
+    facts = session_facts(recording, config)
+    by_name = {name: config.model_copy(update={"method": name}) for name, lacks in facts.missing.items() if lacks}
+    asked = {name for name, own in by_name.items() if not missing_for(name, recording, own)}
+    said = {name: (f"`--method {name}`, by which it has to be asked for",) for name in asked}
+    facts = replace(facts, missing={**facts.missing, **said})
+    refused = {name: said for name in facts.methods if (said := _refused(methods.method(name), recording, config))}
+    return replace(facts, missing={**facts.missing, **{name: (said,) for name, said in refused.items()}})
+
+
+def _refused(method: Method, recording: Recording, config: Config) -> str:
+    """Why a method cannot read the recording, as a phrase; empty where it can."""
+    from alidade.pipelines.vision.recorded import camera_of
+
+    by_key = {topic.key: topic for topic in method.topics}
+    image, camera = by_key.get(IMAGE.key), by_key.get(CAMERA_INFO.key)
+    needless = [key for key in ("los_error", "vision_attitude", "tag_detections") if key in by_key]
+    seen = image is not None and wanted(recording, config, image)
+    measured = [key for key in needless if wanted(recording, config, by_key[key])]
+    try:
+        if camera is not None and (seen or "tag_detections" in measured):
+            camera_of(recording, config)
+        if not seen or (measured and "tag_detections" not in measured):
+            method.read(recording, config)
+    except InputError as error:
+        return f"usable data: {error}"
+    return ""
 
 
 def missing_for(name: str, recording: Recording, config: Config) -> tuple[str, ...]:

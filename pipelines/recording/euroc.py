@@ -17,7 +17,8 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.arrays import ArrayContainer
 from alidade.pipelines.recording.container import sha256_of, sha256_together
-from alidade.pipelines.recording.tables import column_names, nanoseconds, numbers, read_columns
+from alidade.pipelines.recording.table_times import nanoseconds
+from alidade.pipelines.recording.tables import numbers, read_columns, table_form
 
 _DISTORTION = {"radial-tangential": "plumb_bob", "equidistant": "equidistant"}
 _LONGEST_YAML = 1 << 20
@@ -37,7 +38,7 @@ def read_euroc(path: Path, root: Path) -> ArrayContainer:
         found = _topics(table, f"/{table.parent.name}", sensor)
         topics |= found
         if not found:
-            remarks.append(f"{table.parent.name} is not used: columns {', '.join(column_names(table, table))}")
+            remarks.append(f"{table.parent.name} is not used: columns {', '.join(table_form(table, table).names)}")
     return _DataSet(path, topics, remarks, sorted(root.glob("*/data.csv")))
 
 
@@ -57,10 +58,8 @@ class _DataSet(ArrayContainer):
 
 def _topics(table: Path, name: str, sensor: Mapping[str, Any]) -> dict[str, series.Topic]:
     """What a sensor's table holds."""
-    names = column_names(table, table)
-    if not names:
-        raise InputError(f"{table}: a table without columns")
-    columns = read_columns(table, table, names)
+    names = table_form(table, table).names
+    columns, _ = read_columns(table, table, names)
     t_ns = nanoseconds(table, columns[names[0]], "ns")
 
     def chosen(letter: str) -> list[str]:

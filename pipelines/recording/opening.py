@@ -22,7 +22,10 @@ from alidade.pipelines.recording.parts import Parts
 from alidade.pipelines.recording.video import is_video
 
 _ZSTD, _SQLITE, _ULOG, _ARDUPILOT = b"\x28\xb5\x2f\xfd", b"SQLite format 3\0", b"ULog\x01\x12\x35", b"\xa3\x95"
-_TABLES = {".csv", ".tum", ".txt"}
+# So much of a file's beginning tells what it is, B.
+_START = 1024
+# How tables may be called, in a folder that has nothing else of a recording.
+_TABLES = (".csv", ".txt", ".tsv", ".tum", ".log", ".dat")
 # How the parts of a recording may be called.
 PARTS = (".mcap", ".db3", ".bag", ".zstd", ".zst")
 # The bytes of a file that tell it from others of its form and stay as they are while it grows: the heads of some forms
@@ -110,7 +113,7 @@ def _file(path: Path, strict: bool) -> Container:
 def _by_content(path: Path, data: Path, strict: bool) -> Container:
     """The container in a file `data`, which is named `path`."""
     with data.open("rb") as stream:
-        start = stream.read(16)
+        start = stream.read(_START)
     if start.startswith(ros1_bag.MAGIC):
         return ros1_bag.Ros1Bag(path, strict, data)
     if start.startswith(_SQLITE):
@@ -130,11 +133,9 @@ def _by_content(path: Path, data: Path, strict: bool) -> Container:
         raise InputError(f"{path}: compressed twice")
     if is_video(start):
         return ArrayContainer(path, {}, ["a video; `columns:` in the config says which table has its pictures' stamps"])
-    if _TABLES & set(path.suffixes) and start:
-        from alidade.pipelines.recording.tables import read_table
+    from alidade.pipelines.recording.tables import looks_like_text, read_table
 
-        return read_table(path, data)
-    return McapFile(path, strict, data)
+    return read_table(path, data) if looks_like_text(start) else McapFile(path, strict, data)
 
 
 def _unpacked(path: Path, strict: bool) -> Container:
@@ -184,7 +185,7 @@ def _folder(path: Path, strict: bool) -> Container:
     root = find_euroc(path)
     if root is not None:
         return read_euroc(path, root)
-    there = parts_in(path)
+    there = parts_in(path) or _tables_in(path)
     if not there:
         raise InputError(f"{path}: a folder without a recording")
     return _together(there, strict, path)
@@ -216,6 +217,23 @@ def parts_in(path: Path) -> list[Path]:
         names = ", ".join(file.name for file in there)
         raise InputError(f"{path}: a folder of several recordings ({names}); name one, or the parts by a pattern")
     return there
+
+
+def _tables_in(path: Path) -> list[Path]:
+    """The tables in a folder, and what has no rows of numbers left out: a phone's app writes one a sensor."""
+    from alidade.pipelines.recording.tables import looks_like_text, table_form
+
+    found = []
+    for file in sorted(path.iterdir()):
+        if file.suffix.lower() in _TABLES and file.is_file():
+            with file.open("rb") as stream:
+                is_text = looks_like_text(stream.read(_START))
+            try:
+                if is_text and table_form(file, file).width:
+                    found.append(file)
+            except InputError:
+                continue
+    return found
 
 
 def _metadata(path: Path) -> dict[str, Any]:

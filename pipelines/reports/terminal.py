@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -28,6 +29,8 @@ console = Console(highlight=False)
 if console.width < _NARROWEST:
     console.width = _NARROWEST
 _LONGEST = 10_000
+# Sentences are broken at so many characters.
+_WIDTH = 100
 
 COLOURS = {
     "calibrated": "green",
@@ -134,9 +137,9 @@ def show_facts(name: str, facts: SessionFacts, found: Sequence[Suggestion] = (),
     say(f"{name}, {facts.duration_s:.1f} s")
     _show_methods(facts, found)
     if unused:
-        say(f"used by no method: {', '.join(unused)}")
+        _say_wrapped(f"used by no method: {', '.join(unused)}")
     for note in facts.notes:
-        say(f"note: {note}")
+        _say_wrapped(f"note: {note}")
     table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
     table.add_column("topic", no_wrap=True)
     table.add_column("type", overflow="fold")
@@ -159,6 +162,13 @@ def show_facts(name: str, facts: SessionFacts, found: Sequence[Suggestion] = (),
         say(f"attachments: {', '.join(facts.attachments)}")
 
 
+def _say_wrapped(text: str) -> None:
+    """In lines that fit, those after the first indented; words are left whole."""
+    lines = textwrap.wrap(text, _WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
+    for line in [text[: len(text) - len(text.lstrip())] + lines[0].lstrip(), *lines[1:]] if lines else []:
+        say(line)
+
+
 def _show_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:
     """Methods that are served, those that could be with other topics, and what the others lack."""
     for method, missing in facts.missing.items():
@@ -166,15 +176,18 @@ def _show_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:
             console.print(f"[green]{method}: yes[/]")
     for suggestion in found:
         if not suggestion.missing:
-            console.print(f"[yellow]{suggestion.method}: with these topics (calibrate --auto-topics takes them)[/]")
+            name = f"--method {suggestion.method} " if suggestion.has_to_be_asked_for else ""
+            console.print(
+                f"[yellow]{suggestion.method}: with these topics (calibrate {name}--auto-topics takes them)[/]"
+            )
             for reason in suggestion.reasons:
-                say(f"  {reason}")
+                _say_wrapped(f"  {reason}")
             for line in suggestion.yaml.split("\n"):
                 say(f"  {line}")
     whole = {suggestion.method for suggestion in found if not suggestion.missing}
     for method, missing in facts.missing.items():
         if missing and method not in whole:
-            say(f"{method}: no, it lacks {'; '.join(missing)}")
+            _say_wrapped(f"{method}: no, it lacks {'; '.join(missing)}")
 
 
 def show_plan(plan: Plan) -> None:

@@ -382,6 +382,8 @@ def test_tum_trajectories_keep_their_stamps_to_the_nanosecond(tmp_path: Path) ->
     np.testing.assert_array_equal(poses.wxyz, wxyz)
     np.testing.assert_array_equal(poses.position, position)
     path.write_text("\n".join([*lines[:3], "1 2 3"]))
+    assert len(open_recording(path).poses("/trajectory")) == 3, "a last row that is cut"
+    path.write_text("\n".join([*lines[:3], "1 2 3", "1 2 3", lines[3]]))
     with pytest.raises(InputError, match="line 4 has 3 columns instead of 8"):
         open_recording(path)
 
@@ -421,7 +423,7 @@ def test_csv_with_columns_from_the_config(tmp_path: Path) -> None:
         ("{time: t, gyro: [a, b, c]}", r"columns./imu.file: which table is meant\?; tables there: imu.csv, pose.csv"),
         ("{file: imu.cvs, time: t, gyro: [a, b, c]}", "no table imu.cvs; the nearest known key is imu.csv"),
         ("{file: imu.csv, time: t, gyro: [a, wy, wz]}", "imu.csv: no column a; the columns are t, wx"),
-        ("{file: imu.csv, time: t, gyro: [note, wy, wz]}", "columns note, wy, wz: could not convert string"),
+        ("{file: imu.csv, time: t, gyro: [note, wy, wz]}", "row 1, column note: 'x' is no number"),
         ("{file: imu.csv, time: note, gyro: [wx, wy, wz]}", "imu.csv: a time that is no number in s"),
         ("{file: imu.csv, time: t}", "exactly one of gyro, .*latitude_deg, celsius, joints, video is needed"),
         ("{file: imu.csv, time: t, gyro: [a, b, c], units: {gyro: rpm}}", "units.gyro: rpm is not one of rad/s"),
