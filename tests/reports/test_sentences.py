@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.support.pages import Page
 
 from alidade.pipelines.diagnostics.diagnose import diagnose
 from alidade.pipelines.estimation.finding import KINDS, Finding, Severity, status
@@ -18,6 +17,7 @@ from alidade.pipelines.reports.html import report_html
 from alidade.pipelines.reports.result import finding_json, result_json
 from alidade.pipelines.reports.sentences import cause, headline, notes, sentence
 from tests.support.builders import make_calibration
+from tests.support.pages import Page
 
 NOTE, WEAK, INCONSISTENT, UNOBSERVABLE = Severity
 MOUNT = Quantity("helmet_mount_z", "rad", 0.35, 0.35, 1e-2)
