@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from alidade.pipelines import methods, progress
 from alidade.pipelines.config import load_config
-from alidade.pipelines.diagnostics.sensor_noise import AxisNoise, axis_noise
+from alidade.pipelines.diagnostics.noise_spectrum import AxisNoise, axis_noise
 from alidade.pipelines.diagnostics.static_intervals import stretches_at_rest
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages
