@@ -20,6 +20,7 @@ import numpy as np
 from alidade.pipelines import methods, progress
 from alidade.pipelines.applications.discovery import empty, idle, nearest_suggestion, suggestions, with_suggested
 from alidade.pipelines.applications.sharing import device_belief, walks
+from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import load_config, recorded_config
 from alidade.pipelines.diagnostics.change_test import Stability, change_finding, stability, with_change
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf, solve_segments, split_halves
@@ -158,9 +159,12 @@ class Session:
         config_file: Path | Config | None,
         auto_topics: bool = False,
         prior: Path | None = None,
+        auto_columns: bool = False,
     ) -> Session:
         """Read and check a recording (arguments and exceptions as `calibrate` has them)."""
         config = recorded_config(recording, config_file)
+        if auto_columns:
+            config = with_columns(recording, config)
         if auto_topics:
             config = with_suggested(recording, config, method_name)
         chosen = methods.method(resolve_method(method_name, recording, config))
@@ -406,6 +410,7 @@ def calibrate(
     check: bool = False,
     prior: Path | None = None,
     report: bool = True,
+    auto_columns: bool = False,
 ) -> list[Calibration]:
     """One calibration a solver, from one reading of the recording.
 
@@ -417,6 +422,7 @@ def calibrate(
         window: s, of the incremental solver; None keeps the whole history.
         strict: refuse a recording of which anything is lost.
         auto_topics: take the topics that `alidade info` suggests where those of the method are not there.
+        auto_columns: take what `alidade info` concludes of the columns of tables where the config describes none.
         check: hold an incremental calibration against batch.
         prior: an earlier calibration of the device to begin from, result.json or calibration.yaml.
         report: with what only a report tells, see `Session.calibrate`.
@@ -427,7 +433,7 @@ def calibrate(
     """
     start = time.perf_counter()
     with progress.doing("reading"):
-        session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics, prior)
+        session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics, prior, auto_columns)
     return session.calibrations(solvers, window, {"read": time.perf_counter() - start}, check, report)
 
 
@@ -444,8 +450,8 @@ def checked_facts(recording: Recording, config: Config) -> SessionFacts:
     facts = session_facts(recording, config)
     by_name = {name: config.model_copy(update={"method": name}) for name, lacks in facts.missing.items() if lacks}
     asked = {name for name, own in by_name.items() if not missing_for(name, recording, own)}
-    said = {name: (f"`--method {name}`, by which it has to be asked for",) for name in asked}
-    facts = replace(facts, missing={**facts.missing, **said})
+    to_ask = {name: (f"`--method {name}`, by which it has to be asked for",) for name in asked}
+    facts = replace(facts, missing={**facts.missing, **to_ask})
     refused = {name: said for name in facts.methods if (said := _refused(methods.method(name), recording, config))}
     return replace(facts, missing={**facts.missing, **{name: (said,) for name, said in refused.items()}})
 
