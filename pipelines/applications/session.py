@@ -10,7 +10,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -144,12 +144,18 @@ class Arrays:
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """Data as their method takes them, the config in force, and where both come from."""
+    """Data as their method takes them, the config in force, and where both come from.
+
+    Attributes:
+        method, data, config, origin: as above.
+        near: numbers that rotations are reported near of, as another recording of the device has them.
+    """
 
     method: Method
     data: Any
     config: Config
     origin: Origin
+    near: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def read(
@@ -209,7 +215,7 @@ class Session:
     def _problem(self) -> Problem:
         _check_sheets(self.method, self.config)
         with progress.doing("preparing the graph"):
-            return self.method.graph(self.data, self.config)
+            return self.method.graph(self.data, self.config).near(self.near)
 
     @cached_property
     def facts(self) -> SessionFacts:
@@ -504,9 +510,9 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
 
 def _feed(digest: hashlib._Hash, data: Any) -> None:
     """The arrays and numbers of a dataclass, and of those inside it, with their names into a hash."""
-    for field in fields(data):
-        value = getattr(data, field.name)
-        digest.update(field.name.encode())
+    for one in fields(data):
+        value = getattr(data, one.name)
+        digest.update(one.name.encode())
         if is_dataclass(value):
             _feed(digest, value)
         elif isinstance(value, np.ndarray):
