@@ -103,6 +103,9 @@ _Jobs = Annotated[int | None, typer.Option(help="Local worker processes; default
 _OwnJobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Processes to be used; default: one a core.")]
 _Strict = Annotated[bool, typer.Option("--strict", help="Refuse a recording of which anything is lost.")]
 _AutoTopics = Annotated[bool, typer.Option("--auto-topics", help="Take the topics that `info` suggests.")]
+_AutoColumns = Annotated[
+    bool, typer.Option("--auto-columns", help="Take what `info` concludes of the columns of tables.")
+]
 _NoCheck = Annotated[bool, typer.Option("--no-check", help="Do not hold an incremental result against batch.")]
 _Prior = Annotated[
     Path | None, typer.Option(help="An earlier calibration of the device to begin from: result.json, calibration.yaml.")
@@ -143,6 +146,7 @@ def calibrate(
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: SESSION-SOLVER.")] = None,
     strict: _Strict = False,
     auto_topics: _AutoTopics = False,
+    auto_columns: _AutoColumns = False,
     jobs: _OwnJobs = None,
     prior: _Prior = None,
     no_check: _NoCheck = False,
@@ -187,6 +191,7 @@ def calibrate(
                 auto_topics,
                 not no_check,
                 prior,
+                auto_columns=auto_columns,
             )
         with progress.doing("writing"):
             written = write_results(folder, calibration)
@@ -419,6 +424,7 @@ def info(
     from alidade.pipelines import progress
     from alidade.pipelines.applications.discovery import suggestions, unused
     from alidade.pipelines.applications.session import checked_facts
+    from alidade.pipelines.applications.table_discovery import propose_columns, with_columns
     from alidade.pipelines.config import recorded_config
     from alidade.pipelines.recording.reading import open_recording
     from alidade.pipelines.reports import terminal
@@ -426,12 +432,15 @@ def info(
     with progress.shown(quiet), progress.doing("reading"):
         recording = open_recording(session, strict)
         settings = recorded_config(recording, config)
+        columns = None if settings.columns else propose_columns(recording)
+        if columns is not None and columns.columns:
+            settings = with_columns(recording, settings)
         facts = checked_facts(recording, settings)
         found, left = suggestions(recording, settings), unused(recording, settings)
     if as_json:
-        print(terminal.facts_json(facts, found, left))
+        print(terminal.facts_json(facts, found, left, columns))
     else:
-        terminal.show_facts(session.name, facts, found, left)
+        terminal.show_facts(session.name, facts, found, left, columns)
 
 
 @app.command()
@@ -441,6 +450,7 @@ def noise(
     out: Annotated[Path | None, typer.Option(help="Folder for noise.html and noise.json.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print noise.json and nothing else.")] = False,
     strict: _Strict = False,
+    auto_columns: _AutoColumns = False,
     quiet: Quiet = False,
 ) -> None:
     """The noise of gyros, accelerometers and magnetometers from their time at rest, and the config's section for it."""
@@ -450,7 +460,7 @@ def noise(
     from alidade.pipelines.reports.noise import noise_json, write_noise
 
     with progress.shown(quiet):
-        study = noise_of(session, strict, config)
+        study = noise_of(session, strict, config, auto_columns)
     written = () if out is None else write_noise(out, study)
     if as_json:
         print(noise_json(study), end="")

@@ -10,7 +10,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -20,6 +20,7 @@ import numpy as np
 from alidade.pipelines import methods, progress
 from alidade.pipelines.applications.discovery import empty, idle, nearest_suggestion, suggestions, with_suggested
 from alidade.pipelines.applications.sharing import device_belief, walks
+from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import load_config, recorded_config
 from alidade.pipelines.diagnostics.change_test import Stability, change_finding, stability, with_change
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf, solve_segments, split_halves
@@ -143,12 +144,18 @@ class Arrays:
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """Data as their method takes them, the config in force, and where both come from."""
+    """Data as their method takes them, the config in force, and where both come from.
+
+    Attributes:
+        method, data, config, origin: as above.
+        near: numbers that rotations are reported near of, as another recording of the device has them.
+    """
 
     method: Method
     data: Any
     config: Config
     origin: Origin
+    near: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def read(
@@ -158,9 +165,12 @@ class Session:
         config_file: Path | Config | None,
         auto_topics: bool = False,
         prior: Path | None = None,
+        auto_columns: bool = False,
     ) -> Session:
         """Read and check a recording (arguments and exceptions as `calibrate` has them)."""
         config = recorded_config(recording, config_file)
+        if auto_columns:
+            config = with_columns(recording, config)
         if auto_topics:
             config = with_suggested(recording, config, method_name)
         chosen = methods.method(resolve_method(method_name, recording, config))
@@ -205,7 +215,7 @@ class Session:
     def _problem(self) -> Problem:
         _check_sheets(self.method, self.config)
         with progress.doing("preparing the graph"):
-            return self.method.graph(self.data, self.config)
+            return self.method.graph(self.data, self.config).near(self.near)
 
     @cached_property
     def facts(self) -> SessionFacts:
@@ -406,6 +416,7 @@ def calibrate(
     check: bool = False,
     prior: Path | None = None,
     report: bool = True,
+    auto_columns: bool = False,
 ) -> list[Calibration]:
     """One calibration a solver, from one reading of the recording.
 
@@ -417,6 +428,7 @@ def calibrate(
         window: s, of the incremental solver; None keeps the whole history.
         strict: refuse a recording of which anything is lost.
         auto_topics: take the topics that `alidade info` suggests where those of the method are not there.
+        auto_columns: take what `alidade info` concludes of the columns of tables where the config describes none.
         check: hold an incremental calibration against batch.
         prior: an earlier calibration of the device to begin from, result.json or calibration.yaml.
         report: with what only a report tells, see `Session.calibrate`.
@@ -427,7 +439,7 @@ def calibrate(
     """
     start = time.perf_counter()
     with progress.doing("reading"):
-        session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics, prior)
+        session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics, prior, auto_columns)
     return session.calibrations(solvers, window, {"read": time.perf_counter() - start}, check, report)
 
 
@@ -444,8 +456,8 @@ def checked_facts(recording: Recording, config: Config) -> SessionFacts:
     facts = session_facts(recording, config)
     by_name = {name: config.model_copy(update={"method": name}) for name, lacks in facts.missing.items() if lacks}
     asked = {name for name, own in by_name.items() if not missing_for(name, recording, own)}
-    said = {name: (f"`--method {name}`, by which it has to be asked for",) for name in asked}
-    facts = replace(facts, missing={**facts.missing, **said})
+    to_ask = {name: (f"`--method {name}`, by which it has to be asked for",) for name in asked}
+    facts = replace(facts, missing={**facts.missing, **to_ask})
     refused = {name: said for name in facts.methods if (said := _refused(methods.method(name), recording, config))}
     return replace(facts, missing={**facts.missing, **{name: (said,) for name, said in refused.items()}})
 
@@ -498,9 +510,9 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
 
 def _feed(digest: hashlib._Hash, data: Any) -> None:
     """The arrays and numbers of a dataclass, and of those inside it, with their names into a hash."""
-    for field in fields(data):
-        value = getattr(data, field.name)
-        digest.update(field.name.encode())
+    for one in fields(data):
+        value = getattr(data, one.name)
+        digest.update(one.name.encode())
         if is_dataclass(value):
             _feed(digest, value)
         elif isinstance(value, np.ndarray):

@@ -127,7 +127,7 @@ def _held(session: Session, known: Known) -> tuple[CalibrationCheck | None, dict
 
     if known.solver == "published":
         return None, {}
-    problem = session.problem()
+    problem = session.problem().near(dict(zip(known.belief.names, known.belief.mean.tolist(), strict=True)))
     device = walks(session.method, session.config, [q.name for q in problem.quantities])
     belief = device_belief(known, session.method, session.config, session.origin.sha256(), session.origin.epoch_ns)
     try:

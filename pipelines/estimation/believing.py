@@ -83,8 +83,10 @@ def _believing(problem: Problem, belief: Belief) -> Problem:
         for name, mean, sigma in zip(known.names, known.mean, known.sigmas, strict=True)
         if name in replaced
     }
+    means = dict(zip(known.names, known.mean.tolist(), strict=True))
     parameters = tuple(
-        replace(p, quantities=tuple(believed.get(q.name, q) for q in p.quantities)) for p in problem.parameters
+        replace(p, quantities=tuple(believed.get(q.name, q) for q in p.quantities)).near(means)
+        for p in problem.parameters
     )
     told = _Told(parameters, known, replaced)
     steps, after, onward = problem.steps, problem.steps_after, problem.onward

@@ -19,7 +19,7 @@ from alidade.factors import so3
 from alidade.pipelines.diagnostics.observability import Verdict
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Status
-from alidade.pipelines.estimation.problem import Array, rotation_vector_coordinates
+from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.formula import Formula, apply
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
@@ -211,7 +211,7 @@ def _rotations(calibration: Calibration) -> dict[str, SavedRotation]:
     found = {}
     for parameter in calibration.problem.parameters:
         names = [q.name for q in parameter.quantities]
-        if parameter.coordinates is rotation_vector_coordinates and all(name in values for name in names):
+        if parameter.is_rotation and all(name in values for name in names):
             name = names[0].rsplit("_", 1)[0]
             w, x, y, z = (_rounded(v) for v in so3.exp(np.array([values[n] for n in names])).tolist())
             found[name] = SavedRotation(name=known.get(name, name), wxyz=(w, x, y, z))
