@@ -253,6 +253,10 @@ def follow(
     checkpoint: Annotated[Path | None, typer.Option(help="File to save the run in, and to go on from.")] = None,
     serve: Annotated[bool, typer.Option("--serve", help="Estimates live over Foxglove's WebSocket.")] = False,
     port: Annotated[int, typer.Option(help="Of --serve, on this machine alone.")] = 8765,
+    allow_origin: Annotated[
+        list[str] | None,
+        typer.Option(help="Of --serve: a page that may read it beside Foxglove's, https://host; may be repeated."),
+    ] = None,
     page: Annotated[
         bool, typer.Option("--page", help="A page that says what to do, for a browser or a phone.")
     ] = False,
@@ -277,7 +281,8 @@ def follow(
     for place in (folder, checkpoint and checkpoint.parent):
         require_room(place)
     settings = Settings(method, config, parse_window(window), patience, checkpoint, not no_check, prior)
-    calibration = run(source, settings, port if serve else None, record, as_json, (host, page_port) if page else None)
+    page_at = (host, page_port) if page else None
+    calibration = run(source, settings, port if serve else None, record, as_json, page_at, allow_origin or ())
     written = write_results(folder, calibration)
     _tell(calibration, folder, written, as_json)
 

@@ -151,7 +151,7 @@ class Follower:
         started = time.thread_time()
         try:
             problem, steps = self._end_alone() or self._whole()
-        except InputError as error:
+        except (InputError, OSError) as error:  # files may be gone, or too many open, for a while
             self._wait(str(error))
             return time.thread_time() - started
         cost = time.thread_time() - started
