@@ -189,9 +189,9 @@ def calibrate(
                 prior,
             )
         with progress.doing("writing"):
-            written = write_results(folder, calibration)
             if len(recordings) > 1:
                 adopt_parts(folder, Path(parts))
+            written = write_results(folder, calibration)
     _tell(calibration, folder, written, as_json)
 
 
@@ -662,10 +662,18 @@ def main() -> None:
         if _interrupted(error):
             sys.exit(exit_codes.INTERRUPTED)
         code = _TROUBLE.get(type(error).__name__)
-        if code is None:
+        if code is None and not isinstance(error, OSError):
             raise
-        print(f"alidade: {error}", file=sys.stderr)
-        sys.exit(code)
+        print(f"alidade: {_of_system(error) if isinstance(error, OSError) else error}", file=sys.stderr)
+        sys.exit(exit_codes.BAD_INPUT if code is None else code)
+
+
+def _of_system(error: OSError) -> str:
+    """A file or a folder that the system refuses, TMPDIR without room among them, in one line."""
+    from alidade.pipelines.errors import printable
+
+    where = error.filename if isinstance(error.filename, str) else os.environ.get("TMPDIR", "/tmp")
+    return f"{printable(where)}: {error.strerror or printable(str(error))}"
 
 
 if __name__ == "__main__":
