@@ -118,6 +118,14 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
+_TimeLimit = Annotated[
+    float | None,
+    typer.Option(
+        "--time-limit",
+        min=0.1,
+        help="Seconds to solve in; default: 60, or a tenth of the recording, online all of it, where that is more.",
+    ),
+]
 _Version = Annotated[bool, typer.Option("--version", "-V", callback=_version, is_eager=True, help="Print it.")]
 
 
@@ -146,6 +154,7 @@ def calibrate(
     jobs: _OwnJobs = None,
     prior: _Prior = None,
     no_check: _NoCheck = False,
+    time_limit: _TimeLimit = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -155,7 +164,7 @@ def calibrate(
     """
     from tempfile import TemporaryDirectory
 
-    from alidade.pipelines import parallel, progress
+    from alidade.pipelines import deadline, parallel, progress
     from alidade.pipelines.applications.joint import calibrate_device
     from alidade.pipelines.applications.session import calibrate as run
     from alidade.pipelines.errors import InputError
@@ -172,7 +181,12 @@ def calibrate(
         if not as_json:
             terminal.say(f"{len(recordings)} recordings of one device: {told(recordings)}")
     require_room(folder)
-    with progress.shown(quiet or as_json), parallel.processes(jobs), TemporaryDirectory(prefix="alidade-") as parts:
+    with (
+        progress.shown(quiet or as_json),
+        parallel.processes(jobs),
+        deadline.within(time_limit),
+        TemporaryDirectory(prefix="alidade-") as parts,
+    ):
         if len(recordings) > 1:
             by_itself = partial(write_part, Path(parts))
             calibration = calibrate_device(recordings, method, config, strict, auto_topics, prior, by_itself)
