@@ -111,8 +111,10 @@ def test_a_result_is_written_when_the_time_is_over(alidade: Command, recording: 
 def test_ctrl_c_is_answered_within_a_second(after: float, recording: Path, tmp_path: Path) -> None:
     """Reading, solving, trying causes, in several processes."""
     (tmp_path / "c.yaml").write_text("noise: {los_error: 1.0e-7}\nnoise_known: 0\n")
-    command = [sys.executable, "-m", "alidade", "calibrate", recording, "--config", tmp_path / "c.yaml", "--jobs", "2"]
-    process = subprocess.Popen([*command, "--out", tmp_path / "out"], stderr=subprocess.PIPE, text=True)
+    command = [sys.executable, "-m", "alidade", "calibrate", str(recording), "--config", str(tmp_path / "c.yaml")]
+    process = subprocess.Popen(
+        [*command, "--jobs", "2", "--out", str(tmp_path / "out")], stderr=subprocess.PIPE, text=True
+    )
     time.sleep(after)
     if process.poll() is not None:
         pytest.skip("it is done by then")
