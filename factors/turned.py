@@ -50,6 +50,7 @@ class FieldFactor(Model):
     aRn: Array
     gyro: GyroPath
     errors: int = 0
+    shapes: ClassVar = {"raw": (3,), "sigma": ()}
     rows: int = 3
     stacked: ClassVar = ("time", "anchor", "raw", "sigma", "aRn")
 
@@ -110,6 +111,7 @@ class UpFactor(Model):
     errors: int = 0
     unit: float | None = None
     warmth: Array | None = None
+    shapes: ClassVar = {"raw": (3,), "sigma": ()}
     rows: int = 3
     stacked: ClassVar = ("time", "anchor", "raw", "sigma", "aRn", "warmth")
 
