@@ -62,6 +62,8 @@ def _not_tiny(sigma: float) -> float:
 
 Sigma = Annotated[float, Field(gt=0.0), AfterValidator(_not_tiny)]
 SigmaOrZero = Annotated[float, Field(ge=0.0), AfterValidator(_not_tiny)]
+# Beyond it native code that looks for the pose of a tag ends the process.
+TagSize = Annotated[float, Field(gt=0.0, le=100.0), AfterValidator(_not_tiny)]
 # Of a logarithm: beyond it e to the power of it overflows.
 LogSigma = Annotated[float, Field(ge=0.0, le=10.0)]
 # No sensor has more, in any of the units below; beyond it arithmetic overflows.
@@ -249,7 +251,7 @@ SensorSheets = Annotated[Sensors, BeforeValidator(_ideal)]
 class Tag(Section):
     """A tag on a body."""
 
-    size: Annotated[float, Field(ge=1e-4, le=100.0)]  # m: edge of the black square
+    size: TagSize  # m: edge of the black square
     rotation: Quaternion = (1.0, 0.0, 0.0, 0.0)  # bodyRtag as w, x, y, z
     position: Vector = (0.0, 0.0, 0.0)  # in the body, m
 
