@@ -104,7 +104,7 @@ def score_trial(build: Build, data: Any, config: Config, label: str = "") -> flo
 
 
 def _tried(label: str, trial: Callable[[], Result | None]) -> Result | None:
-    """The result of a trial; None where no time is left or it raises, logged as a warning where that is a defect of the program."""
+    """The result of a trial; None without time left, or where it raises: logged, a program's defect as a warning."""
     from alidade.pipelines.solvers.marginals import IndeterminateError
 
     if deadline.passed():

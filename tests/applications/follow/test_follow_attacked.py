@@ -34,7 +34,6 @@ from alidade.pipelines.applications.follow.page import LivePage
 from alidade.pipelines.applications.follow.protocol import MESSAGE_DATA, MESSAGE_HEAD, SUBPROTOCOLS, websockets
 from alidade.pipelines.applications.follow.serve import MAX_SUBSCRIPTIONS, LiveServer
 from alidade.pipelines.applications.follow.spool import Spool
-from alidade.pipelines.diagnostics.observability import assess
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.recording.reading import open_recording
 
@@ -45,7 +44,7 @@ IDLE = 300
 
 def _view() -> View:
     quantities = (Quantity("p0", "rad", 0.1, 0.1, 1e-3),)
-    return View(3.0, 7, quantities, np.zeros(1), assess(quantities, np.eye(1) * 1e-8, None, None), ())
+    return View(3.0, 7, quantities, np.zeros(1), np.eye(1) * 1e-8, ())
 
 
 def _get(port: int, path: str = "/", **headers: str) -> tuple[int, bytes, dict[str, str]]:
