@@ -254,7 +254,7 @@ class Session:
                 raise InputError(f"no solver {solver!r}; there are {', '.join(SOLVERS)}")
         check_window(window)
         solved = (self._solve(solver, window, report=report) for solver in solvers)
-        with self._usual_time("incremental" in solvers):
+        with self.usual_time("incremental" in solvers):
             return self.judged(solved, seconds or {}, check, report)
 
     def calibrated_beside(self, others: Callable[[Told], Mapping[str, float]]) -> Calibration:
@@ -263,11 +263,11 @@ class Session:
         Args:
             others: of what the recording says, linear about its solution, the numbers as they are with the others.
         """
-        with self._usual_time():
+        with self.usual_time():
             (calibration,) = self.judged([self._solve("batch", None, others)], {})
         return calibration
 
-    def _usual_time(self, online: bool = False) -> AbstractContextManager[None]:
+    def usual_time(self, online: bool = False) -> AbstractContextManager[None]:
         """The time for a calibration, where no command has set one."""
         stamps = [time for time in self.faults.times(self.data) if len(time)]
         start = min((float(time[0]) for time in stamps), default=0.0)

@@ -336,7 +336,8 @@ class Follower:
             growing = replace(problem, steps_after=None)
         self._take(growing, steps)
         estimate = self._run.finish(time.perf_counter() - started)
-        (calibration,) = session.judged([(estimate, problem)], {"read": read}, self.settings.check)
+        with session.usual_time(online=True):
+            (calibration,) = session.judged([(estimate, problem)], {"read": read}, self.settings.check)
         return calibration
 
 
