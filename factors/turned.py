@@ -52,6 +52,7 @@ class FieldFactor(Model):
     gyro: GyroPath
     errors: int = 0
     earth: Array | None = None
+    shapes: ClassVar = {"raw": (3,), "sigma": ()}
     rows: int = 3
     stacked: ClassVar = ("time", "anchor", "raw", "sigma", "elapsed")
 
@@ -116,6 +117,7 @@ class UpFactor(Model):
     earth: Array | None = None
     unit: float | None = None
     warmth: Array | None = None
+    shapes: ClassVar = {"raw": (3,), "sigma": ()}
     rows: int = 3
     stacked: ClassVar = ("time", "anchor", "raw", "sigma", "elapsed", "warmth")
 

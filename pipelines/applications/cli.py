@@ -121,6 +121,14 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
+_TimeLimit = Annotated[
+    float | None,
+    typer.Option(
+        "--time-limit",
+        min=0.1,
+        help="Seconds to solve in; default: 60, or a tenth of the recording, online all of it, where that is more.",
+    ),
+]
 _Version = Annotated[bool, typer.Option("--version", "-V", callback=_version, is_eager=True, help="Print it.")]
 
 
@@ -150,6 +158,7 @@ def calibrate(
     jobs: _OwnJobs = None,
     prior: _Prior = None,
     no_check: _NoCheck = False,
+    time_limit: _TimeLimit = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -159,7 +168,7 @@ def calibrate(
     """
     from tempfile import TemporaryDirectory
 
-    from alidade.pipelines import parallel, progress
+    from alidade.pipelines import deadline, parallel, progress
     from alidade.pipelines.applications.joint import calibrate_device
     from alidade.pipelines.applications.session import calibrate as run
     from alidade.pipelines.errors import InputError
@@ -176,7 +185,12 @@ def calibrate(
         if not as_json:
             terminal.say(f"{len(recordings)} recordings of one device: {told(recordings)}")
     require_room(folder)
-    with progress.shown(quiet or as_json), parallel.processes(jobs), TemporaryDirectory(prefix="alidade-") as parts:
+    with (
+        progress.shown(quiet or as_json),
+        parallel.processes(jobs),
+        deadline.within(time_limit),
+        TemporaryDirectory(prefix="alidade-") as parts,
+    ):
         if len(recordings) > 1:
             by_itself = partial(write_part, Path(parts))
             calibration = calibrate_device(recordings, method, config, strict, auto_topics, prior, by_itself)
@@ -194,9 +208,9 @@ def calibrate(
                 auto_columns=auto_columns,
             )
         with progress.doing("writing"):
-            written = write_results(folder, calibration)
             if len(recordings) > 1:
                 adopt_parts(folder, Path(parts))
+            written = write_results(folder, calibration)
     _tell(calibration, folder, written, as_json)
 
 
@@ -258,6 +272,10 @@ def follow(
     checkpoint: Annotated[Path | None, typer.Option(help="File to save the run in, and to go on from.")] = None,
     serve: Annotated[bool, typer.Option("--serve", help="Estimates live over Foxglove's WebSocket.")] = False,
     port: Annotated[int, typer.Option(help="Of --serve, on this machine alone.")] = 8765,
+    allow_origin: Annotated[
+        list[str] | None,
+        typer.Option(help="Of --serve: a page that may read it beside Foxglove's, https://host; may be repeated."),
+    ] = None,
     page: Annotated[
         bool, typer.Option("--page", help="A page that says what to do, for a browser or a phone.")
     ] = False,
@@ -282,7 +300,8 @@ def follow(
     for place in (folder, checkpoint and checkpoint.parent):
         require_room(place)
     settings = Settings(method, config, parse_window(window), patience, checkpoint, not no_check, prior)
-    calibration = run(source, settings, port if serve else None, record, as_json, (host, page_port) if page else None)
+    page_at = (host, page_port) if page else None
+    calibration = run(source, settings, port if serve else None, record, as_json, page_at, allow_origin or ())
     written = write_results(folder, calibration)
     _tell(calibration, folder, written, as_json)
 
@@ -667,10 +686,18 @@ def main() -> None:
         if _interrupted(error):
             sys.exit(exit_codes.INTERRUPTED)
         code = _TROUBLE.get(type(error).__name__)
-        if code is None:
+        if code is None and not isinstance(error, OSError):
             raise
-        print(f"alidade: {error}", file=sys.stderr)
-        sys.exit(code)
+        print(f"alidade: {_of_system(error) if isinstance(error, OSError) else error}", file=sys.stderr)
+        sys.exit(exit_codes.BAD_INPUT if code is None else code)
+
+
+def _of_system(error: OSError) -> str:
+    """A file or a folder that the system refuses, TMPDIR without room among them, in one line."""
+    from alidade.pipelines.errors import printable
+
+    where = error.filename if isinstance(error.filename, str) else os.environ.get("TMPDIR", "/tmp")
+    return f"{printable(where)}: {error.strerror or printable(str(error))}"
 
 
 if __name__ == "__main__":

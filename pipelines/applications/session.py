@@ -10,6 +10,7 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from alidade.pipelines import methods, progress
+from alidade.pipelines import deadline, methods, progress
 from alidade.pipelines.applications.discovery import empty, idle, nearest_suggestion, suggestions, with_suggested
 from alidade.pipelines.applications.sharing import device_belief, walks
 from alidade.pipelines.applications.table_discovery import with_columns
@@ -46,6 +47,15 @@ from alidade.pipelines.simulation.simulated import Simulated
 from alidade.pipelines.solvers.window import check_window
 
 SOLVERS = ("batch", "incremental", "published")
+# Steps that a run takes whatever time it has: of fewer there may be no solution at all.
+_LEAST_STEPS = 20
+# What ends for want of time, in this order.
+_HYPOTHESES, _SEGMENTS, _COMPARISON, _SENSITIVITY = (
+    "the test of hypotheses",
+    "the solution of both sides of a change",
+    "the comparison with batch",
+    "the sensitivity to fixed inputs",
+)
 # Difference between incremental and batch that is worth a note, in sigmas.
 _NOTABLE_DIFFERENCE = 1.0
 
@@ -254,7 +264,8 @@ class Session:
                 raise InputError(f"no solver {solver!r}; there are {', '.join(SOLVERS)}")
         check_window(window)
         solved = (self._solve(solver, window, report=report) for solver in solvers)
-        return self.judged(solved, seconds or {}, check, report)
+        with self.usual_time("incremental" in solvers):
+            return self.judged(solved, seconds or {}, check, report)
 
     def calibrated_beside(self, others: Callable[[Told], Mapping[str, float]]) -> Calibration:
         """The calibration by batch, what it says of its numbers linear where others have them. Raises as `calibrate`.
@@ -262,8 +273,15 @@ class Session:
         Args:
             others: of what the recording says, linear about its solution, the numbers as they are with the others.
         """
-        (calibration,) = self.judged([self._solve("batch", None, others)], {})
+        with self.usual_time():
+            (calibration,) = self.judged([self._solve("batch", None, others)], {})
         return calibration
+
+    def usual_time(self, online: bool = False) -> AbstractContextManager[None]:
+        """The time for a calibration, where no command has set one."""
+        stamps = [time for time in self.faults.times(self.data) if len(time)]
+        start = min((float(time[0]) for time in stamps), default=0.0)
+        return deadline.usual(max((float(time[-1]) for time in stamps), default=0.0) - start, online)
 
     def judged(
         self,
@@ -293,7 +311,7 @@ class Session:
             stable, change = self._change(estimate, quantities)
             if change is not None and change.severity == Severity.NOTE:
                 estimate = with_change(estimate, change)
-            difference = self._difference(estimate) if check else None
+            difference = self._difference(estimate) if check and not deadline.passed(_COMPARISON) else None
             found.append(
                 Calibration(
                     method=self.method,
@@ -303,6 +321,7 @@ class Session:
                         [
                             *self._findings(problem, estimate, quantities, change),
                             *_remarks(problem, estimate, difference),
+                            *_stopped(),
                         ]
                     ),
                     recording=self.origin.name,
@@ -335,10 +354,11 @@ class Session:
     ) -> tuple[Finding, ...]:
         """The findings on an estimate; hypotheses are tested where it is suspect."""
         findings = diagnose(estimate, quantities, problem.advice, change)
-        if not is_suspect(estimate, findings):
+        if not is_suspect(estimate, findings) or deadline.passed(_HYPOTHESES):
             return findings
         with progress.doing("testing hypotheses"):
             hypotheses = find_hypotheses(self.method.graph, self.faults, self.data, self.config, estimate)
+        deadline.passed(_HYPOTHESES)
         return diagnose(estimate, quantities, problem.advice, change, hypotheses)
 
     def _change(self, estimate: Estimate, quantities: Sequence[Quantity]) -> tuple[Stability | None, Finding | None]:
@@ -349,7 +369,7 @@ class Session:
         if stable is None or not stable.changed:
             return stable, None
         parts: Mapping[str, SplitHalf] = {}
-        if self.faults.cut:
+        if self.faults.cut and not deadline.passed(_SEGMENTS):
             with progress.doing("solving both sides of a change"):
                 parts = solve_segments(self.method.graph, self.faults, self.data, self.config, stable.time_s)
         return stable, change_finding(stable, parts, quantities)
@@ -388,6 +408,8 @@ class Session:
     def _changed(self) -> Iterator[tuple[str, Problem]]:
         """Each input that the graph takes for exact, and the graph with that input off by its step."""
         for exact in self.method.hypotheses().exact:
+            if deadline.passed(_SENSITIVITY):
+                return
             changed = exact.changed(self.data, self.config, exact.step)
             if changed is None:
                 continue
@@ -546,4 +568,12 @@ def _shown(problem: Problem, duration: float, chunk: int) -> Iterator[Step]:
     """The problem's steps; those fed one by one are shown as they are taken, by time in the recording."""
     if chunk > 1:
         return problem.steps(chunk)
-    return progress.track(problem.steps(chunk), "step by step", duration, lambda step: step.time)
+    name = "the run at {:.1f} s of {:.1f} s".format
+    steps = deadline.until_passed(problem.steps(chunk), lambda step: name(step.time, duration), _LEAST_STEPS)
+    return progress.track(steps, "step by step", duration, lambda step: step.time)
+
+
+def _stopped() -> list[Finding]:
+    """A note where something ended for want of time."""
+    text = deadline.stopped()
+    return [Finding("remark", Severity.NOTE, {"text": text})] if text else []
