@@ -11,6 +11,7 @@ import json
 import os
 import zipfile
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ import gtsam
 import numpy as np
 
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.noise import Level, Noise
 from alidade.pipelines.estimation.problem import Problem
 from alidade.pipelines.solvers.course import Way
 from alidade.pipelines.solvers.incremental import Run
@@ -26,7 +28,7 @@ from alidade.pipelines.solvers.rows import Rows
 from alidade.pipelines.solvers.state import State
 from alidade.pipelines.solvers.window import Keyframes
 
-_SCHEMA = "alidade.checkpoint/4"
+_SCHEMA = "alidade.checkpoint/5"
 _INNOVATIONS = "innovations/"
 
 
@@ -53,7 +55,8 @@ def save_checkpoint(path: Path, run: Run, identity: Mapping[str, str]) -> None:
         "current_keys": list(run.current_keys.items()),
         "keyframes": run.keyframes,
         "walked": sorted(run.walked),
-        "levels": {level.noise.name: level.scale for level in run.levels},
+        "levels": [asdict(level) for level in run.levels],
+        "trouble": run.trouble,
         "unusable": run.innovations.unusable,
         "rejected_in_a_row": run.innovations.rejected_in_a_row,
         "values": state.values.serialize(),
@@ -104,7 +107,8 @@ def load_checkpoint(path: Path, problem: Problem, identity: Mapping[str, str]) -
         stamps = {int(key): float(stamp) for key, stamp in head["stamps"]}
         # What is saved as a whole number is keyframes.
         window = Keyframes(head["window"]) if isinstance(head["window"], int) else float(head["window"])
-        run = Run.resumed(problem, window, State(head["time"], values, linear, stamps), head["levels"])
+        levels = tuple(_level_of(**level) for level in head["levels"])
+        run = Run.resumed(problem, window, State(head["time"], values, linear, stamps), levels, head["trouble"])
         run.current_keys = {int(key): int(held) for key, held in head["current_keys"]}
         run.keyframes, run.walked = head["keyframes"], set(head["walked"])
         run.history, run.attitudes = Rows(arrays.pop("history")), Rows(arrays.pop("attitudes"))
@@ -116,3 +120,8 @@ def load_checkpoint(path: Path, problem: Problem, identity: Mapping[str, str]) -
     except (zipfile.BadZipFile, KeyError, ValueError, TypeError, EOFError, RuntimeError) as error:
         raise InputError(f"{path}: no checkpoint, or a damaged one ({error}); delete it") from error
     return run
+
+
+def _level_of(noise: Mapping[str, Any], **level: Any) -> Level:
+    """A noise level from its fields; JSON keeps tuples as lists."""
+    return Level(Noise(**{name: tuple(v) if isinstance(v, list) else v for name, v in noise.items()}), **level)

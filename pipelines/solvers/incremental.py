@@ -19,6 +19,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import (
     Array,
     Attitudes,
@@ -148,6 +149,7 @@ class Run:
         attitudes: rows of time and quaternion.
         way: what was known jointly at some moments, of a run that is not young.
         moments: how often another one has come to the course; of a young run, how often it was solved in batch.
+        trouble: why the last batch solution did not converge; empty: it did.
         walked: parameter keys whose values other variables held before.
     """
 
@@ -173,7 +175,7 @@ class Run:
         self._young = True
         self._solved: _Solved | None = None  # the last batch solution while young
         self._looked = 0.0  # from so many s on it is to be seen again whether the past may be folded
-        self._trouble = ""
+        self.trouble = ""
         # Of a young run: information that is its states' noise, and covariance that linear systems do not know of.
         self._noise: Array | None = None
         self._bent: Array | None = None
@@ -182,12 +184,14 @@ class Run:
         self._course: Callable[[], Course | None] = _no_course  # of the last batch solution while young
 
     @classmethod
-    def resumed(cls, problem: Problem, window: Keyframes | float, base: State, scales: Mapping[str, float]) -> Run:
-        """A run that goes on from what another one knew, with its noise levels by name."""
+    def resumed(
+        cls, problem: Problem, window: Keyframes | float, base: State, levels: tuple[Level, ...], trouble: str
+    ) -> Run:
+        """A run that continues from the marginal of another one, with its noise levels and its trouble."""
         run = cls(problem, window)
         run._young = False
         run._before = 1.0 + max(base.stamps.values(), default=-1.0)
-        run.levels = tuple(replace(level, scale=scales[level.noise.name]) for level in run.levels)
+        run.levels, run.trouble = levels, trouble
         run._continue_from(base)
         return run
 
@@ -306,8 +310,8 @@ class Run:
             covariance=grown,
             inflation=inflation,
             colours=colours,
-            converged=not self._trouble,
-            message=self._trouble or "all steps taken",
+            converged=not self.trouble,
+            message=self.trouble or "all steps taken",
             residuals=innovations,
             chi_square=self.chi_square(),
             history=History(history[:, 0], history[:, 1 : 1 + n], history[:, 1 + n :]).inflated(inflation),
@@ -386,7 +390,7 @@ class Run:
         """Solve everything since the base in batch and start the smoother from it, without the outliers."""
         from_start, whole, doubted = self.base is None, self._whole(), self._doubted
         solution, about, noise = self._solution(whole)
-        self._trouble = "" if solution.converged else f"the first {self.time:.1f} s: {solution.message}"
+        self.trouble = "" if solution.converged else f"the first {self.time:.1f} s: {solution.message}"
         values, system = solution.values, solution.system
         if from_start:
             with system.at(values):

@@ -14,6 +14,7 @@ import pytest
 
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import Attitudes, Estimate, Problem
 from alidade.pipelines.methods.los.graph import problem
 from alidade.pipelines.methods.los.recording import read_los, write_los
@@ -62,6 +63,7 @@ class Saved:
     session: Path
     checkpoint: Path
     made: Problem
+    levels: tuple[Level, ...]
     end: Estimate
 
 
@@ -83,8 +85,9 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Saved:
             times += 1
             if times == 1:
                 save_checkpoint(checkpoint, run, IDENTITY)
+                levels = run.levels
     assert times == 2, "the past has to be marginalised out again after the one that is saved"
-    return Saved(session, checkpoint, made, run.finish(0.0))
+    return Saved(session, checkpoint, made, levels, run.finish(0.0))
 
 
 def test_a_new_process_ends_at_the_same_estimates(saved: Saved) -> None:
@@ -98,6 +101,22 @@ def test_a_new_process_ends_at_the_same_estimates(saved: Saved) -> None:
     np.testing.assert_allclose(sigmas, end.sigmas, rtol=1e-9)
     assert chi_square == pytest.approx(end.chi_square.value, rel=1e-9)
     assert (moments, rejected) == (len(end.history.time), end.rejected)
+
+
+def test_a_resumed_run_keeps_noise_levels_and_the_reason_for_not_converging(saved: Saved, tmp_path: Path) -> None:
+    """Noise section, verdict and exit code follow from these."""
+    run = load_checkpoint(saved.checkpoint, saved.made, IDENTITY)
+    assert run.levels == saved.levels
+    assert {level.noise.name for level in run.levels if level.found is not None} == {"los_error", "gyro_density"}
+    run.trouble = "the first 40.0 s: no step lowers the error"
+    save_checkpoint(tmp_path / "c", run, IDENTITY)
+    resumed = load_checkpoint(tmp_path / "c", saved.made, IDENTITY)
+    for step in saved.made.steps(1):
+        if step.time > resumed.time:
+            resumed.add_step(step)
+    end = resumed.finish(0.0)
+    assert (end.converged, end.message) == (False, run.trouble)
+    assert end.levels == saved.end.levels
 
 
 def test_marginalizing_the_past_loses_nothing(saved: Saved) -> None:
