@@ -124,4 +124,5 @@ def load_checkpoint(path: Path, problem: Problem, identity: Mapping[str, str]) -
 
 def _level_of(noise: Mapping[str, Any], **level: Any) -> Level:
     """A noise level from its fields; JSON keeps tuples as lists."""
-    return Level(Noise(**{name: tuple(v) if isinstance(v, list) else v for name, v in noise.items()}), **level)
+    stated: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in noise.items()}
+    return Level(Noise(**stated), **level)
