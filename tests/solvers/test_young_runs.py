@@ -19,7 +19,7 @@ from alidade.pipelines.simulation.motion import EulerMotion
 from alidade.pipelines.solvers import incremental
 from alidade.pipelines.solvers.assembly import CHUNK, Assembly
 from alidade.pipelines.solvers.batch import solve_batch
-from alidade.pipelines.solvers.incremental import Run, solve_incremental
+from alidade.pipelines.solvers.incremental import IncrementalSolver, solve_incremental
 from alidade.pipelines.solvers.noise_levels import weigh
 from alidade.pipelines.solvers.weighing import optimize
 from benchmarks.batch import IDEAL
@@ -143,7 +143,7 @@ def test_no_sigma_is_far_beyond_its_prior(seed: int) -> None:
     settings, _ = CASES["tumble"]["slow"](seed)
     problem, _ = made("tumble", settings, seed)
     widest = 0.0
-    following = Run(problem, 1.0)
+    following = IncrementalSolver(problem, 1.0)
     for step in islice(problem.steps(1), 11):
         following.add_step(step)
         if following.started:
@@ -178,7 +178,7 @@ def test_a_run_that_rejects_all_is_solved_anew_at_once(monkeypatch: pytest.Monke
     wrong = (data.image_t > 2.0) & (data.image_t < 3.2)
     moved = data.error + 0.01 * wrong[:, None]
     problem = los.problem(replace(data, error=moved), load_config(los_config(scenario).encode()))
-    following, solved = Run(problem, 1.0), []
+    following, solved = IncrementalSolver(problem, 1.0), []
     for step in problem.steps(1):
         before = following.moments
         following.add_step(step)
