@@ -4,19 +4,21 @@
 outliers cannot be told. So everything so far is solved in batch at times 1, 1.25, 1.25^2, ... s, and at once when the
 gate rejects more than chance makes, or when a direction of the parameters that was weak is determined. Between these
 solutions the smoother continues from the last one. The phase ends when no direction of the calibrated numbers is weak
-and a new batch solution confirms what the smoother made of the last quarter of the recording, at the latest after
-600 s.
+any more, second-order terms are a small share of every variance, and a new batch solution confirms what the smoother
+made of the last quarter of the recording; at the latest after 600 s.
 
 **Afterwards** states are marginalised out of a fixed-lag window: an update costs the same in hour ten as in minute one.
 From time to time all but the active variables are marginalised out, and a new smoother continues from that Gaussian
 alone; a run can be saved there (alidade.pipelines.solvers.checkpoint). Without a window it is iSAM2 over the whole
 history.
 
-Weak directions (alidade.pipelines.solvers.weak_directions) are reported at their priors, as in batch. While they may
-still move far, the strong ones follow them along curves: of a head that turns about one axis the mount about that axis
-is known to .35 rad, the rest of the mount, along the tangent, to .001 rad. What the curves leave away from the tangent
-(alidade.pipelines.solvers.curvature) is added to the covariance of the strong directions. Without it the joint NEES of
-three such recordings of 24 numbers is 155 after 30 s, with it 23.
+A direction of the calibrated numbers is weak while its posterior sigma is above MAX_SIGMA of the usual prior's. It is
+reported at its prior, uncorrelated with the others: for an error of covariance C, E[NEES] = tr(P^-1 C) is the number of
+directions for every P of diagonal blocks of C. While it may still move far, strong directions follow it along curves:
+of a head that turns about one axis the mount about that axis is known to .35 rad, the rest of the mount, along the
+tangent, to .001 rad. The covariance of what the curves leave off the tangent (alidade.pipelines.solvers.curvature) is
+added to that of the strong directions. Without it the joint NEES of 24 numbers of such heads (three, after 30 s) is
+155, with it 23.
 """
 
 from __future__ import annotations
@@ -52,21 +54,26 @@ from alidade.pipelines.solvers.marginals import (
     coordinate_inverse,
     explain,
     information_of,
+    joint_covariance,
     prior_units,
     reported,
 )
 from alidade.pipelines.solvers.noise_levels import weigh
 from alidade.pipelines.solvers.smoother import FixedLagSmoother, Isam2, Smoother, inliers, linearized, without_loss
 from alidade.pipelines.solvers.system import Linear
-from alidade.pipelines.solvers.weak_directions import MAX_SIGMA, WeakDirections, constrained_step
 from alidade.pipelines.solvers.weighing import optimize, with_levels
 from alidade.pipelines.solvers.window import Keyframes, Window
 
 DEFAULT_WINDOW = 1.0
 # Steps freed with each new one, of those marginalised out: a thousand at once take longer than an update.
 _FREED = 10
-# Sigma of a number without prior, and the largest of any direction, in units of its prior scale.
+# Posterior sigma of a calibrated direction, in units of its usual prior's, above which it is weak: linear Gaussians are
+# wrong about it, and turn the noise of states into information about it.
+MAX_SIGMA = 0.3
+# Largest sigma of a direction, in units of its usual prior's.
 _WIDEST = 1e4
+# Elements of a unit vector below this are rounding.
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -164,53 +171,64 @@ class MomentRecorder:
 
 @dataclass(frozen=True)
 class _Posterior:
-    """The parameters' linear Gaussian of the smoother.
+    """The smoother's Gaussian of the free reported numbers, in units of their usual priors' sigmas.
 
     Attributes:
-        values: (n,) of the reported numbers.
-        whitened: (m,) of the free ones, less the prior mean, in prior sigmas.
-        R: (m, m) their square-root information.
-        precision: (m, m) of their priors.
+        values: (n,) all reported numbers, SI.
+        mean: (m,) of the free ones, less their prior means.
+        covariance: (m, m).
+        prior: (m,) their prior variances; infinite: no prior.
+        calibrated: (m,) whether they are calibrated, and no nuisance parameters.
         free: (m,) their places among the reported numbers.
-        scale, extra: (m,) prior sigmas, and errors that the graph does not model.
+        scale: (m,) the usual priors' sigmas.
+        extra: (m,) sigmas of errors that the graph does not model, SI.
     """
 
     values: Array
-    whitened: Array
-    R: Array
-    precision: Array
+    mean: Array
+    covariance: Array
+    prior: Array
+    calibrated: NDArray[np.bool_]
     free: NDArray[np.intp]
     scale: Array
     extra: Array
 
-    def directions(self, none_is_strong: bool) -> WeakDirections:
-        """Weak and strong directions; all are weak where outliers cannot be told from measurements."""
-        return WeakDirections.of(self.R, self.precision, len(self.R) if none_is_strong else 0)
+    def weak(self) -> Array:
+        """(m, w) orthonormal weak directions: of calibrated numbers, with sigmas above MAX_SIGMA.
 
-    @property
-    def covariance(self) -> Array:
-        """(n, n) of the reported numbers as the linear Gaussian has it, fixed numbers zero."""
-        covariance = np.zeros((len(self.values), len(self.values)))
-        own = np.linalg.inv(self.R.T @ self.R) * np.outer(self.scale, self.scale)
-        covariance[np.ix_(self.free, self.free)] = own
-        return covariance
+        Nuisance parameters are small whatever they are: nothing is nonlinear across their priors.
+        """
+        own = np.flatnonzero(self.calibrated)
+        variance, vectors = np.linalg.eigh(self.covariance[np.ix_(own, own)])
+        weak = np.zeros((len(self.mean), int((variance > MAX_SIGMA**2).sum())))
+        weak[own] = vectors[:, len(own) - weak.shape[1] :]
+        return weak
 
-    def constrained(self, directions: WeakDirections, second: Array | None) -> tuple[Array, Array]:
-        """Values (n,) and covariance (n, n) of the reported numbers, weak directions at their priors.
+    def at_prior(self, directions: Array, second: Array | None) -> tuple[Array, Array]:
+        """Values (n,) and covariance (n, n) of the reported numbers, with some directions at their priors.
+
+        These have the prior's mean and covariance, and no correlation with the others. The others are at the minimum
+        given these. Directions that numbers without a prior are part of stay as they are.
 
         Args:
-            directions: weak and strong.
-            second: (n, n) covariance of second order, added to that of strong directions; None: there is none.
+            directions: (m, w), orthonormal.
+            second: (n, n) covariance of second order, added to that of the others; None: there is none.
         """
-        values, covariance = self.values.copy(), np.zeros((len(self.values), len(self.values)))
-        move = constrained_step(directions, self.R, np.zeros(len(self.R)), self.whitened)
-        values[self.free] += self.scale * move
-        own = directions.covariance()
+        E = directions[:, ~(np.abs(directions[np.isinf(self.prior)]) > _ROUNDING).any(axis=0)]
+        others = np.eye(len(self.mean)) - E @ E.T
+        own = others @ self.covariance @ others + (E @ E.T) @ np.diag(_finite(self.prior)) @ (E @ E.T)
+        mean = self.mean - self.covariance @ E @ np.linalg.solve(E.T @ self.covariance @ E, E.T @ self.mean)
         if second is not None:
-            strong = directions.strong @ directions.strong.T / self.scale
-            own = own + strong @ second[np.ix_(self.free, self.free)] @ strong.T
+            unit = others / self.scale
+            own = own + unit @ second[np.ix_(self.free, self.free)] @ unit.T
+        values, covariance = self.values.copy(), np.zeros((len(self.values), len(self.values)))
+        values[self.free] += self.scale * (mean - self.mean)
         covariance[np.ix_(self.free, self.free)] = own * np.outer(self.scale, self.scale) + np.diag(self.extra**2)
         return values, covariance
+
+
+def _finite(variance: Array) -> Array:
+    return np.where(np.isinf(variance), 0.0, variance)
 
 
 class IncrementalSolver:
@@ -424,7 +442,8 @@ class IncrementalSolver:
         """Values and covariance, weak directions at their priors; `decided`: outliers are taken to be told."""
         posterior = self._posterior()
         undecided = not decided and self.initialising and self.gate.too_few_to_decide()
-        return posterior.constrained(posterior.directions(undecided), self._second)
+        directions = np.eye(len(posterior.mean)) if undecided else posterior.weak()
+        return posterior.at_prior(directions, self._second)
 
     def _posterior(self) -> _Posterior:
         """The smoother's Gaussian of the reported numbers. Raises IndeterminateError when it is singular."""
@@ -438,19 +457,18 @@ class IncrementalSolver:
             raise IndeterminateError(f"the parameters' covariance at {self.time:.3f} s is not finite")
         quantities = self.problem.quantities
         numbers = reported(self.problem, values, self.current_keys)
-        free, usual, unit = prior_units(self.problem.parameters, values, self.keys)
-        scale = np.array([quantities[i].scale for i in free])
-        unit = unit * (scale / usual)
+        free, scale, unit = prior_units(self.problem.parameters, values, self.keys)
         known, axes = np.linalg.eigh(unit.T @ information @ unit)
-        mean = np.array([quantities[i].prior_mean for i in free])
+        own = [quantities[i] for i in free]
         return _Posterior(
             values=numbers,
-            whitened=(numbers[free] - mean) / scale,
-            R=np.sqrt(np.maximum(known, _WIDEST**-2))[:, None] * axes.T,
-            precision=np.diag([_WIDEST**-2 if quantities[i].prior_sigma is None else 1.0 for i in free]),
+            mean=(numbers[free] - [q.prior_mean for q in own]) / scale,
+            covariance=(axes / np.maximum(known, _WIDEST**-2)) @ axes.T,
+            prior=np.array([np.inf if q.prior_sigma is None else q.prior_sigma**2 for q in own]) / scale**2,
+            calibrated=np.array([not q.assumed for q in own], dtype=bool),
             free=free,
             scale=scale,
-            extra=np.array([quantities[i].extra_sigma for i in free]),
+            extra=np.array([q.extra_sigma for q in own]),
         )
 
     # -- step by step
@@ -524,7 +542,7 @@ class IncrementalSolver:
 
     def _count_weak(self) -> bool:
         """Count weak directions; whether there are fewer than ever before."""
-        before, now = self._fewest_weak, self._posterior().directions(False).weak.shape[1]
+        before, now = self._fewest_weak, self._posterior().weak().shape[1]
         self._fewest_weak = min(before, now)
         return now < before
 
@@ -599,7 +617,8 @@ class IncrementalSolver:
         self._start_from(about, stamps)
         if not self.initialising:
             return
-        second = second_order(self.problem, about, self._posterior().covariance, self.current_keys)
+        covariance = joint_covariance(self.problem, about, self.current_keys)
+        second = second_order(self.problem, about, covariance, self.current_keys)
         self._second = None if second is None else second.covariance
         is_curved = second is not None and second.share() > self.config.max_curvature
         if since >= self.config.max_initialisation or (not is_curved and self._is_settled(before)):
@@ -611,11 +630,8 @@ class IncrementalSolver:
         if self.trouble or before is None or len(self.steps_since) < self.config.min_steps:
             return False
         now = self._posterior()
-        covariance = np.linalg.inv(now.R.T @ now.R)
-        calibrated = np.flatnonzero([not self.problem.quantities[i].assumed for i in now.free])
-        widest = np.linalg.eigvalsh(covariance[np.ix_(calibrated, calibrated)])[-1]
-        change = np.abs(now.whitened - before.whitened) / np.sqrt(np.diag(covariance))
-        return bool(widest < MAX_SIGMA**2 and change.max() < self.config.max_change)
+        change = np.abs(now.mean - before.mean) / np.sqrt(np.diag(now.covariance))
+        return now.weak().shape[1] == 0 and bool(change.max() < self.config.max_change)
 
     def _start_from(self, about: Linear, stamps: Mapping[int, float]) -> None:
         """Start the smoother from a solution: from its active variables alone, or without a window from all of it."""

@@ -111,10 +111,15 @@ class FixedLagSmoother(Smoother):
         del self._past[first:]
         self._eliminate(graph)
         self._forget()
+        self._moves = self._solution()
+
+    def _solution(self) -> gtsam.VectorValues:
+        """Moves of all variables from their first values."""
+        assert self._present is not None
         bayes_net = gtsam.GaussianBayesNet()
         for conditional in (*(conditional for _, conditional in self._past), self._present):
             bayes_net.push_back(conditional)
-        self._moves = bayes_net.optimize()
+        return bayes_net.optimize()
 
     def _eliminate(self, graph: gtsam.GaussianFactorGraph) -> None:
         """Eliminate a system, variables that are no longer active first, in time order."""
