@@ -171,7 +171,7 @@ class _Told:
             initial.update(p.key, _value(begun, p.key))
         factors: list[Factor] = []
         for f in step.factors:
-            if f.family == "prior" and all(begun.exists(key) for key in f.factor.keys()):
+            if f.family == "prior" and all(begun.exists(key) for key in f.keys):
                 factors += self._rest(f, begun)
             else:
                 factors.append(f)

@@ -94,7 +94,7 @@ def _copy(values: gtsam.Values, key: int, out: gtsam.Values) -> None:
 def require_known_variables(factors: Iterable[Factor], values: gtsam.Values, time: float) -> None:
     """Raise InputError if a factor needs a variable that is not among the values."""
     for f in factors:
-        for key in f.factor.keys():
+        for key in f.keys:
             if not values.exists(key):
                 raise InputError(
                     f"{f.family} at {time:.3f} s needs the state {gtsam.Symbol(key).string()}, which the smoother has "

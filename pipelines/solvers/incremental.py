@@ -18,7 +18,8 @@ directions for every P of diagonal blocks of C. While it may still move far, str
 of a head that turns about one axis the mount about that axis is known to .35 rad, the rest of the mount, along the
 tangent, to .001 rad. The covariance of what the curves leave off the tangent (alidade.pipelines.solvers.curvature) is
 added to that of the strong directions. Without it the joint NEES of 24 numbers of such heads (three, after 30 s) is
-155, with it 23.
+155, with it 23. Numbers for which second order does not go far enough, as with two or three attitudes of a triad, stay
+at their priors, too, until it does.
 """
 
 from __future__ import annotations
@@ -171,12 +172,12 @@ class MomentRecorder:
 
 @dataclass(frozen=True)
 class _Posterior:
-    """The smoother's Gaussian of the free reported numbers, in units of their usual priors' sigmas.
+    """Mean and covariance of the free reported numbers, in units of their usual priors' sigmas.
 
     Attributes:
         values: (n,) all reported numbers, SI.
         mean: (m,) of the free ones, less their prior means.
-        covariance: (m, m).
+        covariance: (m, m), with terms of second order.
         prior: (m,) their prior variances; infinite: no prior.
         calibrated: (m,) whether they are calibrated, and no nuisance parameters.
         free: (m,) their places among the reported numbers.
@@ -193,36 +194,31 @@ class _Posterior:
     scale: Array
     extra: Array
 
-    def weak(self) -> Array:
-        """(m, w) orthonormal weak directions: of calibrated numbers, with sigmas above MAX_SIGMA.
+    def weak(self, unknown: NDArray[np.bool_] | bool = False) -> Array:
+        """(m, w) orthonormal weak directions: of calibrated numbers but some unknown, with sigmas above MAX_SIGMA.
 
         Nuisance parameters are small whatever they are: nothing is nonlinear across their priors.
         """
-        own = np.flatnonzero(self.calibrated)
+        own = np.flatnonzero(self.calibrated & ~np.asarray(unknown))
         variance, vectors = np.linalg.eigh(self.covariance[np.ix_(own, own)])
         weak = np.zeros((len(self.mean), int((variance > MAX_SIGMA**2).sum())))
         weak[own] = vectors[:, len(own) - weak.shape[1] :]
         return weak
 
-    def at_prior(self, directions: Array, second: Array | None) -> tuple[Array, Array]:
+    def at_prior(self, directions: Array) -> tuple[Array, Array]:
         """Values (n,) and covariance (n, n) of the reported numbers, with some directions at their priors.
 
-        These have the prior's mean and covariance, and no correlation with the others. The others are at the minimum
-        given these. Directions that numbers without a prior are part of stay as they are.
+        These have the prior's mean and covariance, and no correlation with the others, which keep their marginal
+        posterior. Directions that numbers without a prior are part of stay as they are.
 
         Args:
             directions: (m, w), orthonormal.
-            second: (n, n) covariance of second order, added to that of the others; None: there is none.
         """
         E = directions[:, ~(np.abs(directions[np.isinf(self.prior)]) > _ROUNDING).any(axis=0)]
         others = np.eye(len(self.mean)) - E @ E.T
         own = others @ self.covariance @ others + (E @ E.T) @ np.diag(_finite(self.prior)) @ (E @ E.T)
-        mean = self.mean - self.covariance @ E @ np.linalg.solve(E.T @ self.covariance @ E, E.T @ self.mean)
-        if second is not None:
-            unit = others / self.scale
-            own = own + unit @ second[np.ix_(self.free, self.free)] @ unit.T
         values, covariance = self.values.copy(), np.zeros((len(self.values), len(self.values)))
-        values[self.free] += self.scale * (mean - self.mean)
+        values[self.free] -= self.scale * (E @ (E.T @ self.mean))
         covariance[np.ix_(self.free, self.free)] = own * np.outer(self.scale, self.scale) + np.diag(self.extra**2)
         return values, covariance
 
@@ -276,6 +272,7 @@ class IncrementalSolver:
         self._solved = 0, 0.0  # number of steps in the last batch solution, and their time, s
         self._fewest_weak = len(problem.quantities)  # number of weak directions seen until now, at least
         self._second: Array | None = None  # (n, n) covariance of second order in the last batch solution
+        self._beyond = np.ones(len(problem.quantities), dtype=bool)  # numbers that need more than second order
         self._course: Callable[[], Course | None] = lambda: None  # of the last batch solution
 
     @classmethod
@@ -439,14 +436,19 @@ class IncrementalSolver:
         return self._smoother.estimate()
 
     def _constrained(self, decided: bool = False) -> tuple[Array, Array]:
-        """Values and covariance, weak directions at their priors; `decided`: outliers are taken to be told."""
+        """Values and covariance, weak directions at their priors.
+
+        Unless `decided`, so are numbers for which second order does not go far enough yet, and all numbers while
+        outliers cannot be told from measurements.
+        """
         posterior = self._posterior()
-        undecided = not decided and self.initialising and self.gate.too_few_to_decide()
-        directions = np.eye(len(posterior.mean)) if undecided else posterior.weak()
-        return posterior.at_prior(directions, self._second)
+        unknown = np.zeros(len(posterior.mean), dtype=bool)
+        if self.initialising and not decided:
+            unknown = self._beyond[posterior.free] | self.gate.too_few_to_decide()
+        return posterior.at_prior(np.hstack([np.eye(len(unknown))[:, unknown], posterior.weak(unknown)]))
 
     def _posterior(self) -> _Posterior:
-        """The smoother's Gaussian of the reported numbers. Raises IndeterminateError when it is singular."""
+        """The smoother's posterior of the reported numbers. Raises IndeterminateError when it is singular."""
         values = self._current()
         assert self._smoother is not None
         try:
@@ -459,11 +461,14 @@ class IncrementalSolver:
         numbers = reported(self.problem, values, self.current_keys)
         free, scale, unit = prior_units(self.problem.parameters, values, self.keys)
         known, axes = np.linalg.eigh(unit.T @ information @ unit)
+        covariance = (axes / np.maximum(known, _WIDEST**-2)) @ axes.T
+        if self._second is not None:
+            covariance += self._second[np.ix_(free, free)] / np.outer(scale, scale)
         own = [quantities[i] for i in free]
         return _Posterior(
             values=numbers,
             mean=(numbers[free] - [q.prior_mean for q in own]) / scale,
-            covariance=(axes / np.maximum(known, _WIDEST**-2)) @ axes.T,
+            covariance=covariance,
             prior=np.array([np.inf if q.prior_sigma is None else q.prior_sigma**2 for q in own]) / scale**2,
             calibrated=np.array([not q.assumed for q in own], dtype=bool),
             free=free,
@@ -620,6 +625,11 @@ class IncrementalSolver:
         covariance = joint_covariance(self.problem, about, self.current_keys)
         second = second_order(self.problem, about, covariance, self.current_keys)
         self._second = None if second is None else second.covariance
+        # Second order that has once gone far enough does so from then on.
+        if second is None:
+            self._beyond[:] = False
+        elif self._beyond.any():
+            self._beyond &= second.beyond()
         is_curved = second is not None and second.share() > self.config.max_curvature
         if since >= self.config.max_initialisation or (not is_curved and self._is_settled(before)):
             self.initialising = False

@@ -106,7 +106,7 @@ class FixedLagSmoother(Smoother):
         self._vectors.update(key for key in values.keys() if _is_vector(values, key))
         self._stamps.update(stamps)
         graph = linear_graph_of(factors, self._first)
-        first = self._oldest({key for f in factors for key in f.factor.keys()}.union(stamps))
+        first = self._oldest({key for f in factors for key in f.keys}.union(stamps))
         graph.push_back(self._conditionals(first))
         del self._past[first:]
         self._eliminate(graph)
