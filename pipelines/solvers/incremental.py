@@ -507,10 +507,12 @@ class IncrementalSolver:
             processes = [linearized(f, about) for f in processes]
         require_finite(processes, about, step.time)
         prediction = Prediction(smoother, processes, about, new)
+        # Of a single family all information that was measured is its own.
+        parameters = self.keys if len(self.gate.families) > 1 else []
         measurements = []
         for f in factors:
             if f.measurement is not None:
-                used = self.gate.select(f, prediction, self.problem.loss is not None, self.keys)
+                used = self.gate.select(f, prediction, self.problem.loss is not None, parameters)
                 if used is not None:
                     measurements.append(without_loss(used))
         if self.window is not None:
