@@ -22,7 +22,7 @@ numpy.linalg.LinAlgError.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +73,35 @@ class ChainSystem:
     def border(self) -> int:
         """Columns beside the states', right side included: c + s + 1."""
         return int(self.measured.shape[2]) - self.d
+
+    @property
+    def squares(self) -> float:
+        """Sum of squares of the right side: what no step at all leaves."""
+        parts = [self.measured, self.between, self.beside, self.shared, *([] if self.walk is None else [self.walk])]
+        return sum(float(np.square(rows[..., -1]).sum()) for rows in parts)
+
+    def eliminate(self, damping: float = 0.0) -> ChainFactorization:
+        """R of the system, damped as `damped` has it. Raises IndeterminateStateError."""
+        return ChainFactorization.of(self.damped(damping) if damping > 0.0 else self)
+
+    def damped(self, damping: float) -> ChainSystem:
+        """The system with so many times the information of every unknown by itself added, at zero (Marquardt)."""
+        d, c, root = self.d, self.c, np.sqrt(damping)
+        states = np.square(self.measured[..., :d]).sum(axis=1) + np.square(self.between[..., :d]).sum(axis=1)
+        states[:-1] += np.square(self.between[1:, :, d : 2 * d]).sum(axis=1)
+        shared = np.square(self.shared[:, :-1]).sum(axis=0)
+        for rows in (self.measured, self.between, self.beside):
+            shared = shared + np.square(rows[..., rows.shape[2] - len(shared) - 1 : -1]).sum(axis=(0, 1))
+        measured = np.concatenate([self.measured, np.zeros((len(states), d, self.measured.shape[2]))], axis=1)
+        measured[:, np.arange(-d, 0), np.arange(d)] = root * np.sqrt(states)
+        prior = np.vstack([self.shared, np.pad(np.diag(root * np.sqrt(shared)), ((0, 0), (0, 1)))])
+        walk = self.walk
+        if walk is not None:
+            nodes = np.square(walk[..., :c]).sum(axis=1)
+            nodes[:-1] += np.square(walk[1:, :, c : 2 * c]).sum(axis=1)
+            walk = np.concatenate([walk, np.zeros((len(nodes), c, 2 * c + 1))], axis=1)
+            walk[:, np.arange(-c, 0), np.arange(c)] = root * np.sqrt(nodes)
+        return replace(self, measured=measured, shared=prior, walk=walk)
 
     def segments(self) -> Index:
         """(B,) last states of segments, none of which spans two pieces."""
