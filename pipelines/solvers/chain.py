@@ -36,6 +36,9 @@ SEQUENTIAL_STATES = 96
 RANK_TOLERANCE = 1e-13
 
 
+UNDETERMINED = "a state is not determined: no measurement and no process constrains it"
+
+
 class IndeterminateStateError(Exception):
     """A state is determined neither by measurements nor by its neighbours."""
 
@@ -332,5 +335,5 @@ def _determined(R: Array) -> Array:
     triangle = R[..., : R.shape[1]]
     pivots = np.abs(np.diagonal(triangle, axis1=1, axis2=2))
     if not (pivots > RANK_TOLERANCE * np.linalg.norm(triangle, axis=1)).all():
-        raise IndeterminateStateError("a state is not determined: no measurement and no process constrains it")
+        raise IndeterminateStateError(UNDETERMINED)
     return R

@@ -125,6 +125,10 @@ class Layout:
             raise NotAChainError("a factor is about a variable without a first value")
         return found
 
+    def size(self, at: int) -> int:
+        """Numbers of the tangent of the variable at a position."""
+        return dimension(self.blocks[self.block[at]])
+
     def roles(self, columns: Sequence[int | list[int]]) -> tuple[tuple[bool, bool, bool], ...]:
         """Whether each block of a factor is one variable for all its measurements, whether a state, whether a node."""
         at = self.at([column if isinstance(column, int) else column[0] for column in columns])

@@ -388,7 +388,7 @@ class _Draft:
         c, n = layout.sizes[3], len(self.model.time)
         target, place, row = "shared", np.full(n, -1), np.zeros(n, dtype=np.intp)
         if not chain:
-            target, place = "", self.last
+            target, place = "shared" if self.last.max() < 0 and self.node.max() <= 0 else "", self.last
         elif self.last.max(initial=-1) >= 0:
             target, place = ("pair" if (self.count > 1).any() else "state"), self.last
         elif c and self._is_walk(layout):
@@ -412,7 +412,7 @@ class _Draft:
             target=target,
             place=place,
             row=row,
-            columns=[self._columns(i, layout, target, piece) for i in range(len(self.at))] if chain else [],
+            columns=[self._columns(i, layout, target, piece) for i in range(len(self.at))] if target else [],
             deviates=[layout.node[each] > 0 for each in self.at],
         )
 
