@@ -12,14 +12,25 @@ would be excluded at one percent.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.problem import Array, Estimate, History, Minimum, Problem, Residuals, Told
-from alidade.pipelines.solvers.engines import Compiled, EngineName
+from alidade.pipelines.estimation.problem import (
+    Array,
+    Attitudes,
+    EngineName,
+    Estimate,
+    History,
+    Minimum,
+    Problem,
+    Residuals,
+    Told,
+)
+from alidade.pipelines.solvers.chain import ChainFactorization, ChainSystem
+from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import (
     Influence,
     added_variance,
@@ -28,19 +39,14 @@ from alidade.pipelines.solvers.error_budget import (
     inflation,
     most_influential,
 )
-from alidade.pipelines.solvers.layout import Layout, Tangent, Values
-from alidade.pipelines.solvers.levenberg import Engine, Factorization, LevenbergConfig, Solution, minimize
+from alidade.pipelines.solvers.layout import Layout, Values
+from alidade.pipelines.solvers.levenberg import Engine, LevenbergConfig, Solution, minimize
+from alidade.pipelines.solvers.linearization import Group, Linearization
 from alidade.pipelines.solvers.noise_estimation import apply_levels, estimate_noise, group_weights
-from alidade.pipelines.solvers.posterior import (
-    Reported,
-    chi_square,
-    expected_squares,
-    leverages,
-    sqrt_information,
-)
+from alidade.pipelines.solvers.posterior import Reported, chi_square, expected_squares, leverages, sqrt_information
 from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed_bias
 from alidade.pipelines.solvers.robust import RobustConfig, solve_robust
-from alidade.pipelines.solvers.weak_directions import WeakDirections, constrained_step
+from alidade.pipelines.solvers.weak_directions import Posterior, constrained_solution
 
 
 @dataclass(frozen=True)
@@ -53,8 +59,6 @@ class BatchConfig:
         followed: chi-square above the least up to which values are followed to their minimum, which takes off far less.
         different: part of its prior scale by which a number of another solution differs.
         influential: number of the most influential measurements that are told.
-        constrained_steps: steps to the minimum with the weak directions at their priors, at most.
-        constrained_tolerance: of these, in posterior sigmas.
     """
 
     robust: RobustConfig = field(default_factory=RobustConfig)
@@ -62,8 +66,6 @@ class BatchConfig:
     followed: float = 3.0 * 6.635
     different: float = 0.1
     influential: int = 20
-    constrained_steps: int = 10
-    constrained_tolerance: float = 1e-3
 
     @classmethod
     def of(cls, max_iterations: int) -> BatchConfig:
@@ -77,21 +79,34 @@ class Solved:
 
     Attributes:
         compiled: the problem.
-        solution: with the noise levels in force, weak directions at their priors.
+        solution: with the noise levels in force.
         levels: of the noises.
-        factorization: of the system there.
-        reported: the numbers there.
-        directions: of them.
+        posterior: of the reported numbers, weak directions at their priors.
         second: the second best solution, if it is close.
     """
 
     compiled: Compiled
     solution: Solution
     levels: tuple[Level, ...]
-    factorization: Factorization
-    reported: Reported
-    directions: WeakDirections
+    posterior: Posterior
     second: Minimum | None = None
+
+    @property
+    def engine(self) -> Engine:
+        """With the loss and the weights in force."""
+        return self.solution.engine
+
+    @property
+    def values(self) -> Values:
+        """Of all variables, weak directions at their priors."""
+        return self.posterior.values
+
+
+def minimum(compiled: Compiled, levels: Sequence[Level]) -> Solution:
+    """The solution with noise levels that are known, rejected measurements left out."""
+    engine = apply_levels(compiled.engine, levels)
+    solution = solve_robust(engine, compiled.initial, compiled.problem.loss, RobustConfig())
+    return replace(solution, engine=without_rejected(solution.engine, solution.values))
 
 
 def solve(compiled: Compiled, config: BatchConfig | None = None, levels: tuple[Level, ...] | None = None) -> Solved:
@@ -110,9 +125,12 @@ def solve(compiled: Compiled, config: BatchConfig | None = None, levels: tuple[L
     engine: Engine = compiled.engine
     solution = solve_robust(apply_levels(engine, start), compiled.initial, problem.loss, config.robust)
     if levels is None:
-        solution, start = estimate_noise(engine, solution, start, problem.loss, config.robust, _expected)
+        solution, start = estimate_noise(engine, solution, start, problem.loss, config.robust, expected_squares)
     solution, second = _best(compiled, solution, config)
-    return _constrained(compiled, solution, start, second, config)
+    posterior = constrained_solution(
+        problem, without_rejected(solution.engine, solution.values), solution.values, compiled.current_keys
+    )
+    return Solved(compiled, solution, start, posterior, second)
 
 
 def solve_batch(
@@ -152,8 +170,16 @@ def solve_batch(
     return replace(estimate, seconds={"build": built - begin, "solve": found - built, "marginals": done - found})
 
 
-def _expected(engine: Engine, factorization: Factorization, values: Values) -> dict[tuple[str, int], float]:
-    return expected_squares(list(leverages(engine, factorization, values)))
+def without_rejected(engine: Engine, values: Values) -> Engine:
+    """The measurements that count at some values, in full, whatever they are elsewhere."""
+    return engine.with_groups([_counting(group, values) for group in engine.groups])
+
+
+def _counting(group: Group, values: Values) -> Group:
+    if group.loss is None:
+        return group
+    used = group.used(group.evaluate(values)[0]) > 0.5
+    return replace(group, loss=None, weights=group_weights(group) * used[:, None])
 
 
 def _best(compiled: Compiled, solution: Solution, config: BatchConfig) -> tuple[Solution, Minimum | None]:
@@ -183,69 +209,40 @@ def _numbers(compiled: Compiled, values: Values) -> Array:
     return Reported.of(compiled.problem, compiled.layout, values, compiled.current_keys).numbers
 
 
-def _constrained(
-    compiled: Compiled, solution: Solution, levels: tuple[Level, ...], second: Minimum | None, config: BatchConfig
-) -> Solved:
-    """The solution with the weak directions at their priors."""
-    layout, weak = compiled.layout, 0
-    for _ in range(config.constrained_steps):
-        factorization = solution.system.eliminate()
-        reported = Reported.of(compiled.problem, layout, solution.values, compiled.current_keys)
-        root = reported.root(factorization.root)
-        directions = WeakDirections.of(root.R, reported.prior, weak)
-        weak = directions.weak.shape[1]
-        found = Solved(compiled, solution, levels, factorization, reported, directions, second)
-        if not weak or not solution.converged:
-            return found
-        du = constrained_step(directions, root.R, root.d, reported.u)
-        if (np.abs(directions.strong.T @ du) < config.constrained_tolerance * directions.sigmas).all() and (
-            np.abs(directions.weak.T @ du) < config.constrained_tolerance
-        ).all():
-            return found
-        last = root.last(du[:, None])
-        states, nodes = factorization.given(last)
-        move = Tangent(states[..., 0], nodes[..., 0], last[factorization.c :, 0])
-        values = layout.retract(solution.values, move)
-        system, cost = solution.engine.at(values)
-        solution = replace(solution, values=values, system=system, cost=cost)
-    return found
-
-
 def _estimate(
     solved: Solved, config: BatchConfig, budget: bool, changed: Iterable[tuple[str, Problem]]
 ) -> Estimate:
     """Everything that is reported of a solution."""
-    compiled, solution, reported = solved.compiled, solved.solution, solved.reported
-    problem, engine, values = compiled.problem, solution.engine, solution.values
+    compiled, engine, values, posterior = solved.compiled, solved.engine, solved.values, solved.posterior
+    problem, found = compiled.problem, solved.posterior.factorization
     names = tuple(q.name for q in problem.quantities)
-    covariance = reported.covariance(solved.directions.covariance())
     correlations = autocorrelations(engine, values) if solved.levels else {}
     influence, added = None, dict[str, Array]()
     if budget or correlations:
-        influence = Influence.of(reported, solved.directions, engine, solved.factorization, values)
+        influence = Influence.of(posterior.reported, posterior.directions, engine, found, values)
         added = added_variance(influence, correlations)
-    by = inflation(names, covariance, influence.names if influence else (), added)
-    covariance = covariance * np.outer(by, by)
-    course = posterior_history(
-        problem, engine, solution.system, solved.factorization, values, compiled.current_keys, engine.time
-    )
+    by = inflation(names, posterior.covariance, influence.names if influence else (), added)
+    covariance = posterior.covariance * np.outer(by, by)
+    system = engine.at(values)[0]
+    course = None
+    if isinstance(engine, Linearization) and isinstance(system, ChainSystem) and isinstance(found, ChainFactorization):
+        course = posterior_history(problem, engine, system, found, values, compiled.current_keys, engine.time)
     residuals = residuals_by_family(engine, values)
-    known = compiled.layout.to_gtsam(values) if problem.attitudes else None
     out = Estimate(
         solver="batch",
         names=names,
-        values=reported.numbers,
+        values=posterior.reported.numbers,
         covariance=covariance,
         inflation=by,
         colours={family: 1.0 + 2.0 * float(lags.sum()) for family, lags in correlations.items()},
-        converged=solution.converged,
-        message=solution.message,
+        converged=solved.solution.converged,
+        message=solved.solution.message,
         residuals=residuals,
-        chi_square=chi_square(list(leverages(engine, solved.factorization, values))),
+        chi_square=chi_square(leverages(engine, found, values)),
         history=None if course is None else course.history.inflated(by),
         course=course,
         smoothed=_smoothed(solved, covariance),
-        attitudes=problem.attitudes(compiled.keyframes, known) if problem.attitudes and known else None,
+        attitudes=_attitudes(solved) if problem.attitudes else None,
         rejected={family: int((~r.used).sum()) for family, r in residuals.items()},
         levels=solved.levels,
         second=solved.second,
@@ -259,6 +256,13 @@ def _estimate(
         moved={name: moves for name, other in changed if (moves := _moves(solved, influence, other))},
         strongest=most_influential(influence, sigmas, config.influential),
     )
+
+
+def _attitudes(solved: Solved) -> Attitudes | None:
+    """The trajectory."""
+    compiled = solved.compiled
+    attitudes = compiled.problem.attitudes
+    return None if attitudes is None else attitudes(compiled.keyframes, compiled.layout.to_gtsam(solved.values))
 
 
 def residuals_by_family(engine: Engine, values: Values) -> dict[str, Residuals]:
@@ -283,17 +287,17 @@ def _smoothed(solved: Solved, covariance: Array) -> History | None:
     *_, count, c, _ = layout.sizes
     if count < 3 or c == 0:
         return None
-    engine, values = solved.solution.engine, solved.solution.values
+    engine, values = solved.engine, solved.values
     moving = [p for p in compiled.problem.parameters if p.key in compiled.current_keys]
     if len(moving) != 1:
         return None
     (parameter,) = moving
     keys = np.array([_node_key(layout, parameter.key, j) for j in range(count)])
     begins = engine.time[np.searchsorted(engine.piece, np.arange(count))]
-    bias = smoothed_bias(layout, solved.factorization, values, begins, keys, slice(0, len(parameter.quantities)))
+    bias = smoothed_bias(layout, solved.posterior.factorization, values, begins, keys, slice(0, len(parameter.quantities)))
     names = [q.name for q in compiled.problem.quantities]
     at = [names.index(q.name) for q in parameter.quantities]
-    whole = np.tile(solved.reported.numbers, (count, 1)), np.tile(np.sqrt(np.diag(covariance)), (count, 1))
+    whole = np.tile(solved.posterior.reported.numbers, (count, 1)), np.tile(np.sqrt(np.diag(covariance)), (count, 1))
     whole[0][:, at], whole[1][:, at] = bias.values, bias.sigmas
     return History(begins, *whole)
 
@@ -310,7 +314,7 @@ def _moves(solved: Solved, influence: Influence, changed: Problem) -> dict[str, 
 
     Noise levels, and which measurements are rejected, are those of the solution.
     """
-    own, values = solved.solution.engine, solved.solution.values
+    own, values = solved.engine, solved.values
     other = Compiled.of(changed, "gtsam" if solved.compiled.problem.layout is None else "auto")
     engine = apply_levels(other.engine, solved.levels)
     shapes = [[(g.family, g.target, len(g.model.time), g.model.rows) for g in e.groups] for e in (own, engine)]
@@ -328,7 +332,7 @@ def _told(
     solved: Solved, device: Collection[str], elsewhere: Callable[[Told], Mapping[str, float]] | None
 ) -> Told:
     """What a graph says, linear about its solution or where the reported numbers are to be."""
-    compiled, engine, values = solved.compiled, solved.solution.engine, solved.solution.values
+    compiled, engine, values = solved.compiled, solved.engine, solved.values
     own = sqrt_information(compiled.problem, engine, values, compiled.current_keys, device)
     wanted = {} if elsewhere is None else elsewhere(own)
     if not wanted:

@@ -9,16 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Self
 
 import gtsam
 
-from alidade.pipelines.estimation.problem import Factor, Problem, Step
+from alidade.pipelines.estimation.problem import EngineName, Factor, Problem, Step
 from alidade.pipelines.solvers.gtsam_engine import GtsamEngine
 from alidade.pipelines.solvers.layout import Layout, NotAChainError, Values
 from alidade.pipelines.solvers.linearization import Linearization
 
-EngineName = Literal["auto", "chain", "gtsam"]
 # More measurements than any recording has: one step takes all.
 ALL = 1 << 40
 

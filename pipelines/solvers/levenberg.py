@@ -88,6 +88,17 @@ class Engine(Protocol):
     def residuals(self, values: Values) -> list[Array]:
         """Weighted whitened residuals of each group."""
 
+    def products(self, group: Group, values: Values, tangent: Tangent) -> tuple[Array, Array]:
+        """A x (n, m, k) of a group's whitened rows with k tangent vectors, and its right side (n, m)."""
+
+    @property
+    def piece(self) -> Index:
+        """(N,) node in force at each keyframe."""
+
+    @property
+    def time(self) -> Array:
+        """(N,) s of the keyframes."""
+
     def under(self, loss: TruncatedLoss | None) -> Self:
         """With another loss for measurements that have one."""
 

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.problem import Array, ChiSquare, Factor, History, Parameter, Problem
-
 from alidade.pipelines.solvers.chain import IndeterminateError
 
 if TYPE_CHECKING:
