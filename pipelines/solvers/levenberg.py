@@ -88,6 +88,9 @@ class Engine(Protocol):
     def residuals(self, values: Values) -> list[Array]:
         """Weighted whitened residuals of each group."""
 
+    def products(self, group: Group, values: Values, tangent: Tangent) -> tuple[Array, Array]:
+        """A x of a group's whitened rows with tangent vectors, and its right side."""
+
     def under(self, loss: TruncatedLoss | None) -> Self:
         """With another loss for measurements that have one."""
 

@@ -219,8 +219,6 @@ class Linearization:
             else:
                 _put(measured if group.target == "state" else between, group.place, group.row, rows)
         self._complete(measured)
-        # The first node does not deviate from itself: no row may move it.
-        measured[self.piece == 0, :, d : d + c] = between[self.piece == 0, :, 2 * d : 2 * d + c] = 0.0
         prior = np.concatenate([np.zeros((0, s + 1)), *shared])
         beside = np.zeros((N, 0, c + s + 1))
         if not c:
@@ -280,7 +278,6 @@ class Linearization:
         out = np.zeros((len(whole), max(map(len, whole)), 2 * c + 1))
         for each, own in zip(out, whole, strict=True):
             each[: len(own)] = own
-        out[1:2, :, c : 2 * c] = 0.0  # the first node
         return out
 
 
