@@ -22,11 +22,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.estimation.problem import Problem, Pull
-from alidade.pipelines.solvers.chain import Array, ChainFactorization
+from alidade.pipelines.estimation.problem import Pull
+from alidade.pipelines.solvers.chain import Array
 from alidade.pipelines.solvers.layout import Tangent, Values
-from alidade.pipelines.solvers.linearization import Group, Linearization
-from alidade.pipelines.solvers.posterior import Reported, counted, products, responses
+from alidade.pipelines.solvers.levenberg import Engine, Factorization
+from alidade.pipelines.solvers.linearization import Group
+from alidade.pipelines.solvers.posterior import Reported, counted, responses
 from alidade.pipelines.solvers.weak_directions import WeakDirections
 
 # Fewer measurements show no autocorrelation.
@@ -37,8 +38,6 @@ DIED_OUT, CORRELATED = 2.0, 4.0
 MAX_LAG = 0.25
 # Coefficients of a prior's row below this share of its largest are rounding.
 ROUNDING = 1e-9
-# Variance in units of the prior's below which there is rounding only.
-MIN_VARIANCE = 1e-18
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +45,7 @@ class Influence:
     """Influence of all residuals on the free reported numbers.
 
     Attributes:
-        linearization: of all factors.
+        engine: of all factors.
         values: at which it is linearised.
         reported: the numbers there.
         step: (m) columns N^-1 J'P' of all unknowns.
@@ -54,7 +53,7 @@ class Influence:
         from_priors: (m, m) square root of it, a column for each number's prior.
     """
 
-    linearization: Linearization
+    engine: Engine
     values: Values
     reported: Reported
     step: Tangent
@@ -66,8 +65,8 @@ class Influence:
         cls,
         reported: Reported,
         directions: WeakDirections,
-        linearization: Linearization,
-        factorization: ChainFactorization,
+        engine: Engine,
+        factorization: Factorization,
         values: Values,
     ) -> Influence:
         """The influence at an estimate.
@@ -81,7 +80,7 @@ class Influence:
         of_weak = scale[:, None] * (weak @ directions.prior_covariance @ weak.T)
         root = of_weak * np.sqrt(np.diag(reported.prior))
         step = responses(factorization, projected)
-        return cls(linearization, values, reported, step, of_weak * scale, root)
+        return cls(engine, values, reported, step, of_weak * scale, root)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -90,34 +89,31 @@ class Influence:
 
     def rows(self, group: Group) -> tuple[Array, Array]:
         """L (n, rows, m) of a group, and minus its weighted residuals (n, rows)."""
-        return products(self.linearization, group, self.values, self.step)
+        return self.engine.products(group, self.values, self.step)
 
-    def moves(self, changed: Linearization) -> Array:
+    def moves(self, changed: Engine) -> Array:
         """(m,) how far the numbers move, to first order, where other factors of the same layout are in force."""
         moved = np.zeros(len(self.names))
-        for sign, linearization in ((1.0, changed), (-1.0, self.linearization)):
-            for group in linearization.groups:
-                L, right = products(linearization, group, self.values, self.step)
+        for sign, engine in ((1.0, changed), (-1.0, self.engine)):
+            for group in engine.groups:
+                L, right = engine.products(group, self.values, self.step)
                 moved += sign * np.einsum("nrm,nr->m", L, right)
         return moved
 
 
-def error_budget(
-    problem: Problem, influence: Influence, added: Mapping[str, Array], covariance: Array
-) -> dict[str, dict[str, float]]:
+def error_budget(influence: Influence, added: Mapping[str, Array], covariance: Array) -> dict[str, dict[str, float]]:
     """Number -> source -> share of the number's variance, the largest first; shares sum to one.
 
     Sources are the families of the noise, each prior ("prior of NAME"), and what no measurement model has, together
     with what is of second order ("not modelled").
 
     Args:
-        problem: of which the numbers are.
-        influence: of its residuals.
+        influence: of the residuals.
         added: family -> variance (m,) that correlation of its residuals adds, see `added_variance`.
         covariance: (n, n) final posterior of all reported numbers.
     """
     names, variances = influence.names, dict[str, Array]()
-    for group in influence.linearization.groups:
+    for group in influence.engine.groups:
         L, _ = influence.rows(group)
         for source, variance in _sources(influence, group, np.square(L)):
             variances[source] = variances.get(source, np.zeros(len(names))) + variance
@@ -144,14 +140,12 @@ def _sources(influence: Influence, group: Group, squares: Array) -> list[tuple[s
     """The sources of a group and the variance (m,) of each, from squares (n, rows, m) of its influence."""
     if group.family != "prior" or group.target != "shared":
         return [(group.family, squares.sum(axis=(0, 1)))]
-    layout, reported = influence.linearization.layout, influence.reported
+    layout, reported = influence.engine.layout, influence.reported
     rows, _ = group.rows(influence.values, layout.sizes[4] + 1)
     A = np.pad(rows[..., :-1].reshape(-1, layout.sizes[4]), ((0, 0), (layout.sizes[3], 0)))
     about = np.abs(A @ np.linalg.pinv(reported.jacobian)[:, reported.free] * reported.scale)
     largest = about > ROUNDING * about.max(axis=1, keepdims=True, initial=0.0)
-    labels = [
-        f"prior of {influence.names[int(row.argmax())]}" if row.sum() == 1 else group.family for row in largest
-    ]
+    labels = [f"prior of {influence.names[int(row.argmax())]}" if row.sum() == 1 else group.family for row in largest]
     return list(zip(labels, squares.reshape(-1, squares.shape[2]), strict=True))
 
 
@@ -172,15 +166,15 @@ def most_influential(influence: Influence, sigmas: Mapping[str, float], count: i
     columns = [influence.names.index(name) for name in names]
     scale = np.array([sigmas[name] for name in names])
     found: list[tuple[float, str, float, str]] = []
-    for group in influence.linearization.groups:
+    for group in influence.engine.groups:
         if group.target == "shared" and group.family == "prior":
             continue
         L, right = influence.rows(group)
         moves = np.einsum("nrm,nr->nm", L[..., columns], -right) / scale
         which = np.abs(moves).argmax(axis=1)
         moved = moves[np.arange(len(moves)), which]
-        for i in np.argsort(-np.abs(moved), kind="stable")[:count].tolist():
-            found.append((float(moved[i]), group.family, float(group.model.time[i]), names[int(which[i])]))
+        first = np.argsort(-np.abs(moved), kind="stable")[:count].tolist()
+        found += [(float(moved[i]), group.family, float(group.model.time[i]), names[int(which[i])]) for i in first]
     found.sort(key=lambda each: -abs(each[0]))
     return tuple(Pull(family, time, name, move) for move, family, time, name in found[:count])
 
@@ -200,10 +194,10 @@ def autocorrelation(whitened: Array) -> Array:
     return np.asarray(correlation[: small[0] if len(small) else None])
 
 
-def autocorrelations(linearization: Linearization, values: Values) -> dict[str, Array]:
+def autocorrelations(engine: Engine, values: Values) -> dict[str, Array]:
     """Family of measurements -> autocorrelation of its residuals where they are not white; rejected ones are zero."""
     found = {}
-    for family, groups in _measured(linearization).items():
+    for family, groups in _measured(engine).items():
         if len({group.model.rows for group in groups}) == 1:
             whitened = [g.weighted(g.evaluate(values)[0]) * counted(g, values)[:, None] for g in groups]
             if len(lags := autocorrelation(np.concatenate(whitened)[_in_time(groups)])):
@@ -218,7 +212,7 @@ def added_variance(influence: Influence, correlations: Mapping[str, Array]) -> d
         influence: of the residuals.
         correlations: see `autocorrelations`.
     """
-    added, groups = {}, _measured(influence.linearization)
+    added, groups = {}, _measured(influence.engine)
     for family, correlation in correlations.items():
         L = np.concatenate([influence.rows(group)[0] for group in groups[family]])[_in_time(groups[family])]
         more = 2.0 * correlation @ _lagged(L, len(correlation) + 1)[1:]
@@ -226,10 +220,10 @@ def added_variance(influence: Influence, correlations: Mapping[str, Array]) -> d
     return added
 
 
-def _measured(linearization: Linearization) -> dict[str, list[Group]]:
+def _measured(engine: Engine) -> dict[str, list[Group]]:
     """Family -> its groups of measurements."""
     found: dict[str, list[Group]] = {}
-    for group in linearization.groups:
+    for group in engine.groups:
         if group.is_measurement:
             found.setdefault(group.family, []).append(group)
     return found
@@ -248,26 +242,6 @@ def _lagged(L: Array, lags: int) -> Array:
         power = (np.abs(np.fft.rfft(L[..., j], size, axis=0)) ** 2).sum(axis=1)
         out[:, j] = np.fft.irfft(power, size)[: len(out)]
     return out
-
-
-def inflated_by_family(
-    prior: Array, information: Mapping[str, Array], lengths: Mapping[str, float]
-) -> tuple[Array, Array]:
-    """Covariance (m, m) of a filter's parameters, nominal and with each family's information by its correlation.
-
-    A family of whose measurements `length` in a row count as one says that much less; what other families say stays.
-
-    Args:
-        prior: (m, m) precision of the priors, in prior units.
-        information: family -> information (m, m) that its measurements added.
-        lengths: family -> number of successive measurements that count as one; 1 where there is none.
-    """
-    out = []
-    for by in ({}, lengths):
-        whole = prior + sum(each / by.get(family, 1.0) for family, each in information.items())
-        variances, axes = np.linalg.eigh(0.5 * (whole + whole.T))
-        out.append((axes / np.maximum(variances, MIN_VARIANCE)) @ axes.T)
-    return out[0], out[1]
 
 
 def inflation(names: Sequence[str], covariance: Array, free: Sequence[str], added: Mapping[str, Array]) -> Array:

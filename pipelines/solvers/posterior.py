@@ -13,7 +13,7 @@ the variance of a x under the posterior (`sample`), and a family of n rows has n
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,10 +22,9 @@ from numpy.typing import NDArray
 from alidade.pipelines.estimation.problem import ChiSquare, Problem, Told
 from alidade.pipelines.solvers.chain import Array, ChainFactorization, ChainSystem
 from alidade.pipelines.solvers.layout import Layout, Tangent, Values
-from alidade.pipelines.solvers.linearization import Group, Linearization
+from alidade.pipelines.solvers.levenberg import Engine, Factorization
+from alidade.pipelines.solvers.linearization import NOT_MEASURED, Group, Linearization
 
-# Families whose residuals say nothing about the noise of the recording.
-NOT_MEASURED = ("prior", "definition")
 # A direction without any information gets this many times its prior scale as sigma.
 MAX_SIGMA = 1e4
 # Combinations whose sigma would be more than this many times their prior's are left out of square-root information.
@@ -99,7 +98,7 @@ class Reported:
         _, sizes, axes = np.linalg.svd(self.jacobian, full_matrices=True)
         seen = int(np.count_nonzero(sizes > UNSEEN * sizes.max(initial=0.0)))
         basis = np.hstack([axes[seen:].T, inverse[:, self.free] * self.scale])
-        R = np.linalg.qr(np.column_stack([root[:, :-1] @ basis, root[:, -1]]), mode="r")
+        R = np.asarray(np.linalg.qr(np.column_stack([root[:, :-1] @ basis, root[:, -1]]), mode="r"), dtype=float)
         return ReportedRoot(basis, R, basis.shape[1] - len(self.free))
 
     def covariance(self, of_u: Array) -> Array:
@@ -151,7 +150,7 @@ class ReportedRoot:
         return np.asarray(root @ root.T)
 
 
-def responses(factorization: ChainFactorization, jacobian: Array) -> Tangent:
+def responses(factorization: Factorization, jacobian: Array) -> Tangent:
     """N^-1 J' of all unknowns, a column for each row of a Jacobian (n, c + s) by the last node and the shared unknowns.
 
     Raises:
@@ -163,29 +162,28 @@ def responses(factorization: ChainFactorization, jacobian: Array) -> Tangent:
     return Tangent(states, nodes, last[factorization.c :])
 
 
-def draws(factorization: ChainFactorization, count: int, generator: np.random.Generator) -> Tangent:
+def draws(factorization: Factorization, count: int, generator: np.random.Generator) -> Tangent:
     """Deviations from the posterior mean, drawn; the first bias node does not deviate from itself."""
     states, nodes, shared = factorization.sample(count, generator)
     nodes[:1] = 0.0
     return Tangent(states, nodes, shared)
 
 
-def products(linearization: Linearization, group: Group, values: Values, step: Tangent) -> tuple[Array, Array]:
-    """A x (n, m, k) of the whitened rows of a group with columns x, and minus its weighted residuals (n, m)."""
-    N, d, J, c, s = linearization.layout.sizes
-    width = {"state": d + c + s + 1, "pair": 2 * d + c + s + 1, "walk": 2 * c + s + 1, "shared": s + 1}[group.target]
-    rows, _ = group.rows(values, width)
-    n, k = len(rows), step.shared.shape[1]
-    parts = [np.broadcast_to(step.shared, (n, s, k))]
-    if c and group.target in ("state", "pair"):
-        parts.insert(0, step.nodes[linearization.piece[group.place]])
-    if group.target == "walk":
-        parts = [step.nodes[group.place], step.nodes[group.place - 1], *parts]
-    elif group.target == "pair":
-        parts = [step.states[group.place], step.states[group.place - 1], *parts]
-    elif group.target == "state":
-        parts.insert(0, step.states[group.place])
-    return rows[..., :-1] @ np.concatenate(parts, axis=1), rows[..., -1]
+@dataclass(frozen=True, eq=False)
+class Leverage:
+    """Leverages of the rows of a group.
+
+    Attributes:
+        group: of n measurements of m rows.
+        used: (n,) which the loss does not reject.
+        h: (n, m) variance of what the rows predict under the posterior, in squared sigmas of their noise.
+        squares: (n, m) of the whitened residuals.
+    """
+
+    group: Group
+    used: NDArray[np.bool_]
+    h: Array
+    squares: Array
 
 
 def counted(group: Group, values: Values) -> NDArray[np.bool_]:
@@ -194,37 +192,48 @@ def counted(group: Group, values: Values) -> NDArray[np.bool_]:
     return np.asarray(group.used(residuals) > 0.0)
 
 
-def leverages(
-    linearization: Linearization, values: Values
-) -> list[tuple[Group, NDArray[np.bool_], Array, Array]]:
-    """Each group of measurements and processes with its used measurements (n,), leverages h and squares (n, m).
+def leverages(engine: Engine, factorization: Factorization, values: Values) -> list[Leverage]:
+    """Leverages of all measurements, processes and priors.
 
-    Random signs e stand as more right sides in the columns of the system, so that one elimination solves for all of
-    them: h is the mean of e A x(e), which has the trace of the projection without the scatter of its diagonal
-    (Hutchinson, Comm. Statist. Simul. Comput. 1989). That all leverages together are the number of unknowns is exact.
+    In a chain random signs e stand as more right sides in the columns of the system, so that one elimination solves for
+    all of them: h is the mean of e A x(e), which has the trace of the projection without the scatter of its diagonal
+    (Hutchinson, Comm. Statist. Simul. Comput. 1989). Rows about nodes alone, and all rows of another engine, have the
+    mean square of A x over draws of the posterior. That all leverages together are the number of unknowns is exact.
+
+    Args:
+        engine: of the factors.
+        factorization: of its system at the values.
+        values: the estimate.
 
     Raises:
         IndeterminateStateError: a state is not determined.
     """
-    system, _ = linearization.at(values)
-    rows = sum(g.model.rows * len(g.model.time) for g in linearization.groups)
+    system, _ = engine.at(values)
+    rows = sum(g.model.rows * len(g.model.time) for g in engine.groups)
     count = int(np.clip(DRAWN_ROWS // max(rows, 1), DRAWS, MAX_DRAWS))
-    signs, solved = _solved_signs(system, count)
-    unknowns, found, weights = float(_unknowns(linearization.layout)), [], []
-    drawn = draws(ChainFactorization.of(system), count, np.random.default_rng(1)) if system.c else None
-    begin = 0
-    for group in linearization.groups:
-        own, begin = _signs_of(signs, group, begin, count)
-        moves, right = products(linearization, group, values, solved if drawn is None or own is not None else drawn)
+    chain = system if isinstance(system, ChainSystem) else None
+    signs, solved = (None, None) if chain is None else _solved_signs(chain, count)
+    drawn = draws(factorization, count, np.random.default_rng(1)) if chain is None or chain.c else None
+    found, begin = [], 0
+    for group in engine.groups:
+        own = None
+        if signs is not None:
+            own, begin = _signs_of(signs, group, begin, count)
+        tangent = drawn if own is None else solved
+        assert tangent is not None
+        moves, right = engine.products(group, values, tangent)
         h = (np.square(moves) if own is None else own * moves).mean(axis=2)
-        found.append((group, counted(group, values), h, np.square(right)))
-        weights.append(0.0 if own is None else max(float((h - h**2).sum()), 0.0))
-    gap = unknowns - sum(float(h.sum()) for _, _, h, _ in found)
-    share = gap / max(sum(weights), 1e-300)
-    sizes = [max(int(used.sum()) * h.shape[1], 1) for _, used, h, _ in found]
+        found.append(Leverage(group, counted(group, values), h, np.square(right)))
+    return _summing_to(found, _unknowns(engine.layout))
+
+
+def _summing_to(found: Sequence[Leverage], unknowns: int) -> list[Leverage]:
+    """Leverages that sum to the number of unknowns, corrected where they are uncertain: neither 0 nor 1."""
+    weights = [max(float((each.h - each.h**2)[each.used].sum()), 0.0) for each in found]
+    share = (unknowns - sum(float(each.h.sum()) for each in found)) / max(sum(weights), 1e-300)
     return [
-        (group, used, h + share * weight / size * used[:, None], squares)
-        for (group, used, h, squares), weight, size in zip(found, weights, sizes, strict=True)
+        replace(each, h=each.h + share * weight / max(each.used.sum() * each.h.shape[1], 1) * each.used[:, None])
+        for each, weight in zip(found, weights, strict=True)
     ]
 
 
@@ -236,8 +245,13 @@ def _solved_signs(system: ChainSystem, count: int) -> tuple[ChainSystem, Tangent
         signs = generator.choice([-1.0, 1.0], (*rows.shape[:-1], count)) * rows[..., :-1].any(axis=-1, keepdims=True)
         return np.concatenate([rows[..., :-1], signs, 0.0 * rows[..., -1:]], axis=-1)
 
-    arrays = {name: beside(getattr(system, name)) for name in ("measured", "between", "beside", "shared")}
-    wider = replace(system, **arrays)
+    wider = replace(
+        system,
+        measured=beside(system.measured),
+        between=beside(system.between),
+        beside=beside(system.beside),
+        shared=beside(system.shared),
+    )
     factorization = ChainFactorization.of(wider)
     known = len(factorization.root) - 1 - count
     R = factorization.root[:known]
@@ -262,35 +276,28 @@ def _unknowns(layout: Layout) -> int:
     return int(layout.kept[0].sum() + layout.kept[1].sum() + layout.sizes[4])
 
 
-def chi_square(found: Sequence[tuple[Group, NDArray[np.bool_], Array, Array]]) -> ChiSquare:
-    """Sum of squares of measurements and processes and their degrees of freedom, whole and by family; none negative.
-
-    Args:
-        found: see `leverages`.
-    """
+def chi_square(found: Sequence[Leverage]) -> ChiSquare:
+    """Sum of squares of measurements and processes and their degrees of freedom, whole and by family; none negative."""
     families: dict[str, tuple[float, float]] = {}
-    for group, used, h, squares in found:
-        if group.family not in NOT_MEASURED:
-            value, dof = families.get(group.family, (0.0, 0.0))
-            more = used.sum() * group.model.rows - h[used].sum()
-            families[group.family] = value + float(squares[used].sum()), dof + float(more)
+    for each in found:
+        family, used = each.group.family, each.used
+        if family not in NOT_MEASURED:
+            value, dof = families.get(family, (0.0, 0.0))
+            families[family] = value + float(each.squares[used].sum()), dof + float((1.0 - each.h[used]).sum())
     families = {family: (value, max(dof, 0.0)) for family, (value, dof) in families.items()}
     sums = [sum(each[i] for each in families.values()) for i in range(2)]
     return ChiSquare(sums[0], sums[1], families)
 
 
-def expected_squares(found: Sequence[tuple[Group, NDArray[np.bool_], Array, Array]]) -> dict[tuple[str, int], float]:
+def expected_squares(engine: Engine, factorization: Factorization, values: Values) -> dict[tuple[str, int], float]:
     """(family, row of its measurements) -> expected sum of squares under noise of unit variance.
 
-    Rows of a process or a prior count as one.
-
-    Args:
-        found: see `leverages`.
+    Rows of a process or a prior count as one. Arguments and errors are those of `leverages`.
     """
     squares: dict[tuple[str, int], float] = {}
-    for group, used, h, _ in found:
-        for row, more in enumerate((1.0 - h[used]).sum(axis=0).tolist()):
-            label = group.family, row if group.is_measurement else 0
+    for each in leverages(engine, factorization, values):
+        for row, more in enumerate((1.0 - each.h[each.used]).sum(axis=0).tolist()):
+            label = each.group.family, row if each.group.is_measurement else 0
             squares[label] = squares.get(label, 0.0) + more
     return {label: max(square, 0.0) for label, square in squares.items()}
 

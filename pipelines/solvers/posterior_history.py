@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from alidade.pipelines.estimation.problem import Course, History, Problem
-from alidade.pipelines.solvers.chain import Array, ChainFactorization, ChainSystem, Index, IndeterminateStateError
+from alidade.pipelines.solvers.chain import Array, ChainFactorization, ChainSystem, IndeterminateStateError, Index
 from alidade.pipelines.solvers.layout import Layout, Values
 from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.posterior import Reported, draws
@@ -34,7 +34,7 @@ def posterior_history(
     current_keys: Mapping[int, int],
     time: Array,
 ) -> Course | None:
-    """Values and joint covariance of the reported numbers at the moments of the coarse chain, weak directions at priors.
+    """Values and joint covariance of the reported numbers at moments, weak directions at their priors.
 
     Args:
         problem: of which the numbers are.
