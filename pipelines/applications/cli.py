@@ -190,7 +190,7 @@ def calibrate(
                 auto_topics,
                 not no_check,
                 prior,
-                engine=cast("EngineName", engine.value),
+                engine=engine.value,
             )
         with progress.doing("writing"):
             written = write_results(folder, calibration)

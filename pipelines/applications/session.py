@@ -411,7 +411,8 @@ def calibrate(
     start = time.perf_counter()
     with progress.doing("reading"):
         session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics, prior)
-    return replace(session, engine=engine).calibrations(solvers, window, {"read": time.perf_counter() - start}, check, report)
+    seconds = {"read": time.perf_counter() - start}
+    return replace(session, engine=engine).calibrations(solvers, window, seconds, check, report)
 
 
 def self_agreement(

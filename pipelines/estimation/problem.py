@@ -155,7 +155,7 @@ class Factor:
     @property
     def keys(self) -> list[int]:
         """The variables."""
-        return list(self.native.keys()) if self.vectorized is None else self.vectorized.keys
+        return list(self.factor.keys()) if self.vectorized is None else self.vectorized.keys
 
     @property
     def vectorized(self) -> VectorizedFactor | None:

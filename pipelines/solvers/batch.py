@@ -14,8 +14,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import (
@@ -209,9 +211,7 @@ def _numbers(compiled: Compiled, values: Values) -> Array:
     return Reported.of(compiled.problem, compiled.layout, values, compiled.current_keys).numbers
 
 
-def _estimate(
-    solved: Solved, config: BatchConfig, budget: bool, changed: Iterable[tuple[str, Problem]]
-) -> Estimate:
+def _estimate(solved: Solved, config: BatchConfig, budget: bool, changed: Iterable[tuple[str, Problem]]) -> Estimate:
     """Everything that is reported of a solution."""
     compiled, engine, values, posterior = solved.compiled, solved.engine, solved.values, solved.posterior
     problem, found = compiled.problem, solved.posterior.factorization
@@ -252,7 +252,7 @@ def _estimate(
     sigmas = {q.name: sigma for q, sigma in zip(problem.quantities, out.sigmas.tolist(), strict=True) if not q.assumed}
     return replace(
         out,
-        budget=error_budget(problem, influence, added, covariance),
+        budget=error_budget(influence, added, covariance),
         moved={name: moves for name, other in changed if (moves := _moves(solved, influence, other))},
         strongest=most_influential(influence, sigmas, config.influential),
     )
@@ -267,7 +267,7 @@ def _attitudes(solved: Solved) -> Attitudes | None:
 
 def residuals_by_family(engine: Engine, values: Values) -> dict[str, Residuals]:
     """Family -> whitened residuals of its measurements at some values, in the order of the problem's factors."""
-    parts: dict[str, list[tuple[Array, Array, Array, Array]]] = {}
+    parts: dict[str, list[tuple[NDArray[Any], ...]]] = {}
     for group in engine.groups:
         if group.is_measurement:
             residuals = group.evaluate(values)[0]
@@ -287,14 +287,17 @@ def _smoothed(solved: Solved, covariance: Array) -> History | None:
     *_, count, c, _ = layout.sizes
     if count < 3 or c == 0:
         return None
-    engine, values = solved.engine, solved.values
+    engine, values, factorization = solved.engine, solved.values, solved.posterior.factorization
+    if not isinstance(factorization, ChainFactorization):
+        return None
     moving = [p for p in compiled.problem.parameters if p.key in compiled.current_keys]
     if len(moving) != 1:
         return None
     (parameter,) = moving
     keys = np.array([_node_key(layout, parameter.key, j) for j in range(count)])
     begins = engine.time[np.searchsorted(engine.piece, np.arange(count))]
-    bias = smoothed_bias(layout, solved.posterior.factorization, values, begins, keys, slice(0, len(parameter.quantities)))
+    part = slice(0, len(parameter.quantities))
+    bias = smoothed_bias(layout, factorization, values, begins, keys, part)
     names = [q.name for q in compiled.problem.quantities]
     at = [names.index(q.name) for q in parameter.quantities]
     whole = np.tile(solved.posterior.reported.numbers, (count, 1)), np.tile(np.sqrt(np.diag(covariance)), (count, 1))
@@ -328,9 +331,7 @@ def _moves(solved: Solved, influence: Influence, changed: Problem) -> dict[str, 
     return dict(zip(influence.names, moves.tolist(), strict=True))
 
 
-def _told(
-    solved: Solved, device: Collection[str], elsewhere: Callable[[Told], Mapping[str, float]] | None
-) -> Told:
+def _told(solved: Solved, device: Collection[str], elsewhere: Callable[[Told], Mapping[str, float]] | None) -> Told:
     """What a graph says, linear about its solution or where the reported numbers are to be."""
     compiled, engine, values = solved.compiled, solved.engine, solved.values
     own = sqrt_information(compiled.problem, engine, values, compiled.current_keys, device)
