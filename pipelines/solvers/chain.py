@@ -24,6 +24,7 @@ numpy.linalg.LinAlgError.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -249,9 +250,11 @@ class ChainFactorization:
 
     def prefix_roots(self) -> tuple[Index, list[Array]]:
         """(M,) keyframes, and R of (their node, shared, right side) by all until then; few rows at first."""
-        d = self.d
-        pairs = zip(self._ends.heads, self._ends.known, strict=True)
-        return self._ends.keyframes, [_root([head, known], head.shape[1])[d:, d:] for head, known in pairs]
+        ends, roots, known = self._ends, list[Array](), np.zeros((0, 1))
+        for k, (head, pile) in enumerate(zip(ends.heads, ends.piles, strict=True)):
+            known = _root([known, pile] if k and ends.piece[k] == ends.piece[k - 1] else [pile], pile.shape[1])
+            roots.append(_root([head, known], head.shape[1])[self.d :, self.d :])
+        return ends.keyframes, roots
 
     def _back(self, last: Array, right: float, generator: np.random.Generator | None = None) -> tuple[Array, Array]:
         last = np.pad(last, ((0, 1), (0, 0)), constant_values=right)
@@ -279,7 +282,7 @@ class _TimeOrder:
             (state, node), (next state, next node), shared; of the last state: it, node, shared.
         piece: (M,) node in force at each.
         heads: rows [state | node | shared | right side] about each by itself and all before it.
-        known: rows [node | shared | right side] left by all before it.
+        piles: rows [node | shared | right side] left by the state before; at the begin of a piece by all before.
     """
 
     d: int
@@ -288,33 +291,33 @@ class _TimeOrder:
     rows: list[Array]
     piece: Index
     heads: list[Array]
-    known: list[Array]
+    piles: list[Array]
 
     @classmethod
     def eliminate(cls, chain: ChainSystem, keyframes: Index, own: int) -> tuple[_TimeOrder, Array]:
         """The states of a chain, and R of (last node, shared unknowns, right side); the first `own` numbers go last."""
         d, c, w, count = chain.d, chain.c, chain.border, len(chain.measured)
         piece = np.zeros(count, dtype=np.intp) if chain.piece is None else chain.piece
-        rows, heads, known = list[Array](), list[Array](), list[Array]()
-        left = [chain.shared, *([] if chain.walk is None else [_about_node(chain.walk[0], w)])]
+        rows, heads, piles, begin = list[Array](), list[Array](), list[Array](), 0
+        left = _below([chain.shared, *([] if chain.walk is None else [_about_node(chain.walk[0], w)])], w)
         carried = np.delete(chain.between[0], np.s_[d : 2 * d], axis=1)
         for k, measured in enumerate(chain.measured):
             heads.append(np.concatenate([carried, measured]))
-            known.append(_root([*left, chain.beside[k]], w))
+            piles.append(np.concatenate([left, chain.beside[k]]))
             if k == count - 1:
                 break
             between = _swapped(chain.between[k + 1], d)
             if piece[k + 1] == piece[k]:
-                (R,), (carried,), (rest,) = _step(heads[-1][None], measured[None, :0], between[None], d, 0)
-                left = [known[-1], rest]
+                (R,), (carried,), (left,) = _step(heads[-1][None], measured[None, :0], between[None], d, 0)
             else:
                 assert chain.walk is not None
-                R, carried, rest = _last_of_piece(heads[-1], known[-1], between, chain.walk[piece[k + 1]], d, c)
-                left = [rest]
+                known = _root(piles[begin:], w)
+                R, carried, left = _last_of_piece(heads[-1], known, between, chain.walk[piece[k + 1]], d, c)
+                begin = k + 1
             rows.append(R)
-        R = _root([heads[-1], known[-1]], d + w)
+        R = _root([heads[-1], *piles[begin:]], d + w)
         rows.append(_determined(R[None, :own])[0])
-        return cls(d, c, keyframes, rows, piece, heads, known), R[own:, own:]
+        return cls(d, c, keyframes, rows, piece, heads, piles), R[own:, own:]
 
     def back(self, last: Array, tail: int, generator: np.random.Generator | None) -> tuple[Array, Array]:
         """States (M, d, n) and nodes (J, c, n), given the last node (`tail` numbers) and the shared unknowns."""
@@ -397,12 +400,27 @@ def _reduced(piles: list[Array], columns: int) -> Array:
 def _triangle(rows: Array) -> Array:
     """R (..., r, columns) of rows (..., m, columns), without the copies that numpy's mode "r" makes."""
     R: Array = np.swapaxes(np.linalg.qr(rows, mode="raw")[0], -1, -2)[..., : min(rows.shape[-2:]), :]
-    return R * np.tri(*R.shape[:-3:-1]).T
+    return R * _upper(R.shape[-2], R.shape[-1])
 
 
 def _root(rows: list[Array], columns: int) -> Array:
     """R of several rows, of which those with fewer columns are about the last ones."""
-    return _triangle(np.concatenate([np.pad(each, ((0, 0), (columns - each.shape[1], 0))) for each in rows]))
+    return _triangle(_below(rows, columns))
+
+
+def _below(rows: list[Array], columns: int) -> Array:
+    """Rows one below the other, those with fewer columns about the last ones."""
+    out, begin = np.zeros((sum(map(len, rows)), columns)), 0
+    for each in rows:
+        out[begin : begin + len(each), columns - each.shape[1] :] = each
+        begin += len(each)
+    return out
+
+
+@cache
+def _upper(rows: int, columns: int) -> Array:
+    """1 on and above the diagonal, 0 below."""
+    return np.triu(np.ones((rows, columns)))
 
 
 def _solved(R: Array, right: Array, generator: np.random.Generator | None) -> Array:
