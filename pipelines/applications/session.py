@@ -33,7 +33,7 @@ from alidade.pipelines.diagnostics.observability import finite_covariance
 from alidade.pipelines.diagnostics.trial_fit import held_out_residuals
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
-from alidade.pipelines.estimation.problem import Estimate, Problem, Quantity, Step, Told
+from alidade.pipelines.estimation.problem import EngineName, Estimate, Problem, Quantity, Step, Told
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.checks import COPIED, OVERTAKEN
 from alidade.pipelines.recording.info import SessionFacts, facts_of, lacking
@@ -160,6 +160,7 @@ class Session:
 
     Attributes:
         method, data, config, origin: as above.
+        engine: that eliminates batch's linear systems.
         near: numbers that rotations are reported near of, as another recording of the device has them.
     """
 
@@ -167,6 +168,7 @@ class Session:
     data: Any
     config: Config
     origin: Origin
+    engine: EngineName = "auto"
     near: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
@@ -407,7 +409,10 @@ class Session:
         device = walks(self.method, self.config, [q.name for q in problem.quantities])
         with progress.doing("solving"):
             changed = self._changed() if report else ()
-            return solve_batch(problem, budget=report, changed=changed, device=device, elsewhere=others), problem
+            estimate = solve_batch(
+                problem, budget=report, changed=changed, device=device, elsewhere=others, engine=self.engine
+            )
+            return estimate, problem
 
     def _changed(self) -> Iterator[tuple[str, Problem]]:
         """Each input that the graph takes for exact, and the graph with that input off by its step."""
@@ -442,6 +447,7 @@ def calibrate(
     check: bool = False,
     prior: Path | None = None,
     report: bool = True,
+    engine: EngineName = "auto",
     auto_columns: bool = False,
 ) -> list[Calibration]:
     """One calibration a solver, from one reading of the recording.
@@ -458,6 +464,7 @@ def calibrate(
         check: hold an incremental calibration against batch.
         prior: an earlier calibration of the device to begin from, result.json or calibration.yaml.
         report: with what only a report tells, see `Session.calibrate`.
+        engine: that eliminates batch's linear systems: "chain", "gtsam", or "auto".
 
     Raises:
         InputError: recording or config cannot be used, or there is no such solver.
@@ -466,7 +473,8 @@ def calibrate(
     start = time.perf_counter()
     with progress.doing("reading"):
         session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics, prior, auto_columns)
-    return session.calibrations(solvers, window, {"read": time.perf_counter() - start}, check, report)
+    seconds = {"read": time.perf_counter() - start}
+    return replace(session, engine=engine).calibrations(solvers, window, seconds, check, report)
 
 
 def session_facts(recording: Recording, config: Config) -> SessionFacts:
