@@ -115,7 +115,7 @@ def _known(
     padded = np.zeros((max(len(root), width), width))
     padded[: len(root)] = root
     found = end.root(padded)
-    directions = WeakDirections.of(found.R, end.prior)
+    directions = WeakDirections.of(found.R, end.prior, end.calibrated)
     u = (here[end.free] - end.mean) / end.scale
     numbers = here.copy()
     numbers[end.free] += end.scale * constrained_step(directions, found.R, found.d, u)

@@ -129,7 +129,7 @@ def test_degrees_of_freedom_are_rows_less_leverages(name: str) -> None:
     covariance, families, total = case.covariance, dict[str, list[float]](), 0.0
     for f, A, b in zip(case.factors, case.rows, case.rights, strict=True):
         if f.family not in NOT_MEASURED:
-            h = np.einsum("ij,jk,ik->i", A, covariance, A)
+            h = ((A @ covariance) * A).sum(axis=1)
             value, dof, used = families.get(f.family, [0.0, 0.0, 0.0])
             v = f.vectorized
             count = len(A) if v is None else v.model.rows * len(v.model.time)  # of which a compressed factor has fewer
@@ -262,7 +262,7 @@ def test_history_ends_with_the_estimate(name: str) -> None:
     assert course is not None
     reported = case.reported
     R = reported.root(case.factorization.root).R
-    expected = reported.covariance(WeakDirections.of(R, reported.prior).covariance())
+    expected = reported.covariance(WeakDirections.of(R, reported.prior, reported.calibrated).covariance())
     np.testing.assert_allclose(course.covariance[-1], expected, rtol=1e-6, atol=1e-12 * expected.max())
     assert len(course.time) > 10
     # What is determined only gets better known.
