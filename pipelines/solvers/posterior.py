@@ -164,7 +164,7 @@ def responses(factorization: Factorization, jacobian: Array, basis: Array) -> Ta
     Raises:
         LinAlgError: these are not determined.
     """
-    R = np.linalg.qr(factorization.root[:, :-1] @ basis, mode="r")
+    R = np.asarray(np.linalg.qr(factorization.root[:, :-1] @ basis, mode="r"), dtype=float)
     last = basis @ np.linalg.solve(R, np.linalg.solve(R.T, basis.T @ jacobian.T))
     states, nodes = factorization.propagate(last)
     return Tangent(states, nodes, last[factorization.c :])

@@ -101,7 +101,7 @@ class WeakDirections:
         """
         w = weak.shape[1]
         others = np.linalg.svd(weak, full_matrices=True)[0][:, w:] if w else np.eye(len(R))
-        T = np.linalg.qr(R @ np.hstack([others, weak]), mode="r")
+        T = np.asarray(np.linalg.qr(R @ np.hstack([others, weak]), mode="r"), dtype=float)
         k = others.shape[1]
         own, slope = np.linalg.svd(T[:k, :k]), np.linalg.lstsq(T[:k, :k], T[:k, k:], rcond=None)[0]
         root = own[2].T / np.maximum(own[1], UNDETERMINED)
