@@ -86,6 +86,14 @@ class Solver(StrEnum):
     published = "published"
 
 
+class Engine(StrEnum):
+    """What eliminates batch's linear systems."""
+
+    auto = "auto"
+    chain = "chain"
+    gtsam = "gtsam"
+
+
 _METHODS = "los, indexer, head, cube, tumble or one installed"
 _MethodName = Annotated[
     str | None,
@@ -138,6 +146,7 @@ def calibrate(
     jobs: _OwnJobs = None,
     prior: _Prior = None,
     no_check: _NoCheck = False,
+    engine: Annotated[Engine, typer.Option(help="What eliminates batch's linear systems.")] = Engine.auto,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -160,6 +169,8 @@ def calibrate(
     if len(recordings) > 1:
         if solver != Solver.batch:
             raise InputError(f"--solver {solver.value}: several recordings are calibrated together by batch alone")
+        if engine != Engine.auto:
+            raise InputError(f"--engine {engine.value}: of several recordings each has the one that fits it")
         folder = out or _beside(sessions[0], "device")
         if not as_json:
             terminal.say(f"{len(recordings)} recordings of one device: {told(recordings)}")
@@ -179,6 +190,7 @@ def calibrate(
                 auto_topics,
                 not no_check,
                 prior,
+                engine=engine.value,
             )
         with progress.doing("writing"):
             written = write_results(folder, calibration)

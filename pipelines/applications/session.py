@@ -30,7 +30,7 @@ from alidade.pipelines.diagnostics.observability import assess
 from alidade.pipelines.diagnostics.second import other_solution
 from alidade.pipelines.diagnostics.self_check import SelfCheck
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Estimate, Problem, Step, Told
+from alidade.pipelines.estimation.problem import EngineName, Estimate, Problem, Step, Told
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.info import SessionFacts, facts_of, lacking
 from alidade.pipelines.recording.message_reader import ENCODING
@@ -139,12 +139,13 @@ class Arrays:
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """Data as their method takes them, the config in force, and where both come from."""
+    """Data as their method takes them, the config in force, where both come from, and batch's engine."""
 
     method: Method
     data: Any
     config: Config
     origin: Origin
+    engine: EngineName = "auto"
 
     @classmethod
     def read(
@@ -343,7 +344,10 @@ class Session:
         device = walks(self.method, self.config, [q.name for q in problem.quantities])
         with progress.doing("solving"):
             changed = self._changed() if report else ()
-            return solve_batch(problem, budget=report, changed=changed, device=device, elsewhere=others), problem
+            estimate = solve_batch(
+                problem, budget=report, changed=changed, device=device, elsewhere=others, engine=self.engine
+            )
+            return estimate, problem
 
     def _changed(self) -> Iterator[tuple[str, Problem]]:
         """Each input that the graph takes for exact, and the graph with that input off by its step."""
@@ -383,6 +387,7 @@ def calibrate(
     check: bool = False,
     prior: Path | None = None,
     report: bool = True,
+    engine: EngineName = "auto",
 ) -> list[Calibration]:
     """One calibration a solver, from one reading of the recording.
 
@@ -397,6 +402,7 @@ def calibrate(
         check: hold an incremental calibration against batch.
         prior: an earlier calibration of the device to begin from, result.json or calibration.yaml.
         report: with what only a report tells, see `Session.calibrate`.
+        engine: that eliminates batch's linear systems: "chain", "gtsam", or "auto".
 
     Raises:
         InputError: recording or config cannot be used, or there is no such solver.
@@ -405,7 +411,8 @@ def calibrate(
     start = time.perf_counter()
     with progress.doing("reading"):
         session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics, prior)
-    return session.calibrations(solvers, window, {"read": time.perf_counter() - start}, check, report)
+    seconds = {"read": time.perf_counter() - start}
+    return replace(session, engine=engine).calibrations(solvers, window, seconds, check, report)
 
 
 def self_agreement(

@@ -7,6 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from alidade.pipelines import parallel
 from alidade.pipelines.diagnostics.outcome import at_once, outcome, times_of
@@ -17,9 +18,10 @@ from alidade.pipelines.settings import Config
 if TYPE_CHECKING:
     from alidade.pipelines.diagnostics.fault_models import Hypotheses
     from alidade.pipelines.methods import Method
+    from alidade.pipelines.solvers.linearization import Group
 
-# One chunk in so many is held out.
-_HELD_OUT = 5
+# One chunk of so many frames is held out of so many chunks.
+_CHUNK, _HELD_OUT = 20, 5
 
 
 def cut(hypotheses: Hypotheses, data: Any, start: float, stop: float) -> Any:
@@ -100,18 +102,30 @@ def held_out(problem: Problem) -> dict[str, float]:
 
     One chunk in five is held out. 1 is as good as the noise; a little more is the uncertainty of the prediction.
     """
-    from alidade.pipelines.solvers.assembly import CHUNK, Assembly
-    from alidade.pipelines.solvers.system import residuals_of
-    from alidade.pipelines.solvers.weighing import optimize
+    from alidade.pipelines.solvers.engines import Compiled
+    from alidade.pipelines.solvers.robust import RobustConfig, solve_robust
 
-    steps = list(problem.steps(CHUNK))
-    whole = Assembly.of(steps)
-    out = [f for step in steps[_HELD_OUT - 1 :: _HELD_OUT] for f in step.factors if f.measurement is not None]
-    left = {id(f) for f in out}
-    kept = [f for f in whole.factors if id(f) not in left]
-    if not any(f.measurement is not None for f in kept):
+    steps = list(problem.steps(_CHUNK))
+    counts = [len(step.factors) for step in steps]
+    out = np.repeat(np.arange(len(steps)) % _HELD_OUT == _HELD_OUT - 1, counts)
+    compiled = Compiled.of(problem, steps=steps)
+    measurements = [g for g in compiled.engine.groups if g.is_measurement]
+    if all(out[g.factors].all() for g in measurements):
         return {}
-    solution = optimize(kept, whole.initial, whole.shared(problem), problem.loss, held=problem.assumed)
+    kept = compiled.engine.with_groups([_without(g, out[g.factors]) for g in compiled.engine.groups])
+    solution = solve_robust(kept, compiled.initial, problem.loss, RobustConfig())
     if not solution.converged:
         return {}
-    return {family: robust_sigma(r.whitened) for family, r in residuals_of(out, solution.values).items()}
+    found: dict[str, list[Array]] = {}
+    for group in measurements:
+        residuals = group.evaluate(solution.values)[0]
+        found.setdefault(group.family, []).append(residuals[out[group.factors]].ravel())
+    return {family: robust_sigma(np.concatenate(each)) for family, each in found.items()}
+
+
+def _without(group: Group, out: NDArray[np.bool_]) -> Group:
+    """The measurements that are not held out; processes and priors stay."""
+    if not group.is_measurement:
+        return group
+    weights = np.ones((len(out), group.model.rows)) if group.weights is None else group.weights
+    return replace(group, weights=weights * ~out[:, None])

@@ -114,14 +114,15 @@ def times_of(method: Method, data: Any) -> list[Array]:
 
 
 def _score(problem: Problem) -> float:
-    from alidade.pipelines.solvers.assembly import CHUNK, Assembly
-    from alidade.pipelines.solvers.system import residuals_of
-    from alidade.pipelines.solvers.weighing import optimize
+    from alidade.pipelines.solvers.engines import Compiled
+    from alidade.pipelines.solvers.levenberg import LevenbergConfig, minimize
+    from alidade.pipelines.solvers.linearization import NOT_MEASURED
 
-    whole = Assembly.of(problem.steps(CHUNK))
-    factors = whole.factors
-    values = optimize(factors, whole.initial, whole.shared(problem), None, _FEW, _MOST_DAMPING).values
-    measured = np.concatenate([np.abs(r.whitened).ravel() for r in residuals_of(factors, values).values()])
-    processes = [f.factor for f in factors if f.measurement is None and f.family not in ("prior", "definition")]
-    sizes = [np.sqrt(2.0 * f.error(values) / f.dim()) for f in processes]
-    return float(np.median(measured) + (np.median(sizes) if sizes else 0.0))
+    compiled = Compiled.of(problem)
+    engine = compiled.engine.under(None)
+    values = minimize(engine, compiled.initial, LevenbergConfig(_FEW, max_damping=_MOST_DAMPING)).values
+    whitened = list(zip(engine.groups, engine.residuals(values), strict=True))
+    measured = np.concatenate([np.abs(r).ravel() for group, r in whitened if group.is_measurement])
+    processes = [r for group, r in whitened if not group.is_measurement and group.family not in NOT_MEASURED]
+    sizes = np.concatenate([np.sqrt((r**2).mean(axis=1)) for r in processes]) if processes else np.zeros(1)
+    return float(np.median(measured) + np.median(sizes))

@@ -91,9 +91,7 @@ class GtsamEngine:
         return GtsamEngine(self.linearization.with_groups(groups))
 
 
-def _factors(
-    layout: Layout, group: Group, right: Array, jacobians: tuple[Array, ...]
-) -> list[gtsam.GaussianFactor]:
+def _factors(layout: Layout, group: Group, right: Array, jacobians: tuple[Array, ...]) -> list[gtsam.GaussianFactor]:
     """The rows of a group: one factor if all are about the same variables, else one a measurement."""
     n, m = right.shape
     if all(len(at) == 1 for at in group.at):
@@ -154,7 +152,6 @@ class GtsamSystem:
         explained = sum(float(each.d @ each.d) for each in conditionals) + float(root[:-1, -1] @ root[:-1, -1])
         root[-1, -1] = np.sqrt(max(self.squares - explained, 0.0))
         return GtsamFactorization(layout, root, conditionals)
-
 
     def _damped(self, damping: float) -> gtsam.GaussianFactorGraph:
         graph, layout = gtsam.GaussianFactorGraph(), self.layout
@@ -254,9 +251,7 @@ class GtsamFactorization:
         """None: the elimination is not in time order."""
         return np.zeros(0, dtype=np.intp), []
 
-    def _back(
-        self, last: Array, right: float, noise: Callable[[tuple[int, int]], Array]
-    ) -> tuple[Array, Array]:
+    def _back(self, last: Array, right: float, noise: Callable[[tuple[int, int]], Array]) -> tuple[Array, Array]:
         layout, n = self.layout, last.shape[1]
         N, d, J, c, _ = layout.sizes
         states, nodes, found = np.zeros((N, d, n)), np.zeros((J, c, n)), dict[int, Array]()

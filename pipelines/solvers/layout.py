@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.model import POSE3, ROT3, Block, dimension, retract
+from alidade.factors.model import POSE3, ROT3, Block, dimension, retract, width
 from alidade.pipelines.estimation.problem import ChainLayout
 from alidade.pipelines.solvers.chain import Array, Index
 
@@ -180,6 +180,16 @@ class Layout:
             block = self.blocks[self.block[at]]
             insert_value(out, int(self.key[at]), block, values.arrays[block][self.row[at]])
         return out
+
+    def from_gtsam(self, values: gtsam.Values) -> Values:
+        """The values of all variables as gtsam has them."""
+        arrays = {}
+        for i, block in enumerate(self.blocks):
+            some = np.flatnonzero(self.block == i)
+            found = np.empty((len(some), width(block)))
+            found[self.row[some]] = _read(values, self.key[some])[1]
+            arrays[block] = found
+        return Values(arrays)
 
     def root_columns(self, key: int) -> Array:
         """(d, c + s) by which a variable's tangent follows from the last node and the shared unknowns.

@@ -1,9 +1,9 @@
 """Levenberg-Marquardt: full Gauss-Newton steps, damped only after one that raises the cost.
 
-With A, b the whitened rows at the values, a step minimises |A dx - b|^2 + damping |D dx|^2, D'D the diagonal of A'A. The
-ratio of the decrease of the cost to the one that the linear system predicts says how far the damping goes up or down:
-Madsen, Nielsen, Tingleff, "Methods for non-linear least squares problems", 2004, section 3.2. Under a robust loss the
-rows have its weights at the values (iteratively reweighted least squares), and the prediction is that of these rows.
+With A, b the whitened rows at the values, a step minimises |A dx - b|^2 + damping |D dx|^2, D'D the diagonal of A'A.
+The ratio of the decrease of the cost to the one that the linear system predicts says how far the damping goes up or
+down: Madsen, Nielsen, Tingleff, "Methods for non-linear least squares problems", 2004, section 3.2. Under a robust loss
+the rows have its weights at the values (iteratively reweighted least squares), and the prediction is that of these.
 
 Limits: a minimum is a local one. A cost is a sum of squares, in units of squared sigmas, with the losses in force.
 """
@@ -89,7 +89,15 @@ class Engine(Protocol):
         """Weighted whitened residuals of each group."""
 
     def products(self, group: Group, values: Values, tangent: Tangent) -> tuple[Array, Array]:
-        """A x of a group's whitened rows with tangent vectors, and its right side."""
+        """A x (n, m, k) of a group's whitened rows with k tangent vectors, and its right side (n, m)."""
+
+    @property
+    def piece(self) -> Index:
+        """(N,) node in force at each keyframe."""
+
+    @property
+    def time(self) -> Array:
+        """(N,) s of the keyframes."""
 
     def under(self, loss: TruncatedLoss | None) -> Self:
         """With another loss for measurements that have one."""

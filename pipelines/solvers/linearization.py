@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.model import (
@@ -94,9 +95,9 @@ class Group:
             alone; "shared": rows about shared unknowns; "": there is no chain.
         place: (n,) keyframe, of "walk" the node.
         row: (n,) first row of each among those of its place.
-        columns: for each block, of (n or 1, dim) columns each, those that its Jacobian is added to; beside the shared
-            ones of the first bias node those of the node's deviation from it, of later nodes alone: `deviates` (n or 1,).
-        deviates: for each block.
+        columns: for each block those (n or 1, dim) that its Jacobian is added to: of a bias node the shared ones of the
+            first node and those of its deviation from that.
+        deviates: for each block (n or 1,) whether it is a later node than the first.
     """
 
     family: str

@@ -236,9 +236,7 @@ def _shape(group: Group) -> tuple[int, int]:
     return len(group.model.time), group.model.rows
 
 
-def _within(
-    level: Level, groups: Sequence[Group], values: Values, redundancy: float, config: NoiseConfig
-) -> Level:
+def _within(level: Level, groups: Sequence[Group], values: Values, redundancy: float, config: NoiseConfig) -> Level:
     """A process at the level that its residuals have, between what its samples say and what was stated.
 
     Where measurements take most of the redundancy its squares hardly tell the levels between: it stays as stated if
@@ -273,9 +271,7 @@ def _used_square(group: Group, values: Values) -> Array:
     return np.where((group.used(residuals) > 0.5)[:, None], group.weighted(residuals) ** 2, 0.0)
 
 
-def _size(
-    noise: Noise, groups: Sequence[Group], values: Values, config: NoiseConfig
-) -> tuple[float, float]:
+def _size(noise: Noise, groups: Sequence[Group], values: Values, config: NoiseConfig) -> tuple[float, float]:
     """Sum of squares of a noise's whitened residuals that are used, and what it would be if all were of typical size.
 
     Of few residuals, and of processes, the latter is 0.

@@ -23,7 +23,7 @@ from alidade.pipelines.estimation.problem import ChiSquare, Problem, Told
 from alidade.pipelines.solvers.chain import Array, ChainFactorization, ChainSystem
 from alidade.pipelines.solvers.layout import Layout, Tangent, Values
 from alidade.pipelines.solvers.levenberg import Engine, Factorization
-from alidade.pipelines.solvers.linearization import NOT_MEASURED, Group, Linearization
+from alidade.pipelines.solvers.linearization import NOT_MEASURED, Group
 
 # A direction without any information gets this many times its prior scale as sigma.
 MAX_SIGMA = 1e4
@@ -312,7 +312,7 @@ def expected_squares(engine: Engine, factorization: Factorization, values: Value
 
 def sqrt_information(
     problem: Problem,
-    linearization: Linearization,
+    engine: Engine,
     values: Values,
     current_keys: Mapping[int, int],
     device: Collection[str],
@@ -322,7 +322,7 @@ def sqrt_information(
 
     Args:
         problem: of which the numbers are.
-        linearization: of its factors, rejected measurements without weight.
+        engine: of its factors, rejected measurements without weight.
         values: the estimate.
         current_keys: parameter key -> variable that holds its value.
         device: names of the numbers whose priors are set apart.
@@ -331,54 +331,53 @@ def sqrt_information(
     Raises:
         IndeterminateStateError: a state is not determined.
     """
-    layout = linearization.layout
     if at:
-        values = moved_to(problem, linearization, values, current_keys, at)
+        values = moved_to(problem, engine, values, current_keys, at)
+    layout = engine.layout
     reported = Reported.of(problem, layout, values, current_keys)
-    system, _ = linearization.at(values)
-    inverse = np.linalg.pinv(reported.jacobian)[:, reported.free]
-    about = np.pad(system.shared[:, :-1], ((0, 0), (system.c, 0))) @ inverse
-    priors = np.concatenate(
-        [np.full(g.model.rows * len(g.model.time), g.family == "prior") for g in shared_groups(linearization)]
-        or [np.zeros(0, dtype=bool)]
-    )
+    inverse = np.linalg.pinv(reported.jacobian)[layout.sizes[3] :, reported.free]
     named = np.array([reported.names[i] in device for i in reported.free], dtype=bool)
-    of_device = priors & _about_alone(about * reported.scale, named)
-    R = ChainFactorization.of(replace(system, shared=system.shared[~of_device])).root
-    found = reported.root(R)
+    groups, prior_R, prior_d = [], [np.empty((0, len(named)))], [np.empty(0)]
+    for group in engine.groups:
+        if group.target == "shared" and group.family == "prior":
+            rows, _ = group.rows(values, layout.sizes[4] + 1)
+            about = rows[..., :-1] @ inverse
+            of_device = _about_alone((about * reported.scale).reshape(-1, len(named)), named).reshape(rows.shape[:2])
+            prior_R.append(about[of_device])
+            prior_d.append(rows[of_device, -1])
+            weights = np.ones(of_device.shape) if group.weights is None else group.weights
+            groups.append(replace(group, weights=weights * ~of_device))
+        else:
+            groups.append(group)
+    found = reported.root(engine.with_groups(groups).at(values)[0].eliminate().root)
     rows, d = _fewest(found.R, found.d)
     return Told(
         names=tuple(reported.names[i] for i in reported.free),
         at=reported.numbers[reported.free],
         R=rows / reported.scale,
         d=d,
-        prior_R=about[of_device],
-        prior_d=system.shared[of_device, -1],
+        prior_R=np.concatenate(prior_R),
+        prior_d=np.concatenate(prior_d),
         scales=np.array([problem.quantities[i].prior_scale for i in reported.free]),
     )
 
 
 def moved_to(
     problem: Problem,
-    linearization: Linearization,
+    engine: Engine,
     values: Values,
     current_keys: Mapping[int, int],
     numbers: Mapping[str, float],
 ) -> Values:
     """Values with some of the reported numbers moved, the other numbers kept and all states optimal to first order."""
-    reported = Reported.of(problem, linearization.layout, values, current_keys)
+    reported = Reported.of(problem, engine.layout, values, current_keys)
     wanted = np.array([numbers.get(n, here) for n, here in zip(reported.names, reported.numbers, strict=True)])
     du = (wanted - reported.numbers)[reported.free] / reported.scale
-    factorization = ChainFactorization.of(linearization.at(values)[0])
+    factorization = engine.at(values)[0].eliminate()
     last = reported.root(factorization.root).last(du[:, None])
     states, nodes = factorization.given(last)
     move = Tangent(states[..., 0], nodes[..., 0], last[factorization.c :, 0])
-    return linearization.layout.retract(values, move)
-
-
-def shared_groups(linearization: Linearization) -> list[Group]:
-    """Groups of the rows about shared unknowns alone, in the order of these rows."""
-    return [group for group in linearization.groups if group.target == "shared"]
+    return engine.layout.retract(values, move)
 
 
 def _about_alone(rows: Array, named: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -7,9 +7,9 @@ the last one leaves is plain least squares on the measurements inside the gate, 
 It begins with plain least squares, or at the first guess where that explains more measurements: gross outliers take
 plain least squares, and small effects that priors alone hold, out of all bounds.
 
-Outliers are a minority. A family of measurements of which more than half are rejected, beyond what chance could make of
-one in which every second is an outlier (binomial, in the normal approximation; one sided, p = `max_chance`), has another noise than stated, or its
-model is wrong: all of it counts then, and chi-square says so.
+Outliers are a minority. A family of measurements of which more than half are rejected, beyond what chance could make
+of one in which every second is an outlier (binomial in the normal approximation, one sided, p = `max_chance`), has
+another noise than stated, or its model is wrong: all of it counts then, and chi-square says so.
 """
 
 from __future__ import annotations
