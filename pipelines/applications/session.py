@@ -276,15 +276,17 @@ class Session:
             ours = estimate.solver != "published"
             change = stability(estimate, quantities) if ours and estimate.converged else None
             moved = self._moved(change) if change is not None and change.changed else None
+            # The one covariance that everything reads from here on.
+            final = estimate if moved is None else replace(estimate, covariance=moved.widened(estimate, quantities))
             assessment = assess(
                 quantities,
-                estimate.covariance if moved is None else moved.widened(estimate, quantities),
+                final.covariance,
                 estimate.chi_square,
                 problem.advice,
                 decides=not noise_levels.asked(estimate.levels),
             )
             if ours:
-                assessment = explained(assessment, estimate, quantities, causes)
+                assessment = explained(assessment, final, quantities, causes)
             if moved is not None and change is not None:
                 sentence = f"{change.sentence}{told_steps(moved, quantities)}"
                 small = moved.small(quantities)
@@ -300,7 +302,7 @@ class Session:
                 Calibration(
                     method=self.method,
                     problem=problem,
-                    estimate=estimate,
+                    estimate=final,
                     assessment=assessment,
                     recording=self.origin.name,
                     sha256=sha256,
@@ -312,7 +314,7 @@ class Session:
                     beside=cache(self._published) if estimate.solver == "incremental" else None,
                     stability=change,
                     self_check=checked,
-                    findings=self.method.findings(self.data, self.config, estimate) if report else {},
+                    findings=self.method.findings(self.data, self.config, final) if report else {},
                 )
             )
         return found
