@@ -221,3 +221,14 @@ def test_slips_are_found_at_all_seeds_and_false_alarms_are_rare() -> None:
         assert found is not None
         alarms += found.changed
     assert alarms <= 1
+
+
+def test_small_change_widens_the_one_covariance_that_all_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = session(0, 0.5)
+    require = next(q.require for q in found.problem().quantities if q.name == "helmet_mount_x")
+    small = Moved({"helmet_mount_x": Halves(0.0, 1e-5, 0.3 * require, 1e-5)})
+    monkeypatch.setattr(type(found), "_moved", lambda *_: small)
+    calibration = found.calibrate()
+    estimate = calibration.estimate
+    place = estimate.names.index("helmet_mount_x")
+    assert 0.3 * require < estimate.sigmas[place] < 0.5 * require
