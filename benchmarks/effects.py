@@ -99,8 +99,8 @@ def run(case: Case, numbers: Mapping[str, float]) -> Found:
         if p.group is None and p.require and name in truth and p.sigma > 0.0
     ]
     told = [parameters[name].sigma < 0.5 * prior for name, prior in numbers.items() if name in parameters]
-    headline = calibration.assessment.headline
-    first = headline.split(". ")[0].lower()
+    headline = calibration.headline
+    first = headline.split(". ")[0]
     return Found(
         case,
         calibration.status,

@@ -19,6 +19,11 @@ from alidade.factors.gyro import PLATFORM, Derivatives, by_platform_errors, carr
 from alidade.factors.model import ROT3, Array, Block, Model, Residuals
 from alidade.factors.preintegration import GyroPath, Increments
 
+# Numbers of the pictures' errors: time offset, clock skew, angle scale, filter.
+PICTURE = 4
+# rad, beyond which a scale of angles fades out.
+FADE = np.deg2rad(150.0)
+
 
 def ahrs_factors(
     keys_i: list[int], keys_j: list[int], bias_keys: list[int], increments: Increments, bias_hat: Array, variance: Array
@@ -59,10 +64,15 @@ class VisionAttitudeFactor(Model):
 
     Predicted: cRh = cRb bRv(at) vRh with bRv(at) = dB(anchor, at)^T bRv(anchor) dV(anchor, at), the gyros' own samples
     carrying the attitude from the time of the variable to that of the picture. Blocks: bRv at the anchors (rotations),
-    gyro bias (3), cRb, vRh (rotations), the pictures' errors (1 or 3) and, unless the gyros are perfect, the helmet
+    gyro bias (3), cRb, vRh (rotations), the pictures' errors (1 or 4) and, unless the gyros are perfect, the helmet
     gyro's errors (6 to 18) and those of the platform's gyro (9), see alidade.factors.gyro. The pictures' errors are
     time offset, s, positive when a picture was taken later than its stamp says; clock skew, at = stamp + time offset -
-    skew * elapsed; angle scale, Log(first^T cRh) is measured 1 + scale times as large.
+    skew * elapsed; angle scale, Log(first^T cRh) is measured 1 + scale times as large; filter, s^2, half the difference
+    of the second moments of both impulse responses, vision's less the gyro's, which adds Exp(filter * acceleration) to
+    bRv, the angular acceleration by the helmet's gyro (a platform's own, of 1 rad/s^2, would add 2e-5 rad).
+
+    Scale and filter act on the prediction: a measurement that is scaled shrinks its own noise. The scale fades out
+    between FADE and half a turn from the first attitude, where the logarithm changes sign.
 
     Attributes:
         time: (n,) stamps, s.
@@ -75,8 +85,8 @@ class VisionAttitudeFactor(Model):
         anchor: (n,) times of the variables, s; None: the stamps.
         expected: (n,) about when the pictures were taken, s; None: at their stamps. The gyros' errors are evaluated
             halfway between it and the anchor.
-        elapsed, first: (n,) s since the recording's first stamp, (n, 4) cRh of its first picture; with both, skew and
-            angle scale are variables.
+        elapsed, first: (n,) s since the recording's first stamp, (n, 4) cRh of its first picture; with both, skew,
+            angle scale and filter are variables.
     """
 
     time: Array
@@ -90,13 +100,14 @@ class VisionAttitudeFactor(Model):
     expected: Array | None = None
     elapsed: Array | None = None
     first: Array | None = None
+    shapes: ClassVar = {"measured": (4,), "sqrt_information": (3, 3)}
     rows: int = 3
     stacked: ClassVar = ("time", "measured", "sqrt_information", "anchor", "expected", "elapsed", "first")
 
     @property
     def blocks(self) -> tuple[Block, ...]:
         """Attitudes, bias, mounts, the pictures' errors and those of the gyros."""
-        return ROT3, 3, ROT3, ROT3, 1 if self.elapsed is None else 3, *self._error_blocks
+        return ROT3, 3, ROT3, ROT3, 1 if self.elapsed is None else PICTURE, *self._error_blocks
 
     @property
     def _error_blocks(self) -> tuple[int, ...]:
@@ -109,7 +120,10 @@ class VisionAttitudeFactor(Model):
         anchor = self.time if self.anchor is None else self.anchor
         middle = 0.5 * (anchor + (self.time if self.expected is None else self.expected))
         dV, rate, by_gyro = carried(self.helmet, anchor, middle, at, bias, errors)
-        bRv = so3.multiply(bRv, dV)
+        filtered, acceleration, jerk = self._filtered(at, picture)
+        lag = so3.exp(filtered)
+        bRv = so3.compose(bRv, dV, lag)
+        rate = so3.rotate(so3.inverse(lag), rate)
         by_dB: Derivatives = tuple
         if self.platform is not None:
             base_bias, base_errors = platform_errors(self.platform, platform, len(at))
@@ -126,19 +140,31 @@ class VisionAttitudeFactor(Model):
             weight = weight @ by_cRh()
             by_bRv = weight @ so3.matrix(so3.inverse(vRh))
             by_cRb = by_bRv @ so3.matrix(so3.inverse(bRv))
-            by_times = (by_bRv @ rate[..., None]) * by_at[:, None]
-            by_bias, *by_errors = (by_bRv @ each for each in by_gyro())
+            by_dV = by_bRv @ so3.matrix(so3.inverse(lag))
+            by_filtered = by_bRv @ so3.right_jacobian(filtered)
+            by_times = (by_bRv @ rate[..., None] + by_filtered @ jerk[..., None]) * by_at[:, None]
+            by_filter = [by_filtered @ acceleration[..., None]] if picture.shape[1] > 1 else []
+            by_bias, *by_errors = (by_dV @ each for each in by_gyro())
             return (
-                by_bRv @ so3.matrix(so3.inverse(dV)),
+                by_dV @ so3.matrix(so3.inverse(dV)),
                 by_bias,
                 by_cRb,
                 weight,
-                np.concatenate([by_times, by_picture], axis=2),
+                np.concatenate([by_times, by_picture, *by_filter], axis=2),
                 *by_errors,
                 *(-by_cRb @ each for each in by_platform_errors(by_dB, platform)),
             )
 
         return np.einsum("nij,nj->ni", self.sqrt_information, error), jacobians
+
+    def _filtered(self, at: Array, picture: Array) -> tuple[Array, Array, Array]:
+        """What the filter turns bRv by (n, 3), the angular acceleration and the former's derivative by time."""
+        if picture.shape[1] == 1:
+            nothing = np.zeros((len(at), 3))
+            return nothing, nothing, nothing
+        acceleration, jerk = self.helmet.acceleration(at)
+        filter_ = picture[:, 3:]
+        return filter_ * acceleration, acceleration, filter_ * jerk
 
     def _times(self, picture: Array) -> tuple[Array, Array]:
         """When the pictures were taken (n,), and its derivatives by time offset and skew (n, 1 or 2)."""
@@ -153,10 +179,24 @@ class VisionAttitudeFactor(Model):
         n = len(cRh)
         if picture.shape[1] == 1:
             return cRh, lambda: np.eye(3), np.empty((n, 3, 0))
-        first = needed(self.first)
-        turned, scale = so3.log(so3.multiply(so3.inverse(first), cRh)), 1.0 + picture[:, 2:]
+        first, scale = needed(self.first), picture[:, 2:3]
+        turned = so3.log(so3.multiply(so3.inverse(first), cRh))
+        angle = np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-12)
+        share, slope = faded(angle)
+        along = turned / angle
+        scaled = (1.0 + scale * share) * turned
 
         def by_cRh() -> Array:
-            return scale[..., None] * so3.right_jacobian(scale * turned) @ so3.right_jacobian_inverse(turned)
+            across = 1.0 + scale * share
+            both = along[:, :, None] * along[:, None, :]
+            grown = across[..., None] * (np.eye(3) - both) + (1.0 + scale * slope)[..., None] * both
+            return so3.right_jacobian(scaled) @ grown @ so3.right_jacobian_inverse(turned)
 
-        return so3.multiply(first, so3.exp(scale * turned)), by_cRh, turned[..., None]
+        return so3.multiply(first, so3.exp(scaled)), by_cRh, (share * turned)[..., None]
+
+
+def faded(angle: Array) -> tuple[Array, Array]:
+    """Share of itself by which a scale enlarges an angle, 1 to FADE and 0 at half a turn; d(share angle)/d angle."""
+    phase = np.pi * np.clip((angle - FADE) / (np.pi - FADE), 0.0, 1.0)
+    share = 0.5 * (1.0 + np.cos(phase))
+    return share, share - angle * 0.5 * np.sin(phase) * np.pi / (np.pi - FADE)

@@ -23,6 +23,8 @@ _FLATTENING = 1.0 / 298.257223563
 _ECCENTRICITY_SQUARED = 6.69437999014e-3
 _GRAVITY_EQUATOR = 9.7803253359  # m/s^2
 _SOMIGLIANA = 1.93185265241e-3
+# Editions of the World Magnetic Model that pygeomag brings, and how long each holds.
+_EDITIONS, _EDITION_YEARS = (2010, 2015, 2020, 2025), 5
 _CENTRIFUGAL_RATIO = 3.449786506841e-3  # omega^2 a^2 b / GM
 
 
@@ -44,7 +46,7 @@ def gravity(latitude: ArrayLike, height: ArrayLike = 0.0) -> Array:
 
 
 def magnetic_field(latitude: float, longitude: float, height: float, year: float) -> Array:
-    """World Magnetic Model 2025 in n, shape (3,), T.
+    """World Magnetic Model in n, shape (3,), T, by the edition that holds in that year (2010 to 2029).
 
     Args:
         latitude, longitude: rad.
@@ -54,19 +56,21 @@ def magnetic_field(latitude: float, longitude: float, height: float, year: float
     Raises:
         ValueError: the model does not hold at that date or height.
     """
-    model = _world_magnetic_model()
-    first, last = model.life_span
-    if not first <= year <= last:
-        raise ValueError(f"the World Magnetic Model 2025 holds from {first:g} to {last:g}, not in {year:.2f}")
+    if not _EDITIONS[0] <= year <= _EDITIONS[-1] + _EDITION_YEARS:
+        raise ValueError(
+            f"the World Magnetic Model holds from {_EDITIONS[0]} to {_EDITIONS[-1] + _EDITION_YEARS}, not in {year:.2f}"
+        )
     if not -1e3 <= height <= 850e3:
-        raise ValueError(f"the World Magnetic Model 2025 holds from -1 to 850 km, not at {height * 1e-3:.1f} km")
+        raise ValueError(f"the World Magnetic Model holds from -1 to 850 km, not at {height * 1e-3:.1f} km")
+    model = _world_magnetic_model(max(edition for edition in _EDITIONS if edition <= year))
     # It counts north, east, down, in nT; degrees and km go in.
     found = model.calculate(np.rad2deg(latitude), np.rad2deg(longitude), height * 1e-3, year)
     return 1e-9 * np.array([found.y, found.x, -found.z])
 
 
-@lru_cache(maxsize=1)
-def _world_magnetic_model() -> Any:
+@lru_cache(maxsize=len(_EDITIONS))
+def _world_magnetic_model(edition: int) -> Any:
     from pygeomag import GeoMag
 
-    return GeoMag(base_year=2025)
+    # The second version of 2015 mends the first, NOAA/NCEI, February 2019.
+    return GeoMag(coefficients_file=f"wmm/WMM_{edition}{'v2' if edition == 2015 else ''}.COF")

@@ -145,12 +145,17 @@ class GyroIncrementFactor(Model):
     attitudes are those on the platform: bRm_j = dB(platform)^T bRm_i dV. Blocks: attitudes i and j (rotations), gyro
     bias (3, rad/s); unless all are perfect, errors (6 to 18) and, on a platform, its gyro's bias and S (3 + 6).
 
+    The residual is in the units in which noise is white, those of what the sensors read: (I + S) Log(predicted^T j).
+    In true units a larger S would shrink the noise, which pays for nothing in the cost. Of two gyros each contributes
+    its share of the variance: I + share S + (1 - share) S_platform, the latter turned to the helmet's axes.
+
     Attributes:
         time: (n,) ends of the windows, s.
         turns: over the windows, by `gyro`, with the derivatives that the blocks need.
         gyro: whose bias_hat was taken off.
         sigma: (n,) rad per axis of each increment, both gyros together.
         platform_turns, platform: the same of the platform's gyro; None where the attitudes are inertial.
+        share: of the increments' variance that is the gyro's own; the rest is the platform's.
     """
 
     time: Array
@@ -159,6 +164,8 @@ class GyroIncrementFactor(Model):
     sigma: Array
     platform_turns: Increments | None = None
     platform: GyroPath | None = None
+    share: float = 1.0
+    shapes: ClassVar = {"sigma": ()}
     rows: int = 3
     stacked: ClassVar = ("time", "turns", "sigma", "platform_turns")
 
@@ -174,7 +181,7 @@ class GyroIncrementFactor(Model):
         return (*([own] if own else []), *([PLATFORM] if platform else []))
 
     def __call__(self, i: Array, j: Array, bias: Array, *of_gyros: Array) -> Residuals:
-        """Residual Log(predicted_j^T j) / sigma, (n, 3)."""
+        """Residual (I + S) Log(predicted_j^T j) / sigma, (n, 3)."""
         errors, platform = parted(of_gyros, errors_block(self.turns) > 0)
         dV, by_gyro = corrected(self.turns, bias - self.gyro.bias_hat, errors)
         predicted = so3.multiply(i, dV)
@@ -185,19 +192,70 @@ class GyroIncrementFactor(Model):
             predicted = so3.multiply(so3.inverse(dB), predicted)
         error = so3.log(so3.multiply(so3.inverse(predicted), j))
         weight = (1.0 / self.sigma)[:, None]
+        units, by_own, by_platform, by_turning = self._units(errors, platform, j, error)
 
         def jacobians() -> tuple[Array, ...]:
-            left = -so3.right_jacobian_inverse(-error) * weight[..., None]
-            right = so3.right_jacobian_inverse(error) * weight[..., None]
+            scaled = units * weight[..., None]
+            left = -scaled @ so3.right_jacobian_inverse(-error)
+            right = scaled @ so3.right_jacobian_inverse(error)
             ahead = -left @ so3.matrix(so3.inverse(predicted))
+            by_bias, *by_errors = by_gyro()
+            platform_jacobians = [ahead @ each for each in by_platform_errors(by_dB, platform)]
+            own = [left @ each for each in by_errors]
+            for of, direct in ((own, by_own), (platform_jacobians, by_platform)):
+                if of:
+                    of[0] = of[0] + weight[..., None] * direct()
             return (
                 left @ so3.matrix(so3.inverse(dV)),
-                right,
-                *(left @ each for each in by_gyro()),
-                *(ahead @ each for each in by_platform_errors(by_dB, platform)),
+                right + weight[..., None] * by_turning(),
+                left @ by_bias,
+                *own,
+                *platform_jacobians,
             )
 
-        return error * weight, jacobians
+        return _apply(units, error) * weight, jacobians
+
+    def _units(
+        self, errors: Array | None, platform: Array | None, j: Array, error: Array
+    ) -> tuple[Array, Callable[[], Array], Callable[[], Array], Callable[[], Array | float]]:
+        """The matrices from true units to those of white noise (n or 1, 3, 3), and what they add to derivatives.
+
+        Returns:
+            The matrices, and the derivatives of matrix times error by the gyro's errors, by those of the platform's
+            gyro and by the attitudes j, (n, 3, d) each.
+        """
+        units = np.eye(3)[None]
+        if errors is not None:
+            units = units + self.share * symmetric(_distinct(errors)[:, :SCALE])
+        bRm = turned = None
+        if platform is not None and self.share < 1.0:
+            bRm = so3.matrix(j)
+            turned = np.swapaxes(bRm, 1, 2) @ symmetric(platform[:, 3:]) @ bRm
+            units = units + (1.0 - self.share) * turned
+
+        def by_own() -> Array:
+            assert errors is not None
+            out = np.zeros((len(error), 3, errors.shape[1]))
+            out[:, :, :SCALE] = self.share * _by_scale(error)
+            return out
+
+        def by_platform() -> Array:
+            out = np.zeros((len(error), 3, PLATFORM))
+            if bRm is not None:
+                out[:, :, 3:] = (1.0 - self.share) * np.swapaxes(bRm, 1, 2) @ _by_scale(_apply(bRm, error))
+            return out
+
+        def by_turning() -> Array | float:
+            if turned is None:
+                return 0.0
+            return (1.0 - self.share) * (so3.hat(_apply(turned, error)) - turned @ so3.hat(error))
+
+        return units, by_own, by_platform, by_turning
+
+
+def _by_scale(vectors: Array) -> Array:
+    """Derivatives (n, 3, 6) of S v by the numbers of S, v (n, 3)."""
+    return by_symmetric(np.eye(3)[:, :, None] * vectors[:, None, None, :])
 
 
 def rate_error(

@@ -29,6 +29,8 @@ _UNEVEN = 0.05
 _GAP = 1.5
 # Sample intervals integrated together, and how many such blocks are kept.
 _BLOCK, _KEPT = 1 << 16, 48
+# s, half of what accelerations are differenced over: short against motion, long against the noise of a sample.
+_HALF = 0.007
 # Windows looked up together.
 _TOGETHER = 20_000
 
@@ -161,6 +163,15 @@ class GyroPath:
         i, s = self._place(np.asarray(at, dtype=float))
         rate, slope = self._line(i, _rates)
         return np.asarray(rate + slope * s)
+
+    def acceleration(self, at: ArrayLike) -> tuple[Array, Array]:
+        """Angular acceleration (n, 3) at the times, rad/s^2, and its derivative by the time; differences over 14 ms."""
+        at = np.asarray(at, dtype=float)
+        i, s = self._place(np.concatenate([at - _HALF, at + _HALF]))
+        rate, slope = self._line(i, _rates)
+        rate = rate + slope * s
+        n = len(at)
+        return (rate[n:] - rate[:n]) / (2.0 * _HALF), (slope[n:] - slope[:n]) / (2.0 * _HALF)
 
     def drivers(self, at: ArrayLike) -> Array | None:
         """The drivers (n, d) at the times; None without."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numbers
 import typing
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import MISSING, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,6 +13,7 @@ from types import NoneType
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
 from alidade.pipelines import methods
@@ -21,9 +23,17 @@ from alidade.pipelines.config import model as _config_model
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import EngineName
 from alidade.pipelines.methods import Method
+from alidade.pipelines.recording.checks import (
+    SLOWEST_GYRO_S,
+    SLOWEST_S,
+    check_gyro,
+    check_time_unit,
+    clean,
+    nanoseconds,
+)
 from alidade.pipelines.recording.opening import Where
 from alidade.pipelines.recording.reading import open_recording
-from alidade.pipelines.recording.shapes import Array, Rows, rows_by_name
+from alidade.pipelines.recording.shapes import Array, Rows, as_dates, rows_by_name
 from alidade.pipelines.settings import Config as _BaseConfig
 from alidade.pipelines.simulation.simulated import Simulated
 
@@ -44,6 +54,8 @@ Settings = _BaseConfig | str | Path | None
 
 # No session takes longer, s; stamps in ns, and in us after ten seconds, look as if one had.
 _LONGEST = 1e7
+# A place in arrays and in the config is the same within so many rad, deg or m: of rounding.
+_SAME_PLACE = 1e-6
 
 
 def open(
@@ -61,7 +73,8 @@ def open(
     Args:
         source: a recording, or a list of its files; what `simulate` returns; or arrays, either by name (those of the
             method's data, see `alidade.Method.data`; what is not there counts as not recorded) or as an object of that
-            class. Times are s, everything else SI; lists, integers and masked arrays become arrays of floats.
+            class. Times are s or dates (datetime64, pandas' stamps), everything else SI; lists, integers, masked arrays
+            and columns of data frames become arrays of floats, and rows are sorted by their stamps.
         method: its name; by default that of the config, or the only one the recording can serve.
         config: overrides, key by key, the config that comes with the source.
         strict: refuse a recording of which anything is lost.
@@ -87,7 +100,7 @@ def _open(source: Source, method: str | None, config: Settings, strict: bool) ->
     if name is None:
         raise InputError("arrays do not say which method they are for: open(..., method=...)")
     chosen = methods.method(name)
-    data = _checked(chosen, _data(chosen, source))
+    data = _placed(_checked(chosen, _data(chosen, source)), settings)
     return Session(chosen, data, settings, Arrays(chosen, data))
 
 
@@ -270,37 +283,104 @@ def _data(method: Method, given: Any) -> Any:
 
 
 def _checked(method: Method, data: Any) -> Any:
-    """The data with all arrays as floats.
+    """The data with all arrays as floats, sorted by their stamps, without the same row twice.
 
     Raises:
-        InputError: an array is none of numbers or has rows of another shape than its class says, stamps do not increase
-            or are not in s, or what they stamp is not as long as they are, or not finite.
+        InputError: an array is none of numbers or has rows of another shape than its class says, stamps are not in s
+            or cannot be sorted as those of a file are, or what they stamp is not as long as they are, or not finite.
     """
     streams = method.hypotheses().streams
     # Stamps and what they stamp are arrays, whatever annotations say.
     rows = {name: Rows() for stamps, carried in streams.items() for name in (stamps, *carried)}
     rows |= rows_by_name(method.data)
     given = {name: value for name in rows if (value := getattr(data, name)) is not None}
+    dates = {name: t_ns for name in streams if name in given and (t_ns := as_dates(given[name])) is not None}
+    if dates:
+        if len(dates) < len(streams.keys() & given.keys()):
+            others = ", ".join(sorted(streams.keys() & given.keys() - dates.keys()))
+            raise InputError(f"arrays: {', '.join(dates)} are dates, {others} are not: give all as dates, or all in s")
+        start = min(int(t_ns.min(initial=np.iinfo(np.int64).max)) for t_ns in dates.values())
+        given |= {name: (t_ns - start) * 1e-9 for name, t_ns in dates.items()}
+        data = replace(data, epoch_ns=start)
     arrays = {name: rows[name].read(name, value) for name, value in given.items()}
+    dropped: dict[str, int] = {}
     for stamps, carried in streams.items():
-        t = arrays.get(stamps)
-        if t is not None:
-            _check_stamps(stamps, t)
-        for name in (name for name in carried if name in arrays):
+        t, names = arrays.get(stamps), [name for name in carried if name in arrays]
+        if t is None:
+            if names:
+                raise InputError(f"arrays: {names[0]} needs its stamps, {stamps}")
+            continue
+        _check_stamps(stamps, given[stamps], t)
+        for name in names:
             values = arrays[name]
-            if t is None:
-                raise InputError(f"arrays: {name} needs its stamps, {stamps}")
             if len(values) != len(t):
                 raise InputError(f"arrays: {name} has {len(values)} rows for the {len(t)} stamps of {stamps}")
             lost = rows[name].lost(values)
             if len(lost):
                 more = f" (and {len(lost) - 1} more)" if len(lost) > 1 else ""
                 raise InputError(f"arrays: {name} is not finite at {t[lost[0]]:.6f} s{more}; leave out such rows")
+        kept = _in_order(stamps, t, [arrays[name] for name in names], dropped)
+        arrays |= {name: arrays[name][kept] for name in (stamps, *names)} if kept is not None else {}
+        has_gyro = any("gyro" in name for name in names)
+        t_ns = nanoseconds(arrays[stamps], 0)
+        check_time_unit(f"arrays: {stamps}", t_ns, SLOWEST_GYRO_S if has_gyro else SLOWEST_S)
+        for name in names:
+            # Those of a method that takes counts are looked at with their conversion.
+            if "gyro" in name and "raw" not in getattr(method.section, "model_fields", {}):
+                with _of_arrays():
+                    check_gyro(name, arrays[stamps], arrays[name])
+    if dropped:
+        data = replace(data, dropped={**data.dropped, **dropped})
     return replace(data, **arrays)
 
 
-def _check_stamps(name: str, t: Array) -> None:
-    if t.ndim != 1 or not np.isfinite(t).all() or not (np.diff(t) > 0.0).all():
+@contextmanager
+def _of_arrays() -> Iterator[None]:
+    """Has what is said of a topic said of an array."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"arrays: {str(error).removeprefix('topic ')}") from error
+
+
+def _in_order(name: str, t: Array, carried: Sequence[Array], dropped: dict[str, int]) -> NDArray[np.int64] | None:
+    """The rows to keep, by time, as of a file; None for all of them as they are."""
+    if (np.diff(t) > 0.0).all():
+        return None
+    values = np.hstack([t[:, None] * 0.0, *(np.nan_to_num(one).reshape(len(t), -1) for one in carried)])
+    with _of_arrays():
+        return clean(name, nanoseconds(t, 0), 0, values, dropped)[1]
+
+
+def _check_stamps(name: str, given: Any, t: Array) -> None:
+    if t.ndim != 1 or not np.isfinite(t).all():
         raise InputError(f"arrays: {name} has to be one row of stamps in s, each later than the one before")
-    if t[-1] - t[0] > _LONGEST:
-        raise InputError(f"arrays: {name} spans {t[-1] - t[0]:.3g} s; times have to be in s, not in us or ns")
+    if getattr(given, "dtype", None) == np.float32 and len(t) > 1:
+        held, step = float(np.spacing(np.float32(np.abs(t).max()))), float(np.ptp(t)) / (len(t) - 1)
+        if held > 0.1 * step:
+            raise InputError(
+                f"arrays: {name} is float32, which holds {np.abs(t).max():.6g} to {held:.3g} s: give float64, or "
+                "subtract the first stamp before it becomes float32"
+            )
+    if np.ptp(t) > _LONGEST:
+        raise InputError(f"arrays: {name} spans {np.ptp(t):.3g} s; times have to be in s, not in us or ns")
+
+
+def _placed(data: Any, config: _BaseConfig) -> Any:
+    """The data at the config's place, as of a file. Raises InputError where the data say another."""
+    given = {
+        "latitude": None if config.latitude_deg is None else np.deg2rad(config.latitude_deg),
+        "longitude": None if config.longitude_deg is None else np.deg2rad(config.longitude_deg),
+        "height": config.altitude_m,
+        "latitude_deg": config.latitude_deg,
+    }
+    known = {field.name: field.default for field in fields(data)}
+    found: dict[str, float] = {}
+    for name, value in given.items():
+        if value is None or name not in known:
+            continue
+        there = getattr(data, name)
+        if there is not None and there != known[name] and abs(there - value) > _SAME_PLACE:
+            raise InputError(f"arrays: {name} is {there:.8g}, by the config {value:.8g}; give one of them")
+        found[name] = float(value)
+    return replace(data, **found)

@@ -111,6 +111,9 @@ _Jobs = Annotated[int | None, typer.Option(help="Local worker processes; default
 _OwnJobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Processes to be used; default: one a core.")]
 _Strict = Annotated[bool, typer.Option("--strict", help="Refuse a recording of which anything is lost.")]
 _AutoTopics = Annotated[bool, typer.Option("--auto-topics", help="Take the topics that `info` suggests.")]
+_AutoColumns = Annotated[
+    bool, typer.Option("--auto-columns", help="Take what `info` concludes of the columns of tables.")
+]
 _NoCheck = Annotated[bool, typer.Option("--no-check", help="Do not hold an incremental result against batch.")]
 _Prior = Annotated[
     Path | None, typer.Option(help="An earlier calibration of the device to begin from: result.json, calibration.yaml.")
@@ -126,11 +129,27 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
+_TimeLimit = Annotated[
+    float | None,
+    typer.Option(
+        "--time-limit",
+        min=0.1,
+        help="Seconds to solve in; default: 60, or a tenth of the recording, online all of it, where that is more.",
+    ),
+]
 _Version = Annotated[bool, typer.Option("--version", "-V", callback=_version, is_eager=True, help="Print it.")]
 
 
+_Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say what is tried and fails, with tracebacks.")]
+
+
 @app.callback()
-def _options(version: _Version = False) -> None: ...
+def _options(version: _Version = False, verbose: _Verbose = False) -> None:  # noqa: ARG001
+    if verbose:
+        import logging
+
+        logging.basicConfig(level=logging.WARNING, format="%(message)s")
+        logging.getLogger("alidade").setLevel(logging.DEBUG)
 
 
 @app.command()
@@ -143,10 +162,12 @@ def calibrate(
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: SESSION-SOLVER.")] = None,
     strict: _Strict = False,
     auto_topics: _AutoTopics = False,
+    auto_columns: _AutoColumns = False,
     jobs: _OwnJobs = None,
     prior: _Prior = None,
     no_check: _NoCheck = False,
     engine: Annotated[Engine, typer.Option(help="What eliminates batch's linear systems.")] = Engine.auto,
+    time_limit: _TimeLimit = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -156,7 +177,7 @@ def calibrate(
     """
     from tempfile import TemporaryDirectory
 
-    from alidade.pipelines import parallel, progress
+    from alidade.pipelines import deadline, parallel, progress
     from alidade.pipelines.applications.joint import calibrate_device
     from alidade.pipelines.applications.session import calibrate as run
     from alidade.pipelines.errors import InputError
@@ -175,7 +196,12 @@ def calibrate(
         if not as_json:
             terminal.say(f"{len(recordings)} recordings of one device: {told(recordings)}")
     require_room(folder)
-    with progress.shown(quiet or as_json), parallel.processes(jobs), TemporaryDirectory(prefix="alidade-") as parts:
+    with (
+        progress.shown(quiet or as_json),
+        parallel.processes(jobs),
+        deadline.within(time_limit),
+        TemporaryDirectory(prefix="alidade-") as parts,
+    ):
         if len(recordings) > 1:
             by_itself = partial(write_part, Path(parts))
             calibration = calibrate_device(recordings, method, config, strict, auto_topics, prior, by_itself)
@@ -191,11 +217,12 @@ def calibrate(
                 not no_check,
                 prior,
                 engine=engine.value,
+                auto_columns=auto_columns,
             )
         with progress.doing("writing"):
-            written = write_results(folder, calibration)
             if len(recordings) > 1:
                 adopt_parts(folder, Path(parts))
+            written = write_results(folder, calibration)
     _tell(calibration, folder, written, as_json)
 
 
@@ -214,24 +241,29 @@ def compare(
     quiet: Quiet = False,
 ) -> None:
     """The published, batch and incremental solvers side by side, with errors where the truth is known."""
+    import time
+
     from alidade.pipelines import parallel, progress
-    from alidade.pipelines.applications.session import calibrate as run
-    from alidade.pipelines.applications.session import self_agreement
+    from alidade.pipelines.applications.session import Session
+    from alidade.pipelines.recording.reading import open_recording
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.compare import write_compare
     from alidade.pipelines.reports.whole import require_room
 
     require_room(out)
-    solvers = ["published", "batch", "incremental"]
+    kept, start = parse_window(window), time.perf_counter()
     with progress.shown(quiet or as_json), parallel.processes(jobs):
-        calibrations = run(session, solvers, method, config, parse_window(window), strict, auto_topics, prior=prior)
+        with progress.doing("reading"):
+            opened = Session.read(open_recording(session, strict), method, config, auto_topics, prior)
+        seconds = {"read": time.perf_counter() - start}
+        calibrations = opened.calibrations(["published", "batch", "incremental"], kept, seconds)
     if as_json:
         terminal.show_json(calibrations)
     else:
         terminal.show(calibrations)
     if out is not None:
         with progress.shown(quiet), parallel.processes(jobs), progress.doing("solving parts of the recording"):
-            written = write_compare(out, calibrations, *self_agreement(session, method, config))
+            written = write_compare(out, calibrations, *opened.cross_validate())
         if not as_json:
             terminal.say(f"Comparison in {written}")
 
@@ -252,6 +284,10 @@ def follow(
     checkpoint: Annotated[Path | None, typer.Option(help="File to save the run in, and to go on from.")] = None,
     serve: Annotated[bool, typer.Option("--serve", help="Estimates live over Foxglove's WebSocket.")] = False,
     port: Annotated[int, typer.Option(help="Of --serve, on this machine alone.")] = 8765,
+    allow_origin: Annotated[
+        list[str] | None,
+        typer.Option(help="Of --serve: a page that may read it beside Foxglove's, https://host; may be repeated."),
+    ] = None,
     page: Annotated[
         bool, typer.Option("--page", help="A page that says what to do, for a browser or a phone.")
     ] = False,
@@ -276,7 +312,8 @@ def follow(
     for place in (folder, checkpoint and checkpoint.parent):
         require_room(place)
     settings = Settings(method, config, parse_window(window), patience, checkpoint, not no_check, prior)
-    calibration = run(source, settings, port if serve else None, record, as_json, (host, page_port) if page else None)
+    page_at = (host, page_port) if page else None
+    calibration = run(source, settings, port if serve else None, record, as_json, page_at, allow_origin or ())
     written = write_results(folder, calibration)
     _tell(calibration, folder, written, as_json)
 
@@ -403,7 +440,7 @@ def plan(
             terminal.say(f"The better motion is in {out}")
         if page is not None:
             terminal.say(f"The page is {page}")
-    raise typer.Exit(exit_codes.OF_STATUS[planned.now.assessment.status])
+    raise typer.Exit(exit_codes.OF_STATUS[planned.now.status])
 
 
 @app.command()
@@ -417,7 +454,8 @@ def info(
     """What can be calibrated from a recording, with which topics, what is missing, and what is in it."""
     from alidade.pipelines import progress
     from alidade.pipelines.applications.discovery import suggestions, unused
-    from alidade.pipelines.applications.session import session_facts
+    from alidade.pipelines.applications.session import checked_facts
+    from alidade.pipelines.applications.table_discovery import propose_columns, with_columns
     from alidade.pipelines.config import recorded_config
     from alidade.pipelines.recording.reading import open_recording
     from alidade.pipelines.reports import terminal
@@ -425,12 +463,15 @@ def info(
     with progress.shown(quiet), progress.doing("reading"):
         recording = open_recording(session, strict)
         settings = recorded_config(recording, config)
-        facts = session_facts(recording, settings)
+        columns = None if settings.columns else propose_columns(recording)
+        if columns is not None and columns.columns:
+            settings = with_columns(recording, settings)
+        facts = checked_facts(recording, settings)
         found, left = suggestions(recording, settings), unused(recording, settings)
     if as_json:
-        print(terminal.facts_json(facts, found, left))
+        print(terminal.facts_json(facts, found, left, columns))
     else:
-        terminal.show_facts(session.name, facts, found, left)
+        terminal.show_facts(session.name, facts, found, left, columns)
 
 
 @app.command()
@@ -440,6 +481,7 @@ def noise(
     out: Annotated[Path | None, typer.Option(help="Folder for noise.html and noise.json.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print noise.json and nothing else.")] = False,
     strict: _Strict = False,
+    auto_columns: _AutoColumns = False,
     quiet: Quiet = False,
 ) -> None:
     """The noise of gyros, accelerometers and magnetometers from their time at rest, and the config's section for it."""
@@ -449,7 +491,7 @@ def noise(
     from alidade.pipelines.reports.noise import noise_json, write_noise
 
     with progress.shown(quiet):
-        study = noise_of(session, strict, config)
+        study = noise_of(session, strict, config, auto_columns)
     written = () if out is None else write_noise(out, study)
     if as_json:
         print(noise_json(study), end="")
@@ -636,7 +678,7 @@ def _tell(calibration: "Calibration", folder: Path, written: Sequence[Path], as_
     else:
         terminal.show([calibration])
         terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
-    raise typer.Exit(exit_codes.OF_STATUS[calibration.assessment.status])
+    raise typer.Exit(exit_codes.OF_STATUS[calibration.status])
 
 
 def _interrupted(error: BaseException | None) -> bool:
@@ -656,10 +698,18 @@ def main() -> None:
         if _interrupted(error):
             sys.exit(exit_codes.INTERRUPTED)
         code = _TROUBLE.get(type(error).__name__)
-        if code is None:
+        if code is None and not isinstance(error, OSError):
             raise
-        print(f"alidade: {error}", file=sys.stderr)
-        sys.exit(code)
+        print(f"alidade: {_of_system(error) if isinstance(error, OSError) else error}", file=sys.stderr)
+        sys.exit(exit_codes.BAD_INPUT if code is None else code)
+
+
+def _of_system(error: OSError) -> str:
+    """A file or a folder that the system refuses, TMPDIR without room among them, in one line."""
+    from alidade.pipelines.errors import printable
+
+    where = error.filename if isinstance(error.filename, str) else os.environ.get("TMPDIR", "/tmp")
+    return f"{printable(where)}: {error.strerror or printable(str(error))}"
 
 
 if __name__ == "__main__":

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from alidade.pipelines import methods
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.info import lacking
 from alidade.pipelines.recording.pairing import Pairing, pair
+from alidade.pipelines.recording.placeholders import is_there
 from alidade.pipelines.recording.reading import Recording
 from alidade.pipelines.recording.series import ImuSeries
 from alidade.pipelines.recording.sources import TopicSource
@@ -39,12 +40,14 @@ class Suggestion:
         topics: key in the config -> where it could come from; the keys that are lacking alone.
         reasons: sentences about why.
         missing: what would still be lacking.
+        has_to_be_asked_for: whether it serves only where the method is named.
     """
 
     method: str
     topics: dict[str, TopicSource]
     reasons: tuple[str, ...]
     missing: tuple[str, ...]
+    has_to_be_asked_for: bool = False
 
     @property
     def yaml(self) -> str:
@@ -60,6 +63,9 @@ def suggestions(recording: Recording, config: Config, only: Sequence[str] | None
     for name in methods.names() if only is None else only:
         if lacking(methods.method(name).needs, recording, config):
             made = _suggestion(name, recording, config, pairings)
+            if made.topics and made.missing and config.method is None:
+                by_name = _suggestion(name, recording, config.model_copy(update={"method": name}), pairings)
+                made = replace(by_name, has_to_be_asked_for=True) if not by_name.missing else made
             if made.topics:
                 found.append(made)
     return tuple(found)
@@ -72,11 +78,12 @@ def with_suggested(recording: Recording, config: Config, method: str | None = No
     Raises InputError when no method could be served, or several.
     """
     asked = method or config.method
+    config = config.model_copy(update={"method": asked}) if asked else config
     served = [name for name in methods.names() if not lacking(methods.method(name).needs, recording, config)]
     if asked in served or (asked is None and served):
         return config
     found = suggestions(recording, config, [asked] if asked else None)
-    whole = [suggestion for suggestion in found if not suggestion.missing]
+    whole = [suggestion for suggestion in found if not suggestion.missing and not suggestion.has_to_be_asked_for]
     if len(whole) != 1:
         which = " and ".join(suggestion.method for suggestion in whole)
         what = f"topics could be found for {which}; choose with --method" if whole else nearest_suggestion(found)
@@ -111,6 +118,7 @@ def idle(recording: Recording, config: Config, method: str) -> tuple[str, ...]:
     """Sentences about topics that a method could read as another of its sensors, and does not."""
     chosen = methods.method(method)
     read = {part for topic in chosen.topics for part in _recorded_as(config, topic)}
+    read |= {source.name for source in config.topics.values()}
     sentences = []
     for topic in chosen.topics:
         if _is_attitude(topic) or wanted(recording, config, topic):
@@ -157,7 +165,14 @@ def _suggestion(
             continue
         if topic not in needed and not topics:
             continue
-        used = taken | {source.name for source in topics.values()}
+        used = taken | {part for source in topics.values() for part in (source.name, *source.parts)}
+        split = _split_imu(recording, used) if messages.IMU in topic.types and not _is_attitude(topic) else None
+        if split is not None and topic in needed:
+            topics[topic.key] = split
+            reasons.append(
+                f"{split.gyro} has rates alone, {split.accel} accelerations: together they are the {topic.key}"
+            )
+            continue
         named = _by_name(recording, topic, used, is_needed=topic in needed)
         if named is not None:
             topics[topic.key] = TopicSource(topic=named)
@@ -261,11 +276,38 @@ def _by_name(recording: Recording, topic: Topic, used: set[str], is_needed: bool
         for name, found in recording.topics.items()
         if found.type in topic.types and found.count and found.is_readable and name not in used
         if not (_is_attitude(topic) and found.type == messages.IMU)
+        if not (topic.key.startswith("reference") and found.type == messages.IMU and not _has_attitude(recording, name))
     ]
     words = topic.key.replace("_", " ")
     alike = {name: difflib.SequenceMatcher(None, words, name.strip("/").replace("/", " ")).ratio() for name in there}
     best = max(there, key=lambda name: alike[name], default=None)
     return best if best is not None and (is_needed or alike[best] > _ALIKE or _is_other_gyro(topic, there)) else None
+
+
+def _split_imu(recording: Recording, used: set[str]) -> TopicSource | None:
+    """A gyro and an accelerometer on two topics, as some drivers publish them; None where there are not both."""
+    free = [n for n, t in recording.topics.items() if t.type == messages.IMU and t.count and n not in used]
+    there = {name: imu for name in free if (imu := _rates(recording, name)) is not None} if len(free) > 1 else {}
+    gyros = [n for n, imu in there.items() if _has_gyro(imu) and not _has_accel(imu)]
+    accels = [n for n, imu in there.items() if _has_accel(imu) and not _has_gyro(imu)]
+    if not gyros or not accels:
+        return None
+    pairs = [(difflib.SequenceMatcher(None, g, a).ratio(), g, a) for g in gyros for a in accels]
+    _, gyro, accel = max(pairs)
+    return TopicSource(gyro=gyro, accel=accel)
+
+
+def _has_gyro(imu: ImuSeries) -> bool:
+    return is_there("gyro", imu.gyro, imu.gyro_cov)
+
+
+def _has_attitude(recording: Recording, topic: str) -> bool:
+    imu = _rates(recording, topic)
+    return imu is not None and bool((imu.wxyz_cov[:, 0, 0] >= 0.0).any() and imu.wxyz.any())
+
+
+def _has_accel(imu: ImuSeries) -> bool:
+    return is_there("accel", imu.accel, imu.accel_cov)
 
 
 def _is_other_gyro(topic: Topic, there: list[str]) -> bool:

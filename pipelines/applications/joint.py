@@ -26,18 +26,21 @@ from alidade.pipelines import progress
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.applications.sharing import DAY_S, walk_as_told, walks
 from alidade.pipelines.belief import Belief
-from alidade.pipelines.diagnostics import noise_levels
 from alidade.pipelines.diagnostics.device_changes import Changes, Rate, changes
-from alidade.pipelines.diagnostics.observability import Assessment, Fit, assess
+from alidade.pipelines.diagnostics.diagnose import diagnose
+from alidade.pipelines.diagnostics.goodness_of_fit import Fit
+from alidade.pipelines.diagnostics.observability import finite_covariance
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.assumptions import kind
 from alidade.pipelines.estimation.believing import believing
+from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
+from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import Array, ChiSquare, Estimate, Parameter, Problem, Quantity, Step, Told
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.info import SessionFacts
 from alidade.pipelines.recording.opening import Where
 from alidade.pipelines.recording.reading import open_recording
-from alidade.pipelines.reports.over_time import recordings_shown, sentences
+from alidade.pipelines.reports.over_time import recordings_shown
 from alidade.pipelines.reports.result import Calibration, PartParameter, PartResult
 from alidade.pipelines.solvers.joint import Joined, grown, join, tell
 
@@ -48,7 +51,7 @@ _STAYS, _MOST_PASSES = 1e-2, 6
 _FAR_APART = 10.0
 # So many recordings are named in a sentence.
 _MOST_NAMED = 3
-_ADVICE = "Calibrate those after the last change together, or let what changed walk: `share` in the config."
+_NO_SOLUTION = "linearised at the joint estimate the recordings lead elsewhere again and again"
 _OVERLAP = (
     "recordings overlap in time and count as several all the same; parts of one are named by a folder or a pattern in "
     "quotes"
@@ -114,6 +117,11 @@ class Alone:
         return datetime.datetime.fromtimestamp(self.day * DAY_S, datetime.UTC)
 
     @property
+    def values(self) -> dict[str, float]:
+        """What it estimated by itself."""
+        return {name: p.value for name, p in self.calibration.parameters.items()}
+
+    @property
     def sigmas(self) -> dict[str, float]:
         """Of what it estimated by itself."""
         found = self.calibration.parameters
@@ -169,6 +177,8 @@ def calibrate_together(
         for i, read in enumerate(sessions):
             with progress.doing("reading"):
                 session = read()
+            if alone:
+                session = replace(session, near=alone[0].values)
             calibration = session.calibrated_beside(partial(_with_those_before, session, alone))
             alone.append(Alone.of(session, calibration, Path(folder) / str(i)))
             written(calibration)
@@ -304,30 +314,29 @@ def _calibration(
     extra = np.diag([quantities[name].extra_sigma ** 2 if name in found else 0.0 for name in names])
     covariance = covariance * np.outer(inflation, inflation) + extra
     converged = len(alone) == 1 or step < _STAYS
+    ordered = [quantities[name] for name in names]
     shares = joined.budget(last, [each.name for each in alone])
     estimate = Estimate(
         solver="batch",
         names=names,
         values=values,
-        covariance=covariance,
+        covariance=finite_covariance(ordered, covariance),
         converged=converged,
         message=f"{len(alone)} recordings; the joint estimate moved last by {step:.1g} sigmas",
         chi_square=_sum([each.calibration.estimate.chi_square for each in alone]),
         rejected=_counts([each.calibration.estimate.rejected for each in alone]),
+        levels=_combined_levels([each.calibration.estimate.levels for each in alone]),
         inflation=inflation,
         budget={name: _with_extra(shares[name], names.index(name), covariance, extra) for name in shares},
     )
     parts = [_part(each, joined, i) for i, each in enumerate(alone)]
     changed = _changes(alone, joined)
     changed = replace(changed, rates={**changed.rates, **known})
-    decides = not any(noise_levels.asked(each.calibration.estimate.levels) for each in alone)
-    ordered = [quantities[name] for name in names]
-    assessment = assess(ordered, covariance, estimate.chi_square, problem.advice, decides)
     return Calibration(
         method=method,
         problem=problem,
         estimate=estimate,
-        assessment=_judged(assessment, alone, joined, converged, sentences(changed, parts, problem.quantities)),
+        findings=_findings(estimate, ordered, problem, alone, joined, changed),
         recording=_named([each.name for each in alone]),
         sha256=hashlib.sha256(b"".join(bytes.fromhex(each.calibration.sha256) for each in alone)).hexdigest(),
         facts=_facts([each.calibration.facts for each in alone]),
@@ -365,23 +374,80 @@ def _inflation(name: str, alone: Sequence[Alone]) -> float:
     return grown([p.sigma for p in found], [p.inflation for p in found])
 
 
-def _judged(
-    assessment: Assessment, alone: Sequence[Alone], joined: Joined, converged: bool, changed: Sequence[str]
-) -> Assessment:
-    """With what the recordings say beside each other; `changed` are sentences about steps of the device."""
-    if not converged:
-        return assessment.unsolved("linearised at the joint estimate the recordings lead elsewhere again and again")
-    wrong = [each.calibration for each in alone if each.calibration.status == "inconsistent"]
-    for each in wrong[:_MOST_NAMED]:
-        assessment = assessment.misfit(f"{each.recording} by itself: {each.headline}")
+def _findings(
+    estimate: Estimate,
+    quantities: Sequence[Quantity],
+    problem: Problem,
+    alone: Sequence[Alone],
+    joined: Joined,
+    changed: Changes,
+) -> tuple[Finding, ...]:
+    """The findings on the joint estimate, on recordings by themselves, and on changes of the device between them."""
+    if not estimate.converged:
+        return diagnose(replace(estimate, message=_NO_SOLUTION), quantities)
+    own = (_of_recording(each.calibration) for each in alone)
+    found = [*diagnose(estimate, quantities, problem.advice), *(each for each in own if each is not None)]
+    steps = list(_device_changes(changed, alone))
+    found += steps
     value, dof = joined.disagreement
-    if changed:
-        assessment = assessment.misfit(f"The device is not the same in all recordings. {' '.join(changed)} {_ADVICE}")
-    elif dof >= 1 and value > Fit.of(value, float(dof)).high:
-        assessment = assessment.misfit(
-            f"The recordings disagree about the device: chi-square {value:.4g} for {dof} degrees of freedom."
-        )
-    return assessment.remarked(f"{len(alone)} recordings of one device.")
+    if not steps and dof >= 1 and value > Fit.of(value, float(dof)).high:
+        found.append(_disagreement([each.name for each in alone], (), value, dof))
+    found.append(Finding("remark", Severity.NOTE, {"text": f"{len(alone)} recordings of one device"}))
+    return by_severity(found)
+
+
+# Notes on one recording that the joint estimate, which has no residuals, cannot have.
+_OWN_NOTES = ("rejection", "change")
+
+
+def _of_recording(calibration: Calibration) -> Finding | None:
+    """What makes a recording inconsistent by itself, and notes on its residuals; None: nothing."""
+    own = [
+        finding
+        for finding in calibration.findings
+        if finding.severity == Severity.INCONSISTENT
+        or (finding.severity == Severity.NOTE and finding.kind in _OWN_NOTES)
+    ]
+    if not own:
+        return None
+    evidence = {"recording": calibration.recording, "findings": tuple(own)}
+    return Finding("recording", max(finding.severity for finding in own), evidence)
+
+
+def _device_changes(changed: Changes, alone: Sequence[Alone]) -> Iterator[Finding]:
+    """Steps of the device between recordings, the most significant first; else all parameters together."""
+    places = [(each.name, each.calibration.start) for each in alone]
+    for step in sorted(changed.found, key=lambda step: -abs(step.z)):
+        names, dates = zip(*places[step.after : step.after + 2], strict=True)
+        numbers = {"parameter": step.name, "step": step.size, "sigma": step.sigma}
+        yield Finding("device_change", Severity.INCONSISTENT, {**numbers, "recordings": names, "dates": dates})
+    for each in changed.together if not changed.found else ():
+        if each.significant:
+            names, dates = zip(*places[each.after : each.after + 2], strict=True)
+            yield _disagreement(names, dates, each.chi_square, each.dof)
+
+
+def _disagreement(names: Sequence[str], dates: Sequence[str], chi_square: float, dof: int) -> Finding:
+    evidence = {"recordings": names, "dates": dates, "chi_square": chi_square, "dof": dof}
+    return Finding("recordings_disagree", Severity.INCONSISTENT, evidence)
+
+
+def _combined_levels(each: Sequence[Sequence[Level]]) -> tuple[Level, ...]:
+    """Noise levels of all recordings as one: estimates weighted by their information, the mean of what is used."""
+    names = dict.fromkeys(level.noise.name for levels in each for level in levels)
+    return tuple(
+        _combined([level for levels in each for level in levels if level.noise.name == name]) for name in names
+    )
+
+
+def _combined(levels: Sequence[Level]) -> Level:
+    newest, told = levels[-1], [(x.found, x.sigma) for x in levels if x.found is not None and x.sigma]
+    scale = float(np.mean([level.used for level in levels])) / newest.noise.stated if newest.noise.stated else 1.0
+    if not told:
+        return replace(newest, scale=scale, found=None, sigma=None)
+    found, sigma = np.array(told, dtype=float).T
+    information = float((sigma**-2.0).sum())
+    return replace(newest, scale=scale, found=float((found / sigma**2).sum()) / information, sigma=information**-0.5)
 
 
 def _sum(found: Sequence[ChiSquare | None]) -> ChiSquare:
@@ -432,7 +498,7 @@ def _part(alone: Alone, joined: Joined, i: int) -> PartResult:
         sha256=by_itself.sha256,
         start=alone.start.isoformat(timespec="seconds"),
         duration_s=by_itself.facts.duration_s,
-        status=by_itself.assessment.status,
+        status=by_itself.status,
         headline=by_itself.headline,
         dof=_freedoms(by_itself),
         parameters=[number(*each) for each in zip(belief.names, belief.mean, belief.sigmas, strict=True)],
@@ -443,4 +509,8 @@ def _part(alone: Alone, joined: Joined, i: int) -> PartResult:
 def _freedoms(by_itself: Calibration) -> float | None:
     """Degrees of freedom by which a recording tells its own noise; None: it was stated, or there is no chi-square."""
     estimate = by_itself.estimate
-    return estimate.chi_square.dof if estimate.chi_square and noise_levels.asked(estimate.levels) else None
+    return (
+        estimate.chi_square.dof
+        if estimate.chi_square and any(level.noise.estimated for level in estimate.levels)
+        else None
+    )

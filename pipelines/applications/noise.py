@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -11,20 +11,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines import methods, progress
+from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import load_config
-from alidade.pipelines.diagnostics.sensor_noise import AxisNoise, axis_noise
+from alidade.pipelines.diagnostics.noise_spectrum import AxisNoise, axis_noise
 from alidade.pipelines.diagnostics.static_intervals import stretches_at_rest
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.checks import clean
 from alidade.pipelines.recording.even import even_pieces
 from alidade.pipelines.recording.faults import drop_faults
+from alidade.pipelines.recording.placeholders import is_there
+from alidade.pipelines.recording.plausibility import implausible
 from alidade.pipelines.recording.reading import Recording, open_recording
 
 Array = NDArray[np.float64]
 
 # Pieces shorter than this many samples are left out.
 _SHORTEST = 16
+# No gyro at rest has more white noise, rad/s/sqrt(Hz): cheap consumer parts have .05 deg/s/sqrt(Hz), 9e-4.
+_MOST_GYRO_DENSITY = 3e-3
 _UNITS = {"gyro": "rad/s", "accel": "m/s^2", "mag": "T"}
 
 
@@ -75,12 +80,13 @@ class _Device(NamedTuple):
     sensors: dict[str, Array]
 
 
-def noise_of(path: Path, strict: bool = False, config: Path | None = None) -> NoiseStudy:
+def noise_of(path: Path, strict: bool = False, config: Path | None = None, auto_columns: bool = False) -> NoiseStudy:
     """The noise of every gyro, accelerometer and magnetometer of a recording.
 
     Args:
         path: the recording.
         strict: refuse it if anything of it is lost.
+        auto_columns: take what `alidade info` concludes of the columns of tables, where the config describes none.
         config: YAML file with the columns of tables, topics made of others, and those with rates alone.
 
     Raises:
@@ -88,6 +94,8 @@ def noise_of(path: Path, strict: bool = False, config: Path | None = None) -> No
     """
     recording = open_recording(path, strict)
     rates = set() if config is None else _described(recording, config)
+    if auto_columns:
+        with_columns(recording, load_config(None, config))
     names = [
         name
         for name, topic in recording.topics.items()
@@ -135,6 +143,7 @@ def _topic_noise(recording: Recording, name: str, notes: list[str]) -> Iterator[
     together = np.hstack(list(device.sensors.values()))
     t, keep = clean(name, device.t_ns, recording.epoch_ns, together, dropped, least=3)
     samples = {kind: values[keep] for kind, values in device.sensors.items()}
+    _check_units(name, t, samples)
     rests = stretches_at_rest(t, list(samples.values()), samples.get("gyro"))
     if not len(rests):
         raise InputError(
@@ -161,6 +170,25 @@ def _topic_noise(recording: Recording, name: str, notes: list[str]) -> Iterator[
     notes += [f"{reason}: {number}" for reason, number in dropped.items()]
 
 
+def _check_units(name: str, t: Array, samples: Mapping[str, Array]) -> None:
+    """Raise InputError for sensors that are not in SI, all of them named."""
+    wrong = [said for kind, values in samples.items() if (said := implausible(kind, values))]
+    if "gyro" in samples:
+        # Where it is quietest: of differences of white noise a tenth is below this share of a sample's sigma.
+        steps = np.quantile(np.abs(np.diff(samples["gyro"], axis=0)), 0.1, axis=0) / (0.1257 * 2.0**0.5)
+        density = float(np.median(steps)) * float(np.median(np.diff(t))) ** 0.5
+        if density > _MOST_GYRO_DENSITY:
+            wrong.append(
+                f"rates scatter by {density:.2g} rad/s/sqrt(Hz), more than any gyro's ({_MOST_GYRO_DENSITY:g}); is it "
+                "in deg/s?"
+            )
+    if wrong:
+        raise InputError(
+            f"topic {name}: {'; '.join(wrong)} The message has to be in rad/s and m/s^2, T; of a table "
+            "`units:` says what its columns are in"
+        )
+
+
 def _device(recording: Recording, name: str) -> _Device:
     if recording.topics[name].type == messages.MAGNETIC_FIELD:
         field = recording.magnetic(name)
@@ -168,10 +196,8 @@ def _device(recording: Recording, name: str) -> _Device:
     else:
         imu = recording.imu(name)
         sensors, t_ns = {"gyro": imu.gyro, "accel": imu.accel}, imu.t_ns
-        if imu.gyro_cov[0, 0, 0] == -1.0:
-            del sensors["gyro"]
-        if imu.accel_cov[0, 0, 0] == -1.0:
-            del sensors["accel"]
+        covariances = {"gyro": imu.gyro_cov, "accel": imu.accel_cov}
+        sensors = {kind: values for kind, values in sensors.items() if is_there(kind, values, covariances[kind])}
     # A field of the message that nobody filled in is no sensor.
     return _Device(t_ns, {kind: values for kind, values in sensors.items() if np.any(np.nan_to_num(values))})
 

@@ -1,7 +1,7 @@
 """Before recording: what a planned motion would determine, what it would leave weak, and a motion that determines more.
 
     plan = make_plan("los", "my_sway.yaml", None, {"delta_px": 1e-4})
-    plan.now.assessment.status, [step.change for step in plan.steps]
+    plan.now.status, [step.change for step in plan.steps]
 
 The motion is simulated with the noise that its scenario states and goes through the method's own graph; the joint
 covariance there depends on motion and noise levels, and next to nothing on the noise drawn. Where the motion itself, or
@@ -18,9 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from alidade.pipelines import methods, progress
-from alidade.pipelines.diagnostics.observability import Advice, Assessment, assess
+from alidade.pipelines.diagnostics.observability import Advise, Verdict, finite_covariance, verdicts, weak_directions
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Quantity
+from alidade.pipelines.estimation.finding import Finding, Status, status
+from alidade.pipelines.estimation.problem import Array, Quantity
 from alidade.pipelines.methods import Method, Scenario
 from alidade.pipelines.settings import Config
 
@@ -39,7 +40,7 @@ class Prediction:
         scenario: the motion.
         duration: of the recording, s.
         quantities: what is estimated.
-        assessment: its sigmas and verdicts are the predicted ones.
+        covariance: (n, n), predicted, SI, in the order of the quantities.
         budget: parameter -> source -> its share of the variance, of the worst draw.
         worst: the seed of the draw that falls shortest of what is required.
         advice: of the graph, for weak directions.
@@ -48,16 +49,31 @@ class Prediction:
     scenario: Scenario
     duration: float
     quantities: tuple[Quantity, ...]
-    assessment: Assessment
+    covariance: Array
     budget: Mapping[str, Mapping[str, float]]
     worst: int = 0
-    advice: Advice | None = None
+    advice: Advise | None = None
 
     @property
     def sigmas(self) -> dict[str, float]:
         """Parameter -> predicted sigma, SI."""
-        sigmas = self.assessment.sigmas.tolist()
+        sigmas = np.sqrt(np.diag(self.covariance)).tolist()
         return {q.name: sigma for q, sigma in zip(self.quantities, sigmas, strict=True)}
+
+    @property
+    def verdicts(self) -> dict[str, Verdict]:
+        """Parameter -> predicted verdict, of those with a required accuracy."""
+        return verdicts(self.quantities, self.covariance)
+
+    @property
+    def directions(self) -> tuple[Finding, ...]:
+        """Predicted weak and unobservable directions, worst first."""
+        return weak_directions(self.quantities, self.covariance, self.advice)
+
+    @property
+    def status(self) -> Status:
+        """Predicted: calibrated, weak or unobservable."""
+        return status(self.directions)
 
     @property
     def missing(self) -> dict[str, float]:
@@ -171,11 +187,11 @@ def predict(
             made[repr(scenario), seed] = _predicted(method_name, scenario, config_file, require, seed)
     each = [made[repr(scenario), seed] for seed in drawn]
     worst = max(each, key=lambda prediction: max(prediction.missing.values(), default=0.0))
-    largest = np.max([prediction.assessment.sigmas for prediction in each], axis=0)
-    own = worst.assessment.sigmas
+    largest = np.max([np.sqrt(np.diag(prediction.covariance)) for prediction in each], axis=0)
+    own = np.sqrt(np.diag(worst.covariance))
     grown = np.divide(largest, own, out=np.ones_like(own), where=own > 0.0)
-    covariance = worst.assessment.covariance * np.outer(grown, grown)
-    return replace(worst, assessment=assess(worst.quantities, covariance, None, worst.advice))
+    covariance = worst.covariance * np.outer(grown, grown)
+    return replace(worst, covariance=covariance)
 
 
 def _predicted(
@@ -195,9 +211,9 @@ def _predicted(
         estimate = solve_batch(problem, budget=True)
     except IndeterminateError as error:
         raise InputError(f"scenario: {error}") from error
-    assessment = assess(problem.quantities, estimate.covariance, None, problem.advice)
+    covariance = finite_covariance(problem.quantities, estimate.covariance)
     return Prediction(
-        scenario, session.facts.duration_s, problem.quantities, assessment, estimate.budget or {}, seed, problem.advice
+        scenario, session.facts.duration_s, problem.quantities, covariance, estimate.budget or {}, seed, problem.advice
     )
 
 

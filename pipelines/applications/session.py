@@ -10,32 +10,36 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import cache, cached_property, partial
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from alidade.pipelines import methods, progress
+from alidade.pipelines import deadline, methods, progress
 from alidade.pipelines.applications.discovery import empty, idle, nearest_suggestion, suggestions, with_suggested
 from alidade.pipelines.applications.sharing import device_belief, walks
+from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import load_config, recorded_config
-from alidade.pipelines.diagnostics import noise_levels
-from alidade.pipelines.diagnostics.change_test import Moved, Stability, stability
-from alidade.pipelines.diagnostics.cross_validation import Halves, held_out, span, split_at, split_halves
-from alidade.pipelines.diagnostics.explanation import Causes, explained, told_steps
-from alidade.pipelines.diagnostics.hypothesis_tests import find_causes
-from alidade.pipelines.diagnostics.observability import assess
-from alidade.pipelines.diagnostics.second import other_solution
-from alidade.pipelines.diagnostics.self_check import SelfCheck
+from alidade.pipelines.diagnostics.change_test import Stability, change_finding, stability, with_change
+from alidade.pipelines.diagnostics.cross_validation import SplitHalf, solve_segments, split_halves
+from alidade.pipelines.diagnostics.diagnose import diagnose, is_suspect
+from alidade.pipelines.diagnostics.fault_models import FaultModel
+from alidade.pipelines.diagnostics.goodness_of_fit import SolverDifference, solver_difference
+from alidade.pipelines.diagnostics.hypothesis_tests import find_hypotheses
+from alidade.pipelines.diagnostics.observability import finite_covariance
+from alidade.pipelines.diagnostics.trial_fit import held_out_residuals
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import EngineName, Estimate, Problem, Step, Told
+from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
+from alidade.pipelines.estimation.problem import EngineName, Estimate, Problem, Quantity, Step, Told
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.info import SessionFacts, facts_of, lacking
 from alidade.pipelines.recording.message_reader import ENCODING
 from alidade.pipelines.recording.opening import Where
 from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, wanted
 from alidade.pipelines.reports.known import load_known
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import TRUTH, Config
@@ -43,6 +47,17 @@ from alidade.pipelines.simulation.simulated import Simulated
 from alidade.pipelines.solvers.window import check_window
 
 SOLVERS = ("batch", "incremental", "published")
+# Steps that a run takes whatever time it has: of fewer there may be no solution at all.
+_LEAST_STEPS = 20
+# What ends for want of time, in this order.
+_HYPOTHESES, _SEGMENTS, _COMPARISON, _SENSITIVITY = (
+    "the test of hypotheses",
+    "the solution of both sides of a change",
+    "the comparison with batch",
+    "the sensitivity to fixed inputs",
+)
+# Difference between incremental and batch that is worth a note, in sigmas.
+_NOTABLE_DIFFERENCE = 1.0
 
 
 class Origin(Protocol):
@@ -129,7 +144,7 @@ class Arrays:
 
     def facts(self, _: Config) -> SessionFacts:
         """Length of the data; there are no topics."""
-        start, stop = span(self.method, self.data)
+        start, stop = self.method.hypotheses().span(self.data)
         return SessionFacts(self.epoch_ns, stop - start, (), (), {self.method.name: ()})
 
     def truth(self) -> dict[str, object] | None:
@@ -139,13 +154,20 @@ class Arrays:
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """Data as their method takes them, the config in force, where both come from, and batch's engine."""
+    """Data as their method takes them, the config in force, and where both come from.
+
+    Attributes:
+        method, data, config, origin: as above.
+        engine: that eliminates batch's linear systems.
+        near: numbers that rotations are reported near of, as another recording of the device has them.
+    """
 
     method: Method
     data: Any
     config: Config
     origin: Origin
     engine: EngineName = "auto"
+    near: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def read(
@@ -155,9 +177,12 @@ class Session:
         config_file: Path | Config | None,
         auto_topics: bool = False,
         prior: Path | None = None,
+        auto_columns: bool = False,
     ) -> Session:
         """Read and check a recording (arguments and exceptions as `calibrate` has them)."""
         config = recorded_config(recording, config_file)
+        if auto_columns:
+            config = with_columns(recording, config)
         if auto_topics:
             config = with_suggested(recording, config, method_name)
         chosen = methods.method(resolve_method(method_name, recording, config))
@@ -202,7 +227,7 @@ class Session:
     def _problem(self) -> Problem:
         _check_sheets(self.method, self.config)
         with progress.doing("preparing the graph"):
-            return self.method.graph(self.data, self.config)
+            return self.method.graph(self.data, self.config).near(self.near)
 
     @cached_property
     def facts(self) -> SessionFacts:
@@ -241,7 +266,8 @@ class Session:
                 raise InputError(f"no solver {solver!r}; there are {', '.join(SOLVERS)}")
         check_window(window)
         solved = (self._solve(solver, window, report=report) for solver in solvers)
-        return self.judged(solved, seconds or {}, check, report)
+        with self.usual_time("incremental" in solvers):
+            return self.judged(solved, seconds or {}, check, report)
 
     def calibrated_beside(self, others: Callable[[Told], Mapping[str, float]]) -> Calibration:
         """The calibration by batch, what it says of its numbers linear where others have them. Raises as `calibrate`.
@@ -249,8 +275,15 @@ class Session:
         Args:
             others: of what the recording says, linear about its solution, the numbers as they are with the others.
         """
-        (calibration,) = self.judged([self._solve("batch", None, others)], {})
+        with self.usual_time():
+            (calibration,) = self.judged([self._solve("batch", None, others)], {})
         return calibration
+
+    def usual_time(self, online: bool = False) -> AbstractContextManager[None]:
+        """The time for a calibration, where no command has set one."""
+        stamps = [time for time in self.faults.times(self.data) if len(time)]
+        start = min((float(time[0]) for time in stamps), default=0.0)
+        return deadline.usual(max((float(time[-1]) for time in stamps), default=0.0) - start, online)
 
     def judged(
         self,
@@ -269,41 +302,30 @@ class Session:
         """
         # The facts before anything is solved, so that the stamps need not be kept meanwhile.
         sha256, truth, facts = self.origin.sha256(), self.origin.truth(), self.facts
-        found, causes = [], Causes(partial(find_causes, self.method, self.data, self.config))
+        found, published = [], None
         for estimate, problem in solved:
             quantities = tuple(q for q in problem.quantities if q.name in estimate.names)
-            # The published solvers stand beside as they are.
-            ours = estimate.solver != "published"
-            change = stability(estimate, quantities) if ours and estimate.converged else None
-            moved = self._moved(change) if change is not None and change.changed else None
-            # The one covariance that everything reads from here on.
-            final = estimate if moved is None else replace(estimate, covariance=moved.widened(estimate, quantities))
-            assessment = assess(
-                quantities,
-                final.covariance,
-                estimate.chi_square,
-                problem.advice,
-                decides=not noise_levels.asked(estimate.levels),
-            )
-            if ours:
-                assessment = explained(assessment, final, quantities, causes)
-            if moved is not None and change is not None:
-                sentence = f"{change.sentence}{told_steps(moved, quantities)}"
-                small = moved.small(quantities)
-                assessment = assessment.remarked(sentence) if small else assessment.misfit(sentence)
-            checked = None
-            if check and estimate.solver == "incremental":
-                checked = SelfCheck.of(estimate, self._batch_beside())
-                assessment = assessment.remarked(checked.sentence if checked else "")
-            if ours:
-                assessment = assessment.remarked(other_solution(estimate, quantities))
-                assessment = assessment.remarked(*noise_levels.remarks(estimate.levels), *problem.premises)
+            estimate = replace(estimate, covariance=finite_covariance(quantities, estimate.covariance))
+            if estimate.solver == "published":
+                published = estimate
+            elif report and estimate.solver == "incremental" and published is None:
+                published = self._published()
+            stable, change = self._change(estimate, quantities)
+            if change is not None and change.severity == Severity.NOTE:
+                estimate = with_change(estimate, change)
+            difference = self._difference(estimate) if check and not deadline.passed(_COMPARISON) else None
             found.append(
                 Calibration(
                     method=self.method,
                     problem=problem,
-                    estimate=final,
-                    assessment=assessment,
+                    estimate=estimate,
+                    findings=by_severity(
+                        [
+                            *self._findings(problem, estimate, quantities, change),
+                            *_remarks(problem, estimate, difference),
+                            *_stopped(),
+                        ]
+                    ),
                     recording=self.origin.name,
                     sha256=sha256,
                     facts=facts,
@@ -311,20 +333,57 @@ class Session:
                     truth=truth,
                     seconds=seconds,
                     plots=partial(self.method.figures, self.data),
-                    beside=cache(self._published) if estimate.solver == "incremental" else None,
-                    stability=change,
-                    self_check=checked,
-                    findings=self.method.findings(self.data, self.config, final) if report else {},
+                    beside=published if estimate.solver == "incremental" else None,
+                    stability=stable,
+                    solver_difference=difference,
+                    tables=self.method.findings(self.data, self.config, estimate) if report else {},
                 )
             )
         return found
 
-    def _moved(self, change: Stability) -> Moved:
-        """What the two sides of a change say."""
-        if not self.method.hypotheses().cut:
-            return Moved({})
-        with progress.doing("looking at both sides of a change"):
-            return Moved(split_at(self.method, self.data, self.config, change.time_s))
+    @property
+    def faults(self) -> FaultModel:
+        """What can be wrong with the data."""
+        return self.method.hypotheses()
+
+    def cross_validate(self) -> tuple[dict[str, SplitHalf], dict[str, float]]:
+        """The parameters of either half of the recording, and held-out measurements' residuals by family."""
+        halves = split_halves(self.method.graph, self.faults, self.data, self.config)
+        return halves, held_out_residuals(self.problem())
+
+    def _findings(
+        self, problem: Problem, estimate: Estimate, quantities: Sequence[Quantity], change: Finding | None
+    ) -> tuple[Finding, ...]:
+        """The findings on an estimate; hypotheses are tested where it is suspect."""
+        findings = diagnose(estimate, quantities, problem.advice, change)
+        if not is_suspect(estimate, findings) or deadline.passed(_HYPOTHESES):
+            return findings
+        with progress.doing("testing hypotheses"):
+            hypotheses = find_hypotheses(self.method.graph, self.faults, self.data, self.config, estimate)
+        deadline.passed(_HYPOTHESES)
+        return diagnose(estimate, quantities, problem.advice, change, hypotheses)
+
+    def _change(self, estimate: Estimate, quantities: Sequence[Quantity]) -> tuple[Stability | None, Finding | None]:
+        """The test for a change, and the finding where there is one, with the steps between its two sides."""
+        if estimate.solver == "published" or not estimate.converged:
+            return None, None
+        stable = stability(estimate, quantities)
+        if stable is None or not stable.changed:
+            return stable, None
+        parts: Mapping[str, SplitHalf] = {}
+        if self.faults.cut and not deadline.passed(_SEGMENTS):
+            with progress.doing("solving both sides of a change"):
+                parts = solve_segments(self.method.graph, self.faults, self.data, self.config, stable.time_s)
+        return stable, change_finding(stable, parts, quantities)
+
+    def _difference(self, estimate: Estimate) -> SolverDifference | None:
+        """An incremental estimate compared with batch's, which has nothing of what a report needs."""
+        if estimate.solver != "incremental":
+            return None
+        from alidade.pipelines.solvers.batch import solve_batch
+
+        with progress.doing("solving"):
+            return solver_difference(estimate, solve_batch(self.problem()))
 
     def _solve(
         self,
@@ -354,6 +413,8 @@ class Session:
     def _changed(self) -> Iterator[tuple[str, Problem]]:
         """Each input that the graph takes for exact, and the graph with that input off by its step."""
         for exact in self.method.hypotheses().exact:
+            if deadline.passed(_SENSITIVITY):
+                return
             changed = exact.changed(self.data, self.config, exact.step)
             if changed is None:
                 continue
@@ -362,13 +423,6 @@ class Session:
             except InputError:  # on the edge of what can be used, a step farther than the recording itself
                 continue
             yield exact.name, problem
-
-    def _batch_beside(self) -> Estimate:
-        """Batch's estimate to compare with: without what its own report would tell of it."""
-        from alidade.pipelines.solvers.batch import solve_batch
-
-        with progress.doing("solving"):
-            return solve_batch(self.problem())
 
     def _published(self) -> Estimate | None:
         """The published solver's estimate, where it can serve the recording: it needs more than the graphs."""
@@ -390,6 +444,7 @@ def calibrate(
     prior: Path | None = None,
     report: bool = True,
     engine: EngineName = "auto",
+    auto_columns: bool = False,
 ) -> list[Calibration]:
     """One calibration a solver, from one reading of the recording.
 
@@ -401,6 +456,7 @@ def calibrate(
         window: s, of the incremental solver; None keeps the whole history.
         strict: refuse a recording of which anything is lost.
         auto_topics: take the topics that `alidade info` suggests where those of the method are not there.
+        auto_columns: take what `alidade info` concludes of the columns of tables where the config describes none.
         check: hold an incremental calibration against batch.
         prior: an earlier calibration of the device to begin from, result.json or calibration.yaml.
         report: with what only a report tells, see `Session.calibrate`.
@@ -412,22 +468,47 @@ def calibrate(
     """
     start = time.perf_counter()
     with progress.doing("reading"):
-        session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics, prior)
+        session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics, prior, auto_columns)
     seconds = {"read": time.perf_counter() - start}
     return replace(session, engine=engine).calibrations(solvers, window, seconds, check, report)
-
-
-def self_agreement(
-    path: Path, method_name: str | None = None, config_file: Path | None = None
-) -> tuple[dict[str, Halves], dict[str, float]]:
-    """What either half of a recording says, and how well held-out measurements are predicted (arguments as above)."""
-    session = Session.read(open_recording(path), method_name, config_file)
-    return split_halves(session.method, session.data, session.config), held_out(session.problem())
 
 
 def session_facts(recording: Recording, config: Config) -> SessionFacts:
     """Facts about all topics of a recording, and what it lacks for each method."""
     return facts_of(recording, config, {name: methods.method(name).needs for name in methods.names()})
+
+
+def checked_facts(recording: Recording, config: Config) -> SessionFacts:
+    """As `session_facts`; of a method that lacks nothing, what `calibrate` would refuse the recording for.
+
+    Pictures are not looked at.
+    """
+    facts = session_facts(recording, config)
+    by_name = {name: config.model_copy(update={"method": name}) for name, lacks in facts.missing.items() if lacks}
+    asked = {name for name, own in by_name.items() if not missing_for(name, recording, own)}
+    to_ask = {name: (f"`--method {name}`, by which it has to be asked for",) for name in asked}
+    facts = replace(facts, missing={**facts.missing, **to_ask})
+    refused = {name: said for name in facts.methods if (said := _refused(methods.method(name), recording, config))}
+    return replace(facts, missing={**facts.missing, **{name: (said,) for name, said in refused.items()}})
+
+
+def _refused(method: Method, recording: Recording, config: Config) -> str:
+    """Why a method cannot read the recording, as a phrase; empty where it can."""
+    from alidade.pipelines.vision.recorded import camera_of
+
+    by_key = {topic.key: topic for topic in method.topics}
+    image, camera = by_key.get(IMAGE.key), by_key.get(CAMERA_INFO.key)
+    needless = [key for key in ("los_error", "vision_attitude", "tag_detections") if key in by_key]
+    seen = image is not None and wanted(recording, config, image)
+    measured = [key for key in needless if wanted(recording, config, by_key[key])]
+    try:
+        if camera is not None and (seen or "tag_detections" in measured):
+            camera_of(recording, config)
+        if not seen or (measured and "tag_detections" not in measured):
+            method.read(recording, config)
+    except InputError as error:
+        return f"usable data: {error}"
+    return ""
 
 
 def missing_for(name: str, recording: Recording, config: Config) -> tuple[str, ...]:
@@ -459,9 +540,9 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
 
 def _feed(digest: hashlib._Hash, data: Any) -> None:
     """The arrays and numbers of a dataclass, and of those inside it, with their names into a hash."""
-    for field in fields(data):
-        value = getattr(data, field.name)
-        digest.update(field.name.encode())
+    for one in fields(data):
+        value = getattr(data, one.name)
+        digest.update(one.name.encode())
         if is_dataclass(value):
             _feed(digest, value)
         elif isinstance(value, np.ndarray):
@@ -483,8 +564,24 @@ def _check_sheets(method: Method, config: Config) -> None:
         raise InputError(f"{where}: method {method.name} has no use for it; it uses {useful}")
 
 
+def _remarks(problem: Problem, estimate: Estimate, difference: SolverDifference | None) -> Iterator[Finding]:
+    """Findings beside those on the estimate: a difference from batch, and the premises of the method."""
+    if difference is not None and abs(difference.z) >= _NOTABLE_DIFFERENCE:
+        yield Finding("solver_difference", Severity.NOTE, asdict(difference))
+    for premise in problem.premises if estimate.solver != "published" else ():
+        yield Finding("remark", Severity.NOTE, {"text": premise})
+
+
 def _shown(problem: Problem, duration: float, chunk: int) -> Iterator[Step]:
     """The problem's steps; those fed one by one are shown as they are taken, by time in the recording."""
     if chunk > 1:
         return problem.steps(chunk)
-    return progress.track(problem.steps(chunk), "step by step", duration, lambda step: step.time)
+    name = "the run at {:.1f} s of {:.1f} s".format
+    steps = deadline.until_passed(problem.steps(chunk), lambda step: name(step.time, duration), _LEAST_STEPS)
+    return progress.track(steps, "step by step", duration, lambda step: step.time)
+
+
+def _stopped() -> list[Finding]:
+    """A note where something ended for want of time."""
+    text = deadline.stopped()
+    return [Finding("remark", Severity.NOTE, {"text": text})] if text else []

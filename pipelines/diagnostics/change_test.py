@@ -1,4 +1,4 @@
-"""Whether what was calibrated stayed as it was over the recording.
+"""Test for a change of the calibrated parameters within a recording.
 
 If nothing changed, the estimate from what was recorded until t differs from the final one by a normal number with the
 covariance P(t) - P(T): the later estimate uses all that the earlier one does, and more (Hausman 1978, for an estimator
@@ -12,13 +12,14 @@ changed: such priors are widened to what was found before anything is compared.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from alidade.pipelines.diagnostics.cross_validation import Halves
+from alidade.pipelines.diagnostics.cross_validation import SplitHalf
 from alidade.pipelines.estimation.assumptions import pull
-from alidade.pipelines.estimation.problem import Array, Estimate, Quantity
+from alidade.pipelines.estimation.finding import Finding, Severity
+from alidade.pipelines.estimation.problem import Array, Estimate, Quantity, Told
 
 # A recording in which nothing changed is taken for one in which something did so often.
 LEVEL = 1e-3
@@ -26,8 +27,12 @@ LEVEL = 1e-3
 _PATHS, _BATCH = 4000, 500
 # Directions in which the rest of the recording added less than this share of the variance say nothing of a change.
 _LEAST = 1e-3
-# A step between the sides of a change is more than chance beyond so many sigmas.
-_STEP = 3.0
+# A step between the segments is significant beyond so many sigmas, and material from this share of the requirement on.
+_STEP, _MATERIAL = 3.0, 0.5
+# Differences that are named where no segment has a solution.
+_MAX_NAMED = 3
+# Source of variance, as in the budget.
+CHANGE = "change during the recording"
 # Priors are widened to what was found from so many sigmas on.
 _BEYOND = 3.0
 # Two moments make no path.
@@ -47,54 +52,79 @@ class Stability:
         time_s: when, s.
         departures: parameter -> estimate until then less the final one, in the sigmas of that difference; largest
             first.
+        differences: parameter -> final estimate less that until then, and the sigma of that, SI; the largest ones.
     """
 
     statistic: float
     level: float
     time_s: float
     departures: dict[str, float]
+    differences: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def changed(self) -> bool:
         """Whether it is more than chance."""
         return self.level < LEVEL
 
-    @property
-    def sentence(self) -> str:
-        """What changed and when."""
-        name, size = next(iter(self.departures.items()))
-        when, far = f"{self.time_s:.0f} s", f"{abs(size):.1f} sigmas"
-        return f"Something changed at about {when}: {name} from before is {far} from that of the whole recording."
 
+def change_finding(found: Stability, parts: Mapping[str, SplitHalf], quantities: Sequence[Quantity]) -> Finding:
+    """The finding of kind `change`: a NOTE where all steps are known and immaterial.
 
-@dataclass(frozen=True)
-class Moved:
-    """What the two sides of a change say of the parameters that both determine.
+    Its steps are those between the segments that are significant, the most significant first; where the segments have
+    none, the estimate of the whole recording less that until the change.
 
-    Attributes:
-        parts: parameter -> value and sigma before and after; none where the sides cannot be solved.
+    Args:
+        found: a change that is more than chance.
+        parts: parameter -> values before and after it; none where the segments have no solution.
+        quantities: of the estimate.
     """
+    significant = sorted((n for n in parts if abs(parts[n].z) > _STEP), key=lambda name: -abs(parts[name].z))
+    steps = {name: (parts[name].step, parts[name].step_sigma) for name in significant}
+    required = {q.name: q.require for q in quantities}
+    immaterial = bool(steps) and all(abs(step) < _MATERIAL * required[name] for name, (step, _) in steps.items())
+    severity = Severity.NOTE if immaterial else Severity.INCONSISTENT
+    return Finding("change", severity, {"time_s": found.time_s, "steps": steps or dict(found.differences)})
 
-    parts: Mapping[str, Halves]
 
-    @property
-    def steps(self) -> dict[str, tuple[float, float]]:
-        """Parameter -> step and its sigma, of those that are more than chance, the surest first."""
-        sure = {name: p for name, p in self.parts.items() if abs(p.difference_sigmas) > _STEP}
-        order = sorted(sure.items(), key=lambda each: -abs(each[1].difference_sigmas))
-        return {name: (p.second - p.first, float(np.hypot(p.first_sigma, p.second_sigma))) for name, p in order}
+def with_change(estimate: Estimate, change: Finding) -> Estimate:
+    """The estimate with an immaterial change in its covariance: the steps occur together, P + s s'.
 
-    def small(self, quantities: Sequence[Quantity]) -> bool:
-        """Whether every step is known, and less than half of what is required."""
-        required = {q.name: q.require for q in quantities}
-        return bool(self.steps) and all(abs(step) < 0.5 * required[name] for name, (step, _) in self.steps.items())
+    Whoever reads the estimate reads that covariance: its history from the change on, the budget, and the square-root
+    information from which a joint calibration is made.
+    """
+    steps: Mapping[str, tuple[float, float]] = change.evidence["steps"]
+    step = np.array([steps.get(name, (0.0, 0.0))[0] for name in estimate.names])
+    covariance = estimate.covariance + np.outer(step, step)
+    history, budget = estimate.history, estimate.budget
+    if history is not None:
+        after = (history.time >= change.evidence["time_s"])[:, None]
+        history = replace(history, sigmas=np.where(after, np.hypot(history.sigmas, step), history.sigmas))
+    if budget is not None:
+        share = dict(zip(estimate.names, step**2 / np.maximum(np.diag(covariance), 1e-300), strict=True))
+        budget = {name: _with_share(shares, float(share[name])) for name, shares in budget.items()}
+    told = estimate.told
+    if told is not None:
+        whole = dict(zip(estimate.names, step / estimate.inflations, strict=True))
+        told = _marginalised(told, np.array([whole[name] for name in told.names]))
+    return replace(estimate, covariance=covariance, history=history, budget=budget, told=told)
 
-    def widened(self, estimate: Estimate, quantities: Sequence[Quantity]) -> Array:
-        """The estimate's covariance with small steps added in square."""
-        if not self.small(quantities):
-            return estimate.covariance
-        step = np.array([self.steps.get(name, (0.0, 0.0))[0] for name in estimate.names])
-        return estimate.covariance + np.diag(step**2)
+
+def _with_share(shares: Mapping[str, float], share: float) -> dict[str, float]:
+    """Shares of a variance with that of the change, the largest first."""
+    if share == 0.0:
+        return dict(shares)
+    whole = {**{source: (1.0 - share) * each for source, each in shares.items()}, CHANGE: share}
+    return dict(sorted(whole.items(), key=lambda item: -item[1]))
+
+
+def _marginalised(told: Told, step: Array) -> Told:
+    """R (x - a s - at) = d with a unit normal a marginalised out: rows whitened by (I + r r')^-1/2, r = R s."""
+    r = told.R @ step
+    square = float(r @ r)
+    if square == 0.0:
+        return told
+    k = (1.0 - 1.0 / np.sqrt(1.0 + square)) / square
+    return replace(told, R=told.R - k * np.outer(r, r @ told.R), d=told.d - k * r * float(r @ told.d))
 
 
 def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability | None:
@@ -129,7 +159,9 @@ def stability(estimate: Estimate, quantities: Sequence[Quantity]) -> Stability |
     sigmas = np.sqrt(np.maximum(np.diag(P[worst] - P[-1]), 1e-12 * np.diag(P[worst])))
     by_size = np.argsort(-np.abs(difference[worst] / sigmas))
     departures = {quantities[kept[j]].name: float(difference[worst, j] / sigmas[j]) for j in by_size}
-    return Stability(float(sizes[worst]), beyond, float(time[worst]), departures)
+    largest = [(quantities[kept[j]].name, -float(difference[worst, j]), float(sigmas[j])) for j in by_size[:_MAX_NAMED]]
+    differences = {name: (size, sigma) for name, size, sigma in largest}
+    return Stability(float(sizes[worst]), beyond, float(time[worst]), departures, differences)
 
 
 def _long_enough(estimate: Estimate, numbers: int) -> float:

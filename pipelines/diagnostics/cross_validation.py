@@ -1,48 +1,23 @@
-"""Whether a recording agrees with itself: either half by itself, and measurements held out."""
+"""Cross-validation: a recording's segments solved by themselves, and the errors before and after compensation."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from alidade.pipelines import parallel
-from alidade.pipelines.diagnostics.outcome import at_once, outcome, times_of
-from alidade.pipelines.estimation.problem import Array, Problem, Quantity
-from alidade.pipelines.estimation.robust import robust_sigma
+from alidade.pipelines.diagnostics.fault_models import FaultModel
+from alidade.pipelines.diagnostics.trial_fit import Build, max_concurrent, solve_trial
+from alidade.pipelines.estimation.problem import Array, Quantity
 from alidade.pipelines.settings import Config
-
-if TYPE_CHECKING:
-    from alidade.pipelines.diagnostics.fault_models import Hypotheses
-    from alidade.pipelines.methods import Method
-    from alidade.pipelines.solvers.linearization import Group
-
-# One chunk of so many frames is held out of so many chunks.
-_CHUNK, _HELD_OUT = 20, 5
-
-
-def cut(hypotheses: Hypotheses, data: Any, start: float, stop: float) -> Any:
-    """The data of [start, stop), s; times stay as they are."""
-    changes: dict[str, Array] = {}
-    for stamps, fields in hypotheses.streams.items():
-        time = getattr(data, stamps)
-        if time is None:
-            continue
-        # Times increase: the samples are a view of those that there are.
-        inside = slice(*np.searchsorted(time, [start, stop]).tolist())
-        for name in (stamps, *fields):
-            values = getattr(data, name)
-            if values is not None:
-                changes[name] = values[inside]
-    return replace(data, **changes)
 
 
 @dataclass(frozen=True)
-class Halves:
-    """A parameter from either half of a recording: values and sigmas, SI."""
+class SplitHalf:
+    """A parameter from either segment of a recording: values and sigmas, SI."""
 
     first: float
     first_sigma: float
@@ -50,82 +25,87 @@ class Halves:
     second_sigma: float
 
     @property
-    def difference_sigmas(self) -> float:
-        """Second less first, over the sigma of that difference."""
-        return (self.second - self.first) / float(np.hypot(self.first_sigma, self.second_sigma))
+    def step(self) -> float:
+        """Second less first."""
+        return self.second - self.first
+
+    @property
+    def step_sigma(self) -> float:
+        """One standard deviation of the step."""
+        return float(np.hypot(self.first_sigma, self.second_sigma))
+
+    @property
+    def z(self) -> float:
+        """The step over its sigma."""
+        return self.step / self.step_sigma
 
 
-def split_halves(method: Method, data: Any, config: Config) -> dict[str, Halves]:
-    """What either half of a recording determines by itself, see `split_at`."""
-    start, stop = span(method, data)
-    return split_at(method, data, config, 0.5 * (start + stop))
+def split_halves(build: Build, faults: FaultModel, data: Any, config: Config) -> dict[str, SplitHalf]:
+    """Solve either half of a recording by itself, see `solve_segments`."""
+    start, stop = faults.span(data)
+    return solve_segments(build, faults, data, config, 0.5 * (start + stop))
 
 
-def split_at(method: Method, data: Any, config: Config, middle: float) -> dict[str, Halves]:
-    """The parameters that a recording determines both before and after a time (s); none when a part cannot be solved.
+def solve_segments(build: Build, faults: FaultModel, data: Any, config: Config, middle: float) -> dict[str, SplitHalf]:
+    """The parameters that a recording determines both before and after a time (s); none when a part has no solution.
 
-    Those that a prior holds in either part are left out: they would agree whatever was recorded. A bias that walks
-    differs between the parts by its walk too.
+    Parameters that a prior determines in either part are left out: they would agree whatever was recorded. A bias that
+    walks differs between the parts by its walk too.
     """
-    start, stop = span(method, data)
-    sides = [partial(_side, method, data, config, *part) for part in ((start, middle), (middle, stop + 1.0))]
-    first, second = parallel.done(sides, "either side", at_once(method, data))
+    start, stop = faults.span(data)
+    parts = [partial(_solved, build, faults, data, config, *part) for part in ((start, middle), (middle, stop + 1.0))]
+    first, second = parallel.done(parts, "either side", max_concurrent(faults.times(data)))
     both = {name: (first[name], second[name]) for name in first if name in second}
     return {
-        name: Halves(value, sigma, other, its_sigma)
-        for name, ((quantity, value, sigma), (_, other, its_sigma)) in both.items()
-        if quantity.determined(max(sigma, its_sigma))
+        name: SplitHalf(value, sigma, other, other_sigma)
+        for name, ((quantity, value, sigma), (_, other, other_sigma)) in both.items()
+        if quantity.determined(max(sigma, other_sigma))
     }
 
 
-# A number with its value and sigma.
+# A quantity with its value and sigma.
 _Number = tuple[Quantity, float, float]
 
 
-def _side(method: Method, data: Any, config: Config, start: float, stop: float) -> dict[str, _Number]:
-    """What [start, stop), s, of a recording determines by itself; nothing when it cannot be solved."""
-    found = outcome(method, cut(method.hypotheses(), data, start, stop), config)
+def _solved(
+    build: Build, faults: FaultModel, data: Any, config: Config, start: float, stop: float
+) -> dict[str, _Number]:
+    """The numbers of [start, stop), s, of a recording by itself; none when it has no solution."""
+    found = solve_trial(build, faults.segment(data, start, stop), config, f"{start:.0f} to {stop:.0f} s")
     if found is None:
         return {}
     numbers = zip(found.quantities, found.estimate.values.tolist(), found.estimate.sigmas.tolist(), strict=True)
     return {number[0].name: number for number in numbers}
 
 
-def span(method: Method, data: Any) -> tuple[float, float]:
-    """First and last stamp of a method's data, s; zeros where there is none."""
-    times = [time for time in times_of(method, data) if len(time)]
-    return float(min((t[0] for t in times), default=0.0)), float(max((t[-1] for t in times), default=0.0))
+@dataclass(frozen=True, eq=False)
+class Validation:
+    """One kind of error of a recording, before and after compensation; a method may have several.
 
-
-def held_out(problem: Problem) -> dict[str, float]:
-    """Family -> typical size of measurements that took no part in the solution, in sigmas of their own noise.
-
-    One chunk in five is held out. 1 is as good as the noise; a little more is the uncertainty of the prediction.
+    Attributes:
+        name: what is compared with what.
+        unit: SI, that of the errors.
+        time: (n,) s from the session's start.
+        before: (n, m) errors, one column an axis, with nothing compensated.
+        after: (n, m) the same with the calibration applied.
+        note: what a reader has to know beside it, a sentence without its full stop; may be empty.
+        micro: angles are read in µrad, as in the trade of pointing, not in degrees.
     """
-    from alidade.pipelines.solvers.engines import Compiled
-    from alidade.pipelines.solvers.robust import RobustConfig, solve_robust
 
-    steps = list(problem.steps(_CHUNK))
-    counts = [len(step.factors) for step in steps]
-    out = np.repeat(np.arange(len(steps)) % _HELD_OUT == _HELD_OUT - 1, counts)
-    compiled = Compiled.of(problem, steps=steps)
-    measurements = [g for g in compiled.engine.groups if g.is_measurement]
-    if all(out[g.factors].all() for g in measurements):
-        return {}
-    kept = compiled.engine.with_groups([_without(g, out[g.factors]) for g in compiled.engine.groups])
-    solution = solve_robust(kept, compiled.initial, problem.loss, RobustConfig())
-    if not solution.converged:
-        return {}
-    found: dict[str, list[Array]] = {}
-    for group in measurements:
-        residuals = group.evaluate(solution.values)[0]
-        found.setdefault(group.family, []).append(residuals[out[group.factors]].ravel())
-    return {family: robust_sigma(np.concatenate(each)) for family, each in found.items()}
+    name: str
+    unit: str
+    time: Array
+    before: Array
+    after: Array
+    note: str = ""
+    micro: bool = False
 
 
-def _without(group: Group, out: NDArray[np.bool_]) -> Group:
-    """The measurements that are not held out; processes and priors stay."""
-    if not group.is_measurement:
-        return group
-    weights = np.ones((len(out), group.model.rows)) if group.weights is None else group.weights
-    return replace(group, weights=weights * ~out[:, None])
+def rms(errors: Array) -> float:
+    """Root mean square of the lengths of errors (n, m)."""
+    return float(np.sqrt((errors**2).sum(axis=1).mean()))
+
+
+def peak(errors: Array) -> float:
+    """Largest length of errors (n, m)."""
+    return float(np.linalg.norm(errors, axis=1).max())

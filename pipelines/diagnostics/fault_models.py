@@ -1,28 +1,30 @@
-"""What can be wrong with a method's data, in the names of its fields."""
+"""What can be wrong with a method's data, in the names of its fields; `hypothesis_tests` tests it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, field, replace
+from typing import Any
 
-if TYPE_CHECKING:
-    from alidade.pipelines.settings import Config
+import numpy as np
+
+from alidade.pipelines.estimation.problem import Array
+from alidade.pipelines.settings import Config
 
 AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
-class Scaling:
+class ScaleFactor:
     """A number of the config that may be off by an unknown factor.
 
     Attributes:
         label: the fault in words, with {factor}.
-        scaled: data, config and factor -> both with the number multiplied; None where it does not occur.
+        apply: data, config and factor -> both with the number multiplied; None where it does not occur.
     """
 
     label: str
-    scaled: Callable[[Any, Config, float], tuple[Any, Config] | None]
+    apply: Callable[[Any, Config, float], tuple[Any, Config] | None]
 
 
 @dataclass(frozen=True)
@@ -43,23 +45,23 @@ class ExactInput:
 
 
 @dataclass(frozen=True)
-class Fault:
-    """A fault of its own kind.
+class DataFault:
+    """A fault of one method's own kind.
 
     Attributes:
         label: in words.
-        mended: data and config -> both without it; None where it cannot be.
-        last: whether what mends it would mend much else, so that it counts only where nothing else does.
+        corrected: data and config -> both without it; None where it cannot be.
+        fallback: whether its correction would fit much else, so that it is tested only where nothing else fits.
     """
 
     label: str
-    mended: Callable[[Any, Config], tuple[Any, Config] | None]
-    last: bool = False
+    corrected: Callable[[Any, Config], tuple[Any, Config] | None]
+    fallback: bool = False
 
 
 @dataclass(frozen=True)
-class Hypotheses:
-    """Faults to be tried by solving again, told by the names of the data's fields.
+class FaultModel:
+    """Faults that are tested by solving again, in the names of the data's fields.
 
     Attributes:
         streams: stamps -> what carries them.
@@ -69,8 +71,8 @@ class Hypotheses:
         clock: stamps that may be late, and how people call their source.
         scalings: numbers of the config that may be off by a factor.
         faults: of other kinds.
-        exact: numbers that are not tried, but told what they would do.
-        cut: whether a stretch of the recording is a recording.
+        exact: fixed inputs, whose effect is reported and not tested.
+        cut: whether a segment of the recording is a recording.
     """
 
     streams: Mapping[str, Sequence[str]]
@@ -78,7 +80,31 @@ class Hypotheses:
     offset: bool = False
     delays: Mapping[str, str] = field(default_factory=dict)
     clock: tuple[str, str] | None = None
-    scalings: Sequence[Scaling] = ()
-    faults: Sequence[Fault] = ()
+    scalings: Sequence[ScaleFactor] = ()
+    faults: Sequence[DataFault] = ()
     exact: Sequence[ExactInput] = ()
     cut: bool = True
+
+    def times(self, data: Any) -> list[Array]:
+        """Stamps (n,), s, of all streams that the data have."""
+        return [time for name in self.streams if (time := getattr(data, name)) is not None]
+
+    def span(self, data: Any) -> tuple[float, float]:
+        """First and last stamp, s; zeros where there is none."""
+        times = [time for time in self.times(data) if len(time)]
+        return float(min((t[0] for t in times), default=0.0)), float(max((t[-1] for t in times), default=0.0))
+
+    def segment(self, data: Any, start: float, stop: float) -> Any:
+        """The data of [start, stop), s; times stay as they are."""
+        changes: dict[str, Array] = {}
+        for stamps, fields in self.streams.items():
+            time = getattr(data, stamps)
+            if time is None:
+                continue
+            # Times increase: the samples are a view of those that there are.
+            inside = slice(*np.searchsorted(time, [start, stop]).tolist())
+            for name in (stamps, *fields):
+                values = getattr(data, name)
+                if values is not None:
+                    changes[name] = values[inside]
+        return replace(data, **changes)

@@ -1,108 +1,136 @@
-"""Why residuals do not fit: causes tried for real, each by solving again with the data or the config changed.
+"""Hypotheses on why residuals do not fit: faults of the data, each tested by solving again with that fault corrected.
 
-    causes = find_causes(method, data, config)      # after a calibration that ended inconsistent
-    causes[0].label, causes[0].evidence             # the likeliest
+    find_hypotheses(method.graph, method.hypotheses(), data, config, estimate)
 
-A cause counts when the recording fits with it, or fits far better. Noise is offered where it is said to be known
-exactly and nothing else explains: noise large enough fits anything.
+A hypothesis counts when the recording fits with it, or fits far better. Noise is offered where it is stated as known
+exactly and nothing else fits: noise large enough fits anything.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from alidade.pipelines import parallel
-from alidade.pipelines.diagnostics.cross_validation import cut
-from alidade.pipelines.diagnostics.observability import Cause
-from alidade.pipelines.diagnostics.outcome import Outcome, at_once, outcome, quick_score
-from alidade.pipelines.diagnostics.rejection import too_many_rejected
-from alidade.pipelines.diagnostics.trial_cases import Trial, faults, trials
+from alidade.pipelines.diagnostics.diagnose import DEFAULT
+from alidade.pipelines.diagnostics.fault_models import FaultModel
+from alidade.pipelines.diagnostics.trial_cases import TrialCase, data_faults, trial_cases
+from alidade.pipelines.diagnostics.trial_fit import Build, TrialFit, max_concurrent, score_trial, solve_trial
+from alidade.pipelines.estimation.finding import Finding, Severity
 from alidade.pipelines.estimation.problem import Estimate, Residuals
 from alidade.pipelines.settings import Config
 
-if TYPE_CHECKING:
-    from alidade.pipelines.methods import Method
-
-# Trials are made on this much of a recording, s, where it fits worst, and looked at on less.
-_STRETCH, _SHORT = 30.0, 8.0
-# Two numbers of one recording differ by more than chance beyond this many sigmas.
+# Trials use this much of a recording, s, where it fits worst; their scores use less.
+_SEGMENT_S, _SCORE_SEGMENT_S = 30.0, 8.0
+# A fall of chi-square beyond the square of this is no chance, and within it two hypotheses are equivalent.
 _SIGNIFICANT = 5.0
-# A change that leaves more than this share of the noise factor explains little.
-_BETTER = 0.8
-# Noise so many times larger explains anything, and is never offered.
-_MOST_NOISE = 4.0
-_MOST_NAMED = 3
-# How well noise counts as known, in the logarithm, when the recording is asked for it: what it contradicts counts for
-# little, and what would be known worse than this could hardly be contradicted.
-_KNOWN = 0.1
-# How far the typical residual has to fall for a change to be looked at closely.
-_PROMISING = 0.97
-# A change whose typical residual is so many times the least one's explains nothing that the other does not.
-_RIVAL = 3.0
-# Noise this far from the one stated is worth a word.
-_NOTABLE = 1.1
-_WHAT = "looking for causes"
+# A correction that leaves more than this share of the noise factor explains little.
+_MAX_REMAINING = 0.8
+# Larger noise explains anything, and is never offered.
+_MAX_NOISE_FACTOR = 4.0
+_MAX_TESTED, _MAX_REPORTED = 3, 3
+# How well noise counts as known, one sigma of its logarithm, where it is looked for.
+_NOISE_KNOWN = 0.1
+# A score is promising below this share of the score as recorded, and below so many times the best one.
+_PROMISING, _MAX_RIVAL = 0.97, 3.0
+# Noise less than this factor from its statement is not reported.
+_MIN_NOISE_FACTOR = 1.1
+_WHAT = "testing hypotheses"
+
+# The fit with a fault corrected, and the fault in words.
+_Tested = tuple[TrialFit, str]
 
 
-def find_causes(method: Method, data: Any, config: Config, estimate: Estimate | None = None) -> tuple[Cause, ...]:
-    """What makes a recording fit that does not, the likeliest first; empty when nothing that was tried does.
+def find_hypotheses(
+    build: Build, model: FaultModel, data: Any, config: Config, estimate: Estimate | None = None
+) -> tuple[Finding, ...]:
+    """Faults with whose correction a recording fits that does not as it is, the best fit first.
 
     Args:
-        method: that read the data.
-        data: what the method read.
+        build: makes the graph of the data.
+        model: what can be wrong with the data.
+        data: as read.
         config: of the recording.
-        estimate: its calibration, which tells where to look; by default the whole is tried.
+        estimate: its calibration, by whose residuals the worst segment is chosen; None: the whole is used.
     """
-    hypotheses = method.hypotheses()
     known = config.noise_known == 0.0
-    # With the noise stated: levels made to fit hide what is looked for.
+    # With the noise as stated: levels that are estimated hide what is looked for.
     config = config.model_copy(update={"noise_known": 0.0})
-    if estimate is not None and hypotheses.cut:
-        data = cut(hypotheses, data, *_worst_stretch(estimate.residuals, _STRETCH))
-    before = outcome(method, data, config)
-    if before is None or (before.fits and not too_many_rejected(before.estimate.residuals)):
+    if estimate is not None and model.cut and estimate.residuals:
+        data = model.segment(data, *_worst_segment(estimate.residuals, _SEGMENT_S))
+    before = solve_trial(build, data, config)
+    if before is None or (before.fits and not _rejects_many(before.estimate)):
         return ()
-    found = _explaining(method, _screened(method, data, config, before), before)
+    concurrent = max_concurrent(model.times(data))
+    found = _explaining(build, _promising(build, model, data, config, before), before, concurrent)
     if any(after.fits for after, _ in found):
         found = [each for each in found if each[0].fits]
     if not found:
-        last = _explaining(method, faults(hypotheses, data, config, last=True), before)
-        found = [each for each in last if each[0].fits]
+        fallback = _explaining(build, data_faults(model, data, config, fallback=True), before, concurrent)
+        found = [each for each in fallback if each[0].fits]
     if not found and known:
-        return _noise(method, data, config)
-    return tuple(Cause(label, _evidence(before, after)) for after, label in found[:_MOST_NAMED])
+        found = _noise(build, data, config)
+    return _findings(before, found[:_MAX_REPORTED])
 
 
-def _explaining(method: Method, tried: Iterable[Trial], before: Outcome) -> list[tuple[Outcome, str]]:
-    """The changes that explain the misfit, the best first, each with what is wrong in words."""
-    tried, found = list(tried), []
-    works = [partial(outcome, method, changed, config) for _, changed, config in tried]
-    solved = parallel.done(works, _WHAT, min((at_once(method, changed) for _, changed, _ in tried), default=1))
-    for (label, *_), after in zip(tried, solved, strict=True):
+def _rejects_many(estimate: Estimate) -> bool:
+    """Whether so much of a family is rejected that these can be no outliers."""
+    shares = (np.mean(~r.used) for r in estimate.residuals.values() if len(r.used) >= DEFAULT.min_family)
+    return bool(max(shares, default=0.0) > DEFAULT.rejected)
+
+
+def _findings(before: TrialFit, found: Sequence[_Tested]) -> tuple[Finding, ...]:
+    """One finding for hypotheses whose chi-square is alike, the best of them named and the others its equivalents."""
+    groups: list[list[_Tested]] = []
+    for each in found:
+        if groups and each[0].cost - groups[-1][0][0].cost < _SIGNIFICANT**2:
+            groups[-1].append(each)
+        else:
+            groups.append([each])
+    return tuple(
+        Finding(
+            "hypothesis",
+            Severity.INCONSISTENT,
+            {
+                "label": group[0][1],
+                "chi_square_before": before.cost,
+                "chi_square_after": group[0][0].cost,
+                "dof": group[0][0].dof,
+                "equivalents": [label for _, label in group[1:]],
+            },
+        )
+        for group in groups
+    )
+
+
+def _explaining(build: Build, cases: Iterable[TrialCase], before: TrialFit, concurrent: int) -> list[_Tested]:
+    """The cases that explain the misfit, the best fit first."""
+    cases, found = list(cases), []
+    works = [partial(solve_trial, build, case.data, case.config, case.label) for case in cases]
+    for case, after in zip(cases, parallel.done(works, _WHAT, concurrent), strict=True):
         if after is not None and _explains(before, after):
-            found.append((after, _named(label, after)))
+            found.append((after, _with_delays(case.label, after)))
     return sorted(found, key=lambda each: each[0].factor)
 
 
-def _screened(method: Method, data: Any, config: Config, before: Outcome) -> list[Trial]:
-    """The changes worth a closer look, by the typical residual after a few iterations."""
-    hypotheses = method.hypotheses()
-    stretch = _worst_stretch(before.estimate.residuals, _SHORT) if hypotheses.cut else (-np.inf, np.inf)
-    found = list(trials(method, data, config))
-    looked_at = [*((changed, other) for _, changed, other in found), (data, config)]
-    short = [(cut(hypotheses, changed, *stretch), other) for changed, other in looked_at]
-    works = [partial(quick_score, method, *each) for each in short]
-    *scores, as_it_is = parallel.done(works, _WHAT, at_once(method, short[-1][0]))
-    enough = min(_PROMISING * as_it_is, _RIVAL * min(scores, default=np.inf))
-    return [found[i] for i in np.argsort(scores)[:_MOST_NAMED] if scores[i] < enough]
+def _promising(build: Build, model: FaultModel, data: Any, config: Config, before: TrialFit) -> list[TrialCase]:
+    """The cases worth solving, by their scores after a few iterations on a short segment."""
+    found = list(trial_cases(build, model, data, config))
+    cases = [*found, TrialCase("", data, config)]
+    if model.cut and before.estimate.residuals:
+        worst = _worst_segment(before.estimate.residuals, _SCORE_SEGMENT_S)
+        cases = [TrialCase(case.label, model.segment(case.data, *worst), case.config) for case in cases]
+    works = [partial(score_trial, build, case.data, case.config, case.label) for case in cases]
+    *scores, recorded = parallel.done(works, _WHAT, max_concurrent(model.times(cases[-1].data)))
+    enough = min(_PROMISING * recorded, _MAX_RIVAL * min(scores, default=np.inf))
+    return [found[i] for i in np.argsort(scores)[:_MAX_TESTED] if scores[i] < enough]
 
 
-def _worst_stretch(residuals: Mapping[str, Residuals], length: float) -> tuple[float, float]:
-    """Of the residuals' time, the stretch with the largest sum of squares, rejected ones counted in full."""
+def _worst_segment(residuals: Mapping[str, Residuals], length: float) -> tuple[float, float]:
+    """Start and end, s, of the segment with the largest sum of squares, rejected measurements counted in full."""
     time = np.concatenate([r.time for r in residuals.values()])
     square = np.concatenate([(r.whitened**2).sum(axis=1) for r in residuals.values()])
     order = np.argsort(time, kind="stable")
@@ -113,35 +141,24 @@ def _worst_stretch(residuals: Mapping[str, Residuals], length: float) -> tuple[f
     return float(start) - 0.1, float(start) + length + 0.1
 
 
-def _named(label: str, after: Outcome) -> str:
-    """With the delays that were found, which stand in it by name."""
+def _with_delays(label: str, after: TrialFit) -> str:
+    """The label with the estimated delays, which stand in it by name."""
     found = zip(after.estimate.names, after.estimate.values, after.estimate.sigmas, strict=True)
     return label.format(**{name: f"{1e3 * value:.3g} ± {1e3 * sigma:.2g} ms" for name, value, sigma in found})
 
 
-def _explains(before: Outcome, after: Outcome) -> bool:
-    """Whether a change makes chi-square fall by far more than chance and to (nearly) what it should be."""
+def _explains(before: TrialFit, after: TrialFit) -> bool:
+    """Whether chi-square falls by far more than chance, and to (nearly) what it should be."""
     fall = (before.cost - after.cost) / max(after.factor, 1.0) ** 2
-    return fall > _SIGNIFICANT**2 and (after.fits or after.factor < _BETTER * before.factor)
+    return fall > _SIGNIFICANT**2 and (after.fits or after.factor < _MAX_REMAINING * before.factor)
 
 
-def _evidence(before: Outcome, after: Outcome) -> str:
-    fits = "and fits" if after.fits else "and still does not fit"
-    return (
-        f"with that changed chi-square falls from {before.cost:.4g} to {after.cost:.4g} for {after.rows:.4g} degrees "
-        f"of freedom {fits}"
-    )
-
-
-def _noise(method: Method, data: Any, config: Config) -> tuple[Cause, ...]:
-    """The noises that are stated too small, as the recording has them; none so large as to explain anything."""
-    found = outcome(method, data, config.model_copy(update={"noise_known": _KNOWN}))
+def _noise(build: Build, data: Any, config: Config) -> list[_Tested]:
+    """Noises whose estimate is larger than stated, the largest first; none so large as to explain anything."""
+    found = solve_trial(build, data, config.model_copy(update={"noise_known": _NOISE_KNOWN}))
     levels = [level for level in found.estimate.levels if level.contradicted] if found is not None else []
-    return tuple(
-        Cause(
-            f"the noise {level.noise.name} is stated {level.scale:.2g} times too small",
-            f"the recording says {level.used:.3g} {level.noise.unit}, stated are {level.noise.stated:.3g}",
-        )
+    return [
+        (found, f"{level.noise.name} is {level.used:.3g} {level.noise.unit}, {level.scale:.2g} times its statement")
         for level in sorted(levels, key=lambda level: -level.scale)
-        if _NOTABLE < level.scale <= _MOST_NOISE
-    )
+        if found is not None and _MIN_NOISE_FACTOR < level.scale <= _MAX_NOISE_FACTOR
+    ]

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from alidade.pipelines.diagnostics.fault_models import Hypotheses, Scaling
-from alidade.pipelines.diagnostics.outcome import outcome, quick_score
+from alidade.pipelines.diagnostics.fault_models import FaultModel, ScaleFactor
+from alidade.pipelines.diagnostics.trial_fit import Build, score_trial, solve_trial
 from alidade.pipelines.settings import Config
-
-if TYPE_CHECKING:
-    from alidade.pipelines.methods import Method
 
 _OFFSET = "time_offset"
 _DELAY_PRIOR = 0.05
@@ -23,31 +20,36 @@ _DELAY_PRIOR = 0.05
 # parabola.
 _FIRST_SHIFT, _FIRST_SCALING, _SECOND_SCALING, _PARABOLAS = 0.01, 0.01, 5e-3, 4
 
-# What it would be, data and config.
-Trial = tuple[str, Any, Config]
+
+@dataclass(frozen=True)
+class TrialCase:
+    """Changed data and config, and the fault that they correct, in words."""
+
+    label: str
+    data: Any
+    config: Config
 
 
-def trials(method: Method, data: Any, config: Config) -> Iterator[Trial]:
-    """All that is tried, but for what counts only where nothing else does."""
-    hypotheses = method.hypotheses()
-    yield from faults(hypotheses, data, config)
-    yield from flips(hypotheses, data, config)
-    yield from turned(hypotheses, data, config)
-    yield from units(hypotheses, data, config)
-    yield from offset(method, hypotheses, data, config)
-    yield from scaled(method, hypotheses, data, config)
+def trial_cases(build: Build, model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
+    """All faults that are tested, but for those that count only where nothing else fits."""
+    yield from data_faults(model, data, config)
+    yield from inverted_signs(model, data, config)
+    yield from axis_orders(model, data, config)
+    yield from units(model, data, config)
+    yield from delays(build, model, data, config)
+    yield from scale_factors(build, model, data, config)
 
 
-def faults(hypotheses: Hypotheses, data: Any, config: Config, last: bool = False) -> Iterator[Trial]:
-    """The method's own, those that count last or the others."""
-    for fault in hypotheses.faults:
-        if fault.last is last and (mended := fault.mended(data, config)) is not None:
-            yield fault.label, *mended
+def data_faults(model: FaultModel, data: Any, config: Config, fallback: bool = False) -> Iterator[TrialCase]:
+    """The method's own faults, those that are a fallback or the others."""
+    for fault in model.faults:
+        if fault.fallback is fallback and (corrected := fault.corrected(data, config)) is not None:
+            yield TrialCase(fault.label, *corrected)
 
 
-def flips(hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]:
+def inverted_signs(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
     """Every choice of opposite signs of a sensor's axes."""
-    for name, (sensor, columns) in hypotheses.signs.items():
+    for name, (sensor, columns) in model.signs.items():
         values = getattr(data, name)
         if values is None:
             continue
@@ -57,12 +59,12 @@ def flips(hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]:
                 axes = " and ".join(wrong)
                 label = f"the sign of the {sensor}'s {axes} is wrong"
                 factor = np.array(signs) if values.ndim > 1 else signs[0]
-                yield label, replace(data, **{name: factor * values}), config
+                yield TrialCase(label, replace(data, **{name: factor * values}), config)
 
 
-def turned(hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]:
+def axis_orders(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
     """Axes of a sensor in another order: two of them swapped, or turned by a right angle about the third."""
-    for name, (sensor, columns) in hypotheses.signs.items():
+    for name, (sensor, columns) in model.signs.items():
         values = getattr(data, name)
         if values is None or len(columns) < 3:
             continue
@@ -78,62 +80,61 @@ def turned(hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]
                 ),
             }
             for label, signs in labels.items():
-                yield label, replace(data, **{name: values @ swapped * signs}), config
+                yield TrialCase(label, replace(data, **{name: values @ swapped * signs}), config)
 
 
-def units(hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]:
+def units(model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
     """Rates in degrees a second, or turned into radians twice."""
-    for name, (sensor, _) in hypotheses.signs.items():
+    for name, (sensor, _) in model.signs.items():
         values = getattr(data, name)
         if values is not None and "gyro" in name:
-            yield f"the {sensor} is in deg/s, not rad/s", replace(data, **{name: np.deg2rad(values)}), config
-            yield (
-                f"the {sensor} was turned from deg/s to rad/s twice",
-                replace(data, **{name: np.rad2deg(values)}),
-                config,
-            )
+            for label, changed in {
+                f"the {sensor} is in deg/s, not rad/s": np.deg2rad(values),
+                f"the {sensor} was turned from deg/s to rad/s twice": np.rad2deg(values),
+            }.items():
+                yield TrialCase(label, replace(data, **{name: changed}), config)
 
 
-def offset(method: Method, hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]:
+def delays(build: Build, model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
     """Delays as parameters with wide priors, or the stamps that may be late moved to where residuals are smallest."""
-    known = {_OFFSET: "a time offset of {time_offset} is taken for known"} if hypotheses.offset else {}
-    for name, label in {**known, **hypotheses.delays}.items():
-        yield label, data, config.model_copy(update={"priors": {**config.priors, name: _DELAY_PRIOR}})
-    if hypotheses.clock is None:
+    known = {_OFFSET: "a time offset of {time_offset} is taken for known"} if model.offset else {}
+    for name, label in {**known, **model.delays}.items():
+        yield TrialCase(label, data, config.model_copy(update={"priors": {**config.priors, name: _DELAY_PRIOR}}))
+    if model.clock is None:
         return
-    stamps, source = hypotheses.clock
+    stamps, source = model.clock
 
     def moved(shift: float) -> tuple[Any, Config]:
         return replace(data, **{stamps: getattr(data, stamps) + shift}), config
 
-    shift = _lowest(partial(_cost, method, moved), _FIRST_SHIFT)
+    shift = _lowest(partial(_cost, build, moved), _FIRST_SHIFT)
     if shift is not None:
         side = "early" if shift > 0.0 else "late"
-        yield f"the stamps of the {source} are {1e3 * abs(shift):.3g} ms too {side}", *moved(shift)
+        yield TrialCase(f"the stamps of the {source} are {1e3 * abs(shift):.3g} ms too {side}", *moved(shift))
 
 
-def scaled(method: Method, hypotheses: Hypotheses, data: Any, config: Config) -> Iterator[Trial]:
+def scale_factors(build: Build, model: FaultModel, data: Any, config: Config) -> Iterator[TrialCase]:
     """Numbers of the config multiplied by what makes residuals smallest."""
-    for scaling in hypotheses.scalings:
-        if scaling.scaled(data, config, 1.0) is None:
+    for factor in model.scalings:
+        if factor.apply(data, config, 1.0) is None:
             continue
 
-        def changed(more: float, scaling: Scaling = scaling) -> tuple[Any, Config]:
-            found = scaling.scaled(data, config, 1.0 + more)
+        def changed(more: float, factor: ScaleFactor = factor) -> tuple[Any, Config]:
+            found = factor.apply(data, config, 1.0 + more)
             assert found is not None
             return found
 
         # Not chi-square, which levels off where most measurements are rejected; near the bottom it tells best.
-        rough = _lowest(lambda more: quick_score(method, *changed(more)) ** 2, _FIRST_SCALING)
+        rough = _lowest(lambda more: score_trial(build, *changed(more)) ** 2, _FIRST_SCALING)
         if rough:
-            more = _lowest(partial(_cost, method, changed), _SECOND_SCALING, rough)
+            more = _lowest(partial(_cost, build, changed), _SECOND_SCALING, rough)
             more = rough if more is None else more
-            yield scaling.label.format(factor=1.0 + more), *changed(more)
+            yield TrialCase(factor.label.format(factor=1.0 + more), *changed(more))
 
 
-def _cost(method: Method, changed: Callable[[float], tuple[Any, Config]], size: float) -> float:
-    """Of a solution with a change of some size; infinite where there is none."""
-    found = outcome(method, *changed(size))
+def _cost(build: Build, changed: Callable[[float], tuple[Any, Config]], size: float) -> float:
+    """Chi-square with a change of some size; infinite where there is no solution."""
+    found = solve_trial(build, *changed(size), label=f"change of {size:.3g}")
     return found.cost if found else np.inf
 
 

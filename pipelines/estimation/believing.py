@@ -6,7 +6,7 @@ but numbers that are believed; rows that tie these to others stay.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -22,6 +22,9 @@ from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Probl
 _ROUNDING = 1e-9
 # First values farther from what is believed than this, in sigmas, are moved there, in so many steps.
 _APART, _MOVES = 3.0, 5
+# In units of a number's usual prior: means and sigmas beyond, sigmas below and not 0, and combinations of numbers known
+# so much better than these themselves are slips, by which no linear system in double precision can be solved.
+_FARTHEST, _LEAST_SIGMA, _LEAST_CORRELATED = 1e6, 1e-10, 1e-12
 
 
 def believing(problem: Problem, beliefs: Sequence[Belief]) -> Problem:
@@ -75,6 +78,7 @@ def _believing(problem: Problem, belief: Belief) -> Problem:
                 f"priors.{name}: where it is fixed it is left out of the graph, which takes it for 0; give it a sigma"
             )
     known, by_hand = belief.of(own), not belief.source
+    _require_sense(known, own)
     replaced = frozenset(name for name in known.names if by_hand or own[name].prior_sigma != 0.0)
     if not replaced:
         return problem
@@ -83,8 +87,10 @@ def _believing(problem: Problem, belief: Belief) -> Problem:
         for name, mean, sigma in zip(known.names, known.mean, known.sigmas, strict=True)
         if name in replaced
     }
+    means = dict(zip(known.names, known.mean.tolist(), strict=True))
     parameters = tuple(
-        replace(p, quantities=tuple(believed.get(q.name, q) for q in p.quantities)) for p in problem.parameters
+        replace(p, quantities=tuple(believed.get(q.name, q) for q in p.quantities)).near(means)
+        for p in problem.parameters
     )
     told = _Told(parameters, known, replaced)
     steps, after, onward = problem.steps, problem.steps_after, problem.onward
@@ -97,6 +103,24 @@ def _believing(problem: Problem, belief: Belief) -> Problem:
         onward=None if onward is None else lambda data, time: _grown(onward(data, time), belief),
         premises=(*problem.premises, *filter(None, [premise])),
     )
+
+
+def _require_sense(belief: Belief, own: Mapping[str, Quantity]) -> None:
+    """Raise InputError for a mean, a sigma or a covariance of which no solution can be made."""
+    where = belief.source or "priors"
+    for name, mean, sigma in zip(belief.names, belief.mean, belief.sigmas, strict=True):
+        scale, unit = own[name].prior_scale, own[name].unit
+        if not (abs(mean) <= _FARTHEST * scale and sigma <= _FARTHEST * scale):
+            raise InputError(
+                f"{where}: {name}: {mean:g} ± {sigma:g} {unit} is far from anything it can be; units are SI"
+            )
+        if 0.0 < sigma < _LEAST_SIGMA * scale:
+            raise InputError(f"{where}: {name}: a sigma of {sigma:g} {unit} is less than any; 0 fixes it")
+    sigmas = belief.sigmas
+    free = sigmas > 0.0
+    correlation = belief.covariance[np.ix_(free, free)] / np.outer(sigmas[free], sigmas[free])
+    if np.linalg.eigvalsh(correlation).min(initial=1.0) < _LEAST_CORRELATED:
+        raise InputError(f"{where}: the covariance is singular: a combination of its numbers is known exactly")
 
 
 def _grown(problem: Problem | None, belief: Belief) -> Problem | None:

@@ -87,6 +87,7 @@ class GyroChain:
         platform, platform_turns: the platform's gyro and its increments; None in an inertial frame.
         platform_errors: of that gyro, its bias first; None: perfect.
         first: number of the first keyframe in the recording, where the chain is over its end alone.
+        share: of the increments' white variance that is the gyro's own, not the platform's.
     """
 
     time: Array
@@ -102,6 +103,7 @@ class GyroChain:
     platform_turns: Increments | None = None
     platform_errors: Parameter | None = None
     first: int = 0
+    share: float = 1.0
 
     @classmethod
     def over(
@@ -153,6 +155,7 @@ class GyroChain:
             platform_turns=platform_turns,
             platform_errors=platform_errors,
             first=0 if trunk is None else trunk.keyframe,
+            share=density**2 / max(density**2 + other_density**2, 1e-300),
         )
 
     def trunk(self, time: float) -> Trunk | None:
@@ -218,7 +221,7 @@ class GyroChain:
         bias, turns, variance = self.bias_keys(after), self.turns[as_slice(after - 1)], self.variance[after - 1]
         carrying = None if self.platform_turns is None else self.platform_turns[as_slice(after - 1)]
         model = GyroIncrementFactor(
-            self.time[as_slice(after)], turns, self.gyro, np.sqrt(variance), carrying, self.platform
+            self.time[as_slice(after)], turns, self.gyro, np.sqrt(variance), carrying, self.platform, self.share
         )
         return [Factor.process_of("gyro", model.on(*states, bias, *self.error_keys))]
 

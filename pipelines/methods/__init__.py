@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
     from alidade.pipelines.diagnostics.checklist import ChecklistItem
-    from alidade.pipelines.diagnostics.fault_models import Hypotheses
-    from alidade.pipelines.diagnostics.validation import Validation
+    from alidade.pipelines.diagnostics.cross_validation import Validation
+    from alidade.pipelines.diagnostics.fault_models import FaultModel
     from alidade.pipelines.estimation.problem import Array, Estimate, Findings, Problem
     from alidade.pipelines.methods.formula import Formula
     from alidade.pipelines.recording.reading import Recording
@@ -157,7 +157,7 @@ class Method(ABC):
     # -- judgement
 
     @abstractmethod
-    def hypotheses(self) -> Hypotheses:
+    def hypotheses(self) -> FaultModel:
         """What can be wrong with its data, to be tried when residuals do not fit."""
 
     def validate(self, data: Any, config: Config, values: Mapping[str, float]) -> Sequence[Validation]:  # noqa: ARG002

@@ -86,7 +86,7 @@ class ChannelFormat:
         return rows_of(rows.channel, translated, rows.log_ns)
 
     def stamps(self, rows: Rows) -> NDArray[np.int64]:
-        """Header stamps of messages as the container has them, ns; log times where there are none to be read."""
+        """Header stamps of messages as the container has them, ns: 0 where there is none, log times if none is read."""
         stamps = rows.log_ns
         if self._wire and not self._is_translated and self._schema is not None and self._language == "msg":
             has_header = messages.has_header(self._schema.data.decode(errors="replace"))
@@ -96,7 +96,7 @@ class ChannelFormat:
                 stamps = header_stamps(self.definition.has_header, self.rows(rows), self.definition.wire)
             except MessageError:
                 return rows.log_ns
-        return np.where(stamps == 0, rows.log_ns, stamps)
+        return stamps
 
     @cached_property
     def _translation(self) -> Translation:

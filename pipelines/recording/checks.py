@@ -19,41 +19,108 @@ MAX_NORM_ERROR = 1e-3
 # The best sensors there are have more noise, rad/s/sqrt(Hz), m/s^2/sqrt(Hz) and T/sqrt(Hz). Drivers that know nothing
 # write a variance of 1e-12, say.
 LEAST_GYRO, LEAST_ACCEL, LEAST_MAG = 2e-7, 1e-6, 1e-12
+# Steps that tell in which unit of time stamps are, and the shortest of a sensor: of 40 kHz, s.
+_FEWEST_STEPS, _SHORTEST_STEP_S = 10, 2.5e-5
+# A gyro is read more often than once in so many s; another sensor than once in so many.
+SLOWEST_GYRO_S, SLOWEST_S = 0.5, 5.0
+# The unit that stamps are in whose step has to be multiplied so.
+_MEANT = {1e-3: "ms", 1e-6: "us", 1e-9: "ns", 1e3: "s or ms", 1e6: "s", 1e9: "s"}
+# Messages overtake each other by at most so many usual steps; sorted, so many of their steps are within so much of it.
+_OVERTAKING_STEPS, _EVEN_SHARE, _EVEN = 20.0, 0.9, 0.5
+_ADVICE = {"out of order": ": sort the recording by header stamps", "duplicate": ", written with all their digits"}
+# With so many stamps twice, of different readings, two devices are likelier than a recorder's mistake.
+_TWO_DEVICES = 0.2
+_MIXED = "; are two devices on one topic? choose one by `frame:` under `topics`, of a table by `where:` under `columns`"
 # A few stamps out of place are a recorder's hiccup, more are a broken time base.
 MAX_BAD_STAMPS = 0.01
 
 
 def clean(
-    topic: str, t_ns: NDArray[np.int64], epoch_ns: int, values: Array, dropped: dict[str, int], least: int = 2
+    topic: str,
+    t_ns: NDArray[np.int64],
+    epoch_ns: int,
+    values: Array,
+    dropped: dict[str, int],
+    least: int = 2,
+    slowest_s: float = SLOWEST_S,
 ) -> tuple[Array, NDArray[np.int64]]:
     """Times in s from epoch_ns, strictly increasing, and which samples they belong to (indexes into the series).
 
     Samples with a NaN or infinite value (rows of `values`) are dropped, and so are all but the first of several with
-    the same stamp; stamps out of order are sorted. What was done is counted in `dropped`. Raises InputError when stamps
-    are bad in more than 1 % of the samples, or fewer than `least` samples are left.
+    the same stamp; stamps out of order are sorted. What was done is counted in `dropped`.
+
+    Args:
+        topic: for what is said.
+        t_ns: (N,) stamps in the order of the file.
+        epoch_ns: zero of the times.
+        values: (N, ...) what was measured.
+        dropped: reason -> samples, added to.
+        least: samples needed; of a topic that one message of will do the rate is not looked at.
+        slowest_s: the longest usual step that such a sensor may have, s.
+
+    Raises:
+        InputError: more than 1 % of the stamps are those of other, different samples, or out of order by more than
+            messages that overtake each other; the usual step is that of another unit of time; fewer than `least`
+            samples are left.
     """
     keep = np.flatnonzero(np.isfinite(values.reshape(len(t_ns), -1)).all(axis=1))
     count(dropped, f"{topic}: not a finite number", len(t_ns) - len(keep))
     if not len(keep):
         raise InputError(f"topic {topic}: every one of the {len(t_ns)} messages has a NaN or infinite value")
+    in_file = t_ns[keep]
+    backward = int(np.count_nonzero(in_file < np.maximum.accumulate(in_file)))
+    keep = keep[np.argsort(in_file, kind="stable")]
+    copies = _copies(t_ns[keep], taken(values, keep))
+    count(dropped, f"{topic}: the same message once more", int(np.count_nonzero(copies)))
+    keep = keep[~copies]
     stamps = t_ns[keep]
-    backward = int(np.count_nonzero(stamps < np.maximum.accumulate(stamps)))
-    keep = keep[np.argsort(stamps, kind="stable")]
-    first = np.diff(t_ns[keep], prepend=np.iinfo(np.int64).min // 2) > 0
+    first = np.diff(stamps, prepend=np.iinfo(np.int64).min // 2) > 0
     duplicate = int(np.count_nonzero(~first))
-    for what, number in (("out of order", backward), ("duplicate", duplicate)):
-        if number > MAX_BAD_STAMPS * len(stamps):
-            at = _first_bad(stamps, epoch_ns, what)
+    overtaken = backward and _is_overtaking(in_file, stamps[first])
+    for what, number in (("out of order", 0 if overtaken else backward), ("duplicate", duplicate)):
+        if number > MAX_BAD_STAMPS * len(in_file):
+            mixed = "" if number < _TWO_DEVICES * len(in_file) or what != "duplicate" else _MIXED
+            at = _first_bad(in_file if what == "out of order" else stamps, epoch_ns, what)
             raise InputError(
-                f"topic {topic}: {number} of {len(stamps)} stamps are {what} (the first at {at:.6f} s from the start); "
-                "the stamps have to be those of the measurements"
+                f"topic {topic}: {number} of {len(in_file)} stamps are {what} (the first at {at:.6f} s from the "
+                f"start); the stamps have to be those of the measurements{_ADVICE[what]}{mixed}"
             )
     count(dropped, f"{topic}: stamp out of order (sorted, kept)", backward)
     count(dropped, f"{topic}: duplicate stamp", duplicate)
     keep = keep[first]
     if len(keep) < least:
         raise InputError(f"topic {topic}: {len(keep)} usable messages, at least {least} are needed")
+    if least > 1:
+        check_time_unit(f"topic {topic}", t_ns[keep], slowest_s)
     return seconds(t_ns[keep], epoch_ns), keep
+
+
+def check_time_unit(name: str, t_ns: NDArray[np.int64], slowest_s: float) -> None:
+    """Raise InputError where the usual step between stamps, ns, is no sensor's, but would be in another unit."""
+    factor = likely_time_unit(t_ns, slowest_s)
+    if factor is not None:
+        step = float(np.median(np.diff(t_ns))) * 1e-9
+        raise InputError(
+            f"{name}: samples are {step:.3g} s apart (median); is the unit of time {_MEANT[factor]}? Stamps have to be "
+            f"in s, multiplied by {factor:g}"
+        )
+
+
+def likely_time_unit(t_ns: NDArray[np.int64], slowest_s: float) -> float | None:
+    """What stamps, ns, have to be multiplied with (1e-3, 1e3, ...) for their usual step to be a sensor's; None: by 1.
+
+    Args:
+        t_ns: (N,), in order or not.
+        slowest_s: the longest usual step of such a sensor, s.
+    """
+    if len(t_ns) < _FEWEST_STEPS:
+        return None
+    step = float(np.median(np.abs(np.diff(t_ns.astype(float))))) * 1e-9
+    if step > slowest_s:
+        return next((factor for factor in (1e-3, 1e-6, 1e-9) if step * factor <= slowest_s), None)
+    if 0.0 < step < _SHORTEST_STEP_S:
+        return next((factor for factor in (1e3, 1e6, 1e9) if step * factor >= _SHORTEST_STEP_S), None)
+    return None
 
 
 def taken(values: Array, rows: NDArray[np.int64]) -> Array:
@@ -92,6 +159,15 @@ def too_fast(topic: str, t: Array, gyro: Array) -> str:
     )
 
 
+def tracked(topic: str, wxyz: Array, dropped: dict[str, int]) -> Array:
+    """Quaternions (N, 4), NaN in place of those that are all zero: a tracker that lost the body; counted."""
+    lost = np.asarray(~wxyz.any(axis=1))
+    if lost.all() or not lost.any():
+        return wxyz
+    count(dropped, f"{topic}: a quaternion of zeros, as of a body that was not seen", int(lost.sum()))
+    return np.where(lost[:, None], np.nan, wxyz)
+
+
 def unit_quaternions(topic: str, t: Array, wxyz: Array) -> Array:
     """The quaternions, shape (N, 4), at exactly unit length. Raises InputError beyond 1e-3, at zero norm and at NaN."""
     norm = np.linalg.norm(wxyz, axis=1)
@@ -116,41 +192,29 @@ def check_overlap(spans: Mapping[str, Array]) -> None:
         raise InputError(f"no stretch of time is covered by all of: {described}; are the clocks the same?")
 
 
-def density(topic: str, t: Array, covariance: Array, least: float, dropped: dict[str, int]) -> float | None:
-    """Noise density, per sqrt(Hz), from the covariances (N, 3, 3) of samples: sigma/sqrt(rate); None if unknown.
-
-    Unknown is what the messages say with zero, with -1, or with less than `least`, a density that no sensor has; the
-    last two are counted in `dropped`.
-    """
-    step = float(np.median(np.diff(t)))
-    covariance = believed(topic, covariance, least**2 / step, dropped)
-    variance = float(np.trace(covariance.mean(axis=0))) / 3.0
-    return float(np.sqrt(variance * step)) if np.isfinite(variance) and variance > 0.0 else None
-
-
-def believed(topic: str, covariance: Array, least: float, dropped: dict[str, int]) -> Array:
-    """Covariances (N, 3, 3), zero in place of those that start with -1 or have a smaller mean variance than `least`.
-
-    Both are what drivers write that know nothing; they are counted in `dropped`.
-    """
-    # Those that never change are one in memory.
-    alike = len(covariance) if len(covariance) and covariance.strides[0] == 0 else 1
-    own = covariance[:1] if alike > 1 else covariance
-    absent = own[:, 0, 0] == -1.0
-    variance = np.trace(own, axis1=1, axis2=2) / 3.0
-    tiny = ~absent & (variance > 0.0) & (variance < least)
-    for mask, what in ((absent, "of -1"), (tiny, "too small for any sensor")):
-        count(dropped, f"{topic}: covariance {what}, not believed (kept)", alike * int(np.count_nonzero(mask)))
-    unknown = absent | tiny
-    return (
-        np.broadcast_to(np.where(unknown[:, None, None], 0.0, own), covariance.shape) if unknown.any() else covariance
-    )
-
-
 def count(dropped: dict[str, int], reason: str, number: int) -> None:
     """Add to a tally; nothing for zero."""
     if number:
         dropped[reason] = dropped.get(reason, 0) + number
+
+
+def _copies(stamps: NDArray[np.int64], values: Array) -> NDArray[np.bool_]:
+    """Which of samples sorted by stamp are the one before once more, stamp and numbers."""
+    out = np.zeros(len(stamps), dtype=bool)
+    again = np.flatnonzero(np.diff(stamps) == 0) + 1
+    rows = values.reshape(len(stamps), -1)
+    out[again] = (rows[again] == rows[again - 1]).all(axis=1)
+    return out
+
+
+def _is_overtaking(in_file: NDArray[np.int64], stamps: NDArray[np.int64]) -> bool:
+    """Whether stamps out of order are of messages that overtook each other: late by little, and even once sorted."""
+    steps = np.diff(stamps)
+    if not len(steps):
+        return False
+    usual = float(np.median(steps))
+    late = float((np.maximum.accumulate(in_file) - in_file).max())
+    return late <= _OVERTAKING_STEPS * usual and bool(np.mean(np.abs(steps - usual) <= _EVEN * usual) >= _EVEN_SHARE)
 
 
 def _first_bad(stamps: NDArray[np.int64], epoch_ns: int, what: str) -> float:

@@ -19,6 +19,10 @@ Order = Callable[[Any], Sequence[int] | None]
 # Stamps and log times, ns, in the file's order.
 Times = tuple[NDArray[np.int64], NDArray[np.int64]]
 
+Stamps = NDArray[np.int64]
+
+# Up to so many messages of a topic without a stamp are left out; of more the log times are taken.
+_FEW_UNSTAMPED = 0.1
 # What every message with a header starts with: CDR encapsulation, in ROS 1 a sequence number; then the stamp.
 _STAMP = {
     order: np.dtype([("kind", "u1", 2), ("options", "u1", 2), ("sec", f"{order}i4"), ("nanosec", f"{order}u4")])
@@ -39,6 +43,8 @@ class Table:
         self._t_ns = np.zeros(rows, dtype=np.int64)
         self._log_ns = np.zeros(rows, dtype=np.int64)
         self._shapes = shapes
+        self._frame = np.zeros(rows, dtype=np.int32)
+        self._frames: dict[str, int] = {}
         self._constant: dict[str, Array] = {}
         self._full: dict[str, Array] = {}
         self._next = 0
@@ -52,29 +58,44 @@ class Table:
             self.filled[new] = True
         return np.arange(new.start, new.stop)
 
-    def put(self, rows: NDArray[np.int64], values: Mapping[str, NDArray[Any]]) -> None:
-        """Fill these rows, in order: (rows, numbers) for every column. Raises KeyError at another width."""
+    def put(self, rows: NDArray[np.int64], values: Mapping[str, NDArray[Any]], frame: str = "") -> None:
+        """Fill these rows, in order: (rows, numbers) for every column, all of one frame. KeyError at another width."""
         # Rows that follow each other are written in half the time.
         first, last = int(rows[0]), int(rows[-1])
         where = slice(first, last + 1) if last - first == len(rows) - 1 else rows
         for name, column in values.items():
             self._put(name, where, column)
         self.filled[where] = True
+        self._frame[where] = self._frames.setdefault(frame, len(self._frames))
+
+    def frames(self) -> dict[str, NDArray[np.bool_]]:
+        """Frames of the messages and the rows, of those filled, that have them; where they are mixed, more than one."""
+        found = {name: self.filled & (self._frame == i) for name, i in self._frames.items()}
+        return {name: rows for name, rows in found.items() if rows.any()}
+
+    def keep(self, rows: NDArray[np.bool_]) -> None:
+        """Let go of all other rows."""
+        self.filled &= rows
 
     @property
     def taken(self) -> int:
         """Messages taken up so far: rows beyond them are those of damaged chunks."""
         return self._next
 
+    def drop_unstamped(self) -> int:
+        """Let go of the rows without a stamp where they are few; returns how many they are."""
+        few = few_unstamped(self._t_ns[: self._next], self._log_ns[: self._next])
+        self.filled[: self._next] &= ~few
+        return int(np.count_nonzero(few))
+
     def times(self, filled: bool = True) -> Times:
         """Stamps, log times where there are none, and log times of the rows that were filled, or of all taken up."""
         rows: Any = self.filled if filled and not self.filled.all() else slice(self._next)
-        t_ns, log_ns = self._t_ns[rows], self._log_ns[rows]
-        return (t_ns if t_ns.all() else np.where(t_ns == 0, log_ns, t_ns)), log_ns
+        return with_log_times(self._t_ns[rows], self._log_ns[rows])
 
     def sorted(self) -> tuple[NDArray[np.int64], int, dict[str, Any]]:
         """Stamps, how many of them are log times, and the columns, of the rows that were filled, by log time."""
-        by_log = (self._t_ns == 0) & self.filled
+        by_log = is_unstamped(self._t_ns, self._log_ns) & self.filled
         t_ns = np.where(by_log, self._log_ns, self._t_ns)
         keep: Any = slice(None)
         if not self.filled.all() or (np.diff(self._log_ns) < 0).any():
@@ -108,6 +129,7 @@ class _Plan(NamedTuple):
 
     layout: Layout | None
     fields: dict[str, tuple[Leaf, Any]]
+    frame: str = ""
 
 
 class Decoder:
@@ -139,9 +161,10 @@ class Decoder:
             left = left[~self._append_alike(self._plans[-1], rows, left, table, into)]
         for i in left.tolist():
             with logged_at(int(rows.log_ns[i])):
-                values = self._one(self._definition.decode(rows.message(i)))
+                message = self._definition.decode(rows.message(i))
+                values = self._one(message)
             if values is not None:
-                table.put(into[i : i + 1], values)
+                table.put(into[i : i + 1], values, _frame_of(message))
 
     def _plan(self, data: bytes) -> _Plan:
         """Work out the layout of a message and where in it the fields are."""
@@ -152,7 +175,8 @@ class Decoder:
         orders = {name: order(message) if order else slice(None) for name, (_, order) in self._fields.items()}
         if None in orders.values():
             return _Plan(None, {})
-        return _Plan(layout, {name: (layout.run(path), orders[name]) for name, (path, _) in self._fields.items()})
+        runs = {name: (layout.run(path), orders[name]) for name, (path, _) in self._fields.items()}
+        return _Plan(layout, runs, _frame_of(message))
 
     def _append_alike(
         self, plan: _Plan, rows: Rows, left: NDArray[np.int64], table: Table, into: NDArray[np.int64]
@@ -167,7 +191,8 @@ class Decoder:
         alike[alike] = agrees
         data = data if agrees.all() else data[agrees]
         if len(data):
-            table.put(into[left[alike]], {name: run.of(data)[:, order] for name, (run, order) in plan.fields.items()})
+            values = {name: run.of(data)[:, order] for name, (run, order) in plan.fields.items()}
+            table.put(into[left[alike]], values, plan.frame)
         return alike
 
     def _one(self, message: Any) -> dict[str, NDArray[Any]] | None:
@@ -180,6 +205,11 @@ class Decoder:
         return values
 
 
+def _frame_of(message: Any) -> str:
+    """The frame in a message's header, empty where it has none."""
+    return str(getattr(getattr(message, "header", None), "frame_id", "")).lstrip("/")
+
+
 @contextmanager
 def logged_at(log_ns: int) -> Iterator[None]:
     """Notes the log time of the message that cannot be read in the error that says so."""
@@ -188,6 +218,24 @@ def logged_at(log_ns: int) -> Iterator[None]:
     except MessageError as error:
         error.log_ns = log_ns
         raise
+
+
+def is_unstamped(stamps: Stamps, log_ns: Stamps) -> NDArray[np.bool_]:
+    """Which messages have no stamp: zero, but for those that were logged at zero, too, as rows of a table are."""
+    return np.asarray((stamps == 0) & (log_ns != 0))
+
+
+def few_unstamped(stamps: Stamps, log_ns: Stamps) -> NDArray[np.bool_]:
+    """The messages without a stamp where they are few among others: sent before a clock was there. Otherwise none."""
+    without = is_unstamped(stamps, log_ns)
+    return without & (np.count_nonzero(without) <= _FEW_UNSTAMPED * len(without))
+
+
+def with_log_times(stamps: Stamps, log_ns: Stamps) -> Times:
+    """Stamps and log times: these stand in for stamps that are not there; where those are few they are left out."""
+    kept: Any = ~few if (few := few_unstamped(stamps, log_ns)).any() else slice(None)
+    stamps, log_ns = stamps[kept], log_ns[kept]
+    return (stamps if stamps.all() else np.where(stamps == 0, log_ns, stamps)), log_ns
 
 
 def header_stamps(has_header: bool, rows: Rows, wire: Wire) -> NDArray[np.int64]:

@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.arrays import ArrayContainer
 from alidade.pipelines.recording.container import sha256_of, sha256_together
-from alidade.pipelines.recording.tables import column_names, nanoseconds, numbers, read_columns
+from alidade.pipelines.recording.table_times import nanoseconds
+from alidade.pipelines.recording.tables import numbers, read_columns, table_form
 
 _DISTORTION = {"radial-tangential": "plumb_bob", "equidistant": "equidistant"}
-_LONGEST_YAML = 1 << 20
 
 
 def find_euroc(path: Path) -> Path | None:
@@ -37,7 +38,7 @@ def read_euroc(path: Path, root: Path) -> ArrayContainer:
         found = _topics(table, f"/{table.parent.name}", sensor)
         topics |= found
         if not found:
-            remarks.append(f"{table.parent.name} is not used: columns {', '.join(column_names(table, table))}")
+            remarks.append(f"{table.parent.name} is not used: columns {', '.join(table_form(table, table).names)}")
     return _DataSet(path, topics, remarks, sorted(root.glob("*/data.csv")))
 
 
@@ -57,10 +58,8 @@ class _DataSet(ArrayContainer):
 
 def _topics(table: Path, name: str, sensor: Mapping[str, Any]) -> dict[str, series.Topic]:
     """What a sensor's table holds."""
-    names = column_names(table, table)
-    if not names:
-        raise InputError(f"{table}: a table without columns")
-    columns = read_columns(table, table, names)
+    names = table_form(table, table).names
+    columns, _ = read_columns(table, table, names)
     t_ns = nanoseconds(table, columns[names[0]], "ns")
 
     def chosen(letter: str) -> list[str]:
@@ -122,16 +121,10 @@ def _camera_info(table: Path, t_ns: int, sensor: Mapping[str, Any]) -> series.Ca
 
 def _sensor(path: Path) -> dict[str, Any]:
     """What a sensor.yaml says; nothing if there is none."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
-    if not path.is_file() or path.stat().st_size > _LONGEST_YAML:
+    if not path.is_file() or path.stat().st_size > MAX_YAML_BYTES:
         return {}
-    try:
-        text = path.read_text(errors="replace").removeprefix("%YAML:1.0\n")
-        content = YAML(typ="safe", pure=True).load(text)
-    except (YAMLError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: unreadable YAML: {' '.join(str(error).split())[:200]}") from error
+    text = read_bytes(path, MAX_YAML_BYTES).decode(errors="replace").removeprefix("%YAML:1.0\n")
+    content = load_yaml(text, str(path))
     if not isinstance(content, dict):
         return {}
     for key in ("gyroscope_noise_density", "accelerometer_noise_density", "rate_hz"):

@@ -22,6 +22,9 @@ _FROZEN, _FROZEN_SAMPLES = 0.1, 10
 _JUMP, _SPIKE = 10.0, 10.0
 # A reading at the end of the range for so many samples is clipped, if the range is more than so many quanta.
 _CLIPPED, _QUANTA = 3, 20.0
+# Readings of two devices in turn: one differs from the next by so many times what it does from the next but one. Of
+# noise both are alike, of motion the second is larger.
+_ALTERNATE, _ALTERNATE_SAMPLES = 3.0, 100
 # More repeats than this are the nature of the stream.
 _MOST_REPEATED = 0.5
 # What is dropped, as it is counted.
@@ -41,6 +44,7 @@ def drop_faults(
             the samples is lost.
     """
     _check_alive(topic, values, unit, may_stand)
+    _check_one_device(topic, values, unit)
     spikes = np.stack([_spikes(column) for column in values.T], axis=1)
     rest = np.where(spikes, np.nan, values)
     clipped, frozen = (np.stack([find(t, column) for column in rest.T], axis=1) for find in (_clipped, _frozen))
@@ -89,6 +93,19 @@ def _check_alive(topic: str, values: Array, unit: str, may_stand: bool) -> None:
                 f"topic {topic}: axis {'xyz'[axis]} reads {values[0, axis]:.6g} throughout while the others move; "
                 f"{what}"
             )
+
+
+def _check_one_device(topic: str, values: Array, unit: str) -> None:
+    """Refuse readings that alternate between two levels, which are those of two devices."""
+    if len(values) < _ALTERNATE_SAMPLES:
+        return
+    next_one, next_but_one = (np.median(np.abs(values[lag:] - values[:-lag]), axis=0) for lag in (1, 2))
+    axis = int(np.argmax(next_one - _ALTERNATE * next_but_one))
+    if next_one[axis] > _ALTERNATE * next_but_one[axis]:
+        raise InputError(
+            f"topic {topic}: axis {'xyz'[axis]} alternates between two levels {next_one[axis]:.3g} {unit} apart, as "
+            "readings of two devices do: choose one, by `frame:` under `topics`, of a table by `where:` under `columns`"
+        )
 
 
 def _spikes(x: Array) -> Mask:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.recording.checks import LEAST_GYRO, check_gyro, clean, count, density, taken
+from alidade.pipelines.recording.checks import LEAST_GYRO, SLOWEST_GYRO_S, check_gyro, clean, count, taken
 from alidade.pipelines.recording.faults import drop_faults
+from alidade.pipelines.recording.placeholders import density, is_there
+from alidade.pipelines.recording.plausibility import implausible
 from alidade.pipelines.recording.reading import Recording
 from alidade.pipelines.recording.series import ImuSeries
 
@@ -24,7 +26,7 @@ def read_gyro(
     """
     imu = recording.imu(topic)
     t, keep = usable(topic, imu, epoch_ns, dropped, may_stand=True)
-    return t, taken(imu.gyro, keep), density(topic, t, taken(imu.gyro_cov, keep), LEAST_GYRO, dropped)
+    return t, taken(imu.gyro, keep), density(topic, "gyro", t, taken(imu.gyro_cov, keep), LEAST_GYRO, dropped)
 
 
 def read_imu(
@@ -32,13 +34,16 @@ def read_imu(
 ) -> tuple[Array, Array, float | None, Array | None]:
     """As `read_gyro`, and the specific force (N, 3), m/s^2, of the same samples, None where the Imu has none.
 
-    It has none when its messages say so (covariance[0] = -1), when all is zero, or when a number is missing.
+    It has none when it is a placeholder, when a number is missing, or when it is not in m/s^2, gravity in it.
     """
     imu = recording.imu(topic)
     t, keep = usable(topic, imu, epoch_ns, dropped)
     force = taken(imu.accel, keep)
-    told = np.isfinite(force).all() and force.any() and not (imu.accel_cov[keep, 0, 0] == -1.0).any()
-    noise = density(topic, t, taken(imu.gyro_cov, keep), LEAST_GYRO, dropped)
+    told = np.isfinite(force).all() and is_there("accel", force, taken(imu.accel_cov, keep))
+    if told and (said := implausible("accel", force)):
+        count(dropped, f"{topic}: {said}: not used", len(force))
+        told = False
+    noise = density(topic, "gyro", t, taken(imu.gyro_cov, keep), LEAST_GYRO, dropped)
     return t, taken(imu.gyro, keep), noise, force if told else None
 
 
@@ -50,7 +55,7 @@ def usable(
     Raises InputError as alidade.pipelines.recording.checks and alidade.pipelines.recording.faults do.
     """
     count(dropped, f"{topic}: stamped by log time (kept)", imu.stamped_by_log)
-    t, keep = clean(topic, imu.t_ns, epoch_ns, imu.gyro, dropped, least)
+    t, keep = clean(topic, imu.t_ns, epoch_ns, imu.gyro, dropped, least, SLOWEST_GYRO_S)
     sound = drop_faults(topic, t, taken(imu.gyro, keep), dropped, "rad/s", may_stand)
     t, keep = taken(t, sound), keep[sound]
     check_gyro(topic, t, taken(imu.gyro, keep))

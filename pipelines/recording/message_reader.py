@@ -19,7 +19,7 @@ from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.channel_format import READABLE, ChannelFormat, converted
 from alidade.pipelines.recording.clocks import check_clock
 from alidade.pipelines.recording.container import Container, Rows
-from alidade.pipelines.recording.decoding import Decoder, Times, header_stamps, logged_at
+from alidade.pipelines.recording.decoding import Decoder, Times, header_stamps, is_unstamped, logged_at, with_log_times
 from alidade.pipelines.recording.messages import Definition, MessageError
 from alidade.pipelines.recording.stamps import stamp_notes
 from alidade.pipelines.recording.topic_columns import NUMBERS, TopicColumns
@@ -57,6 +57,7 @@ class MessageReader:
 
     Attributes:
         topics: by name, sorted.
+        unstamped: of topics read by now, how many messages without a stamp were left out.
     """
 
     def __init__(self, container: Container, name: str, epoch_ns: int | None = None) -> None:
@@ -68,6 +69,7 @@ class MessageReader:
             for number, channel in container.channels.items()
         }
         self.topics = self._list_topics()
+        self.unstamped: dict[str, int] = {}
         self._at_hand: dict[tuple[str, tuple[str, ...]], TopicColumns] = {}
         self._times: dict[str, Times] = {}
         # Of topics read by now, what their stamps tell: how late messages were logged at least, ns, and sentences.
@@ -82,7 +84,7 @@ class MessageReader:
         first: dict[int, int] = {}
         for rows in self._container.rows(wanted):
             if rows.channel not in first:
-                first[rows.channel] = int(self._formats[rows.channel].stamps(rows)[0])
+                first[rows.channel] = int(with_log_times(self._formats[rows.channel].stamps(rows), rows.log_ns)[0][0])
             if len(first) == len(wanted):
                 break
         return min(first.values()) if first else self.span[0]
@@ -102,7 +104,11 @@ class MessageReader:
     def stamp_notes(self) -> tuple[str, ...]:
         """Sentences about how the stamps came about in the topics read by now."""
         told = self._tell()
-        return tuple(note for name in self.topics if name in told for note in told[name][1])
+        left_out = (
+            f"topic {name}: {n} messages without a stamp, among others that have one, are left out"
+            for name, n in self.unstamped.items()
+        )
+        return (*left_out, *(note for name in self.topics if name in told for note in told[name][1]))
 
     def _tell(self) -> Mapping[str, tuple[int | None, tuple[str, ...]]]:
         for name in self._times.keys() - self._told.keys():
@@ -123,7 +129,7 @@ class MessageReader:
         found: dict[str, list[Times]] = {name: [] for name in self.topics if name not in self._times}
         for name, rows in self._blocks(found):
             found[name].append((self._formats[rows.channel].stamps(rows), rows.log_ns))
-        self._times |= {name: _joined(parts) for name, parts in found.items()}
+        self._times |= {name: with_log_times(*_joined(parts)) for name, parts in found.items()}
         return self._times
 
     def require(self, topic: str, *types: str) -> None:
@@ -176,6 +182,8 @@ class MessageReader:
             for error in self._fill({topic: columns}).values():
                 raise error
         self._check_read(topic, columns.table.taken)
+        if without := columns.table.drop_unstamped():
+            self.unstamped[topic] = without
         return columns
 
     def decoded(self, topic: str, *types: str) -> Iterator[tuple[int, bool, Any, Definition]]:
@@ -189,14 +197,15 @@ class MessageReader:
             except MessageError as error:
                 raise self._unreadable(topic, error) from error
             stamps = header_stamps(definition.has_header, rows, definition.wire)
-            times.append((np.where(stamps == 0, rows.log_ns, stamps), rows.log_ns))
-            for i, (t_ns, log_ns) in enumerate(zip(stamps.tolist(), rows.log_ns.tolist(), strict=True)):
+            absent = is_unstamped(stamps, rows.log_ns)
+            times.append((np.where(absent, rows.log_ns, stamps), rows.log_ns))
+            for i, (t_ns, log_ns) in enumerate(zip(times[-1][0].tolist(), rows.log_ns.tolist(), strict=True)):
                 try:
                     with logged_at(log_ns):
                         message = definition.decode(rows.message(i))
                 except MessageError as error:
                     raise self._unreadable(topic, error) from error
-                yield t_ns or log_ns, not t_ns, message, definition
+                yield t_ns, bool(absent[i]), message, definition
         self._times[topic] = _joined(times)
         self._check_read(topic, len(self._times[topic][0]))
         if self.topics[topic].type in TIMED:

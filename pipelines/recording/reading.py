@@ -11,6 +11,7 @@ that is damaged is left out, see `Recording.notes`.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
@@ -24,19 +25,28 @@ from alidade.pipelines.recording import messages, series, video
 from alidade.pipelines.recording.clocks import check_clock
 from alidade.pipelines.recording.container import Container
 from alidade.pipelines.recording.data_loss import DataLoss
-from alidade.pipelines.recording.decoding import Times
+from alidade.pipelines.recording.decoding import Table, Times
 from alidade.pipelines.recording.message_reader import TIMED, MessageReader, Topic
 from alidade.pipelines.recording.netpbm import netpbm
 from alidade.pipelines.recording.opening import Where, open_container
-from alidade.pipelines.recording.sources import TopicSource, inverted, joined
+from alidade.pipelines.recording.plausibility import to_signed, wrapped_bits
+from alidade.pipelines.recording.sources import TopicSource, along, inverted, joined
 from alidade.pipelines.recording.stamps import jitter_ns
-from alidade.pipelines.recording.table_topics import TableTopic, described
+from alidade.pipelines.recording.table_topics import TableTopic, described, tables_of
+from alidade.pipelines.recording.tables import CsvFile
 
 # Pairs of frames an error lists.
 _MOST_PAIRS = 30
 
 # How late messages usually are when they are logged, s.
 _LATE = 0.01
+
+# Quantities that may be counts.
+_COUNTED: Mapping[type, tuple[str, ...]] = {
+    series.ImuSeries: ("gyro", "accel"),
+    series.MagneticSeries: ("field",),
+    series.VectorSeries: ("vector",),
+}
 
 AnySeries = TypeVar("AnySeries", bound=series.Series)
 
@@ -79,8 +89,9 @@ class Recording:
         return {**recorded, **made}
 
     def remark(self, sentence: str) -> None:
-        """Note something that was assumed about the recording."""
-        self._container.remarks = (*self._container.remarks, sentence)
+        """Note something that was assumed about the recording, once."""
+        if sentence not in self._container.remarks:
+            self._container.remarks = (*self._container.remarks, sentence)
 
     def use(self, sources: Iterable[TopicSource], columns: Mapping[str, TableTopic]) -> None:
         """Take what the config says of topics that are made of others, and of the columns of tables.
@@ -91,6 +102,10 @@ class Recording:
             self._container = described(self._container, columns)
             self._reader = MessageReader(self._container, str(self.path), self._epoch_ns)
         self._made = {source.name: source for source in sources if source.is_made}
+
+    def tables(self) -> dict[str, CsvFile]:
+        """The tables that no config describes yet, by the names of their files."""
+        return tables_of(self._container)
 
     def sha256(self) -> str:
         """SHA-256 of the file, hexadecimal."""
@@ -174,19 +189,25 @@ class Recording:
             wanted |= dict.fromkeys(self._made[name].parts, ())
         self._reader.read_together(wanted)
 
-    def imu(self, topic: str) -> series.ImuSeries:
+    def imu(self, topic: str, frame: str | None = None) -> series.ImuSeries:
         """A sensor_msgs/msg/Imu topic, or rates alone from a Vector3Stamped or TwistStamped one: accelerations NaN."""
         if topic in self._made:
             return self._made_imu(topic, self._made[topic])
         self._reader.require(topic, *messages.RATES)
         if self.topics[topic].type == messages.IMU:
-            return self._series(series.ImuSeries, topic)
-        rate = self._series(series.VectorSeries, topic)
+            return self._series(series.ImuSeries, topic, frame)
+        rate = self._series(series.VectorSeries, topic, frame)
         return series.ImuSeries(rate.t_ns, rate.vector, np.full(3, np.nan), stamped_by_log=rate.stamped_by_log)
 
     def magnetic(self, topic: str) -> series.MagneticSeries:
         """A sensor_msgs/msg/MagneticField topic."""
-        return self._series(series.MagneticSeries, topic)
+        source = self._made.get(topic)
+        if source is None:
+            return self._series(series.MagneticSeries, topic)
+        if source.topic is None:
+            raise InputError(f"{self.path}: topic {topic} is made of rates; it holds no magnetic field")
+        found = self._series(series.MagneticSeries, source.topic, source.frame)
+        return dataclasses.replace(found, field=along(source.axes, found.field))
 
     def vector(self, topic: str) -> series.VectorSeries:
         """A geometry_msgs/msg/Vector3Stamped topic, a TwistStamped's rates or an AccelStamped's accelerations."""
@@ -196,17 +217,17 @@ class Recording:
         """A geometry_msgs/msg/QuaternionStamped topic."""
         return self._series(series.QuaternionSeries, topic)
 
-    def poses(self, topic: str) -> series.PoseSeries:
+    def poses(self, topic: str, frame: str | None = None) -> series.PoseSeries:
         """A topic of poses, or of attitudes alone, in any of the types of messages.ATTITUDES."""
         if topic in self._made:
             return self._made_poses(topic, self._made[topic])
         self._reader.require(topic, *messages.ATTITUDES)
         kind = self.topics[topic].type
         if kind == messages.IMU:
-            return self._attitudes(topic)
+            return self._attitudes(topic, frame)
         if kind != messages.QUATERNION:
-            return self._series(series.PoseSeries, topic)
-        attitude = self.quaternion(topic)
+            return self._series(series.PoseSeries, topic, frame)
+        attitude = self._series(series.QuaternionSeries, topic, frame)
         return series.PoseSeries(attitude.t_ns, attitude.wxyz, stamped_by_log=attitude.stamped_by_log)
 
     def poses_of(self, source: TopicSource) -> series.PoseSeries:
@@ -335,21 +356,27 @@ class Recording:
         found = [part for part in parts if part is not None]
         if len(found) < len(parts):
             return None
-        kind = messages.POSE if source.topic else messages.IMU
+        is_pose = source.topic is not None and (bool(source.frames) or source.invert)
+        kind = messages.POSE if is_pose else messages.IMU if source.topic is None else found[0].type
         is_readable = all(part.is_readable for part in found)
         return Topic(name, kind, found[0].count, found[0].encoding, is_readable)
 
     def _made_poses(self, name: str, source: TopicSource) -> series.PoseSeries:
         if source.topic is None:
             raise InputError(f"{self.path}: topic {name} is made of rates; it holds no attitude")
-        poses = self._between(source.topic, source.frames) if source.frames else self.poses(source.topic)
+        whole = (source.topic, source.frame)
+        poses = self._between(source.topic, source.frames) if source.frames else self.poses(*whole)
         return inverted(poses) if source.invert else poses
 
     def _made_imu(self, name: str, source: TopicSource) -> series.ImuSeries:
-        if source.gyro is None:
+        if source.frames or source.invert:
             raise InputError(f"{self.path}: topic {name} is made of attitudes; it holds no rates")
-        accel = None if source.accel is None else self._part(source.accel, "accel")
-        return joined(self._part(source.gyro, "gyro"), accel)
+        if source.topic is not None:
+            imu = self.imu(source.topic, source.frame)
+        else:
+            accel = None if source.accel is None else self._part(source.accel, "accel")
+            imu = joined(self._part(source.gyro or "", "gyro"), accel)
+        return dataclasses.replace(imu, gyro=along(source.axes, imu.gyro), accel=along(source.axes, imu.accel))
 
     def _part(self, topic: str, which: str) -> series.VectorSeries:
         """The rates or accelerations on a topic that holds either."""
@@ -371,9 +398,9 @@ class Recording:
         self._tell_unstamped(topic, found.t_ns, found.stamped_by_log)
         return found
 
-    def _attitudes(self, topic: str) -> series.PoseSeries:
+    def _attitudes(self, topic: str, frame: str | None) -> series.PoseSeries:
         """The orientations of an Imu topic. Raises InputError where it has none."""
-        imu = self.imu(topic)
+        imu = self.imu(topic, frame)
         if (imu.wxyz_cov[:, 0, 0] < 0.0).all():
             raise InputError(
                 f"{self.path}: topic {topic}: orientation_covariance starts with -1, so there is no attitude in it"
@@ -382,14 +409,42 @@ class Recording:
         cov[:, 3:, 3:] = imu.wxyz_cov
         return series.PoseSeries(imu.t_ns, imu.wxyz, cov=cov, stamped_by_log=imu.stamped_by_log)
 
-    def _series(self, kind: type[AnySeries], topic: str) -> AnySeries:
+    def _series(self, kind: type[AnySeries], topic: str, frame: str | None = None) -> AnySeries:
         self._reader.require(topic, kind.TYPE, *kind.OTHERS)
         table = self._reader.columns(topic).table
+        self._choose(topic, table, frame)
         if self.topics[topic].type in TIMED:
             check_clock(topic, *table.times(), self.epoch_ns)
         t_ns, by_log, columns = table.sorted()
         self._tell_unstamped(topic, t_ns, by_log)
+        for name in _COUNTED.get(kind, ()):
+            if bits := wrapped_bits(columns[name]):
+                columns[name] = to_signed(columns[name], bits)
+                self.remark(
+                    f"topic {topic}: {name} jumps by {1 << bits}: counts of a signed {bits} bit sensor that were "
+                    "written as unsigned, read as signed"
+                )
         return kind(t_ns, stamped_by_log=by_log, **columns)
+
+    def _choose(self, topic: str, table: Table, frame: str | None) -> None:
+        """Keep the messages of a frame. Raises InputError where there are none, and where none is asked for of several.
+
+        Frames that follow one another in time are one device that was renamed.
+        """
+        frames = table.frames()
+        there = ", ".join(f"{name or 'without a name'} ({int(rows.sum())} messages)" for name, rows in frames.items())
+        if frame is not None:
+            if frame.lstrip("/") not in frames:
+                raise InputError(f"{self.path}: topic {topic} has no messages of the frame {frame}; there: {there}")
+            table.keep(frames[frame.lstrip("/")])
+            return
+        spans = [np.flatnonzero(rows)[[0, -1]] for rows in frames.values() if rows.sum() > 1]
+        spans.sort(key=lambda span: int(span[0]))
+        if any(after[0] < before[1] for before, after in itertools.pairwise(spans)):
+            raise InputError(
+                f"{self.path}: topic {topic} has messages of several devices, by their frames: {there}; choose one: "
+                f"`{{topic: {topic}, frame: {next(iter(frames))}}}` in place of its name under `topics:`"
+            )
 
     def _tell_unstamped(self, topic: str, t_ns: NDArray[np.int64], by_log: int) -> None:
         """Remark that log times stand in for stamps, and by how much they jitter."""
@@ -402,8 +457,7 @@ class Recording:
             f"late by a delay that nobody knows (taken for {1e3 * _LATE:.0f} ms, one sigma) and jitter by "
             f"{jitter * 1e-6:.2g} ms (sigma)"
         )
-        if sentence not in self._container.remarks:
-            self.remark(sentence)
+        self.remark(sentence)
 
 
 def _series_of_transforms(rows: Sequence[tuple[int, bool, Any]]) -> series.PoseSeries:

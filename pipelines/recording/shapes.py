@@ -9,6 +9,7 @@ A plain `Array` is one of any shape.
 
 from __future__ import annotations
 
+import datetime
 import types
 import typing
 from collections.abc import Mapping
@@ -44,8 +45,10 @@ class Rows:
         """
         try:
             array = np.asanyarray(value)  # masked ones as they are
+            if array.dtype == object and array.size and not any(isinstance(one, str) for one in array.flat):
+                array = array.astype(float)
         except (ValueError, TypeError) as error:
-            raise InputError(f"arrays: {name} is no array: its rows differ in length") from error
+            raise InputError(f"arrays: {name} is no array: its rows differ in length{_odd_row(value)}") from error
         if array.dtype.kind not in "iuf":
             raise InputError(f"arrays: {name} has to be numbers, not {array.dtype.type.__name__.rstrip('_')}")
         if array.shape[:1] == (0,):
@@ -67,6 +70,34 @@ Pairs = Annotated[Array, Rows((2,))]
 Vectors = Annotated[Array, Rows((3,))]
 Quaternions = Annotated[Array, Rows((4,))]
 Covariances = Annotated[Array, Rows((3, 3))]
+
+
+def as_dates(value: Any) -> NDArray[np.int64] | None:
+    """Dates or times since a start, of numpy or pandas, as integer ns, (N,); None where they are none."""
+    if isinstance(value, list | tuple):
+        if not value or not isinstance(value[0], datetime.datetime | datetime.timedelta | np.datetime64):
+            return None
+        kind = "timedelta64[ns]" if isinstance(value[0], datetime.timedelta) else "datetime64[ns]"
+        return np.array([_without_zone(one) for one in value], dtype=kind).astype(np.int64)
+    if getattr(getattr(value, "dtype", None), "tz", None):  # of pandas, which numpy would have as objects
+        value = getattr(value, "dt", value).tz_convert(None)
+    values = np.asarray(value)
+    return values.astype(f"{values.dtype.kind}8[ns]").astype(np.int64) if values.dtype.kind in "mM" else None
+
+
+def _without_zone(date: Any) -> Any:
+    """A date in UTC, without its zone."""
+    return date.astimezone(datetime.UTC).replace(tzinfo=None) if getattr(date, "tzinfo", None) else date
+
+
+def _odd_row(value: Any) -> str:
+    """Which row is not as long as the first, as the end of a sentence."""
+    try:
+        lengths = [len(row) if hasattr(row, "__len__") else -1 for row in value]
+    except TypeError:
+        return ""
+    at = next((i for i, length in enumerate(lengths) if length != lengths[0]), None)
+    return "" if at is None else f": row {at} is {str(value[at])[:40]}"
 
 
 def rows_by_name(kind: type) -> Mapping[str, Rows]:

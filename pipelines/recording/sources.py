@@ -5,19 +5,42 @@ topics:
   vision_attitude: {topic: /tracker/pose, invert: true}            # the tracker gives the inverse
   vision_attitude: {topic: /tf, frames: [camera, helmet]}          # one pair of frames of a TFMessage
   imu: {gyro: /gyro, accel: /accelerometer}                        # two topics, of any type that holds them
+  imu: {topic: /imu, frame: imu_left}                              # of several devices on one topic the one
+  imu: {topic: /imu, axes: [y, -x, z]}                             # other axes: x is the recorded y, y the -x
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, model_serializer, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_serializer, model_validator
 
 from alidade.pipelines.recording import series
 
 Array = NDArray[np.float64]
+
+
+Axis = Literal["x", "y", "z", "+x", "+y", "+z", "-x", "-y", "-z"]
+
+
+def _each_once(axes: tuple[Axis, Axis, Axis]) -> tuple[Axis, Axis, Axis]:
+    if len({axis[-1] for axis in axes}) < 3:
+        raise ValueError("each of x, y and z is needed once, with its sign")
+    return axes
+
+
+# What is x, y and z, in other axes.
+Axes = Annotated[tuple[Axis, Axis, Axis], Field(strict=False), AfterValidator(_each_once)]
+
+
+def along(axes: Axes | None, vectors: Array) -> Array:
+    """Vectors (N, 3) in other axes."""
+    if axes is None:
+        return vectors
+    signs = [-1.0 if axis.startswith("-") else 1.0 for axis in axes]
+    return np.asarray(vectors[:, ["xyz".index(axis[-1]) for axis in axes]] * signs)
 
 
 class TopicSource(BaseModel):
@@ -27,6 +50,8 @@ class TopicSource(BaseModel):
         topic: recorded name.
         frames: parent and child, of a tf2_msgs/msg/TFMessage.
         invert: whether the recorded attitude is the inverse of the one meant.
+        frame: header.frame_id of the messages that are meant.
+        axes: what is x, y and z, in the recorded axes, of an IMU or magnetometer.
         gyro, accel: topics whose rates and accelerations make an IMU; without `accel` there are rates alone.
     """
 
@@ -35,6 +60,8 @@ class TopicSource(BaseModel):
     topic: str | None = None
     frames: Annotated[tuple[str, str], Field(strict=False)] | None = None
     invert: bool = False
+    frame: str | None = None
+    axes: Axes | None = None
     gyro: str | None = None
     accel: str | None = None
 
@@ -49,8 +76,12 @@ class TopicSource(BaseModel):
             raise ValueError("either a topic or a gyro is needed")
         if self.gyro is None and self.accel is not None:
             raise ValueError("accel goes with a gyro")
-        if self.gyro is not None and (self.frames or self.invert):
-            raise ValueError("frames and invert go with a topic")
+        if self.gyro is not None and (self.frames or self.invert or self.frame):
+            raise ValueError("frame, frames and invert go with a topic")
+        if self.axes and (self.frames or self.invert):
+            raise ValueError("axes go with an IMU or a magnetometer, not with frames or invert")
+        if self.frame and self.frames:
+            raise ValueError("frame is of a header, frames of a transform: give one of them")
         return self
 
     @model_serializer
@@ -61,7 +92,7 @@ class TopicSource(BaseModel):
     @property
     def is_made(self) -> bool:
         """Whether it is more than a name."""
-        return self.topic is None or self.frames is not None or self.invert
+        return self.topic is None or self.frames is not None or self.invert or bool(self.frame or self.axes)
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -71,10 +102,11 @@ class TopicSource(BaseModel):
     @property
     def name(self) -> str:
         """Of the topic recorded, or what is said of the one that is made."""
+        axes = f" along {', '.join(self.axes)}" if self.axes else ""
         if self.topic is None:
-            return f"{self.gyro} with {self.accel}" if self.accel else f"{self.gyro} as gyro"
-        frames = f" ({' to '.join(self.frames)})" if self.frames else ""
-        return f"{self.topic}{frames}{' inverted' if self.invert else ''}"
+            return (f"{self.gyro} with {self.accel}" if self.accel else f"{self.gyro} as gyro") + axes
+        frames = f" ({' to '.join(self.frames)})" if self.frames else f" of {self.frame}" if self.frame else ""
+        return f"{self.topic}{frames}{' inverted' if self.invert else ''}{axes}"
 
 
 def inverted(poses: series.PoseSeries) -> series.PoseSeries:

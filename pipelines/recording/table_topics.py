@@ -5,67 +5,58 @@ columns:
   /vision/attitude: {file: vision.csv, time: t_ns, unit: ns, wxyz: [qw, qx, qy, qz]}
   /gimbal/joint_states: {time: t, joints: {azimuth: az, elevation: el}, units: {joints: deg}}
   /camera/image: {file: stamps.csv, time: t_ns, unit: ns, video: camera.mp4}
+  /imu: {rate: 100, accel: [ax, ay, az], axes: [y, -x, z], where: {sensor: 2}}
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.arrays import ArrayContainer
+from alidade.pipelines.recording.checks import SLOWEST_GYRO_S, SLOWEST_S
 from alidade.pipelines.recording.container import Container, sha256_of, sha256_together
 from alidade.pipelines.recording.parts import Parts
-from alidade.pipelines.recording.tables import CsvFile, nanoseconds, numbers, read_columns
+from alidade.pipelines.recording.sources import Axes, along
+from alidade.pipelines.recording.table_times import check_steps, nanoseconds, of_rate
+from alidade.pipelines.recording.table_units import COMPATIBLE, TIME_UNITS, UNITS, unit_of
+from alidade.pipelines.recording.tables import CsvFile, TableForm, numbers, numbers_or_times, read_columns, table_form
 from alidade.pipelines.recording.video import VideoFile
 
 _Three = Annotated[tuple[str, str, str], Field(strict=False)]
 _Four = Annotated[tuple[str, str, str, str], Field(strict=False)]
 
-# SI of a unit.
-UNITS = {
-    "rad/s": 1.0,
-    "deg/s": math.pi / 180.0,
-    "mdeg/s": math.pi / 180e3,
-    "m/s^2": 1.0,
-    "g": 9.80665,
-    "mg": 9.80665e-3,
-    "T": 1.0,
-    "mT": 1e-3,
-    "uT": 1e-6,
-    "nT": 1e-9,
-    "G": 1e-4,
-    "mG": 1e-7,
-    "rad": 1.0,
-    "deg": math.pi / 180.0,
-    "mrad": 1e-3,
-    "m": 1.0,
-    "mm": 1e-3,
-}
 _KINDS: dict[str, type[series.Series]] = {
     "gyro": series.ImuSeries,
+    "accel": series.ImuSeries,
     "wxyz": series.PoseSeries,
     "field": series.MagneticSeries,
     "vector": series.VectorSeries,
     "latitude_deg": series.FixSeries,
     "celsius": series.TemperatureSeries,
 }
+# Quantities along the axes of a device.
+_VECTORS = ("gyro", "accel", "field")
+# What may be as slow as it likes.
+_SLOW = ("latitude_deg", "celsius", "video")
 
 
 class TableTopic(BaseModel):
-    """A topic made of columns of a CSV file: where its time and its numbers are.
+    """A topic made of columns of a table: where its time and its numbers are.
 
     Attributes:
         file: name of the file; needed where there are several tables.
-        time: column of the stamps.
-        unit: what they count.
-        gyro, accel: columns of an IMU's rates and accelerations.
+        time: column of the stamps: numbers, or dates as ISO 8601 has them.
+        unit: what they count; without it what the header says, else s.
+        rate: Hz, of rows without a time.
+        gyro, accel: columns of an IMU's rates and accelerations, or of one of them.
         wxyz, position: columns of a pose.
         field: columns of a magnetometer.
         vector: columns of a LOS error.
@@ -73,14 +64,17 @@ class TableTopic(BaseModel):
         celsius: column of a temperature.
         joints: name of a joint and its column.
         video: name of a video beside the table, whose rows are the stamps of its pictures.
-        units: of one of these, where it is not SI.
+        units: of one of these; without it what the header says, else SI.
+        axes: of gyro, accel and field: what is x, y and z, in the axes of the columns; `[y, -x, z]`.
+        where: column and the value it has in the rows that are meant.
     """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
     file: str | None = None
-    time: str
-    unit: Literal["s", "ms", "us", "ns"] = "s"
+    time: str | None = None
+    unit: Literal["s", "ms", "us", "ns"] | None = None
+    rate: Annotated[float, Field(gt=0.0, le=1e6, strict=False)] | None = None
     gyro: _Three | None = None
     accel: _Three | None = None
     wxyz: _Four | None = None
@@ -94,48 +88,144 @@ class TableTopic(BaseModel):
     joints: dict[str, str] | None = None
     video: str | None = None
     units: dict[str, str] = {}
+    axes: Axes | None = None
+    where: dict[str, str | float | int] = {}
 
     @model_validator(mode="after")
     def _complete(self) -> TableTopic:
         kinds = [name for name in (*_KINDS, "joints", "video") if getattr(self, name) is not None]
-        if len(kinds) != 1:
+        if len(kinds) != 1 and kinds != ["gyro", "accel"]:
             found = " and ".join(kinds) or "none"
             raise ValueError(f"exactly one of {', '.join(_KINDS)}, joints, video is needed, not {found}")
+        if (self.time is None) == (self.rate is None):
+            raise ValueError("either time, the column of the stamps, or rate, in Hz, is needed")
         for name, unit in self.units.items():
             if name not in TableTopic.model_fields or unit not in UNITS:
                 raise ValueError(f"units.{name}: {unit} is not one of {', '.join(UNITS)}")
+        if self.axes and not {*kinds} <= {*_VECTORS}:
+            raise ValueError("axes go with gyro, accel or field")
         return self
 
-    def read(self, path: Path, data: Path) -> series.Topic:
-        """The topic. Rows without a number in any of its columns are left out. Raises InputError."""
-        if self.video is not None:
-            t_ns = nanoseconds(path, read_columns(path, data, [self.time])[self.time], self.unit)
-            pictures = VideoFile(path.with_name(Path(self.video).name), len(t_ns))
-            return series.ImageSeries(t_ns, pictures, "netpbm")
+    def read(self, path: Path, data: Path, topic: str = "") -> tuple[series.Topic, list[str]]:
+        """The topic, and sentences about what was concluded or left out.
+
+        Rows without a number in any of its columns are left out. Raises InputError.
+        """
         given = {name: self._columns(name) for name in (*_NUMBERS, "joints") if getattr(self, name) is not None}
-        columns = read_columns(path, data, list(dict.fromkeys([self.time, *(c for cs in given.values() for c in cs)])))
-        values = {name: self._scale(name) * numbers(path, columns, names) for name, names in given.items()}
-        filled = np.any([np.isfinite(one).any(axis=1) for one in values.values()], axis=0) & (columns[self.time] != "")
-        t_ns = nanoseconds(path, columns[self.time][filled], self.unit)
+        form = table_form(path, data)
+        stamps = [] if self.time is None else [self.time]
+        names = [*stamps, *self.where, *(name for found in given.values() for name in found)]
+        columns, notes = read_columns(path, data, list(dict.fromkeys(names)))
+        rows = self._rows(path, columns)
+        columns = {name: column[rows] for name, column in columns.items()}
+        values = {name: numbers(path, columns, found) for name, found in given.items()}
+        filled = np.any(
+            [np.isfinite(one).any(axis=1) for one in values.values()] or [np.ones(rows.sum(), bool)], axis=0
+        )
+        if self.time is None:
+            t_ns, unit = of_rate(len(filled), self.rate or 1.0)[filled], "s"
+        else:
+            filled &= numbers_or_times(columns[self.time])
+            unit = self._time_unit(form, path, notes)
+            t_ns = nanoseconds(path, columns[self.time][filled], unit)
         values = {name: one[filled] for name, one in values.items()}
+        t_ns, values = _without_erased(path, t_ns, values, notes)
+        if not self._is_slow and self.time is not None:
+            check_steps(path, topic, t_ns, unit, SLOWEST_GYRO_S if self.gyro else SLOWEST_S)
+        scales = {name: self._scale(name, form, path, notes) for name in values}
+        values = {
+            name: (along(self.axes, one) if name in _VECTORS else one) * scales[name] for name, one in values.items()
+        }
+        if self.video is not None:
+            pictures = VideoFile(path.with_name(Path(self.video).name), len(t_ns))
+            return series.ImageSeries(t_ns, pictures, "netpbm"), notes
         if self.joints is not None:
-            return series.JointSeries(t_ns, values["joints"], tuple(self.joints))
+            return series.JointSeries(t_ns, values["joints"], tuple(self.joints)), notes
         kind = next(kind for name, kind in _KINDS.items() if name in values)
-        if kind is series.ImuSeries and "accel" not in values:
-            values["accel"] = np.full((len(t_ns), 3), np.nan)
         shaped: dict[str, Any] = {
             name: one.reshape(len(t_ns), *kind.COLUMNS[name].shape)
             for name, one in values.items()
             if name in kind.COLUMNS
         }
-        return kind(t_ns, **shaped)
+        if kind is series.ImuSeries:
+            shaped |= _absent({"gyro", "accel"} - values.keys())
+        return kind(t_ns, **shaped), notes
+
+    @property
+    def _is_slow(self) -> bool:
+        return any(getattr(self, name) is not None for name in _SLOW)
+
+    def _rows(self, path: Path, columns: Mapping[str, NDArray[np.str_]]) -> NDArray[np.bool_]:
+        """Which rows have the values that `where` asks for. Raises InputError where none has."""
+        rows = np.ones(len(next(iter(columns.values()))), dtype=bool)
+        for name, value in self.where.items():
+            rows &= np.array([_is_value(text, value) for text in columns[name].tolist()], dtype=bool)
+            if not rows.any():
+                there = ", ".join(dict.fromkeys(columns[name].tolist()[:1000]))
+                raise InputError(f"{path}: where: no row has {name} {value}; its values: {there[:200]}")
+        return rows
 
     def _columns(self, name: str) -> list[str]:
         value = getattr(self, name)
         return [value] if isinstance(value, str) else list(value.values() if isinstance(value, dict) else value)
 
-    def _scale(self, name: str) -> float:
-        return UNITS[self.units[name]] if name in self.units else 1.0
+    def _time_unit(self, form: TableForm, path: Path, notes: list[str]) -> str:
+        """As the config says it, else the header, else s."""
+        stated = "" if self.time is None else form.units[form.index(path, self.time)]
+        if self.unit is not None or stated not in TIME_UNITS:
+            return self.unit or "s"
+        if stated != "s":
+            notes.append(f"{path.name}: {self.time} is in {stated} by its header")
+        return stated
+
+    def _scale(self, name: str, form: TableForm, path: Path, notes: list[str]) -> float:
+        """SI of the unit that the config says, else the header of all its columns, else 1."""
+        if name in self.units:
+            return UNITS[self.units[name]]
+        stated = {unit_of(name, form.units[form.index(path, column)]) for column in self._columns(name)}
+        (unit,) = stated if len(stated) == 1 else ("",)
+        if unit not in UNITS or not _measures(name, unit) or UNITS[unit] == 1.0:
+            return 1.0
+        notes.append(f"{path.name}: {name} is in {unit} by its header")
+        return UNITS[unit]
+
+
+def _absent(names: set[str]) -> dict[str, Any]:
+    """What an IMU has in place of a sensor that is not there: zeros whose covariance is -1, as ROS has it."""
+    found: dict[str, Any] = {}
+    for name in names:
+        found |= {name: np.full(3, 0.0 if name == "gyro" else np.nan), f"{name}_cov": np.diag([-1.0, 0.0, 0.0])}
+    return found
+
+
+def _measures(name: str, unit: str) -> bool:
+    """Whether a unit is one of what the columns hold."""
+    quantity = {"gyro": "rad/s", "accel": "m/s^2", "field": "T", "joints": "rad", "position": "m", "vector": "rad"}
+    return name in quantity and unit in COMPATIBLE[quantity[name]]
+
+
+def _is_value(text: str, value: str | float | int) -> bool:
+    """Whether a cell has a value: as it is written, or as a number."""
+    if text == str(value):
+        return True
+    try:
+        return float(text) == float(value)
+    except ValueError:
+        return False
+
+
+def _without_erased(
+    path: Path, t_ns: NDArray[np.int64], values: dict[str, NDArray[np.float64]], notes: list[str]
+) -> tuple[NDArray[np.int64], dict[str, NDArray[np.float64]]]:
+    """Without last rows that are all the same, time and numbers, as flash memory that was never written."""
+    if len(t_ns) < 3 or t_ns[-1] != t_ns[-2]:
+        return t_ns, values
+    alike = t_ns == t_ns[-1]
+    for one in values.values():
+        alike &= ((one == one[-1]) | (np.isnan(one) & np.isnan(one[-1]))).all(axis=1)
+    kept = len(t_ns) - int(np.argmin(alike[::-1])) if not alike.all() else 0
+    notes.append(f"{path.name}: the last {len(t_ns) - kept} rows are all the same, as erased memory: left out")
+    return t_ns[:kept], {name: one[:kept] for name, one in values.items()}
 
 
 _NUMBERS = (
@@ -145,8 +235,9 @@ _NUMBERS = (
 
 def described(container: Container, columns: Mapping[str, TableTopic]) -> Container:
     """A container with its tables read as the config describes them. Raises InputError at a table that is not there."""
-    tables = _tables(container)
+    tables = tables_of(container)
     of: dict[str, dict[str, series.Topic]] = {name: {} for name in tables}
+    remarks: list[str] = []
     for topic, table in columns.items():
         if (table.file is None and len(tables) != 1) or (table.file is not None and table.file not in tables):
             there = ", ".join(tables) or "none"
@@ -155,16 +246,19 @@ def described(container: Container, columns: Mapping[str, TableTopic]) -> Contai
             )
             raise InputError(f"{container.path}: columns.{topic}.file: {wanted}; tables there: {there}")
         name = table.file or next(iter(tables))
-        of[name][topic] = table.read(tables[name].path, tables[name].data)
-    return _with_topics(container, of)
+        of[name][topic], notes = table.read(tables[name].path, tables[name].data, topic)
+        remarks += [note for note in notes if note not in remarks]
+    whole = _with_topics(container, of)
+    whole.remarks = (*whole.remarks, *(remark for remark in remarks if remark not in whole.remarks))
+    return whole
 
 
-def _tables(container: Container) -> dict[str, CsvFile]:
+def tables_of(container: Container) -> dict[str, CsvFile]:
     """The CSV files in a container, by name."""
     if isinstance(container, CsvFile):
         return {container.path.name: container}
     parts = container.parts if isinstance(container, Parts) else ()
-    return {name: table for part in parts for name, table in _tables(part).items()}
+    return {name: table for part in parts for name, table in tables_of(part).items()}
 
 
 def _with_topics(container: Container, of: Mapping[str, Mapping[str, series.Topic]]) -> Container:

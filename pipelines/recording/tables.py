@@ -1,10 +1,18 @@
-"""Tables as recordings: CSV with columns that the config describes, and trajectories in TUM's form."""
+"""Tables as recordings: columns of numbers in a text file, however it is written, and trajectories in TUM's form.
+
+How a table is written is read off its own lines: the delimiter and the decimal mark are those that make most of its
+cells numbers; the header is the last line of words ahead of the first row of numbers; what stands before it (names of
+devices, dates, comments) is the preamble. A line of units below the header belongs to it.
+"""
 
 from __future__ import annotations
 
+import codecs
 import csv
-import itertools
-from collections.abc import Mapping, Sequence
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,126 +22,310 @@ from numpy.typing import NDArray
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.arrays import ArrayContainer
+from alidade.pipelines.recording.table_units import unit_in, unit_named
 
 Array = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
-# Nanoseconds of a unit of time.
-TIME_UNITS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 _TUM = ["t", "x", "y", "z", "qx", "qy", "qz", "qw"]
 # A line of a table of sensors is shorter, and has fewer columns.
 _LONGEST_LINE, _MOST_COLUMNS = 1 << 16, 1000
+# How a table is written is looked for in so much of its beginning, B, and so many of its lines.
+_HEAD, _SAMPLE = 1 << 18, 200
+# Rows cut short, as by a logger that lost power, are dropped up to this share of all.
+_MOST_CUT = 0.01
+_BOMS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
+_COMMENTS = ("#", "//", "%")
+# What a cell without a number holds, lower case.
+_ABSENT = {"", "nan", "na", "n/a", "null", "none", "-", "--"}
+_NUMBER = re.compile(r"[+-]?(\d+[.,]?\d*|[.,]\d+)([eE][+-]?\d+)?|[+-]?inf(inity)?", re.IGNORECASE)
+_CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?\d{1,2}:\d\d(:\d\d([.,]\d+)?)?( ?(Z|UTC|[+-]\d\d:?\d\d))?")
+
+
+@dataclass(frozen=True)
+class TableForm:
+    """How a table is written.
+
+    Attributes:
+        encoding: of its text.
+        delimiter: between cells; a blank stands for one or more.
+        decimal: mark of a fraction, a point or a comma.
+        names: of its columns; `column 1` and so on where it has no header.
+        units: of its columns as the header has them, in the words of `table_units.UNITS`; empty where it says nothing.
+        first: number of lines ahead of its first row.
+        width: cells of a row.
+        preamble: what stands ahead of the header.
+    """
+
+    encoding: str
+    delimiter: str
+    decimal: str
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    first: int
+    width: int
+    preamble: tuple[str, ...]
+
+    def index(self, path: Path, name: str) -> int:
+        """Number of the column of a name, or of `column 3`. Raises InputError where none or several have it."""
+        found = [i for i, one in enumerate(self.names) if one == name]
+        numbered = re.fullmatch(r"column (\d+)", name)
+        if not found and numbered and 0 < int(numbered[1]) <= len(self.names):
+            found = [int(numbered[1]) - 1]
+        if not found:
+            raise InputError(f"{path}: no column {name}; the columns are {', '.join(self.names)}")
+        if len(found) > 1:
+            places = " and ".join(f"`column {i + 1}`" for i in found)
+            raise InputError(f"{path}: {len(found)} columns are called {name}; name one of them as {places}")
+        return found[0]
 
 
 def read_table(path: Path, data: Path) -> ArrayContainer:
-    """A trajectory (TUM: `timestamp x y z qx qy qz qw`, s), or a CSV file, whose topics the config has to describe.
+    """A trajectory (TUM: `timestamp x y z qx qy qz qw`, s), or a table, whose topics the config has to describe.
 
     Args:
         path: as it was named.
         data: the file to read.
     """
-    head = _head(path, data)
-    if "," not in head and ";" not in head and len(head.split()) == len(_TUM):
-        return ArrayContainer(path, {"/trajectory": _trajectory(path, data)})
-    columns = ", ".join(column_names(path, data)[:40])
+    form = table_form(path, data)
+    if not form.width:
+        raise InputError(f"{path}: not a table, nor any other recording that is known: no line of numbers in it")
+    if _is_trajectory(path, data, form):
+        return ArrayContainer(path, {"/trajectory": _trajectory(path, data, form)})
+    columns = ", ".join(form.names[:40])
     return CsvFile(path, data, [f"a table with the columns {columns}; `columns:` in the config says which is what"])
 
 
 class CsvFile(ArrayContainer):
-    """A CSV file; without topics until `described` says which column is what."""
+    """A table; without topics until `table_topics.described` says which column is what."""
 
     def __init__(self, path: Path, data: Path, remarks: Sequence[str] = ()) -> None:
         super().__init__(path, {}, remarks)
         self.data = data
 
 
-def column_names(path: Path, data: Path) -> list[str]:
-    """Names of the columns: the first line, without a leading `#`; `column 1` and so on where that is of numbers."""
-    names = [name.strip() for name in next(csv.reader([_head(path, data).lstrip("#")]), [])]
-    return [f"column {i}" for i in range(1, len(names) + 1)] if _are_numbers(names) else names
+def looks_like_text(start: bytes) -> bool:
+    """Whether a file that begins with these bytes is one of text."""
+    if start.startswith(tuple(_BOMS)):
+        return True
+    return bool(start) and not any(byte < 32 and byte not in b"\t\n\r\f" for byte in start)
 
 
-def read_columns(path: Path, data: Path, names: Sequence[str]) -> dict[str, NDArray[np.str_]]:
-    """The named columns as texts, row by row. Raises InputError at one that is missing and a row that is too short."""
-    there = column_names(path, data)
-    lacking = [name for name in names if name not in there]
-    if lacking:
-        raise InputError(f"{path}: no column {lacking[0]}; the columns are {', '.join(there)}")
-    wanted = [there.index(name) for name in names]
-    rows: list[list[str]] = []
-    first = 0 if there[:1] == ["column 1"] else 1
-    with data.open(encoding="utf-8", errors="replace", newline="") as stream:
-        try:
-            for number, row in enumerate(itertools.islice(csv.reader(stream), first, None), start=first + 1):
-                if not row or row[0].startswith("#"):
-                    continue
-                if len(row) < len(there):
-                    raise InputError(f"{path}: line {number} has {len(row)} columns instead of {len(there)}")
-                rows.append([row[i].strip() for i in wanted])
-        except csv.Error as error:
-            raise InputError(f"{path}: no CSV ({error})") from error
+def table_form(path: Path, data: Path) -> TableForm:
+    """How a table is written. Raises InputError where it has no row of numbers."""
+    with data.open("rb") as stream:
+        start = stream.read(_HEAD)
+    encoding = _encoding(start)
+    text = start.decode(encoding, errors="replace")
+    lines = text.splitlines()
+    # The last line may be cut.
+    lines = lines[:-1] if len(start) == _HEAD else lines
+    if "\0" in text or not lines or max(map(len, lines)) > _LONGEST_LINE:
+        raise InputError(f"{path}: not a table, nor any other recording that is known")
+    delimiter, decimal = _separators(lines)
+    cells = [_cells(line, delimiter) for line in lines]
+    if max(map(len, cells)) > _MOST_COLUMNS:
+        raise InputError(f"{path}: not a table, nor any other recording that is known")
+    first = next((i for i, row in enumerate(cells) if _is_row(row) and not _is_comment(lines[i])), len(lines))
+    width = len(cells[first]) if first < len(lines) else 0
+    header, units = _header(lines[:first], delimiter, width)
+    if not width and header is None:
+        raise InputError(f"{path}: not a table, nor any other recording that is known: no line of numbers in it")
+    names = (
+        [f"column {i + 1}" for i in range(width)] if header is None else _cells(_uncommented(lines[header]), delimiter)
+    )
+    names = names[:-1] if len(names) > 1 and not names[-1] else names
+    stated = [unit_named(cell) for cell in _cells(lines[units], delimiter)] if units is not None else []
+    stated += [""] * (len(names) - len(stated))
+    return TableForm(
+        encoding,
+        delimiter,
+        decimal,
+        tuple(names),
+        tuple(unit_in(name) or unit for name, unit in zip(names, stated, strict=False)),
+        first,
+        min(width, len(names)),
+        tuple(line.strip() for line in lines[: first if header is None else header] if line.strip()),
+    )
+
+
+def read_columns(path: Path, data: Path, names: Sequence[str]) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
+    """The named columns as texts, row by row, and sentences about rows that are left out.
+
+    Decimal marks are points, what stands for no number is empty. Headers that are repeated, blank lines and comments
+    are no rows; a last row that is cut short is left out, and so are others up to 1 % of all.
+
+    Raises:
+        InputError: a column is missing, or more rows are too short; the first of them is named.
+    """
+    form = table_form(path, data)
+    wanted = [form.index(path, name) for name in names]
+    rows, notes = _whole_rows(path, data, form, wanted)
     table = np.array(rows, dtype=np.str_).reshape(len(rows), len(names))
-    return {name: table[:, i] for i, name in enumerate(names)}
-
-
-def nanoseconds(path: Path, texts: NDArray[np.str_], unit: str) -> Stamps:
-    """Times as written, exactly, as integer ns. Raises InputError at one that is no number."""
-    size = TIME_UNITS[unit]
-    try:
-        if size == 1:
-            return texts.astype(np.int64)
-        whole, _, rest = np.char.partition(texts, ".").T
-        digits = len(str(size)) - 1
-        exact = ~np.char.isdigit(np.char.lstrip(whole, "-")) | ~(np.char.isdigit(rest) | (rest == ""))
-        if exact.any():  # with an exponent, say
-            return np.rint(texts.astype(float) * size).astype(np.int64)
-        fraction = np.array([one[:digits].ljust(digits, "0") for one in rest.tolist()], dtype=np.int64)
-        sign = np.where(np.char.startswith(whole, "-"), -1, 1)
-        return whole.astype(np.int64) * size + sign * fraction
-    except (ValueError, OverflowError) as error:
-        raise InputError(f"{path}: a time that is no number in {unit} ({error})") from error
+    if form.decimal == ",":
+        table = np.char.replace(table, ",", ".")
+    return {name: table[:, i] for i, name in enumerate(names)}, notes
 
 
 def numbers(path: Path, columns: Mapping[str, NDArray[np.str_]], names: Sequence[str]) -> Array:
-    """Columns as numbers (N, len(names)); what is empty is NaN. Raises InputError at what is no number."""
+    """Columns as numbers (N, len(names)), NaN where there is none. Raises InputError, naming the cell, at a word."""
     table = np.stack([columns[name] for name in names], axis=1)
     try:
         return np.where(table == "", "nan", table).astype(float)
-    except ValueError as error:
-        raise InputError(f"{path}: columns {', '.join(names)}: {error}") from error
-
-
-def _are_numbers(texts: Sequence[str]) -> bool:
-    try:
-        return len([float(text) for text in texts]) > 0
     except ValueError:
+        pass
+    out = np.full(table.shape, np.nan)
+    for at, cell in np.ndenumerate(table):
+        if cell.lower() not in _ABSENT:
+            try:
+                out[at] = float(cell)
+            except ValueError:
+                raise InputError(
+                    f"{path}: row {at[0] + 1}, column {names[at[1]]}: {str(cell)[:40]!r} is no number"
+                ) from None
+    return out
+
+
+def numbers_or_times(texts: NDArray[np.str_]) -> NDArray[np.bool_]:
+    """Which cells are not empty, nor stand for nothing."""
+    return ~np.isin(np.char.lower(texts), list(_ABSENT))
+
+
+def _whole_rows(path: Path, data: Path, form: TableForm, wanted: Sequence[int]) -> tuple[list[list[str]], list[str]]:
+    """The wanted cells of each row, and sentences about rows that are left out; see `read_columns`."""
+    rows: list[list[str]] = []
+    cut: list[tuple[int, int]] = []
+    headers = 1
+    for number, row in _rows(path, data, form):
+        if len(row) < form.width:
+            cut.append((number, len(row)))
+        elif row[: len(form.names)] == list(form.names[: len(row)]):
+            headers += 1
+        else:
+            rows.append([row[i] for i in wanted])
+    if len(cut) > max(1, _MOST_CUT * len(rows)):
+        number, width = cut[0]
+        raise InputError(f"{path}: line {number} has {width} columns instead of {form.width}")
+    notes = [f"{path.name}: rows cut short, the first in line {cut[0][0]}: {len(cut)} left out"] if cut else []
+    if headers > 1:
+        notes.append(f"{path.name}: its header is there {headers} times, as of a logger that was started again")
+    return rows, notes
+
+
+def _encoding(start: bytes) -> str:
+    for mark, encoding in _BOMS.items():
+        if start.startswith(mark):
+            return encoding
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(start)
+    except UnicodeDecodeError:
+        return "latin-1"
+    return "utf-8"
+
+
+def _separators(lines: Sequence[str]) -> tuple[str, str]:
+    """Delimiter and decimal mark: those by which most cells of a sample of lines are numbers and fewest are not."""
+    sample = [line for line in lines if line.strip() and not _is_comment(line)][-_SAMPLE:]
+    best = (0, ",", ".")
+    for delimiter in ("\t", ";", ",", "|", " "):
+        rows = [_cells(line, delimiter) for line in sample]
+        width, _ = Counter(map(len, rows)).most_common(1)[0] if rows else (0, 0)
+        cells = [cell for row in rows if len(row) == width for cell in row]
+        filled = [cell for cell in cells if cell.lower() not in _ABSENT]
+        score = sum(1 if _is_value(cell) else -1 for cell in filled)
+        if width > 1 and score > best[0]:
+            comma = delimiter != "," and any("," in cell for cell in filled if _NUMBER.fullmatch(cell))
+            best = (score, delimiter, "," if comma else ".")
+    return best[1], best[2]
+
+
+def _header(lines: Sequence[str], delimiter: str, width: int) -> tuple[int | None, int | None]:
+    """Of the lines ahead of the first row the numbers of the header, and of the line of units below it."""
+    there = [i for i, line in enumerate(lines) if line.strip()]
+    found: list[int] = []
+    for i in reversed(there):
+        cells = _cells(_uncommented(lines[i]), delimiter)
+        # A header may lack the names of last columns, and end with a delimiter where rows do not.
+        if (width and len(cells) not in (width - 1, width, width + 1)) or len(cells) < (2 if width != 1 else 1):
+            break
+        if any(map(_is_value, filter(None, cells))):
+            break
+        found.append(i)
+        if len(found) == 2 or not _are_units(cells):
+            break
+    if not found:
+        return None, None
+    if len(found) == 2 and _are_units(_cells(_uncommented(lines[found[0]]), delimiter)):
+        return found[1], found[0]
+    return found[0], None
+
+
+def _are_units(cells: Sequence[str]) -> bool:
+    """Whether these are units, known by name: of most columns, and no names beside them."""
+    filled = [cell for cell in cells if cell]
+    return bool(filled) and all(unit_named(cell) for cell in filled)
+
+
+def _rows(path: Path, data: Path, form: TableForm) -> Iterator[tuple[int, list[str]]]:
+    """Number of the line and stripped cells of each row; blank lines and comments are none."""
+    with data.open(encoding=form.encoding, errors="replace", newline=None) as stream:
+        for _ in range(form.first):
+            stream.readline()
+        reader = csv.reader(stream, delimiter=form.delimiter, skipinitialspace=True)
+        try:
+            for row in reader:
+                cells = [cell.strip() for cell in row]
+                while len(cells) > len(form.names) and not cells[-1]:
+                    cells.pop()
+                if any(cells) and not cells[0].startswith(_COMMENTS):
+                    yield form.first + reader.line_num, cells
+        except csv.Error as error:
+            raise InputError(f"{path}: line {form.first + reader.line_num}: no table ({error})") from error
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    try:
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])]
+    except csv.Error:
+        return [line]
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith(_COMMENTS)
+
+
+def _uncommented(line: str) -> str:
+    return line.lstrip().lstrip("#/%").strip() if _is_comment(line) else line
+
+
+def _is_row(cells: Sequence[str]) -> bool:
+    """Whether these are cells of a row: numbers or times, or nothing, in most of them and the first."""
+    filled = [cell for cell in cells if cell.lower() not in _ABSENT]
+    return bool(filled) and _is_value(filled[0]) and 2 * sum(map(_is_value, filled)) >= len(filled)
+
+
+def _is_value(cell: str) -> bool:
+    return _NUMBER.fullmatch(cell) is not None or _CLOCK.fullmatch(cell) is not None
+
+
+def _is_trajectory(path: Path, data: Path, form: TableForm) -> bool:
+    """Whether the table is a trajectory in TUM's form: eight columns by blanks, the last four a unit quaternion."""
+    if form.delimiter != " " or len(form.names) != len(_TUM):
         return False
+    for _, row in _rows(path, data, form):
+        try:
+            return len(row) == len(_TUM) and abs(float(np.linalg.norm([float(x) for x in row[4:]])) - 1.0) < 0.01
+        except ValueError:
+            return False
+    return False
 
 
-def _trajectory(path: Path, data: Path) -> series.PoseSeries:
-    rows = []
-    for number, line in enumerate(data.read_text(errors="replace").splitlines(), start=1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        row = line.split()
-        if len(row) != len(_TUM):
-            raise InputError(f"{path}: line {number} has {len(row)} columns instead of {len(_TUM)}: {' '.join(_TUM)}")
-        rows.append(row)
-    if not rows:
-        raise InputError(f"{path}: a trajectory without a pose")
+def _trajectory(path: Path, data: Path, form: TableForm) -> series.PoseSeries:
+    from alidade.pipelines.recording.table_times import nanoseconds
+
+    rows, _ = _whole_rows(path, data, form, range(len(_TUM)))
     columns: dict[str, Any] = dict(zip(_TUM, np.array(rows, dtype=np.str_).T, strict=True))
     xyzw = numbers(path, columns, _TUM[4:])
     return series.PoseSeries(
         nanoseconds(path, columns["t"], "s"), xyzw[:, [3, 0, 1, 2]], numbers(path, columns, _TUM[1:4])
     )
-
-
-def _head(path: Path, data: Path) -> str:
-    """The first line of a table; of one without names the first row."""
-    with data.open(encoding="utf-8", errors="replace") as stream:
-        line = stream.readline(_LONGEST_LINE + 1)
-        while line.startswith("#") and "," not in line:
-            line = stream.readline(_LONGEST_LINE + 1)
-    if len(line) > _LONGEST_LINE or line.count(",") > _MOST_COLUMNS or "\0" in line:
-        raise InputError(f"{path}: not a table, nor any other recording that is known")
-    return line

@@ -8,7 +8,7 @@ from statistics import NormalDist
 
 import numpy as np
 
-from alidade.pipelines.diagnostics.cross_validation import Halves
+from alidade.pipelines.diagnostics.cross_validation import SplitHalf
 from alidade.pipelines.display.figure import COLORS, Dash, Figure
 from alidade.pipelines.display.units import human_unit, signed, to_digits_of
 from alidade.pipelines.estimation.problem import Quantity
@@ -30,7 +30,7 @@ _STYLES: dict[str, tuple[str, Dash]] = {
 
 
 def compare_html(
-    calibrations: Sequence[Calibration], halves: Mapping[str, Halves], predicted: Mapping[str, float]
+    calibrations: Sequence[Calibration], halves: Mapping[str, SplitHalf], predicted: Mapping[str, float]
 ) -> str:
     """The page as one HTML text.
 
@@ -68,7 +68,7 @@ def compare_html(
 
 
 def write_compare(
-    out_dir: Path, calibrations: Sequence[Calibration], halves: Mapping[str, Halves], predicted: Mapping[str, float]
+    out_dir: Path, calibrations: Sequence[Calibration], halves: Mapping[str, SplitHalf], predicted: Mapping[str, float]
 ) -> Path:
     """Write compare.html; returns its path. Raises InputError when it cannot be written."""
     return write_page(out_dir, FILE, compare_html(calibrations, halves, predicted))
@@ -116,7 +116,7 @@ def _cells(calibration: Calibration, calibrations: Sequence[Calibration], quanti
     return [_with_sigma(factor * found[0], factor * found[1]), *apart, *off]
 
 
-def _answer(halves: Mapping[str, Halves], predicted: Mapping[str, float]) -> Answer:
+def _answer(halves: Mapping[str, SplitHalf], predicted: Mapping[str, float]) -> Answer:
     """Whether the recording agrees with itself."""
     question = "Does the recording agree with itself?"
     held_out = ", ".join(f"{size:.2f} ({family})" for family, size in predicted.items())
@@ -125,9 +125,9 @@ def _answer(halves: Mapping[str, Halves], predicted: Mapping[str, float]) -> Ans
         sentence = "Neither half determines a parameter by itself, so they cannot be held against each other."
         return Answer(question, "cannot say", "fixed", sentence + said, (), ("Record about twice as long.",))
     limit = NormalDist().inv_cdf(1.0 - 0.5 * _CHANCE / len(halves))
-    far = {name: half.difference_sigmas for name, half in halves.items() if abs(half.difference_sigmas) > limit}
+    far = {name: half.z for name, half in halves.items() if abs(half.z) > limit}
     if not far:
-        most = max(abs(half.difference_sigmas) for half in halves.values())
+        most = max(abs(half.z) for half in halves.values())
         sentence = (
             f"Its two halves, each solved by itself, agree in all {len(halves)} parameters that both determine: they "
             f"differ by {most:.1f} sigmas at most, and chance makes {limit:.1f} in one recording of a thousand."
@@ -147,11 +147,11 @@ def _with_sigma(value: float, sigma: float) -> str:
     return f"{to_digits_of(value, sigma)} \u00b1 {to_digits_of(sigma, sigma)}"
 
 
-def _half(quantity: Quantity, halves: Halves) -> tuple[str, str, str, str, str]:
+def _half(quantity: Quantity, halves: SplitHalf) -> tuple[str, str, str, str, str]:
     unit, factor = human_unit(quantity)
     first = _with_sigma(factor * halves.first, factor * halves.first_sigma)
     second = _with_sigma(factor * halves.second, factor * halves.second_sigma)
-    return quantity.name, unit, first, second, signed(halves.difference_sigmas)
+    return quantity.name, unit, first, second, signed(halves.z)
 
 
 def _differences(calibrations: Sequence[Calibration], quantities: Sequence[Quantity]) -> list[Plot]:

@@ -10,10 +10,11 @@ import datetime
 from contextlib import suppress
 from dataclasses import dataclass
 
-from alidade.pipelines.diagnostics.observability import by_advice
 from alidade.pipelines.display.units import human_unit, noise_unit, rounded, signed, to_digits_of
+from alidade.pipelines.estimation.finding import Severity
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods.meanings import NOISES, meaning
+from alidade.pipelines.reports import sentences
 from alidade.pipelines.reports.answer import Answer, Tone
 from alidade.pipelines.reports.budget import Limit, limits
 from alidade.pipelines.reports.calibration import SavedCalibration, saved
@@ -89,7 +90,7 @@ def report_html(calibration: Calibration) -> str:
         "report.html",
         plots,
         c=calibration,
-        by_advice=by_advice,
+        advice=_advice(calibration),
         method=calibration.method.title,
         start=datetime.datetime.fromtimestamp(facts.epoch_ns // 1_000_000_000, datetime.UTC),
         rows=[row for row in rows if not row.assumed],
@@ -115,30 +116,23 @@ def _constants(calibration: Calibration) -> list[str]:
     return [f"{name} = {value:.6g}" for name, value in calibration.problem.constants.items() if name in needed]
 
 
-_NEXT = {
-    "calibrated": (
-        "Apply it: formulas, Python, C and ROS parameters are below, under How to apply it.",
-        "Later, `alidade validate RECORDING --calibration calibration.yaml` says whether it still holds.",
-    ),
-    "weak": ("Parameters that are observable can be applied as they are; for the others record again.",),
-    "unobservable": ("Record again with that; do not apply what is not determined.",),
-    "inconsistent": ("Do not apply it before the cause is found: see Do the residuals fit the noise? below.",),
-}
 _TONES: dict[str, Tone] = {"calibrated": "good", "weak": "warn", "unobservable": "bad", "inconsistent": "bad"}
 
 
 def _answer(calibration: Calibration) -> Answer:
     """The verdict, and what follows from it."""
-    found = calibration.assessment
-    advice = [
-        f"{what[:1].upper()}{what[1:]} ({labels})."
-        for verdict in ("unobservable", "weak")
-        for labels, what in by_advice(found.directions, verdict)
+    found, question = calibration.status, "Is it as accurate as required, and does it fit the recording?"
+    steps = sentences.next_steps(calibration.findings)
+    return Answer(question, found, _TONES[found], calibration.headline, calibration.notes, steps)
+
+
+def _advice(calibration: Calibration) -> list[tuple[str, str, str]]:
+    """Verdict, parameters and advice of weak directions, those with the same advice together."""
+    return [
+        (severity.name.lower(), labels, sentences.capital(what))
+        for severity in (Severity.UNOBSERVABLE, Severity.WEAK)
+        for labels, what in sentences.by_advice(calibration.findings, severity)
     ]
-    causes = [f"{cause.label[:1].upper()}{cause.label[1:]}: {cause.evidence}." for cause in found.causes[:2]]
-    steps = (*causes, *advice, *_NEXT[found.status])
-    question = "Is it as accurate as required, and does it fit what was recorded?"
-    return Answer(question, found.status, _TONES[found.status], found.headline, tuple(calibration.notes), steps)
 
 
 def _snippets(calibration: Calibration, kept: SavedCalibration) -> list[tuple[str, str]]:
@@ -156,22 +150,19 @@ def _snippets(calibration: Calibration, kept: SavedCalibration) -> list[tuple[st
 _LANGUAGES = {"Python": python_code, "C": c_code}
 
 
-def _stability(calibration: Calibration) -> list[str]:
-    """Whether what was calibrated stayed as it was, and what an incremental estimate is worth beside batch's."""
-    said = []
+def _stability(calibration: Calibration) -> str:
+    """The result of the test for a change; empty where it was not made."""
     found = calibration.stability
-    if found is not None and found.changed:
-        said.append(found.sentence)
-    elif found is not None:
-        name = next(iter(found.departures), "")
-        said.append(
-            "Yes: estimates on the way agree with the final one. Their largest difference, at "
-            f"{found.time_s:.0f} s and mostly of {name}, is one that chance alone makes in "
-            f"{100.0 * min(found.level, 1.0):.0f} of 100 recordings."
-        )
-    if calibration.self_check is not None:
-        said.append(calibration.self_check.sentence)
-    return said
+    if found is None:
+        return ""
+    changes = [sentences.sentence(f, calibration.quantities) for f in calibration.findings if f.kind == "change"]
+    if changes:
+        return changes[0]
+    name = next(iter(found.departures), "")
+    return (
+        f"No significant change: the largest difference of the estimate until some moment from the final one is at "
+        f"{found.time_s:.0f} s, mostly of {name} (p = {min(found.level, 1.0):.2g})."
+    )
 
 
 def _short_of(calibration: Calibration, found: list[Limit]) -> list[str]:

@@ -2,45 +2,24 @@
 
 from __future__ import annotations
 
-import datetime
 import math
 from collections.abc import Sequence
 from itertools import cycle
 
 import numpy as np
 
-from alidade.pipelines.diagnostics.device_changes import Change, Changes
+from alidade.pipelines.diagnostics.device_changes import Change
 from alidade.pipelines.display.figure import COLORS, Figure, milliseconds
 from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
 from alidade.pipelines.estimation.assumptions import kind
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.reports.result import Calibration, PartResult, Plot, Table
+from alidade.pipelines.reports.sentences import between
 
 # Beyond so many days a forecast says nothing.
 _FAR_DAYS = 36_525.0
-# So many changes are told in sentences, the surest; the table has all.
-_MOST_TOLD = 3
 _DAY_MS, _STEPS = 8.64e7, 40
 _RECORDINGS = ("recording", "start", "length", "by itself")
-
-
-def sentences(changes: Changes, parts: Sequence[PartResult], quantities: Sequence[Quantity]) -> list[str]:
-    """What changed, when, and by how much."""
-    known = {q.name: q for q in quantities}
-    surest = sorted(changes.found, key=lambda step: -abs(step.z))
-    if surest:
-        said = [
-            f"{what(step)} by {_shown(step.size, step.sigma, known[step.name])} {_between(step.after, parts)}."
-            for step in surest[:_MOST_TOLD]
-        ]
-        more = len(surest) - len(said)
-        return [*said, f"So did {more} more, by less for what they are known to."] if more else said
-    return [
-        f"All parameters together changed {_between(each.after, parts)}, chi-square {each.chi_square:.4g} for "
-        f"{each.dof} degrees of freedom, none by more than chance for itself."
-        for each in changes.together
-        if each.significant
-    ]
 
 
 def forecasts(calibration: Calibration) -> list[tuple[str, str]]:
@@ -166,11 +145,9 @@ def what(step: Change) -> str:
 
 
 def _between(after: int, parts: Sequence[PartResult]) -> str:
-    """Two dates in words, or two recordings where these are of one day."""
-    dates = [datetime.datetime.fromisoformat(parts[i].start).date() for i in (after, after + 1)]
-    if dates[0] == dates[1]:
-        return f"between {parts[after].recording} and {parts[after + 1].recording}"
-    return f"between {' and '.join(f'{date.day} {date:%B %Y}' for date in dates)}"
+    """The dates, or names, of a recording and the next."""
+    both = parts[after : after + 2]
+    return between([part.recording for part in both], [part.start for part in both])
 
 
 def _shown(value: float, sigma: float, quantity: Quantity) -> str:

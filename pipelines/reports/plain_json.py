@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from alidade.pipelines.diagnostics.validation import peak, rms
+from alidade.pipelines.diagnostics.cross_validation import peak, rms
+from alidade.pipelines.reports.sentences import label
 
 if TYPE_CHECKING:
     from alidade.pipelines.applications.fleet.analysis import Population
@@ -61,7 +62,7 @@ def plan_json(plan: Plan) -> str:
         "plan",
         {
             "method": plan.method,
-            "status": now.assessment.status,
+            "status": now.status,
             "duration_s": now.duration,
             "parameters": [
                 {
@@ -70,14 +71,19 @@ def plan_json(plan: Plan) -> str:
                     "require": q.require,
                     "sigma": now.sigmas[q.name],
                     "sigma_with_changes": best.sigmas[q.name],
-                    "verdict": now.assessment.verdicts[q.name],
+                    "verdict": now.verdicts[q.name],
                     "budget": dict(best.budget.get(q.name, {})),
                 }
                 for q in now.quantities
                 if q.judged
             ],
             "directions": [
-                {"verdict": d.verdict, "label": d.label, "advice": d.advice} for d in now.assessment.directions
+                {
+                    "verdict": d.severity.name.lower(),
+                    "label": label(d.evidence["weights"]),
+                    "advice": d.evidence["advice"],
+                }
+                for d in now.directions
             ],
             "changes": [{"change": step.change, "gain": step.gain} for step in plan.steps],
             "missing": now.missing,

@@ -24,7 +24,7 @@ def plan_html(plan: Plan) -> str:
         sigmas = [rounded(factor * sigma) for sigma in (q.require, now[q.name], best[q.name])]
         source, share = limited[q.name].parts[0] if q.name in limited else ("", 0.0)
         limit = f"{source}, {100.0 * share:.0f} %" if source else ""
-        verdict = plan.now.assessment.verdicts[q.name]
+        verdict = plan.now.verdicts[q.name]
         rows.append((q.name, meaning(method, q.name), unit, *sigmas, verdict, limit))
     return page(
         "alidade.pipelines.reports",

@@ -147,7 +147,7 @@ _OTHERS = (
 
 def _others(out: Figure, calibration: Calibration, name: str, factor: float, color: str) -> set[str]:
     """Draws what else is known of a parameter over time; returns which of _OTHERS that was."""
-    estimate, beside = calibration.estimate, calibration.beside() if calibration.beside else None
+    estimate, beside = calibration.estimate, calibration.beside
     published, smooth, truth = _OTHERS
     shown = set()
     if beside is not None and beside.history is not None and name in beside.names:
@@ -193,11 +193,11 @@ def _common_name(names: Sequence[str]) -> str:
 
 def _correlation(calibration: Calibration) -> Plot | None:
     quantities = quantities_of(calibration.problem, calibration.estimate)
-    sigmas = calibration.assessment.sigmas
+    sigmas = calibration.estimate.sigmas
     shown: NDArray[np.intp] = np.flatnonzero(sigmas > 0.0)
     if len(shown) < 2:
         return None
-    covariance = calibration.assessment.covariance[np.ix_(shown, shown)]
+    covariance = calibration.covariance[np.ix_(shown, shown)]
     correlation = np.clip(covariance / np.outer(sigmas[shown], sigmas[shown]), -1.0, 1.0)
     names = tuple(quantities[i].name for i in shown)
     ends = (-0.5, len(names) - 0.5)
@@ -215,7 +215,7 @@ def _correlation(calibration: Calibration) -> Plot | None:
 def _ellipses(calibration: Calibration) -> Plot | None:
     """One-sigma ellipses of the pairs with the strongest correlation, each in units of its own two sigmas."""
     quantities = quantities_of(calibration.problem, calibration.estimate)
-    covariance, sigmas = calibration.assessment.covariance, calibration.assessment.sigmas
+    covariance, sigmas = calibration.covariance, calibration.estimate.sigmas
     pairs = [
         (float(covariance[i, j] / (sigmas[i] * sigmas[j])), i, j)
         for i in range(len(sigmas))

@@ -1,6 +1,6 @@
 """What a calibration is to the reports, and result.json.
 
-calibration = Calibration(problem, estimate, assess(...), session_facts(...), ...)
+calibration = Calibration(problem, estimate, diagnose(...), session_facts(...), ...)
 result_json(calibration)            # the contract's text of result.json
 """
 
@@ -20,31 +20,22 @@ from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler
 
 from alidade.pipelines.diagnostics.change_test import Stability
 from alidade.pipelines.diagnostics.device_changes import Changes
-from alidade.pipelines.diagnostics.observability import (
-    Assessment,
-    Fit,
-    Innovations,
-    Learning,
-    Status,
-    Verdict,
-    learning,
-)
-from alidade.pipelines.diagnostics.rejection import rejection_sentence
-from alidade.pipelines.diagnostics.self_check import SelfCheck
+from alidade.pipelines.diagnostics.goodness_of_fit import Fit, InnovationTest, SolverDifference
+from alidade.pipelines.diagnostics.observability import TimeToAccuracy, Verdict, time_to_accuracy, verdicts
 from alidade.pipelines.display.figure import Figure
 from alidade.pipelines.estimation.assumptions import pull
+from alidade.pipelines.estimation.finding import Finding, Severity, Status, status
 from alidade.pipelines.estimation.noise import Level, Source
 from alidade.pipelines.estimation.problem import Array, Estimate, Findings, History, Problem, Quantity, Residuals
 from alidade.pipelines.recording.faults import CLIPPED
 from alidade.pipelines.recording.info import SessionFacts
+from alidade.pipelines.reports import sentences
 from alidade.pipelines.settings import Config
 
 if TYPE_CHECKING:
     from alidade.pipelines.methods import Method
     from alidade.pipelines.methods.formula import Formula
 
-# Beyond so many of its prior's sigmas a parameter is not where it was said to be.
-_FAR_FROM_PRIOR = 5.0
 _PACKAGES = ("alidade", "gtsam", "numpy", "opencv-contrib-python-headless", "pycolmap")
 
 
@@ -83,7 +74,7 @@ class Calibration:
         method: that was calibrated.
         problem: the method's.
         estimate: by any solver; its names are a part of the problem's.
-        assessment: of that estimate.
+        findings: on that estimate, the most severe first.
         recording: name of the file.
         sha256: of the file.
         facts: about the recording; its epoch is the zero of all times.
@@ -92,11 +83,10 @@ class Calibration:
         software: package -> version.
         seconds: phase -> wall time, beside those of the estimate.
         plots: makes the method's own figures and tables.
-        beside: tells the published solver's estimate of the same recording, where the report shows it too; None when
-            that solver cannot serve the recording.
+        beside: the published solver's estimate of the same recording, which the report shows too; None: there is none.
         stability: whether what was calibrated stayed as it was; None where that cannot be said.
-        self_check: an incremental estimate beside batch's; None where it was not made.
-        findings: what the method found beside its parameters.
+        solver_difference: an incremental estimate less batch's; None where they were not compared.
+        tables: what the method found beside its parameters.
         recordings: of a joint calibration, what each of them has of its own.
         changes: of a joint calibration, whether the device changed from one to another.
     """
@@ -104,7 +94,7 @@ class Calibration:
     method: Method
     problem: Problem
     estimate: Estimate
-    assessment: Assessment
+    findings: tuple[Finding, ...]
     recording: str
     sha256: str
     facts: SessionFacts
@@ -113,20 +103,21 @@ class Calibration:
     software: Mapping[str, str] = field(default_factory=lambda: software_versions())
     seconds: Mapping[str, float] = field(default_factory=dict)
     plots: Callable[[Calibration], Sequence[Plot | Table]] | None = None
-    beside: Callable[[], Estimate | None] | None = None
+    beside: Estimate | None = None
     stability: Stability | None = None
-    self_check: SelfCheck | None = None
-    findings: Findings = field(default_factory=dict)
+    solver_difference: SolverDifference | None = None
+    tables: Findings = field(default_factory=dict)
     recordings: Sequence[PartResult] = ()
     changes: Changes | None = None
 
     @property
     def parameters(self) -> dict[str, ParameterResult]:
         """Name -> parameter, as result.json lists them."""
+        given = self.verdicts
         rows = zip(
             quantities_of(self.problem, self.estimate),
             self.estimate.values,
-            self.assessment.sigmas,
+            self.estimate.sigmas,
             self.estimate.inflations,
             strict=True,
         )
@@ -139,7 +130,7 @@ class Calibration:
                 prior_sigma=q.prior_sigma,
                 prior_mean=q.prior_mean,
                 require=q.require if q.judged else None,
-                observability=self.assessment.verdicts.get(q.name),
+                observability=given.get(q.name),
                 group=q.group,
                 pull=None if q.group is None else pull(q, float(value), float(sigma), float(inflation)),
                 inflation=float(inflation),
@@ -207,19 +198,52 @@ class Calibration:
         return datetime.datetime.fromtimestamp(self.facts.epoch_ns // 1_000_000_000, datetime.UTC).isoformat()
 
     @property
-    def status(self) -> str:
+    def status(self) -> Status:
         """calibrated, weak, unobservable or inconsistent."""
-        return self.assessment.status
+        return status(self.findings)
+
+    @property
+    def verdicts(self) -> dict[str, Verdict]:
+        """Parameter -> verdict, of those with a required accuracy."""
+        return verdicts(quantities_of(self.problem, self.estimate), self.estimate.covariance)
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        """Name -> quantity, those of several recordings too."""
+        return {q.name: q for q in self.problem.quantities}
 
     @property
     def headline(self) -> str:
-        """The verdict in one sentence."""
-        return self.assessment.headline
+        """The status with its reasons."""
+        return sentences.headline(self.findings, self.quantities, self.verdicts)
+
+    @property
+    def directions(self) -> tuple[Finding, ...]:
+        """Findings on weak and unobservable directions, worst first."""
+        return tuple(finding for finding in self.findings if finding.kind == "direction")
+
+    @property
+    def causes(self) -> tuple[tuple[str, str], ...]:
+        """Label and evidence of what may explain the other findings, the most likely first."""
+        found = (sentences.cause(finding, self.quantities) for finding in self.findings)
+        return tuple(cause for cause in found if cause is not None)
+
+    @property
+    def fit(self) -> Fit | None:
+        """Chi-square of all residuals with its interval; None when the solver has none."""
+        chi_square = self.estimate.chi_square
+        return None if chi_square is None else Fit.of(chi_square.value, chi_square.dof)
+
+    @property
+    def family_fits(self) -> dict[str, Fit]:
+        """Family -> chi-square with its interval."""
+        chi_square = self.estimate.chi_square
+        return {} if chi_square is None else {family: Fit.of(*sums) for family, sums in chi_square.families.items()}
 
     @property
     def covariance(self) -> Array:
         """(n, n) joint covariance of the parameters, in their order, SI."""
-        return self.assessment.covariance
+        return self.estimate.covariance
 
     @property
     def history(self) -> History | None:
@@ -330,50 +354,26 @@ class Calibration:
         return {**self.seconds, **self.estimate.seconds}
 
     @property
-    def innovations(self) -> dict[str, Innovations]:
+    def innovations(self) -> dict[str, InnovationTest]:
         """Family -> whiteness and size of its innovations; only the incremental solver has innovations."""
         if self.estimate.solver != "incremental":
             return {}
-        found = {family: Innovations.of(r) for family, r in self.estimate.residuals.items()}
+        found = {family: InnovationTest.of(r) for family, r in self.estimate.residuals.items()}
         return {family: innovations for family, innovations in found.items() if innovations is not None}
 
     @property
-    def learning(self) -> dict[str, Learning]:
-        """Parameter -> how it became known; of the published solver, whose sigmas may be far off, none."""
+    def learning(self) -> dict[str, TimeToAccuracy]:
+        """Parameter -> time to its accuracy; none of the published solver, whose sigmas may be far off."""
         history = self.estimate.history
         if self.estimate.solver == "published" or history is None:
             return {}
-        return learning(history, self.estimate.names, self.problem.quantities)
+        return time_to_accuracy(history, self.estimate.names, self.problem.quantities)
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What a reader has to know beside the headline."""
-        trouble = () if self.estimate.converged else (f"the solver did not converge: {self.estimate.message}",)
-        far = _beyond_priors(self)
-        told = rejection_sentence(self.residuals).removesuffix(".")
-        rejected = (told,) if told and told not in self.headline else ()
         clipped = tuple(f"{what}: {n} samples left out" for what, n in self.dropped.items() if what.endswith(CLIPPED))
-        return (*trouble, *self.facts.notes, *self.assessment.warnings, *far, *rejected, *clipped)
-
-
-def _beyond_priors(calibration: Calibration) -> tuple[str, ...]:
-    """A sentence when the recording takes parameters to where their priors say they cannot be."""
-    if calibration.estimate.solver == "published":
-        return ()
-    quantities = quantities_of(calibration.problem, calibration.estimate)
-    away = {
-        q.name: abs(float(value) - q.prior_mean) / q.prior_sigma
-        for q, value in zip(quantities, calibration.estimate.values, strict=True)
-        if q.prior_sigma and not q.assumed
-    }
-    far = {name: sigmas for name, sigmas in away.items() if sigmas > _FAR_FROM_PRIOR}
-    if not far:
-        return ()
-    named = ", ".join(f"{name} by {sigmas:.3g}" for name, sigmas in far.items())
-    return (
-        f"more than {_FAR_FROM_PRIOR:g} sigmas of its prior away: {named}; is a sensor turned or are its axes in "
-        "another order? if it is meant to be there, widen the prior",
-    )
+        return (*self.facts.notes, *sentences.notes(self.findings, self.quantities), *clipped)
 
 
 class _Record(BaseModel):
@@ -450,10 +450,10 @@ class ChiSquareResult(FitResult):
 
 
 class CauseResult(_Record):
-    """Why the residuals may not fit, tried by solving again."""
+    """A hypothesis or a prior conflict that may explain what does not fit, as text; `findings` has the numbers."""
 
     label: str  # what it is
-    evidence: str  # what it does to chi-square
+    evidence: str  # what shows it
 
 
 class InnovationsResult(_Record):
@@ -616,7 +616,8 @@ class Result(_Record):
     budget: dict[str, dict[str, float]] | None  # parameter: source: its share of the variance
     sensitivity: dict[str, SensitivityResult] | None  # input taken for exact: what it does
     measurements: list[MeasurementResult] | None  # the twenty that matter most
-    findings: dict[str, list[dict[str, object]]]  # the method's own tables
+    findings: list[dict[str, object]]  # kind, severity and evidence, the most severe first
+    tables: dict[str, list[dict[str, object]]]  # the method's own
     second_best: SecondResult | None = None  # where there is another solution that is nearly as likely
     constants: dict[str, float] | None = None  # that formulas need beside the parameters
     recordings: list[PartResult] | None = None  # of a joint calibration
@@ -626,40 +627,65 @@ class Result(_Record):
 
 def result(calibration: Calibration) -> Result:
     """result.json as a model. Raises pydantic's ValidationError if a number is not finite."""
-    c, a = calibration, calibration.assessment
+    c = calibration
     return Result(
         method=c.problem.method,
         solver=c.estimate.solver,
-        status=a.status,
+        status=c.status,
         parameters=list(c.parameters.values()),
-        covariance=CovarianceResult(order=list(c.estimate.names), matrix=a.covariance.tolist()),
-        null_directions=[
-            DirectionResult(sigma_ratio=d.sigma_ratio, weights=dict(d.weights), advice=d.advice) for d in a.directions
-        ],
-        chi_square=_chi_square(a),
+        covariance=CovarianceResult(order=list(c.estimate.names), matrix=c.covariance.tolist()),
+        null_directions=[DirectionResult(**direction.evidence) for direction in c.directions],
+        chi_square=_chi_square(c),
         noise=c.noises,
         session=SessionResult(
             sha256=c.sha256, start=c.start, duration_s=c.facts.duration_s, counts=c.counts, dropped=c.dropped
         ),
         software=dict(c.software),
         timing_s=c.timing,
-        headline=a.headline,
+        headline=c.headline,
         notes=list(c.notes),
-        causes=[CauseResult(**asdict(cause)) for cause in a.causes],
+        causes=[CauseResult(label=label, evidence=evidence) for label, evidence in c.causes],
         innovations={family: InnovationsResult(**asdict(found)) for family, found in c.innovations.items()},
         learning={name: LearningResult(**asdict(found)) for name, found in c.learning.items()},
         stability=_stability(c.stability),
-        self_check=None if c.self_check is None else SelfCheckResult(**asdict(c.self_check)),
+        self_check=_self_check(c.solver_difference),
         budget=None if c.budget is None else {name: dict(shares) for name, shares in c.budget.items()},
         sensitivity=c.sensitivity,
         measurements=c.measurements,
-        findings={name: [dict(row) for row in rows] for name, rows in c.findings.items()},
+        findings=[finding_json(finding) for finding in c.findings],
+        tables={name: [dict(row) for row in rows] for name, rows in c.tables.items()},
         second_best=_second(c.estimate),
         constants=dict(c.problem.constants) or None,
         recordings=list(c.recordings) or None,
         changes=_changes(c),
         truth=truth_errors(c) if c.truth is not None else None,
     )
+
+
+def finding_json(finding: Finding) -> dict[str, object]:
+    """A finding as result.json has it: kind, severity (note, weak, inconsistent, unobservable) and its evidence."""
+    return {
+        "kind": finding.kind,
+        "severity": Severity(finding.severity).name.lower(),
+        **{key: _json(value) for key, value in finding.evidence.items()},
+    }
+
+
+def _json(value: Any) -> object:
+    """Findings within evidence as objects, pairs as lists; null in place of what is no finite number."""
+    if isinstance(value, Finding):
+        return finding_json(value)
+    if isinstance(value, Mapping):
+        return {key: _json(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_json(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _self_check(found: SolverDifference | None) -> SelfCheckResult | None:
+    if found is None:
+        return None
+    return SelfCheckResult(parameter=found.parameter, difference=found.z, sigma_ratio=found.sigma_ratio)
 
 
 def _second(estimate: Estimate) -> SecondResult | None:
@@ -741,11 +767,11 @@ def _changes(c: Calibration) -> ChangesResult | None:
     return ChangesResult(level=c.changes.level, steps=steps, rates=rates)
 
 
-def _chi_square(assessment: Assessment) -> ChiSquareResult:
-    if assessment.consistency is None:
+def _chi_square(c: Calibration) -> ChiSquareResult:
+    if c.fit is None:
         return ChiSquareResult(value=None, dof=None, low=None, high=None, families={})
-    families = {family: FitResult(**_numbers(fit)) for family, fit in assessment.consistency.families.items()}
-    return ChiSquareResult(**_numbers(assessment.consistency.total), families=families)
+    families = {family: FitResult(**_numbers(fit)) for family, fit in c.family_fits.items()}
+    return ChiSquareResult(**_numbers(c.fit), families=families)
 
 
 def _numbers(fit: Fit) -> dict[str, float | None]:

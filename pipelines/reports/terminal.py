@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from alidade.pipelines.applications.discovery import Suggestion
     from alidade.pipelines.applications.noise import NoiseStudy
     from alidade.pipelines.applications.planning import Plan
+    from alidade.pipelines.applications.table_discovery import Columns
+    from alidade.pipelines.estimation.finding import Finding
     from alidade.pipelines.recording.info import SessionFacts
     from alidade.pipelines.reports.result import Calibration, ParameterResult
 
@@ -27,6 +30,8 @@ console = Console(highlight=False)
 if console.width < _NARROWEST:
     console.width = _NARROWEST
 _LONGEST = 10_000
+# Sentences are broken at so many characters.
+_WIDTH = 100
 
 COLOURS = {
     "calibrated": "green",
@@ -61,7 +66,7 @@ def show(calibrations: Sequence[Calibration]) -> None:
 
     alone = len(calibrations) == 1
     errors = [truth_errors(c) for c in calibrations]
-    found = [c.parameters for c in calibrations]
+    found, verdicts = [c.parameters for c in calibrations], calibrations[0].verdicts
     table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
     table.add_column("parameter", no_wrap=True)
     table.add_column("unit", no_wrap=True)
@@ -82,7 +87,7 @@ def show(calibrations: Sequence[Calibration]) -> None:
             error = known[q.name].error_sigmas if q.name in known else None
             row.append(_cell(parameters[q.name], factor, error, alone) if q.name in parameters else "-")
         if alone and q.name in found[0]:
-            verdict = calibrations[0].assessment.verdicts[q.name]
+            verdict = verdicts[q.name]
             row.append(f"[{COLOURS[verdict]}]{verdict}[/]")
         table.add_row(*row)
     console.print(table)
@@ -107,7 +112,9 @@ def show_json(calibrations: Sequence[Calibration]) -> None:
     print(texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]")
 
 
-def facts_json(facts: SessionFacts, found: Sequence[Suggestion], unused: Sequence[str]) -> str:
+def facts_json(
+    facts: SessionFacts, found: Sequence[Suggestion], unused: Sequence[str], columns: Columns | None = None
+) -> str:
     """What `info` tells, as JSON."""
     from alidade.pipelines.reports.plain_json import plain_json
 
@@ -125,17 +132,27 @@ def facts_json(facts: SessionFacts, found: Sequence[Suggestion], unused: Sequenc
         }
         for name, missing in told.pop("missing").items()
     }
+    if columns is not None:
+        tables = {topic: table.model_dump(exclude_defaults=True) for topic, table in columns.columns.items()}
+        told["columns"] = {"columns": tables, "reasons": list(columns.reasons), "doubts": list(columns.doubts)}
     return plain_json("info", told | {"unused": list(unused)})
 
 
-def show_facts(name: str, facts: SessionFacts, found: Sequence[Suggestion] = (), unused: Sequence[str] = ()) -> None:
+def show_facts(
+    name: str,
+    facts: SessionFacts,
+    found: Sequence[Suggestion] = (),
+    unused: Sequence[str] = (),
+    columns: Columns | None = None,
+) -> None:
     """What a recording can calibrate and with which topics, what each method lacks, then what there is."""
     say(f"{name}, {facts.duration_s:.1f} s")
+    _show_columns(columns)
     _show_methods(facts, found)
     if unused:
-        say(f"used by no method: {', '.join(unused)}")
+        _say_wrapped(f"used by no method: {', '.join(unused)}")
     for note in facts.notes:
-        say(f"note: {note}")
+        _say_wrapped(f"note: {note}")
     table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
     table.add_column("topic", no_wrap=True)
     table.add_column("type", overflow="fold")
@@ -158,6 +175,25 @@ def show_facts(name: str, facts: SessionFacts, found: Sequence[Suggestion] = (),
         say(f"attachments: {', '.join(facts.attachments)}")
 
 
+def _say_wrapped(text: str) -> None:
+    """In lines that fit, those after the first indented; words are left whole."""
+    lines = textwrap.wrap(text, _WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
+    for line in [text[: len(text) - len(text.lstrip())] + lines[0].lstrip(), *lines[1:]] if lines else []:
+        say(line)
+
+
+def _show_columns(columns: Columns | None) -> None:
+    """What tables hold, as it is concluded, to be pasted."""
+    if columns is None:
+        return
+    if columns.columns:
+        console.print("[yellow]tables, concluded (calibrate --auto-columns takes this):[/]")
+        for line in columns.yaml.split("\n"):
+            say(f"  {line}")
+    for sentence in (*columns.reasons, *(f"in doubt: {doubt}" for doubt in columns.doubts)):
+        _say_wrapped(f"  {sentence}")
+
+
 def _show_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:
     """Methods that are served, those that could be with other topics, and what the others lack."""
     for method, missing in facts.missing.items():
@@ -165,15 +201,18 @@ def _show_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:
             console.print(f"[green]{method}: yes[/]")
     for suggestion in found:
         if not suggestion.missing:
-            console.print(f"[yellow]{suggestion.method}: with these topics (calibrate --auto-topics takes them)[/]")
+            name = f"--method {suggestion.method} " if suggestion.has_to_be_asked_for else ""
+            console.print(
+                f"[yellow]{suggestion.method}: with these topics (calibrate {name}--auto-topics takes them)[/]"
+            )
             for reason in suggestion.reasons:
-                say(f"  {reason}")
+                _say_wrapped(f"  {reason}")
             for line in suggestion.yaml.split("\n"):
                 say(f"  {line}")
     whole = {suggestion.method for suggestion in found if not suggestion.missing}
     for method, missing in facts.missing.items():
         if missing and method not in whole:
-            say(f"{method}: no, it lacks {'; '.join(missing)}")
+            _say_wrapped(f"{method}: no, it lacks {'; '.join(missing)}")
 
 
 def show_plan(plan: Plan) -> None:
@@ -189,17 +228,16 @@ def show_plan(plan: Plan) -> None:
         table.add_column(column, justify="right", no_wrap=True)
     table.add_column("verdict", no_wrap=True)
     table.add_column("limited by")
-    now, best = plan.now.sigmas, plan.best.sigmas
+    now, best, verdicts = plan.now.sigmas, plan.best.sigmas, plan.now.verdicts
     for q in filter(lambda q: q.judged, plan.now.quantities):
         unit, factor = human_unit(q)
         cells = [rounded(factor * sigma) for sigma in (q.require, now[q.name], best[q.name])]
-        verdict = plan.now.assessment.verdicts[q.name]
+        verdict = verdicts[q.name]
         most = limited[q.name].parts[0] if q.name in limited else ("", 0.0)
         limit = f"{most[0]}, {100.0 * most[1]:.0f} %" if most[0] else ""
         table.add_row(q.name, unit, *cells[: 3 if plan.steps else 2], f"[{COLOURS[verdict]}]{verdict}[/]", limit)
     console.print(table)
-    for direction in plan.now.assessment.directions:
-        say(f"  {direction.verdict}: {direction.label}: {direction.advice}")
+    _say_directions(plan.now.directions)
     if not plan.now.missing:
         say(f"This motion, {plan.now.duration:.0f} s of it, determines everything as accurately as required.")
         return
@@ -248,17 +286,23 @@ def _cell(parameter: ParameterResult, factor: float, error_sigmas: float | None,
 
 
 def _verdict(calibration: Calibration, name: bool) -> None:
-    assessment = calibration.assessment
     published = calibration.estimate.solver == "published"
     solver = f"{calibration.estimate.solver}: " if name else ""
-    colour = COLOURS[assessment.status]
-    headline = assessment.headline
-    if published and assessment.directions:
-        # What a recording lacks is told by the graph's solvers; these know their own model only.
+    headline, status = calibration.headline, calibration.status
+    if published and calibration.directions:
+        # The published solvers know their own model only, so they give no advice.
         short = [p.name for p in calibration.parameters.values() if p.observability in ("weak", "unobservable")]
         headline = f"By its own sigmas less accurate than required: {', '.join(short)}."
-    console.print(f"{solver}[bold {colour}]{assessment.status}.[/] {escape(headline)}", soft_wrap=True)
-    for direction in () if published else assessment.directions:
-        say(f"  {direction.verdict}: {direction.label}: {direction.advice}")
+    console.print(f"{solver}[bold {COLOURS[status]}]{status}.[/] {escape(headline)}", soft_wrap=True)
+    _say_directions(() if published else calibration.directions)
     for note in calibration.notes:
         say(f"  note: {note}")
+
+
+def _say_directions(directions: Sequence[Finding]) -> None:
+    """A line a direction: verdict, parameters, advice."""
+    from alidade.pipelines.reports.sentences import label
+
+    for direction in directions:
+        e = direction.evidence
+        say(f"  {direction.severity.name.lower()}: {label(e['weights'])}: {e['advice']}")

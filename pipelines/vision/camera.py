@@ -16,8 +16,50 @@ Array = NDArray[np.float64]
 
 # Number of coefficients that each distortion model may come with; missing ones are zero.
 _COEFFICIENTS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (0, 4, 5, 8), "equidistant": (0, 4)}
+# Other names of the same formulas, lower case: Kalibr, older ROS calibrators, RealSense, drivers.
+_SYNONYMS = {
+    "": "plumb_bob",
+    "none": "plumb_bob",
+    "pinhole": "plumb_bob",
+    "plumb bob": "plumb_bob",
+    "radtan": "plumb_bob",
+    "radial-tangential": "plumb_bob",
+    "radial_tangential": "plumb_bob",
+    "brown_conrady": "plumb_bob",
+    "brown-conrady": "plumb_bob",
+    "opencv": "plumb_bob",
+    "rational": "rational_polynomial",
+    "fisheye": "equidistant",
+    "equi": "equidistant",
+    "kannala_brandt": "equidistant",
+    "kannala_brandt4": "equidistant",
+    "kannala_brandt8": "equidistant",
+    "opencv_fisheye": "equidistant",
+}
+_RATIONAL = "; eight are those of rational_polynomial"
+# What to do about another model.
+_OTHER_MODEL = "rectify the pictures and record their camera_info, or calibrate the lens as one of these"
 _NEWTON_STEPS = 30
 _PIXEL_TOLERANCE = 1e-9
+
+
+def lens_model(name: str, coefficients: Array) -> tuple[str, Array]:
+    """The distortion model of a name, as a driver writes it, and its coefficients without zeros that are none.
+
+    Raises InputError where the model is another, or has another number of coefficients.
+    """
+    model, d = _SYNONYMS.get(name.strip().lower(), name.strip().lower()), np.trim_zeros(coefficients, "b")
+    if model not in _COEFFICIENTS:
+        raise InputError(
+            f"camera_info: distortion model {name!r} is none of {', '.join(_COEFFICIENTS)}: {_OTHER_MODEL}"
+        )
+    lengths = _COEFFICIENTS[model]
+    if d.size > lengths[-1] or not np.isfinite(d).all():
+        raise InputError(
+            f"camera_info: {model} takes {' or '.join(map(str, lengths))} finite coefficients, not "
+            f"{coefficients.tolist()}: {_OTHER_MODEL}{_RATIONAL if model == 'plumb_bob' and d.size == 8 else ''}"
+        )
+    return model, d
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +70,7 @@ class Camera:
         width, height: picture size, px.
         K: (3, 3) camera matrix, px, without skew.
         distortion_model: `plumb_bob` (k1 k2 p1 p2 k3), `rational_polynomial` (k1 k2 p1 p2 k3 k4 k5 k6) or `equidistant`
-            (k1 k2 k3 k4); empty stands for plumb_bob.
+            (k1 k2 k3 k4), or another name of the same formula.
         coefficients: in ROS's order, which is OpenCV's; empty stands for no distortion.
 
     Raises:
@@ -46,7 +88,7 @@ class Camera:
     def __post_init__(self) -> None:
         K = np.asarray(self.K, dtype=float).reshape(3, 3)
         d = np.asarray(self.coefficients, dtype=float).ravel()
-        model = self.distortion_model or "plumb_bob"
+        model, d = lens_model(self.distortion_model, d)
         if self.width <= 0 or self.height <= 0 or not K.any():
             raise InputError(
                 f"camera_info zero: picture {self.width}x{self.height}, K {K.ravel().tolist()}; "
@@ -54,11 +96,10 @@ class Camera:
             )
         plain = np.array([[K[0, 0], 0.0, K[0, 2]], [0.0, K[1, 1], K[1, 2]], [0.0, 0.0, 1.0]])
         if not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0 or not np.array_equal(K, plain):
-            raise InputError(f"camera_info: K {K.ravel().tolist()} is not [fx 0 cx, 0 fy cy, 0 0 1] with fx, fy > 0")
-        if model not in _COEFFICIENTS:
-            raise InputError(f"camera_info: distortion model {model!r} is none of {', '.join(_COEFFICIENTS)}")
-        if d.size not in _COEFFICIENTS[model] or not np.isfinite(d).all():
-            raise InputError(f"camera_info: {model} takes {_COEFFICIENTS[model]} finite coefficients, not {d.tolist()}")
+            skew = f"; a skew of {K[0, 1]:g} may be set to 0 where it is less than a pixel" if K[0, 1] else ""
+            raise InputError(
+                f"camera_info: K {K.ravel().tolist()} is not [fx 0 cx, 0 fy cy, 0 0 1] with fx, fy > 0{skew}"
+            )
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "distortion_model", model)
         object.__setattr__(self, "coefficients", np.pad(d, (0, _COEFFICIENTS[model][-1] - d.size)))

@@ -17,4 +17,12 @@ def camera_of(recording: Recording, config: Config) -> Camera:
     from alidade.pipelines.vision.camera import Camera
 
     info = recording.camera_info(config.topic(CAMERA_INFO))
-    return Camera(info.width, info.height, info.k, info.distortion_model, info.d)
+    camera = Camera(info.width, info.height, info.k, info.distortion_model, info.d)
+    if info.distortion_model not in ("", camera.distortion_model):
+        recording.remark(f"camera_info: distortion model {info.distortion_model} is read as {camera.distortion_model}")
+    if len(info.d) > len(camera.coefficients):
+        recording.remark(
+            f"camera_info: {len(info.d)} coefficients, of which the last {len(info.d) - len(camera.coefficients)} are "
+            "zero and none of the model's"
+        )
+    return camera

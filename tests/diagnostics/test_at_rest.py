@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from alidade.pipelines.config import load_config
-from alidade.pipelines.diagnostics.observability import assess
 from alidade.pipelines.estimation.problem import Problem
 from alidade.pipelines.methods.head import graph as head
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
@@ -17,6 +16,7 @@ from alidade.pipelines.methods.los.simulation import LosScenario, los_config, si
 from alidade.pipelines.settings import Sensors
 from alidade.pipelines.simulation.motion import EulerMotion
 from alidade.pipelines.solvers.batch import solve_batch
+from tests.support.judged import judge
 
 STILL = EulerMotion()
 HEAD = HeadScenario(duration_s=12.0, head=STILL, vision_rate_hz=20.0, gyro_rate_hz=100.0, sensors=Sensors())
@@ -41,7 +41,7 @@ def test_batch_names_the_motion_that_is_missing(make: Callable[[int], Problem], 
     problem = make(seed)
     estimate = solve_batch(problem)
     assert estimate.converged, estimate.message
-    judged = assess(problem.quantities, estimate.covariance, estimate.chi_square, problem.advice)
+    judged = judge(problem.quantities, estimate.covariance, estimate.chi_square, problem.advice)
     assert judged.status == "unobservable"
     assert missing in judged.headline
     # Nothing is made up: what is not known is within what the prior allows.

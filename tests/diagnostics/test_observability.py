@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from alidade.pipelines.diagnostics.observability import Assessment, Cause, Innovations, assess, learning
+from alidade.pipelines.diagnostics.goodness_of_fit import Fit, InnovationTest
+from alidade.pipelines.diagnostics.observability import time_to_accuracy
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.problem import ChiSquare, History, Quantity, Residuals
+from tests.support.judged import Judged, judge
 
 GOOD_FIT = ChiSquare(1000.0, 1000.0, {"vision": (1000.0, 1000.0)})
 
@@ -20,8 +22,8 @@ def quantity(name: str, prior: float | None = 1.0, require: float = 0.1, scale: 
     return Quantity(name, "rad", prior, scale, require)
 
 
-def judged(quantities: list[Quantity], covariance: np.ndarray, chi: ChiSquare | None = GOOD_FIT) -> Assessment:
-    return assess(quantities, covariance, chi, None)
+def judged(quantities: list[Quantity], covariance: np.ndarray, chi: ChiSquare | None = GOOD_FIT) -> Judged:
+    return judge(quantities, covariance, chi, None)
 
 
 @pytest.mark.parametrize(
@@ -47,7 +49,7 @@ def test_verdicts_follow_the_contract(prior: float | None, require: float, sigma
     assert found.verdicts == {"a": verdict}
     status = verdict if verdict in ("weak", "unobservable") else "calibrated"
     assert found.status == status
-    assert [d.verdict for d in found.directions] == ([status] if status != "calibrated" else [])
+    assert [d.severity.name.lower() for d in found.directions] == ([status] if status != "calibrated" else [])
 
 
 def test_gauge_is_named_where_no_single_parameter_is_unobservable() -> None:
@@ -59,9 +61,9 @@ def test_gauge_is_named_where_no_single_parameter_is_unobservable() -> None:
     assert set(found.verdicts.values()) == {"weak"}
     assert found.status == "unobservable"
     (direction,) = found.directions
-    assert direction.sigma_ratio == pytest.approx(1.0, abs=1e-4)
-    assert direction.weights == pytest.approx({"delta_pz": np.sqrt(0.5), "delta_gz": np.sqrt(0.5)}, abs=1e-3)
-    assert "against" in direction.label
+    assert direction.evidence["sigma_ratio"] == pytest.approx(1.0, abs=1e-4)
+    half = np.sqrt(0.5)
+    assert direction.evidence["weights"] == pytest.approx({"delta_pz": half, "delta_gz": half}, abs=1e-3)
     assert "delta_pz" in found.headline
     assert "delta_gz" in found.headline
 
@@ -84,7 +86,7 @@ def test_directions_of_equal_sigma_are_untangled() -> None:
     covariance = null @ null.T + 1e-6 * rest
     names = [f"{mount}_{axis}" for mount in ("camera", "helmet") for axis in "xyz"]
     found = judged([quantity(name) for name in names], covariance)
-    assert {frozenset(d.weights) for d in found.directions} == {
+    assert {frozenset(d.evidence["weights"]) for d in found.directions} == {
         frozenset({f"camera_{axis}", f"helmet_{axis}"}) for axis in "xyz"
     }
 
@@ -101,11 +103,11 @@ def test_a_direction_is_blamed_exactly_when_a_parameter_is_not_good_enough(seed:
     short = [name for name, verdict in found.verdicts.items() if verdict in ("weak", "unobservable")]
     assert bool(found.directions) == bool(short)
     for direction in found.directions:
-        norm = np.linalg.norm(list(direction.weights.values()))
+        norm = np.linalg.norm(list(direction.evidence["weights"].values()))
         assert 0.9 < norm <= 1.0 + 1e-9
-        assert set(direction.weights) & set(short)
-        assert min(abs(w) for w in direction.weights.values()) >= 0.1
-    ratios = [d.sigma_ratio for d in found.directions]
+        assert set(direction.evidence["weights"]) & set(short)
+        assert min(abs(w) for w in direction.evidence["weights"].values()) >= 0.1
+    ratios = [d.evidence["sigma_ratio"] for d in found.directions]
     assert all(b <= a / 0.9 for a, b in pairwise(ratios))
 
 
@@ -134,7 +136,8 @@ def test_singular_or_broken_input_gives_a_verdict_and_finite_numbers(covariance:
     found = judged([quantity("a"), quantity("b")], covariance)
     assert np.isfinite(found.covariance).all()
     assert np.isfinite(found.sigmas).all()
-    assert all(np.isfinite([d.sigma_ratio, *d.weights.values()]).all() for d in found.directions)
+    evidence = [d.evidence for d in found.directions]
+    assert all(np.isfinite([e["sigma_ratio"], *e["weights"].values()]).all() for e in evidence)
     if not np.isfinite(covariance[0, 0]) or covariance[0, 0] < 0.0:
         assert found.verdicts["a"] == "unobservable"
 
@@ -151,34 +154,37 @@ def test_advice_is_the_methods_own_and_gets_the_weights() -> None:
         seen.append(weights)
         return Motion("nod")
 
-    found = assess([quantity("a")], np.eye(1), GOOD_FIT, advice)
-    assert found.directions[0].advice == "nod"
+    found = judge([quantity("a")], np.eye(1), GOOD_FIT, advice)
+    assert found.directions[0].evidence["advice"] == "nod"
     assert seen == [{"a": 1.0}]
-    assert "nod" in found.headline
-    assert assess([quantity("a")], np.eye(1), GOOD_FIT, None).directions[0].advice
+    assert "Nod." in found.headline
+    assert judge([quantity("a")], np.eye(1), GOOD_FIT, None).directions[0].evidence["advice"]
 
 
 @pytest.mark.parametrize("dof", [30.0, 300.0, 5000.0, 1e5])
 def test_bounds_are_the_99_9_percent_interval(dof: float) -> None:
-    consistency = judged([quantity("a")], 1e-4 * np.eye(1), ChiSquare(dof, dof, {})).consistency
-    assert consistency is not None
-    assert consistency.total.low == pytest.approx(stats.chi2.ppf(0.0005, dof), rel=0.01)
-    assert consistency.total.high == pytest.approx(stats.chi2.ppf(0.9995, dof), rel=0.01)
+    fit = Fit.of(dof, dof)
+    assert fit.low == pytest.approx(stats.chi2.ppf(0.0005, dof), rel=0.01)
+    assert fit.high == pytest.approx(stats.chi2.ppf(0.9995, dof), rel=0.01)
 
 
 def test_too_small_noise_is_inconsistent_and_names_the_worst_family() -> None:
     chi = ChiSquare(26000.0, 2000.0, {"gyro": (1000.0, 1000.0), "vision": (25000.0, 1000.0)})
     found = judged([quantity("a")], 1e-4 * np.eye(1), chi)
     assert found.status == "inconsistent"
-    assert "vision (it would have to be 5 times" in found.headline
+    (misfit,) = found.findings
+    assert misfit.evidence["largest"] == "vision"
+    assert misfit.evidence["noise_factor"] == pytest.approx(5.0)
 
 
-def test_too_large_noise_is_a_warning_only() -> None:
+def test_too_large_noise_is_a_note_only() -> None:
     chi = ChiSquare(1040.0, 2000.0, {"gyro": (1000.0, 1000.0), "vision": (40.0, 1000.0)})
     found = judged([quantity("a")], 1e-4 * np.eye(1), chi)
     assert found.status == "calibrated"
-    (warning,) = found.warnings
-    assert "vision (it would have to be 0.2 times" in warning
+    (misfit,) = found.findings
+    assert misfit.kind == "misfit"
+    assert misfit.evidence["largest"] == "vision"
+    assert misfit.evidence["noise_factor"] == pytest.approx(0.2)
 
 
 @pytest.mark.parametrize(("sigma", "status"), [(0.05, "inconsistent"), (0.5, "inconsistent"), (0.95, "unobservable")])
@@ -188,17 +194,15 @@ def test_status_is_the_first_that_applies(sigma: float, status: str) -> None:
 
 
 def test_no_chi_square_and_no_redundancy_are_no_inconsistency() -> None:
-    assert judged([quantity("a")], 1e-4 * np.eye(1), None).consistency is None
-    assert judged([quantity("a")], 1e-4 * np.eye(1), ChiSquare(1e-9, 0.0, {})).status == "calibrated"
+    assert judged([quantity("a")], 1e-4 * np.eye(1), None).findings == ()
+    assert judged([quantity("a")], 1e-4 * np.eye(1), ChiSquare(1e-9, 0.0, {})).findings == ()
 
 
 def test_a_family_with_less_than_one_degree_of_freedom_has_no_interval() -> None:
-    chi = ChiSquare(1000.5, 1000.5, {"vision": (1000.0, 1000.0), "bias walk": (0.5, 0.03)})
-    consistency = judged([quantity("a")], 1e-4 * np.eye(1), chi).consistency
-    assert consistency is not None
-    walk = consistency.families["bias walk"]
+    walk = Fit.of(0.5, 0.03)
     assert np.isnan([walk.low, walk.high]).all()
-    assert consistency.message is None
+    chi = ChiSquare(1000.5, 1000.5, {"vision": (1000.0, 1000.0), "bias walk": (0.5, 0.03)})
+    assert judged([quantity("a")], 1e-4 * np.eye(1), chi).findings == ()
 
 
 def test_chi_square_that_is_no_number_is_inconsistent() -> None:
@@ -216,37 +220,35 @@ def test_calibrated_by_prior_alone_says_so() -> None:
 def test_white_innovations_pass_and_correlated_ones_do_not(seed: int) -> None:
     rows = np.random.default_rng(seed).standard_normal((2000, 3))
     time, used = np.arange(2000.0), np.ones(2000, dtype=bool)
-    white = Innovations.of(Residuals(time, rows, used))
+    white = InnovationTest.of(Residuals(time, rows, used))
     assert white is not None
     assert white.white
     assert white.low < white.nis < white.high
-    coloured = Innovations.of(Residuals(time, rows + 0.5 * np.roll(rows, 1, axis=0), used))
+    coloured = InnovationTest.of(Residuals(time, rows + 0.5 * np.roll(rows, 1, axis=0), used))
     assert coloured is not None
     assert coloured.autocorrelation[0] == pytest.approx(0.4, abs=0.05)  # 0.5 / (1 + 0.5^2)
     assert not coloured.white
     assert coloured.nis > coloured.high
-    assert Innovations.of(Residuals(time[:5], rows[:5], used[:5])) is None
+    assert InnovationTest.of(Residuals(time[:5], rows[:5], used[:5])) is None
 
 
-def test_learning_finds_when_and_where_a_parameter_became_known() -> None:
+def test_time_to_accuracy_and_the_most_informative_tenth() -> None:
     """Information at a steady small rate, and at a hundred times that rate from 40 to 50 s."""
     time = np.linspace(0.0, 100.0, 501)
     information = 1.0 + 0.1 * time + 10.0 * np.clip(time - 40.0, 0.0, 10.0)
     sigmas = np.column_stack([information**-0.5, np.ones(501), np.zeros(501)])
     quantities = [quantity("a", require=0.2), quantity("b", require=0.2), quantity("c", 0.0)]
-    found = learning(History(time, np.zeros((501, 3)), sigmas), ("a", "b", "c"), quantities)
+    found = time_to_accuracy(History(time, np.zeros((501, 3)), sigmas), ("a", "b", "c"), quantities)
     assert set(found) == {"a", "b"}
     assert found["a"].stretch == pytest.approx((40.0, 50.0))
-    assert found["a"].share == pytest.approx(101.0 / 111.0)
+    assert found["a"].share == pytest.approx(101.0 / 110.0)  # the prior's 1 is no information of the recording
     assert found["a"].met_s == pytest.approx(42.0, abs=0.5)  # 1 + 4 + 10 * 2 = 1 / 0.2^2
     assert found["b"].met_s is None
 
 
-def test_causes_come_first_in_the_headline() -> None:
-    found = judged([quantity("a")], 1e-4 * np.eye(1), ChiSquare(2000.0, 1000.0, {}))
-    assert found.explained([]) == found
-    explained = found.explained([Cause("the clock is late", "moved, it fits"), Cause("other", "too")])
-    assert explained.headline.startswith("The clock is late: moved, it fits. ")
-    assert explained.headline.endswith("chi-square 2000 for 1000.")
-    assert explained.status == "inconsistent"
-    assert len(explained.causes) == 2
+def test_prior_is_no_information_of_the_first_tenth() -> None:
+    """Prior .05, and information that grows evenly: a tenth in each tenth."""
+    time = np.linspace(0.0, 100.0, 501)
+    sigmas = ((0.05**-2 + 10.0 * time) ** -0.5)[:, None]
+    found = time_to_accuracy(History(time, np.zeros((501, 1)), sigmas), ("a",), [quantity("a", 0.05, 0.04)])
+    assert found["a"].share == pytest.approx(0.1, abs=1e-6)

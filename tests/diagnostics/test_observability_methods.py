@@ -73,12 +73,12 @@ def predicted(scenario: _Scenario) -> Prediction:
 def test_a_motion_that_leaves_a_direction_open_is_told_so(
     scenario: _Scenario, verdict: str, trade: set[str], advice: str
 ) -> None:
-    assessment = predicted(scenario).assessment
+    assessment = predicted(scenario)
     assert assessment.status in ("weak", "unobservable")
-    blamed = [d for d in assessment.directions if trade <= set(d.weights)]
-    assert blamed, [d.label for d in assessment.directions]
-    assert verdict in {d.verdict for d in blamed}
-    assert any(advice in d.advice for d in blamed)
+    blamed = [d for d in assessment.directions if trade <= set(d.evidence["weights"])]
+    assert blamed, [d.evidence["weights"] for d in assessment.directions]
+    assert verdict in {d.severity.name.lower() for d in blamed}
+    assert any(advice in d.evidence["advice"] for d in blamed)
 
 
 @pytest.mark.parametrize(
@@ -94,4 +94,4 @@ def test_a_motion_that_leaves_a_direction_open_is_told_so(
 def test_a_motion_that_tells_everything_has_no_such_direction(
     scenario: _Scenario,
 ) -> None:
-    assert predicted(scenario).assessment.directions == ()
+    assert predicted(scenario).directions == ()

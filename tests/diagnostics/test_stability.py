@@ -10,11 +10,10 @@ import pytest
 import alidade
 from alidade.factors import so3
 from alidade.pipelines.applications.follow.guidance import View, Watch
-from alidade.pipelines.diagnostics.change_test import Moved, Stability, stability
-from alidade.pipelines.diagnostics.cross_validation import Halves
-from alidade.pipelines.diagnostics.observability import assess
-from alidade.pipelines.estimation.advice import Motion
-from alidade.pipelines.estimation.problem import Course, Estimate, Quantity
+from alidade.pipelines.diagnostics.change_test import CHANGE, Stability, change_finding, stability, with_change
+from alidade.pipelines.diagnostics.cross_validation import SplitHalf
+from alidade.pipelines.estimation.finding import Severity
+from alidade.pipelines.estimation.problem import Course, Estimate, History, Quantity, Told
 from alidade.pipelines.settings import Config
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, Run
@@ -140,23 +139,45 @@ def test_a_mount_that_slips_is_inconsistent_with_the_time_and_the_step() -> None
     assert calibration.status == "inconsistent"
     assert calibration.stability is not None
     assert calibration.stability.time_s == pytest.approx(30.0, abs=5.0)
-    assert "Something changed at about 3" in calibration.headline
-    step = calibration.headline.split("From before to after: helmet_mount_x by ")[1]
-    assert float(step.split(" ")[0]) == pytest.approx(0.5, abs=0.2)
+    (change,) = [finding for finding in calibration.findings if finding.kind == "change"]
+    name, (step, sigma) = next(iter(change.evidence["steps"].items()))
+    assert name == "helmet_mount_x"
+    assert np.rad2deg(step) == pytest.approx(0.5, abs=0.2)
+    assert step > 3.0 * sigma
+    assert "Change at 3" in calibration.headline
 
 
-def test_a_small_step_is_told_and_widens_the_sigmas() -> None:
-    """Less than half of what is required does no harm, if it is not forgotten."""
+def test_an_immaterial_step_is_a_note_and_in_the_covariance_of_everybody() -> None:
+    """Less than half of what is required: P + s s', read by the history, the budget and joint calibrations alike."""
     quantities = (Quantity("a", "rad", 1.0, 1.0, 1.0), Quantity("b", "rad", 1.0, 1.0, 1.0))
-    moved = Moved({"a": Halves(0.0, 0.05, 0.4, 0.05), "b": Halves(0.0, 0.05, 0.1, 0.05)})
-    assert list(moved.steps) == ["a"]
-    assert moved.small(quantities)
-    estimate = Estimate("batch", ("a", "b"), np.zeros(2), 0.01 * np.eye(2), True, "")
-    np.testing.assert_allclose(moved.widened(estimate, quantities), np.diag([0.17, 0.01]))
-    large = Moved({"a": Halves(0.0, 0.05, 0.6, 0.05)})
-    assert not large.small(quantities)
-    np.testing.assert_allclose(large.widened(estimate, quantities), 0.01 * np.eye(2))
-    assert not Moved({}).small(quantities)
+    found = Stability(7.0, 0.0, 30.0, {"a": -8.0}, {"a": (0.2, 0.02)})
+    parts = {"a": SplitHalf(0.0, 0.05, 0.4, 0.05), "b": SplitHalf(0.0, 0.05, 0.3, 0.05)}
+    small = change_finding(found, parts, quantities)
+    assert small.severity == Severity.NOTE
+    assert list(small.evidence["steps"]) == ["a", "b"]
+    R = np.linalg.cholesky(np.linalg.inv(0.01 * np.eye(2))).T
+    told = Told(("a", "b"), np.zeros(2), R, np.array([1.0, 2.0]), np.empty((0, 2)), np.empty(0), np.ones(2))
+    history = History(np.array([10.0, 40.0]), np.zeros((2, 2)), np.full((2, 2), 0.1))
+    budget = {"a": {"vision": 1.0}, "b": {"vision": 1.0}}
+    narrow = Estimate(
+        "batch", ("a", "b"), np.zeros(2), 0.01 * np.eye(2), True, "", history=history, budget=budget, told=told
+    )
+    wide = with_change(narrow, small)
+    step = np.array([0.4, 0.3])
+    expected = 0.01 * np.eye(2) + np.outer(step, step)
+    np.testing.assert_allclose(wide.covariance, expected)
+    assert wide.history is not None
+    assert wide.told is not None
+    assert wide.budget is not None
+    np.testing.assert_allclose(wide.history.sigmas, [[0.1, 0.1], np.sqrt(np.diag(expected))])
+    np.testing.assert_allclose(np.linalg.inv(wide.told.R.T @ wide.told.R), expected)
+    np.testing.assert_allclose(np.linalg.solve(wide.told.R, wide.told.d), np.linalg.solve(R, told.d))
+    assert wide.budget["a"] == pytest.approx({CHANGE: 0.16 / 0.17, "vision": 0.01 / 0.17})
+    large = change_finding(found, {"a": SplitHalf(0.0, 0.05, 0.6, 0.05)}, quantities)
+    assert large.severity == Severity.INCONSISTENT
+    unknown = change_finding(found, {}, quantities)
+    assert unknown.severity == Severity.INCONSISTENT
+    assert unknown.evidence["steps"] == {"a": (0.2, 0.02)}
 
 
 def test_a_mount_that_stays_is_calibrated() -> None:
@@ -181,12 +202,11 @@ def test_a_slip_is_seen_while_it_is_recorded() -> None:
 
 
 def test_the_person_is_told_what_moved_and_when() -> None:
-    change = Stability(7.0, 0.0, 31.0, {"helmet_mount_x": -8.0})
+    change = Stability(7.0, 0.0, 31.0, {"helmet_mount_x": -8.0}, {"helmet_mount_x": (8e-3, 1e-3)})
     quantities = (Quantity("helmet_mount_x", "rad", 0.1, 0.1, 1e-3),)
-    assessment = assess(quantities, np.eye(1) * 1e-8, None, lambda _: Motion(""))
-    view = View(40.0, 43_200 * 10**9, quantities, np.zeros(1), assessment, (), change)
+    view = View(40.0, 43_200 * 10**9, quantities, np.zeros(1), np.eye(1) * 1e-8, (), change)
     assert not view.done
-    assert view.headline.startswith("Something changed at about 31 s: helmet_mount_x")
+    assert view.headline.startswith("Change at 31 s: helmet_mount_x by 0.458 ± 0.057 deg.")
     assert "12:00:31 UTC" in view.headline
     assert replace(view, change=None).done
 
@@ -221,14 +241,3 @@ def test_slips_are_found_at_all_seeds_and_false_alarms_are_rare() -> None:
         assert found is not None
         alarms += found.changed
     assert alarms <= 1
-
-
-def test_small_change_widens_the_one_covariance_that_all_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = session(0, 0.5)
-    require = next(q.require for q in found.problem().quantities if q.name == "helmet_mount_x")
-    small = Moved({"helmet_mount_x": Halves(0.0, 1e-5, 0.3 * require, 1e-5)})
-    monkeypatch.setattr(type(found), "_moved", lambda *_: small)
-    calibration = found.calibrate()
-    estimate = calibration.estimate
-    place = estimate.names.index("helmet_mount_x")
-    assert 0.3 * require < estimate.sigmas[place] < 0.5 * require

@@ -15,7 +15,6 @@ import alidade
 from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
-from alidade.pipelines.diagnostics.observability import assess
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.assumptions import Assumption, pull, quantities
 from alidade.pipelines.estimation.problem import Estimate, Quantity
@@ -27,6 +26,7 @@ from alidade.pipelines.recording.reading import open_recording
 from alidade.pipelines.simulation.scenario import load_scenario
 from alidade.pipelines.solvers.batch import solve_batch
 from tests.support.command import Command
+from tests.support.judged import judge
 
 SCALE = Assumption(("gyro_scale_x", "gyro_scale_y"), "", "gyro", "scale", 1e-2)
 
@@ -60,10 +60,10 @@ def test_priors_beat_sheets_beat_the_usual_grade(config: str, prior: float, usua
 def test_an_accuracy_wanted_brings_a_verdict() -> None:
     config = load_config(b"require: {gyro_scale_x: 1.0e-3}")
     x, y = quantities(SCALE, config)
-    assessment = assess((x, y), np.diag([4e-6, 1e-4]), None, None)
+    assessment = judge((x, y), np.diag([4e-6, 1e-4]), None, None)
     assert assessment.verdicts == {"gyro_scale_x": "weak"}
-    assert [tuple(d.weights) for d in assessment.directions] == [("gyro_scale_x",)]
-    assert assess((replace(x, require=math.inf), y), np.diag([4e-6, 1e-4]), None, None).status == "calibrated"
+    assert [tuple(d.evidence["weights"]) for d in assessment.directions] == [("gyro_scale_x",)]
+    assert judge((replace(x, require=math.inf), y), np.diag([4e-6, 1e-4]), None, None).status == "calibrated"
 
 
 def test_pull() -> None:

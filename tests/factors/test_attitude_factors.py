@@ -84,7 +84,7 @@ def test_vision_jacobians_near_half_turn_errors() -> None:
 def _errors(size: float, errors: int) -> list[Array]:
     """Blocks of the pictures' errors and of both gyros'."""
     rng = np.random.default_rng(8)
-    picture = np.stack([np.full(N, 0.012), np.full(N, 3e-4), np.full(N, size)], axis=1)
+    picture = np.tile([0.012, 3e-4, size, 1e-3], (N, 1))
     gyro = size * rng.normal(size=(N, 18)) * ([1.0] * 6 + [0.03] * 12)
     return [picture, gyro[:, :errors], size * rng.normal(size=(N, 9))]
 
@@ -129,20 +129,21 @@ def test_vision_jacobians_with_all_variables(errors: int, moving: bool) -> None:
 
 def test_vision_of_known_errors_is_zero() -> None:
     """Times, angles and rates off by what the variables say."""
-    scale, skew, offset = 0.01, 2e-4, 0.01
+    scale, skew, offset, moment = 0.01, 2e-4, 0.01, 1e-4
     at = TIMES + offset - skew * (TIMES - TIMES[0])
     S_numbers = np.array([0.01, -0.005, 0.008, 0.002, -0.003, 0.004])
     S = symmetric(S_numbers)
     base_bias = np.array([1e-3, -2e-3, 5e-4])
     t = HELMET.t
-    w, base = (0.8 * np.sin(np.array(f) * t[:, None] + f[0]) for f in ([1.1, 0.7, 1.9], [0.3, 0.5, 0.4]))
+    w, base = (0.3 * np.sin(np.array(f) * t[:, None] + f[0]) for f in ([1.1, 0.7, 1.9], [0.3, 0.5, 0.4]))
     bRv0, cRb, vRh = so3.exp(np.random.default_rng(3).normal(size=(3, 3)))
     inertial, platform = (GyroPath(t, rate).attitude for rate in (w, base))
 
     def bRv(times: Array) -> Array:
         return so3.compose(so3.inverse(platform(times)), bRv0, inertial(times))
 
-    cRh = so3.compose(cRb, bRv(at), vRh)
+    acceleration = np.array([1.1, 0.7, 1.9]) * 0.3 * np.cos(np.outer(at, [1.1, 0.7, 1.9]) + 1.1)
+    cRh = so3.compose(cRb, bRv(at), so3.exp(moment * acceleration), np.tile(vRh, (N, 1)))
     turned = so3.log(so3.multiply(so3.inverse(cRh[:1]), cRh)) * (1.0 + scale)
     measured = so3.multiply(cRh[:1], so3.exp(turned))
     model = VisionAttitudeFactor(
@@ -157,12 +158,12 @@ def test_vision_of_known_errors_is_zero() -> None:
         elapsed=TIMES - TIMES[0],
         first=np.tile(cRh[:1], (N, 1)),
     )
-    errors = [np.array([offset, skew, scale]), S_numbers, np.concatenate([base_bias, -S_numbers])]
+    errors = [np.array([offset, skew, scale, moment]), S_numbers, np.concatenate([base_bias, -S_numbers])]
     blocks = [bRv(TIMES - 0.02), np.zeros((N, 3)), *(np.tile(each, (N, 1)) for each in (cRb, vRh, *errors))]
     np.testing.assert_allclose(model(*blocks)[0], 0.0, atol=3e-6)
     for k in (4, 5, 6):
         without = [0.0 * b if i == k else b for i, b in enumerate(blocks)]
-        assert np.abs(model(*without)[0]).max() > 1e-4
+        assert np.abs(model(*without)[0]).max() > 5e-5
 
 
 def test_vision_rows_are_independent() -> None:
@@ -237,3 +238,16 @@ def test_relative_equals_native_path() -> None:
     expected = graph.linearize(values).hessian(ordering)[0]
     got = stacked.linearize(ours).hessian(ordering)[0]
     np.testing.assert_allclose(got, expected, atol=1e-7 * np.abs(expected).max())
+
+
+def test_scale_of_angles_is_smooth_through_half_a_turn() -> None:
+    """Beyond 150 deg it fades out, so that attitudes on either side of half a turn are seen alike."""
+    angles = np.deg2rad([100.0, 149.0, 179.9, 180.1])
+    attitudes = so3.exp(np.outer(angles, [0.0, 0.6, 0.8]))
+    model = VisionAttitudeFactor(
+        np.zeros(4), attitudes, np.tile(np.eye(3), (4, 1, 1)), HELMET, None, elapsed=np.zeros(4), first=so3.identity(4)
+    )
+    one = so3.identity(4)
+    at_rest = np.tile(HELMET.bias_hat, (4, 1))
+    seen = model(attitudes, at_rest, one, one, np.tile([0.0, 0.0, 0.01, 0.0], (4, 1)))[0]
+    np.testing.assert_allclose(-seen @ [0.0, 0.6, 0.8], [0.01 * angles[0], 0.01 * angles[1], 0.0, 0.0], atol=1e-6)

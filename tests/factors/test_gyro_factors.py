@@ -132,7 +132,7 @@ def _factor(rows: NDArray[np.intp], errors: int, platform: bool = False) -> Gyro
     (turns, path), (base_turns, base) = _increments(errors, False), _increments(errors, True)
     stop, sigma = WINDOWS[1][rows], np.linspace(0.5, 2.0, N)[rows]
     if platform:
-        return GyroIncrementFactor(stop, turns[rows], path, sigma, base_turns[rows], base)
+        return GyroIncrementFactor(stop, turns[rows], path, sigma, base_turns[rows], base, share=0.4)
     return GyroIncrementFactor(stop, turns[rows], path, sigma)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from alidade.pipelines.applications.session import calibrate
+from alidade.pipelines.estimation.finding import Severity
 from alidade.pipelines.reports.result import Calibration
 
 # Found by an independent fit with the scales free, repeatable to 0.05 deg on another recording of the device.
@@ -27,7 +28,9 @@ def recording(shared_data: Path) -> Path:
 def test_the_scale_is_named_first(recording: Path, tmp_path: Path) -> None:
     found = calibrated(recording, "{}", tmp_path)
     assert found.status == "inconsistent"
-    assert found.assessment.headline.startswith("Gyro_scale_")
+    first = next(finding for finding in found.findings if finding.severity == Severity.INCONSISTENT)
+    assert first.kind == "prior_conflict"
+    assert first.evidence["parameter"].startswith("gyro_scale_")
 
 
 def test_with_its_true_data_sheet_the_mount_is_right(recording: Path, tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from alidade.pipelines.config import load_config
-from alidade.pipelines.diagnostics.observability import assess
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array, Estimate, Problem
 from alidade.pipelines.methods import method
@@ -29,6 +28,7 @@ from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from alidade.pipelines.solvers.batch import solve_batch
 from tests.support.builders import make_calibration
+from tests.support.judged import judge
 
 SWAY = EulerMotion(
     yaw=[Swing(amplitude_deg=20, frequency_hz=0.15)],
@@ -147,7 +147,7 @@ def test_a_faulty_gyro_moves_no_parameter(name: str, fault: Fault, tmp_path: Pat
     assert any(FAULTS[fault] in reason for reason in read.dropped) or not FAULTS[fault]
     problem = case.problem(read, config)
     estimate = solve_batch(problem)
-    judged = assess(problem.quantities, estimate.covariance, estimate.chi_square, problem.advice)
+    judged = judge(problem.quantities, estimate.covariance, estimate.chi_square, problem.advice)
     assert judged.status == "calibrated"
     error = np.abs(estimate.values - [case.truth.get(name, 0.0) for name in estimate.names]) / estimate.sigmas
     assert error.max() < 4.0

@@ -20,9 +20,9 @@ def test_a_gyro_turned_by_90_degrees_is_found_and_told(tmp_path: Path) -> None:
     turned = np.stack([data.gyro[:, 1], -data.gyro[:, 0], data.gyro[:, 2]], axis=1)
     write_los(tmp_path / "s.mcap", replace(data, gyro=turned), None, los_config(scenario))
     (found,) = calibrate(tmp_path / "s.mcap", ["batch"])
-    told = [note for note in found.notes if "of its prior away" in note]
-    assert len(told) == 1
-    assert "delta_z by 15.6" in told[0]
+    far = [f.evidence for f in found.findings if f.kind == "prior_conflict" and f.evidence["parameter"] == "delta_z"]
+    assert [round(each["z"], 1) for each in far] in ([15.6], [-15.6])
+    assert any(note.startswith("delta_z is far from its prior: ") for note in found.notes)
 
 
 def test_what_is_where_it_was_said_to_be_is_no_note() -> None:

@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import alidade
 from alidade.factors import so3
-from alidade.pipelines.diagnostics.observability import assess
+from alidade.pipelines.diagnostics.observability import weak_directions
 from alidade.pipelines.display.units import human_unit, to_digits_of
 from alidade.pipelines.estimation.advice import Motion
-from alidade.pipelines.estimation.problem import Attitudes, Quantity, Residuals
+from alidade.pipelines.estimation.problem import Attitudes, Parameter, Quantity, Residuals
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.methods.head.figures import head_plots
 from alidade.pipelines.methods.head.recording import HeadData
@@ -37,7 +38,7 @@ def test_the_report_loads_nothing_and_is_smaller_than_a_megabyte() -> None:
 
 def test_the_verdict_comes_first_and_numbers_are_for_people() -> None:
     page = Page(report_html(make_calibration(truth={"time_offset": 0.0125})))
-    assert page.text.index("as accurate as required") < page.text.index("helmet_mount_x")
+    assert page.text.index("meet the required accuracy") < page.text.index("helmet_mount_x")
     assert "12.00 0.20 ms 50.0 5.00 observable -0.50 (-2.5 σ)" in page.text
     assert "1.719 0.057 deg" in page.text
     assert "Error is the estimate minus the truth" in page.text
@@ -49,8 +50,8 @@ def test_the_verdict_comes_first_and_numbers_are_for_people() -> None:
 def test_weak_directions_come_with_advice_and_no_formula_to_apply() -> None:
     covariance = np.diag([1e-6, 1e-6, 0.35**2, 1e-8, 1e-8, 0.0])
     calibration = make_calibration(covariance=covariance)
-    judged = assess(calibration.problem.quantities, covariance, None, lambda _: Motion("nod and shake the head"))
-    page = Page(report_html(replace(calibration, assessment=judged)))
+    found = weak_directions(calibration.problem.quantities, covariance, lambda _: Motion("nod and shake the head"))
+    page = Page(report_html(replace(calibration, findings=found)))
     assert page.text.count("od and shake the head") == 3
     assert "How to apply it" not in page.text
 
@@ -159,8 +160,19 @@ def head_case(camera_known: bool) -> tuple[HeadData, Calibration]:
     calibration = make_calibration(values=values, attitudes=Attitudes(t, found))
     data = HeadData(0, t, np.zeros((250, 3)), None, None, t - 0.012, vision, None, t, bRv)
     if not camera_known:
-        unknown = replace(calibration.assessment, verdicts={f"camera_mount_{axis}": "unobservable" for axis in "xyz"})
-        return data, replace(calibration, assessment=unknown)
+        mount = tuple(Quantity(f"camera_mount_{axis}", "rad", 0.35, 0.35, 1e-2) for axis in "xyz")
+        problem = replace(calibration.problem, parameters=(*calibration.problem.parameters, Parameter(9, mount)))
+        n = len(calibration.estimate.names)
+        covariance = 0.35**2 * np.eye(n + 3)
+        covariance[:n, :n] = calibration.covariance
+        estimate = replace(
+            calibration.estimate,
+            names=(*calibration.estimate.names, *(q.name for q in mount)),
+            values=np.append(values, np.zeros(3)),
+            covariance=covariance,
+            history=None,
+        )
+        return data, replace(calibration, problem=problem, estimate=estimate)
     names = (*calibration.estimate.names[:4], "free", "pinned")
     return data, replace(calibration, estimate=replace(calibration.estimate, names=names))
 
@@ -177,7 +189,7 @@ def test_attitude_error_leaves_out_a_camera_mount_that_is_not_known() -> None:
 
 def test_head_figures_are_in_the_report() -> None:
     data, calibration = head_case(camera_known=False)
-    calibration = replace(calibration, assessment=make_calibration().assessment, plots=partial(head_plots, data))
+    calibration = replace(calibration, plots=partial(head_plots, data))
     text = Page(report_html(calibration)).text
     for title in ("Attitude against the truth", "Vision against the fused attitude", "Innovations of vision"):
         assert title in text
@@ -190,6 +202,21 @@ def test_parameters_of_a_partial_estimate_keep_their_units() -> None:
     )
     assert [q.unit for q in quantities_of(calibration.problem, calibration.estimate)] == ["s"]
     assert "Correlation" not in Page(report_html(calibration)).text
+
+
+def test_the_page_solves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside an incremental estimate stands the published one, which the session has solved before."""
+    opened = alidade.open(alidade.simulate("los", {"duration_s": 6.0, "gyro_rate_hz": 50.0}, seed=1))
+    calibration = opened.calibrate("incremental")
+    assert calibration.beside is not None
+    assert opened.calibrate("incremental", report=False).beside is None
+
+    def solves(*_: object) -> None:
+        raise AssertionError("a page solves a problem")
+
+    monkeypatch.setattr(type(opened.method), "published", solves)
+    monkeypatch.setattr(type(opened.method), "graph", solves)
+    assert "dotted is the published solver" in Page(report_html(calibration)).text
 
 
 @needs_browser

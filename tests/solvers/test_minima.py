@@ -47,8 +47,11 @@ def test_a_solution_nearly_as_likely_is_told(tmp_path: Path) -> None:
     second = found["second_best"]
     assert 0.0 < second["chi_square"] < CLOSE
     assert abs(second["parameters"]["mag_k33"] - calibration.parameters["mag_k33"].value) > 0.3
-    sentence = f"its chi-square {second['chi_square']:.1f} higher"
-    assert sentence in found["headline"]
+    (ambiguous,) = [each for each in found["findings"] if each["kind"] == "ambiguous_solution"]
+    assert ambiguous["severity"] == "note"
+    assert ambiguous["values"]["mag_k33"][0] == second["parameters"]["mag_k33"]
+    sentence = f"chi-square with priors is higher by {second['chi_square']:.1f}"
+    assert any(sentence in note for note in found["notes"])
     assert sentence in (tmp_path / "report.html").read_text()
 
 

@@ -11,10 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.pipelines.applications import session
 from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.config import load_config
-from alidade.pipelines.diagnostics.observability import assess
 from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods.cube import graph as cube
 from alidade.pipelines.methods.cube.scenario import CubeScenario, cube_config
@@ -29,6 +27,7 @@ from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import solve_incremental
 from alidade.pipelines.solvers.system import System
+from tests.support.judged import judge
 
 SWAY = EulerMotion(
     yaw=[Swing(amplitude_deg=20, frequency_hz=0.15)],
@@ -81,7 +80,7 @@ def test_mounts_30_degrees_off_are_found(make: Callable[[], Made], solve: Callab
     estimate = solve(problem)
     assert estimate.converged
     assert _worst(estimate, truth) < 4.0
-    judged = assess(problem.quantities, estimate.covariance, estimate.chi_square, problem.advice)
+    judged = judge(problem.quantities, estimate.covariance, estimate.chi_square, problem.advice)
     # The first innovations of the indexer are those of a start 30 deg off, and are called too large.
     assert judged.status == "calibrated" or (make is _far_indexer and solve is solve_incremental)
 
@@ -143,7 +142,7 @@ def test_an_estimate_that_is_no_solution_is_never_calibrated(monkeypatch: pytest
     write_los(tmp_path / "s.mcap", data, truth, los_config(LOS))
     # What gtsam's own optimizers return silently as if it was a solution.
     monkeypatch.setattr(System, "error", lambda *_: np.nan)
-    monkeypatch.setattr(session, "find_causes", lambda *_: ())
     (found,) = calibrate(tmp_path / "s.mcap", ["batch"])
-    assert found.assessment.status == "inconsistent"
-    assert found.assessment.headline.startswith("The solver did not converge (the residuals at the start are not")
+    assert found.status == "inconsistent"
+    assert [finding.kind for finding in found.findings] == ["not_converged"]
+    assert found.headline.startswith("No solution: the residuals at the start are not")

@@ -12,7 +12,6 @@ import pytest
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.model import Model, Residuals
 from alidade.pipelines.config import load_config
-from alidade.pipelines.diagnostics.observability import assess
 from alidade.pipelines.estimation.problem import Array, Estimate, Factor, Parameter, Problem, Quantity, Step
 from alidade.pipelines.methods.los import graph as los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
@@ -27,6 +26,7 @@ from alidade.pipelines.solvers.weighing import optimize
 from alidade.pipelines.solvers.window import Keyframes
 from tests.support import chain
 from tests.support.chain import INTERVAL, PARAMETER, PRIOR, Walk
+from tests.support.judged import judge
 from tests.support.short_problems import los_problem
 
 # Slopes of a gyro's bias, rad/s/K.
@@ -97,11 +97,11 @@ def test_unknown_direction_is_named_not_raised(solve: Callable[[Problem], Estima
     estimate = solve(problem)
     assert np.isfinite(estimate.values).all()
     assert estimate.values.sum() == pytest.approx(truth.sum(), abs=0.5)
-    assessment = assess(problem.quantities, estimate.covariance, estimate.chi_square, None)
+    assessment = judge(problem.quantities, estimate.covariance, estimate.chi_square, None)
     assert assessment.status == "unobservable"
     (direction,) = assessment.directions
-    first, second = direction.weights.values()
-    assert set(direction.weights) == {"slope_0", "slope_1"}
+    first, second = direction.evidence["weights"].values()
+    assert set(direction.evidence["weights"]) == {"slope_0", "slope_1"}
     assert (first, second) == pytest.approx((2**-0.5, -(2**-0.5)), abs=1e-6)
     # The sum is known as well as a single slope with that row would be.
     A, _, _ = Walk(walk.h[:, :1], walk.z, prior=None).whitened()

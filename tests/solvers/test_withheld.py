@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from alidade.pipelines.diagnostics.observability import assess
 from alidade.pipelines.estimation.problem import Array, Problem
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, Run
@@ -17,6 +16,7 @@ from alidade.pipelines.solvers.innovations import Innovations
 from alidade.pipelines.solvers.rows import Rows
 from alidade.pipelines.solvers.withheld import covariance_without, values_without, with_prior
 from benchmarks.young import CASES, made, nees
+from tests.support.judged import judge
 
 FEW, SHARE = 20, 0.25
 
@@ -40,7 +40,7 @@ def assert_withheld(run: Run, names: set[str]) -> None:
     """These and no others: value, sigma, correlation and verdict."""
     quantities, estimate = run.problem.quantities, run.estimate()
     assert {q.name for q, each in zip(quantities, run.withheld, strict=True) if each} == names
-    verdicts = assess(quantities, estimate.covariance, estimate.chi_square, None).verdicts
+    verdicts = judge(quantities, estimate.covariance, estimate.chi_square, None).verdicts
     history = estimate.history
     assert history is not None
     for i, q in enumerate(quantities):

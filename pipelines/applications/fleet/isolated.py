@@ -19,11 +19,10 @@ def run_isolated(summarise: Callable[[Calibration], Result], calibrate: Callable
 
     try:
         calibration = calibrate()
-        assessment = calibration.assessment
         return {
-            "status": assessment.status,
-            "exit_code": exit_codes.OF_STATUS[assessment.status],
-            "reason": "" if assessment.status == "calibrated" else assessment.headline,
+            "status": calibration.status,
+            "exit_code": exit_codes.OF_STATUS[calibration.status],
+            "reason": "" if calibration.status == "calibrated" else calibration.headline,
             "seconds": sum(calibration.timing.values()),
             **summarise(calibration),
         }

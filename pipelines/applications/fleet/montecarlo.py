@@ -251,7 +251,7 @@ def _numbers(calibration: Calibration) -> Result:
     if judged:
         places = [calibration.estimate.names.index(p.name) for p in judged]
         sigmas = np.array([p.sigma for p in judged])
-        correlation = calibration.assessment.covariance[np.ix_(places, places)] / np.outer(sigmas, sigmas)
+        correlation = calibration.covariance[np.ix_(places, places)] / np.outer(sigmas, sigmas)
         normalised = np.array([errors[p.name].error for p in judged]) / sigmas
         numbers |= {"nees": float(normalised @ np.linalg.solve(correlation, normalised)), "dof": len(judged)}
     if calibration.estimate.chi_square is not None:

@@ -151,7 +151,7 @@ class Follower:
         started = time.thread_time()
         try:
             problem, steps = self._end_alone() or self._whole()
-        except InputError as error:
+        except (InputError, OSError) as error:  # files may be gone, or too many open, for a while
             self._wait(str(error))
             return time.thread_time() - started
         cost = time.thread_time() - started
@@ -336,7 +336,8 @@ class Follower:
             growing = replace(problem, steps_after=None)
         self._take(growing, steps)
         estimate = self._run.finish(time.perf_counter() - started)
-        (calibration,) = session.judged([(estimate, problem)], {"read": read}, self.settings.check)
+        with session.usual_time(online=True):
+            (calibration,) = session.judged([(estimate, problem)], {"read": read}, self.settings.check)
         return calibration
 
 

@@ -9,12 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from alidade.pipelines.diagnostics import noise_levels
-from alidade.pipelines.diagnostics.change_test import Stability, stability
+from alidade.pipelines.diagnostics.change_test import Stability, change_finding, stability
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
-from alidade.pipelines.diagnostics.observability import Assessment, assess
+from alidade.pipelines.diagnostics.diagnose import misfits
+from alidade.pipelines.diagnostics.observability import (
+    Advise,
+    Verdict,
+    finite_covariance,
+    verdicts,
+    weak_directions,
+)
 from alidade.pipelines.estimation.advice import Motion
+from alidade.pipelines.estimation.finding import Finding, by_severity, status
 from alidade.pipelines.estimation.problem import Array, Quantity
+from alidade.pipelines.reports import sentences
 from alidade.pipelines.solvers.incremental import Run
 
 # Parameters a sentence names.
@@ -33,40 +41,54 @@ class View:
         epoch_ns: the session's start, Unix ns.
         quantities: what is calibrated.
         values: (n,) of them, as estimated by now; None while there is too little.
-        assessment: of that estimate.
+        covariance: (n, n) of them; None while there is too little.
         checklist: what there is of what the method needs.
         change: in what is calibrated, since the recording began; None: none was found.
+        findings: on the estimate, the most severe first.
+        advise: weights of a direction -> motion that would determine it.
     """
 
     time: float
     epoch_ns: int
     quantities: tuple[Quantity, ...]
     values: Array | None
-    assessment: Assessment | None
+    covariance: Array | None
     checklist: tuple[ChecklistItem, ...]
     change: Stability | None = None
+    findings: tuple[Finding, ...] = ()
+    advise: Advise | None = None
 
     @property
     def sigmas(self) -> Array | None:
         """(n,) standard deviations."""
-        return None if self.assessment is None else self.assessment.sigmas
+        return None if self.covariance is None else np.sqrt(np.diag(self.covariance))
+
+    @property
+    def verdicts(self) -> dict[str, Verdict]:
+        """Parameter -> verdict, of those with a required accuracy; none while there is too little."""
+        return {} if self.covariance is None else verdicts(self.quantities, self.covariance)
+
+    @property
+    def status(self) -> str:
+        """Of the estimate; empty while there is too little."""
+        return "" if self.covariance is None else status(self.findings)
 
     @property
     def short(self) -> tuple[str, ...]:
         """The parameters whose accuracy wanted is not reached."""
-        if self.assessment is None:
+        if self.covariance is None:
             return tuple(q.name for q in self.quantities if q.prior_sigma != 0.0)
-        return tuple(name for name, verdict in self.assessment.verdicts.items() if verdict in ("weak", "unobservable"))
+        return tuple(name for name, verdict in self.verdicts.items() if verdict in ("weak", "unobservable"))
 
     @property
     def done(self) -> bool:
         """Whether every parameter is as accurate as required, by what was recorded and not by its prior alone."""
-        return self.assessment is not None and self.assessment.status == "calibrated" and self.change is None
+        return self.status == "calibrated" and self.change is None
 
     @property
     def missing(self) -> tuple[str, ...]:
         """What to do, the most urgent first, each sentence once."""
-        advice = () if self.assessment is None else tuple(d.advice for d in self.assessment.directions)
+        advice = tuple(finding.evidence["advice"] for finding in self._directions)
         wanted = tuple(f"{c.what}: {c.wanted}" for c in self.checklist if c.wanted)
         return tuple(dict.fromkeys((*advice, *wanted)))
 
@@ -78,17 +100,19 @@ class View:
         if self.done:
             return None
         wanted = (c.motion for c in self.checklist if c.wanted and c.motion is not None)
-        weak = () if self.assessment is None else (d.motion for d in self.assessment.directions)
+        weak = (self.advise(finding.evidence["weights"]) for finding in self._directions if self.advise is not None)
         return next(chain(wanted, weak), None)
+
+    @property
+    def _directions(self) -> tuple[Finding, ...]:
+        return tuple(finding for finding in self.findings if finding.kind == "direction")
 
     @property
     def alarms(self) -> tuple[str, ...]:
         """What is wrong with the recording rather than missing in it, sentences."""
         if self.change is not None:
             return (self.headline,)
-        if self.assessment is not None and self.assessment.status == "inconsistent":
-            return (self.assessment.headline,)
-        return ()
+        return (self._verdict,) if self.status == "inconsistent" else ()
 
     @property
     def shown(self) -> tuple[int, ...]:
@@ -109,7 +133,7 @@ class View:
         """The state in words, as clients are told it."""
         return {
             "time_s": self.time,
-            "status": "" if self.assessment is None else self.assessment.status,
+            "status": self.status,
             "headline": self.headline,
             "missing": list(self.missing),
             "collected": [{"what": c.what, "have": c.have, "wanted": c.wanted} for c in self.checklist],
@@ -118,18 +142,24 @@ class View:
     @property
     def headline(self) -> str:
         """The state in one sentence."""
-        if self.assessment is None:
+        if self.covariance is None:
             return "not enough yet for an estimate"
         if self.change is not None:
             when = datetime.fromtimestamp(self.epoch_ns * 1e-9 + self.change.time_s, UTC)
-            return f"{self.change.sentence} It was {when:%H:%M:%S} UTC: {_BEGIN_ANEW.words}"
+            found = change_finding(self.change, {}, self.quantities)
+            text = sentences.sentence(found, {q.name: q for q in self.quantities})
+            return f"{text} It was {when:%H:%M:%S} UTC: {_BEGIN_ANEW.words}"
         if self.done:
             return "the accuracy wanted is reached: recording may end"
         if not self.short:
-            return self.assessment.headline
+            return self._verdict
         more = len(self.short) - _MOST_NAMED
         names = ", ".join(self.short[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
         return f"not yet as accurate as required: {names}"
+
+    @property
+    def _verdict(self) -> str:
+        return sentences.headline(self.findings, {q.name: q for q in self.quantities}, self.verdicts)
 
 
 class Watch:
@@ -159,11 +189,10 @@ def _is_estimated(q: Quantity) -> bool:
 
 def view_of(epoch_ns: int, run: Run, checklist: tuple[ChecklistItem, ...], change: Stability | None = None) -> View:
     """The view of a run so far."""
-    quantities = run.problem.quantities
-    values, assessment = None, None
-    if run.started:
-        values = run.values()
-        decides = not noise_levels.asked(run.levels)
-        assessment = assess(quantities, run.covariance(), run.chi_square(), run.problem.advice, decides)
+    quantities, advise = run.problem.quantities, run.problem.advice
     time = run.time if np.isfinite(run.time) else 0.0
-    return View(time, epoch_ns, quantities, values, assessment, checklist, change)
+    if not run.started:
+        return View(time, epoch_ns, quantities, None, None, checklist, change)
+    covariance = finite_covariance(quantities, run.covariance())
+    findings = by_severity([*weak_directions(quantities, covariance, advise), *misfits(run.chi_square(), run.levels)])
+    return View(time, epoch_ns, quantities, run.values(), covariance, checklist, change, findings, advise)

@@ -80,10 +80,10 @@ def _parameters(view: View) -> Table:
         q = view.quantities[i]
         unit, factor = human_unit(q)
         required = rounded(factor * q.require)
-        if view.values is None or view.assessment is None or view.sigmas is None:
+        if view.values is None or view.sigmas is None:
             table.add_row(q.name, unit, "", "", required, "")
             continue
-        sigma, verdict = float(view.sigmas[i]), view.assessment.verdicts[q.name]
+        sigma, verdict = float(view.sigmas[i]), view.verdicts[q.name]
         value = to_digits_of(factor * float(view.values[i]), factor * sigma)
         table.add_row(q.name, unit, value, rounded(factor * sigma), required, f"[{COLOURS[verdict]}]{verdict}[/]")
     if len(view.shown) < len(view.estimated):

@@ -10,8 +10,8 @@ from alidade.pipelines.methods import Method, Scenario
 
 if TYPE_CHECKING:
     from alidade.pipelines.diagnostics.checklist import ChecklistItem
-    from alidade.pipelines.diagnostics.fault_models import Hypotheses
-    from alidade.pipelines.diagnostics.validation import Validation
+    from alidade.pipelines.diagnostics.cross_validation import Validation
+    from alidade.pipelines.diagnostics.fault_models import FaultModel
     from alidade.pipelines.estimation.problem import Array, Estimate, Findings, Problem
     from alidade.pipelines.methods.cube.data import CubeData
     from alidade.pipelines.methods.cube.scenario import CubeScenario
@@ -112,7 +112,7 @@ class Cube(Method):
 
         return candidates(scenario)
 
-    def hypotheses(self) -> Hypotheses:
+    def hypotheses(self) -> FaultModel:
         from alidade.pipelines.methods.cube.hypotheses import HYPOTHESES
 
         return HYPOTHESES

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from alidade.pipelines.diagnostics.fault_models import AXES, ExactInput, Hypotheses, Scaling
+from alidade.pipelines.diagnostics.fault_models import AXES, ExactInput, FaultModel, ScaleFactor
 from alidade.pipelines.methods.cube.data import CubeData
 from alidade.pipelines.methods.cube.parameters import FOCAL, is_stated
 from alidade.pipelines.methods.cube.topics import CubeConfig
@@ -53,10 +53,10 @@ def _as_found(data: CubeData, config: Config, changed: CubeData, other: Config) 
 
 
 # Opposite signs of accelerometer and magnetometer are part of what is calibrated.
-HYPOTHESES = Hypotheses(
+HYPOTHESES = FaultModel(
     streams={"imu_t": ("gyro", "accel"), "mag_t": ("mag",), "reference_t": ("reference_wxyz", "reference_cov")},
     signs={"gyro": ("gyro", AXES)},
-    scalings=(Scaling("the tags are {factor:.3g} times as large as the config says", _tag_sizes),),
+    scalings=(ScaleFactor("the tags are {factor:.3g} times as large as the config says", _tag_sizes),),
     exact=(
         ExactInput("latitude_deg", "deg", 0.1, _latitude),
         ExactInput("tag_size", "1", 2e-3, _tag_size),

@@ -18,14 +18,15 @@ from alidade.pipelines.recording.checks import (
     LEAST_ACCEL,
     LEAST_GYRO,
     LEAST_MAG,
-    believed,
+    SLOWEST_GYRO_S,
     check_overlap,
     clean,
     count,
-    density,
+    tracked,
     unit_quaternions,
 )
 from alidade.pipelines.recording.faults import drop_faults
+from alidade.pipelines.recording.placeholders import believed, density, measured_once
 from alidade.pipelines.recording.reading import Recording
 from alidade.pipelines.recording.topics import IMAGE, IMU, MAG, wanted
 from alidade.pipelines.settings import Config
@@ -50,7 +51,7 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
     name = config.topic(IMU)
     imu = recording.imu(name)
     count(dropped, f"{name}: stamped by log time (kept)", imu.stamped_by_log)
-    imu_t, keep = clean(name, imu.t_ns, epoch, np.hstack([imu.gyro, imu.accel]), dropped, least=3)
+    imu_t, keep = clean(name, imu.t_ns, epoch, np.hstack([imu.gyro, imu.accel]), dropped, 3, SLOWEST_GYRO_S)
     sound = np.intersect1d(
         drop_faults(name, imu_t, imu.gyro[keep], dropped, "rad/s"),
         drop_faults(name, imu_t, imu.accel[keep], dropped, "m/s^2"),
@@ -59,8 +60,8 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
     gyro, accel = imu.gyro[keep], imu.accel[keep]
     raw = config.section(CubeConfig).raw
     sensors = [Readings(name, imu_t, accel, raw.accel), Readings(name, imu_t, gyro, raw.gyro)]
-    gyro_density = density(name, imu_t, imu.gyro_cov[keep], LEAST_GYRO, dropped)
-    accel_density = density(name, imu_t, imu.accel_cov[keep], LEAST_ACCEL, dropped)
+    gyro_density = density(name, "gyro", imu_t, imu.gyro_cov[keep], LEAST_GYRO, dropped)
+    accel_density = density(name, "accel", imu_t, imu.accel_cov[keep], LEAST_ACCEL, dropped)
     spans = {name: imu_t}
 
     mag_t = mag = mag_density = None
@@ -69,8 +70,9 @@ def read_cube(recording: Recording, config: Config) -> CubeData:
         field_ = recording.magnetic(name)
         mag_t, keep = clean(name, field_.t_ns, epoch, field_.field, dropped)
         sound = drop_faults(name, mag_t, field_.field[keep], dropped, "T")
+        sound = sound[measured_once(name, field_.field[keep[sound]], dropped)]
         mag_t, keep = mag_t[sound], keep[sound]
-        mag, mag_density = field_.field[keep], density(name, mag_t, field_.field_cov[keep], LEAST_MAG, dropped)
+        mag, mag_density = field_.field[keep], density(name, "mag", mag_t, field_.field_cov[keep], LEAST_MAG, dropped)
         sensors.append(Readings(name, mag_t, mag, raw.mag))
         spans[name] = mag_t
     check_units(*sensors)
@@ -124,8 +126,9 @@ def _reference(
             f"topic {topic}: orientation_covariance starts with -1, so there is no attitude in it; the "
             "reference has to put out its attitude in East-North-Up"
         )
-    t, keep = clean(topic, imu.t_ns, epoch_ns, imu.wxyz, dropped, least=1)
-    wxyz, cov = unit_quaternions(topic, t, imu.wxyz[keep]), imu.wxyz_cov[keep]
-    cov = believed(topic, cov, _LEAST_VARIANCE, dropped)
+    given = tracked(topic, imu.wxyz, dropped)
+    t, keep = clean(topic, imu.t_ns, epoch_ns, given, dropped, least=1)
+    wxyz, cov = unit_quaternions(topic, t, given[keep]), imu.wxyz_cov[keep]
+    cov = believed(topic, "attitude", cov, _LEAST_VARIANCE, dropped)
     known = (np.linalg.eigvalsh(0.5 * (cov + cov.swapaxes(1, 2)))[:, 0] > 0.0).all()
     return t, wxyz, cov if known else None

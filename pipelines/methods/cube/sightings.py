@@ -68,7 +68,7 @@ def _detections(recording: Recording, config: Config, epoch_ns: int, dropped: di
     topic = config.topic(TAG_DETECTIONS)
     found = recording.detections(topic)
     count(dropped, f"{topic}: stamped by log time (kept)", found.stamped_by_log)
-    t, keep = clean(topic, found.t_ns, epoch_ns, np.zeros((len(found), 1)), dropped, least=1)
+    t, keep = clean(topic, found.t_ns, epoch_ns, np.arange(float(len(found)))[:, None], dropped, least=1)
     place = np.full(len(found), -1)
     place[keep] = np.arange(len(keep))
     good = (place[found.frame] >= 0) & np.isfinite(found.corners).all(axis=(1, 2))
@@ -107,7 +107,9 @@ def _pictures(recording: Recording, config: Config, data: CubeData, dropped: dic
             f"topic {topic}: no tag is seen sharply in any of the {len(stamps)} pictures of the static poses; are they "
             "blurred, or the tags of another family?"
         )
-    t, keep = clean(topic, np.array(stamps, dtype=np.int64), epoch_ns, np.zeros((len(stamps), 1)), dropped, least=1)
+    t, keep = clean(
+        topic, np.array(stamps, dtype=np.int64), epoch_ns, np.arange(float(len(stamps)))[:, None], dropped, least=1
+    )
     place = np.full(len(stamps), -1)
     place[keep] = np.arange(len(keep))
     frames = place[np.array(frame, dtype=np.int64)]

@@ -30,7 +30,7 @@ def cube_tables(calibration: Calibration) -> list[Table]:
 
 def rows_of(calibration: Calibration, name: str) -> Sequence[Mapping[str, Any]]:
     """Rows of a table of findings; none if there is no such table."""
-    return calibration.findings.get(name, ())
+    return calibration.tables.get(name, ())
 
 
 def _taken_apart(calibration: Calibration) -> Table:

@@ -10,13 +10,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.cube.data import Array, nominal
 from alidade.pipelines.methods.cube.topics import RawConversion
 from alidade.pipelines.recording.checks import too_fast
-
-# Norms at rest that no accelerometer in m/s^2 and no magnetometer in T shows, and what they are likely to be.
-_PLAUSIBLE = {"accel": (3.0, 30.0), "mag": (1e-6, 1e-3)}
-_UNITS = {"accel": "m/s^2", "gyro": "rad/s", "mag": "T"}
-_ACCEL_UNITS = {"g": (0.5, 2.0), "mg": (500.0, 2000.0), "raw counts": (2000.0, np.inf)}
-_MAG_UNITS = {"gauss": (0.05, 5.0), "uT": (5.0, 1000.0), "mG or raw counts": (1000.0, 2e4), "nT": (2e4, np.inf)}
-_LIKELY = {"accel": _ACCEL_UNITS, "mag": _MAG_UNITS}
+from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, SI, implausible
 
 # SI of what sensors count in: units, and the full scales of 16 bits.
 _G, _DEG = 9.80665, np.pi / 180.0
@@ -72,16 +66,13 @@ def _wrong(name: str, readings: Readings) -> str:
     if name == "gyro":
         said = too_fast(readings.topic, readings.t, values)
         return said and f"{said}, or its conversion under cube.raw"
-    low, high = _PLAUSIBLE[name]
-    norm = float(np.median(np.linalg.norm(values, axis=1)))
-    if low <= norm <= high:
-        return ""
-    likely = next((unit for unit, (a, b) in _LIKELY[name].items() if a <= norm < b), None)
-    what, unit = {"accel": "acceleration", "mag": "field"}[name], _UNITS[name]
-    hint = f"; is it in {likely}?" if likely else ";"
-    return (
-        f"topic {readings.topic}: {what} has a norm of {norm:.4g} (median), implausible in {unit}{hint} It has to be "
-        f"in {unit}, or its conversion in the config under cube.raw"
+    said = implausible(name, values)
+    if GRAVITY_REMOVED in said:
+        raise InputError(f"topic {readings.topic}: {said}")
+    unit = SI[name]
+    return said and (
+        f"topic {readings.topic}: {said}{'' if said.endswith('?') else ';'} It has to be in {unit}, or its conversion "
+        "in the config under cube.raw"
     )
 
 
@@ -95,7 +86,7 @@ def _section(found: dict[str, tuple[float, float]]) -> str:
         shown = f"{_USUAL[name][usual] if usual else scale:.6g}" if usual else f"{scale:.3g}"
         number = shown if "." in shown else shown.replace("e", ".0e")
         entries.append(f"{name}: {{scale: {number}{f', offset: {offset:.1f}' if offset else ''}}}")
-        words.append(f"{name} {usual or f'{1.0 / scale:.4g} counts a {_UNITS[name]}'}")
+        words.append(f"{name} {usual or f'{1.0 / scale:.4g} counts a {SI[name]}'}")
     return (
         f". By these data it is about cube: {{raw: {{{', '.join(entries)}}}}} ({'; '.join(words)}): check it against "
         "the data sheet; what it is off by is calibrated"

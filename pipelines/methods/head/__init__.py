@@ -10,8 +10,8 @@ from alidade.pipelines.methods import Method, Scenario
 
 if TYPE_CHECKING:
     from alidade.pipelines.diagnostics.checklist import ChecklistItem
-    from alidade.pipelines.diagnostics.fault_models import Hypotheses
-    from alidade.pipelines.diagnostics.validation import Validation
+    from alidade.pipelines.diagnostics.cross_validation import Validation
+    from alidade.pipelines.diagnostics.fault_models import FaultModel
     from alidade.pipelines.estimation.problem import Estimate, Findings, Problem
     from alidade.pipelines.methods.formula import Formula
     from alidade.pipelines.methods.head.recording import HeadData
@@ -32,7 +32,7 @@ class Head(Method):
     sheets: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "gyro": ("scale", "skew", "g_sensitivity", "temperature"),
         "platform_gyro": ("bias", "scale", "skew"),
-        "camera": ("scale",),
+        "camera": ("scale", "filter"),
         "clock": ("skew",),
     }
     of_recording = ("gyro_bias_*", "time_offset", "clock_skew", "platform_bias_*")
@@ -41,6 +41,7 @@ class Head(Method):
         r"helmet_mount_([xyz])": "Markers turned against the helmet's IMU: {0} of the rotation vector of vRh.",
         r"camera_mount_([xyz])": "Platform turned against the camera: {0} of the rotation vector of cRb.",
         r"vision_scale": "Part by which the angles that the camera tells are too large.",
+        r"vision_filter": "Half the second moment of vision's impulse response less the gyro's: t^2 of a low-pass t.",
     }
     rotations: ClassVar[Mapping[str, str]] = {"helmet_mount": "vRh", "camera_mount": "cRb"}
 
@@ -107,7 +108,7 @@ class Head(Method):
 
         return candidates(scenario)
 
-    def hypotheses(self) -> Hypotheses:
+    def hypotheses(self) -> FaultModel:
         from alidade.pipelines.methods.head.hypotheses import HYPOTHESES
 
         return HYPOTHESES

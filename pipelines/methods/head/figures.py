@@ -89,7 +89,7 @@ def _against_truth(data: HeadData, calibration: Calibration, attitudes: Attitude
 
 
 def _camera_mount_unknown(calibration: Calibration) -> bool:
-    verdicts = calibration.assessment.verdicts
+    verdicts = calibration.verdicts
     return any(verdicts.get(f"camera_mount_{axis}") in ("weak", "unobservable") for axis in _AXES)
 
 

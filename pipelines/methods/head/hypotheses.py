@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from alidade.factors import so3
-from alidade.pipelines.diagnostics.fault_models import AXES, Fault, Hypotheses
+from alidade.pipelines.diagnostics.fault_models import AXES, DataFault, FaultModel
 from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.settings import Config
 
@@ -50,7 +50,7 @@ def _moving(data: HeadData, config: Config) -> tuple[HeadData, Config] | None:
     return data, config.model_copy(update={"noise": noise})
 
 
-HYPOTHESES = Hypotheses(
+HYPOTHESES = FaultModel(
     streams={
         "head_t": ("head_gyro", "head_force"),
         "platform_t": ("platform_gyro",),
@@ -60,8 +60,10 @@ HYPOTHESES = Hypotheses(
     signs={"head_gyro": ("helmet gyro", AXES), "platform_gyro": ("platform gyro", AXES)},
     offset=True,
     faults=(
-        Fault("the attitudes of vision are inverted: they map the camera's frame to the markers', not back", _inverted),
-        Fault("the topics of helmet and platform IMU are swapped", _swapped),
-        Fault("the platform moves, and no topic tells how: record /platform/imu", _moving, last=True),
+        DataFault(
+            "the attitudes of vision are inverted: they map the camera's frame to the markers', not back", _inverted
+        ),
+        DataFault("the topics of helmet and platform IMU are swapped", _swapped),
+        DataFault("the platform moves, and no topic tells how: record /platform/imu", _moving, fallback=True),
     ),
 )

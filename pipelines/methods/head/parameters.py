@@ -33,7 +33,13 @@ PLATFORM_BIAS = Assumption(tuple(f"platform_bias_{axis}" for axis in "xyz"), "ra
 PLATFORM_SCALE = scale_assumptions("platform", "platform_gyro", 1e-2)
 CLOCK_SKEW = Assumption(("clock_skew",), "", "clock", "skew", 1e-4)
 VISION_SCALE = Assumption(("vision_scale",), "", "camera", "scale", 3e-3)
-ASSUMPTIONS = (*SCALE, SENSITIVITY, PLATFORM_BIAS, *PLATFORM_SCALE, CLOCK_SKEW, VISION_SCALE, TEMPERATURE)
+# Half the square of 10 ms, what impulse responses of trackers and gyros differ by.
+VISION_FILTER = Assumption(("vision_filter",), "s^2", "camera", "filter", 5e-5)
+PICTURES = (CLOCK_SKEW, VISION_SCALE, VISION_FILTER)
+ASSUMPTIONS = (
+    *(*SCALE, SENSITIVITY, PLATFORM_BIAS, *PLATFORM_SCALE),
+    *(CLOCK_SKEW, VISION_SCALE, TEMPERATURE, VISION_FILTER),
+)
 
 
 @dataclass(frozen=True)
@@ -43,7 +49,7 @@ class HeadParameters:
     Attributes:
         bias: the helmet gyro's (3), rad/s, its first node.
         helmet, camera: vRh, cRb.
-        picture: time offset alone, or with clock skew and vision scale.
+        picture: time offset alone, or with clock skew, vision scale and filter.
         gyro: S of the helmet's gyro and what its drivers do, see alidade.factors.gyro; None for a perfect one.
         platform: bias and S of the platform's gyro (9); None for a perfect one, or none.
     """
@@ -91,7 +97,7 @@ class HeadParameters:
         check_names(config.priors, known, "priors")
         check_names(config.require, known, "require")
 
-        clock = parameter(_key("T"), (CLOCK_SKEW, VISION_SCALE), config)
+        clock = parameter(_key("T"), PICTURES, config)
         return cls(
             bias=Parameter(FIRST_BIAS, bias),
             helmet=Parameter(_key("H"), mounts[0], rotation_vector_coordinates),
@@ -103,7 +109,7 @@ class HeadParameters:
 
     @property
     def clock(self) -> bool:
-        """Whether clock skew and vision scale are variables."""
+        """Whether clock skew, vision scale and filter are variables."""
         return len(self.picture.quantities) > 1
 
     @property

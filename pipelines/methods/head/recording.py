@@ -15,14 +15,15 @@ from alidade.pipelines.methods.head import parameters
 from alidade.pipelines.methods.head.topics import HEAD_IMU, PLATFORM_IMU, TRUTH_ATTITUDE, VISION_ATTITUDE, HeadConfig
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import (
-    believed,
     check_overlap,
     clean,
     count,
     nanoseconds,
+    tracked,
     unit_quaternions,
 )
 from alidade.pipelines.recording.gyro import read_gyro, read_imu
+from alidade.pipelines.recording.placeholders import believed
 from alidade.pipelines.recording.reading import Recording
 from alidade.pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
 from alidade.pipelines.recording.temperature import Temperature
@@ -188,10 +189,11 @@ def _vision(
 ) -> tuple[Array, Array, Array | None]:
     poses = recording.poses(topic)
     count(dropped, f"{topic}: stamped by log time (kept)", poses.stamped_by_log)
-    t, keep = clean(topic, poses.t_ns, epoch_ns, poses.wxyz, dropped)
-    wxyz = unit_quaternions(topic, t, poses.wxyz[keep])
+    given = tracked(topic, poses.wxyz, dropped)
+    t, keep = clean(topic, poses.t_ns, epoch_ns, given, dropped)
+    wxyz = unit_quaternions(topic, t, given[keep])
     cov = poses.cov[keep][:, _ROTATION, _ROTATION]
-    cov = believed(topic, cov, _LEAST_VARIANCE, dropped)
+    cov = believed(topic, "attitude", cov, _LEAST_VARIANCE, dropped)
     known = np.abs(cov).max(axis=(1, 2)) > 0.0
     if not known.any():
         return t, wxyz, None

@@ -222,9 +222,17 @@ def _sights(scenario: HeadScenario, effects: Mapping[str, float]) -> tuple[Array
     t = t[seen]
     cRb, vRh = _mount(scenario.camera_mount_deg), _mount(scenario.helmet_mount_deg)
     at = t + scenario.time_offset_s - effects["clock_skew"] * (t - t[0])
-    cRh = so3.compose(cRb, scenario.head.attitude(at), vRh)
+    filtered = so3.exp(effects["vision_filter"] * _acceleration(scenario, at))
+    cRh = so3.compose(cRb, scenario.head.attitude(at), filtered, vRh)
     turned = so3.log(so3.multiply(so3.inverse(cRh[0]), cRh))
     return t, at, so3.multiply(cRh[0], so3.exp((1.0 + effects["vision_scale"]) * turned))
+
+
+def _acceleration(scenario: HeadScenario, at: Array, h: float = 2e-3) -> Array:
+    """Angular acceleration of the helmet on its platform, (K, 3) rad/s^2 in v, by differences over h s."""
+    before, now, after = (scenario.head.attitude(at + late) for late in (-h, 0.0, h))
+    ahead, behind = (so3.log(so3.multiply(so3.inverse(now), other)) for other in (after, before))
+    return np.asarray((ahead + behind) / h**2)
 
 
 def _vision(scenario: HeadScenario, effects: Mapping[str, float], rng: np.random.Generator) -> tuple[Array, Array]:

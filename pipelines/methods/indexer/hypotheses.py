@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from alidade.pipelines.diagnostics.fault_models import AXES, ExactInput, Hypotheses
+from alidade.pipelines.diagnostics.fault_models import AXES, ExactInput, FaultModel
 from alidade.pipelines.methods.indexer.recording import IndexerData
 from alidade.pipelines.settings import Config
 
@@ -15,7 +15,7 @@ def _latitude(data: IndexerData, config: Config, change: float) -> tuple[Indexer
     return replace(data, latitude_deg=data.latitude_deg + change), config
 
 
-HYPOTHESES = Hypotheses(
+HYPOTHESES = FaultModel(
     streams={"gyro_t": ("gyro", "attitude"), "encoder_t": ("outer", "inner")},
     signs={"gyro": ("gyro", AXES), "outer": ("encoder", ("outer",)), "inner": ("encoder", ("inner",))},
     clock=("encoder_t", "encoders"),

@@ -20,11 +20,11 @@ from alidade.pipelines.recording.checks import (
     check_overlap,
     clean,
     count,
-    density,
     nanoseconds,
     unit_quaternions,
 )
 from alidade.pipelines.recording.gyro import usable
+from alidade.pipelines.recording.placeholders import density
 from alidade.pipelines.recording.reading import Recording
 from alidade.pipelines.recording.shapes import Numbers, Quaternions, Vectors
 from alidade.pipelines.recording.temperature import Temperature
@@ -93,7 +93,7 @@ def read_indexer(recording: Recording, config: Config) -> IndexerData:
         inner,
         _latitude(recording, config),
         attitude,
-        density(imu_topic, gyro_t, imu.gyro_cov[keep], LEAST_GYRO, dropped),
+        density(imu_topic, "gyro", gyro_t, imu.gyro_cov[keep], LEAST_GYRO, dropped),
         dropped,
         recording.stamp_sigma_s,
         temperature.read(recording, config, (parameters.TEMPERATURE,), gyro_t, dropped),

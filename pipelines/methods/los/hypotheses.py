@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from alidade.pipelines.diagnostics.fault_models import AXES, Hypotheses
+from alidade.pipelines.diagnostics.fault_models import AXES, FaultModel
 
-HYPOTHESES = Hypotheses(
+HYPOTHESES = FaultModel(
     streams={"gyro_t": ("gyro", "force"), "gimbal_t": ("gimbal",), "image_t": ("error", "error_cov")},
     signs={"gyro": ("gyro", AXES), "gimbal": ("gimbal", ("azimuth", "elevation"))},
     offset=True,

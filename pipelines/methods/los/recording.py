@@ -249,6 +249,10 @@ def _error(recording: Recording, topic: str, epoch_ns: int, dropped: dict[str, i
         )
     t, keep = clean(topic, errors.t_ns, epoch_ns, offset, dropped)
     error = errors.vector[keep][:, [0, 2, 1]]
+    if len(error) >= _FEWEST and np.isfinite(error[:, 2]).all() and np.ptp(error[:, 2]) == 0.0:
+        # What never changes was not measured: a driver that measures two angles leaves the third as it is.
+        error[:, 2] = np.nan
+        recording.remark(f"topic {topic}: y, the roll, reads one value in all messages: it was not measured")
     size = np.abs(error[:, :2]).max(axis=1)
     if np.median(size) > _WIDEST_ERROR:
         raise InputError(

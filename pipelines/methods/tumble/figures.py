@@ -29,7 +29,7 @@ def figures(data: TumbleData, calibration: Calibration) -> list[Plot | Table]:
 
 def _words(calibration: Calibration) -> Table:
     kinds = ("offsets", "stretches", "coverage")
-    rows = [(NAMES[str(row["sensor"])], str(row["says"])) for kind in kinds for row in calibration.findings[kind]]
+    rows = [(NAMES[str(row["sensor"])], str(row["says"])) for kind in kinds for row in calibration.tables[kind]]
     return Table(
         "In plain words", "Directions are those of the device's axes.", ("sensor", "what was found"), tuple(rows)
     )

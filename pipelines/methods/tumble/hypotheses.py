@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from alidade.pipelines.diagnostics.fault_models import Hypotheses
+from alidade.pipelines.diagnostics.fault_models import FaultModel
 
 # Signs, order and scale of axes are what is calibrated.
-HYPOTHESES = Hypotheses(streams={"mag_t": ("mag",), "accel_t": ("accel",), "gyro_t": ("gyro",)}, signs={})
+HYPOTHESES = FaultModel(streams={"mag_t": ("mag",), "accel_t": ("accel",), "gyro_t": ("gyro",)}, signs={})

@@ -20,11 +20,12 @@ from alidade.pipelines.recording.checks import (
     check_overlap,
     clean,
     count,
-    density,
     nanoseconds,
     too_fast,
 )
 from alidade.pipelines.recording.faults import drop_faults
+from alidade.pipelines.recording.placeholders import density, is_there, measured_once
+from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, lacks_gravity
 from alidade.pipelines.recording.reading import Recording
 from alidade.pipelines.recording.shapes import Numbers, Vectors
 from alidade.pipelines.recording.temperature import Temperature
@@ -90,18 +91,26 @@ def read_tumble(recording: Recording, config: Config) -> TumbleData:
         count(dropped, f"{name}: stamped by log time (kept)", measured.stamped_by_log)
         mag_t, keep = clean(name, measured.t_ns, epoch, measured.field, dropped)
         sound = drop_faults(name, mag_t, measured.field[keep], dropped, "T")
+        sound = sound[measured_once(name, measured.field[keep[sound]], dropped)]
         mag_t, keep = mag_t[sound], keep[sound]
-        mag, mag_density = measured.field[keep], density(name, mag_t, measured.field_cov[keep], LEAST_MAG, dropped)
+        mag, mag_density = (
+            measured.field[keep],
+            density(name, "mag", mag_t, measured.field_cov[keep], LEAST_MAG, dropped),
+        )
         spans[name] = mag_t
     name = config.topic(IMU)
     if wanted(recording, config, IMU):
         imu = recording.imu(name)
-        if np.isfinite(imu.accel).any() and np.nan_to_num(imu.accel).any() and not (imu.accel_cov[:, 0, 0] == -1).all():
+        if is_there("accel", imu.accel, imu.accel_cov):
             count(dropped, f"{name}: stamped by log time (kept)", imu.stamped_by_log)
             accel_t, keep = clean(name, imu.t_ns, epoch, imu.accel, dropped)
             sound = drop_faults(name, accel_t, imu.accel[keep], dropped, "m/s^2")
             accel_t, keep = accel_t[sound], keep[sound]
-            accel, accel_density = imu.accel[keep], density(name, accel_t, imu.accel_cov[keep], LEAST_ACCEL, dropped)
+            _check_gravity(name, imu.accel[keep])
+            accel, accel_density = (
+                imu.accel[keep],
+                density(name, "accel", accel_t, imu.accel_cov[keep], LEAST_ACCEL, dropped),
+            )
             spans[name] = accel_t
         if mag is not None:
             gyro_t, gyro, gyro_density = _gyro(name, imu, epoch, dropped)
@@ -133,18 +142,23 @@ def read_tumble(recording: Recording, config: Config) -> TumbleData:
     )
 
 
+def _check_gravity(topic: str, accel: Array) -> None:
+    """Raise InputError where gravity, which calibrates an accelerometer, is not in its readings."""
+    if lacks_gravity(np.linalg.norm(accel, axis=1)):
+        raise InputError(f"topic {topic}: {GRAVITY_REMOVED}")
+
+
 def _gyro(
     topic: str, imu: series.ImuSeries, epoch: int, dropped: dict[str, int]
 ) -> tuple[Array | None, Array | None, float | None]:
     """Times, rates and density; None where there is none, or one that is not in rad/s."""
-    absent = not np.nan_to_num(imu.gyro).any() or (imu.gyro_cov[:, 0, 0] == -1.0).all()
-    if absent:
+    if not is_there("gyro", imu.gyro, imu.gyro_cov):
         return None, None, None
     t, keep = clean(topic, imu.t_ns, epoch, imu.gyro, {})
     if too_fast(topic, t, imu.gyro[keep]):
         count(dropped, f"{topic}: {NO_RATE}", len(t))
         return None, None, None
-    return t, imu.gyro[keep], density(topic, t, imu.gyro_cov[keep], LEAST_GYRO, dropped)
+    return t, imu.gyro[keep], density(topic, "gyro", t, imu.gyro_cov[keep], LEAST_GYRO, dropped)
 
 
 def write_tumble(path: Path, simulated: Simulated) -> None:

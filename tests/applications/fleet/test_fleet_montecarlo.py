@@ -93,8 +93,8 @@ def test_numbers_do_not_depend_on_what_a_report_tells() -> None:
     session = Session.of(found, found.simulate(found.scenario.model_validate(BRIEFEST["los"]), 5))
     whole, bare = session.calibrate(), session.calibrate(report=False)
     np.testing.assert_array_equal(bare.estimate.values, whole.estimate.values)
-    np.testing.assert_array_equal(bare.assessment.covariance, whole.assessment.covariance)
-    assert bare.assessment.headline == whole.assessment.headline
+    np.testing.assert_array_equal(bare.covariance, whole.covariance)
+    assert bare.headline == whole.headline
     assert whole.budget is not None
     assert bare.budget is None
 

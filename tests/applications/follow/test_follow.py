@@ -213,13 +213,13 @@ def test_what_is_missing_is_said_until_the_accuracy_is_reached(whole: Path, tmp_
     recorder = _recorder(whole, session, 8.0, tmp_path / "go")
     calibration, views, _ = _follow(session, Settings(patience=30.0), tmp_path / "go")
     assert recorder.wait() == 0
-    assert calibration.assessment.status == "calibrated"
+    assert calibration.status == "calibrated"
     last = views[-1]
     assert last.done
     assert last.headline == "the accuracy wanted is reached: recording may end"
     early = [view for view in views if not view.done]
     assert early, "it was to be seen before enough was there"
-    assert all(view.missing or view.assessment is None for view in early)
+    assert all(view.missing or view.covariance is None for view in early)
     assert {c.what for c in last.checklist} >= {"target", "sway about x", "sway about y", "sway about z"}
 
 

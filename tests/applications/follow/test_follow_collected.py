@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.applications.follow.screen import Screen
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
-from alidade.pipelines.diagnostics.observability import assess
+from alidade.pipelines.diagnostics.observability import weak_directions
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods import method
@@ -109,11 +110,16 @@ def test_the_next_best_pose_shows_the_axis_that_was_not_up() -> None:
     )
 
 
+def _sway(_: Mapping[str, float]) -> Motion:
+    return Motion("sway it more")
+
+
 def _view(sigma: float) -> View:
     quantities = (Quantity("delta_px", "rad", 0.1, 0.1, 1e-3),)
-    assessment = assess(quantities, np.eye(1) * sigma**2, None, lambda _: Motion("sway it more"))
+    covariance = np.eye(1) * sigma**2
+    findings = weak_directions(quantities, covariance, _sway)
     wanted = ChecklistItem("sway", "1.0 deg", "turn it")
-    return View(3.0, 0, quantities, np.array([0.02]), assessment, (wanted,))
+    return View(3.0, 0, quantities, np.array([0.02]), covariance, (wanted,), None, findings, _sway)
 
 
 @pytest.mark.parametrize("terminal", [True, False])

@@ -9,6 +9,7 @@ import threading
 import time
 import urllib.error
 import urllib.request
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from http.cookiejar import CookieJar
@@ -29,7 +30,7 @@ from alidade.pipelines.applications.follow.screen import Screen
 from alidade.pipelines.applications.follow.sources import Source
 from alidade.pipelines.diagnostics.change_test import Stability
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
-from alidade.pipelines.diagnostics.observability import assess
+from alidade.pipelines.diagnostics.observability import weak_directions
 from alidade.pipelines.display.drawing import covered, swaying
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.advice import Motion
@@ -44,17 +45,21 @@ WORDS = "document.getElementById('words').textContent"
 LOST = "document.body.className === 'lost'"
 
 
+def _sway(_: Mapping[str, float]) -> Motion:
+    return Motion("sway it more")
+
+
 def _view(time_s: float, sigma: float) -> View:
     """Of two parameters, the second of which is known well enough, and a sway that is wanted at the beginning."""
     quantities = (Quantity("delta_px", "rad", 0.1, 0.1, 1e-3), Quantity("delta_gx", "rad", 0.1, 0.1, 1e-3))
     covariance = np.diag([sigma**2, 1e-8])
-    assessment = assess(quantities, covariance, None, lambda _: Motion("sway it more"))
+    findings = weak_directions(quantities, covariance, _sway)
     wanted = "sway the carrier about its x"
     collected = (
         ChecklistItem("sway about x", "1.0 deg", wanted, 0.5, Motion(wanted, swaying("x", "carrier"))),
         ChecklistItem("sides up", "3 of 6", chart=covered(np.eye(3), "sides up")),
     )
-    return View(time_s, 0, quantities, np.array([0.02, 0.01]), assessment, collected)
+    return View(time_s, 0, quantities, np.array([0.02, 0.01]), covariance, collected, None, findings, _sway)
 
 
 @needs_browser
@@ -258,7 +263,7 @@ def test_a_recording_followed_on_a_phone_and_on_a_desktop(name: str, tmp_path: P
         page.end(calibration)
         threads[1].join(30.0)
 
-    assert calibration.assessment.status == "calibrated"
+    assert calibration.status == "calibrated"
     words = [one["words"] for one in seen]
     assert words[-1] == "The recording has ended: calibrated"
     assert "You may stop" in words

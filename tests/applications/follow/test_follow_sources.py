@@ -22,7 +22,6 @@ from alidade.pipelines.applications.follow.protocol import SUBPROTOCOLS, websock
 from alidade.pipelines.applications.follow.serve import LiveServer
 from alidade.pipelines.applications.follow.sources import Source, StandardInput, source_of
 from alidade.pipelines.applications.session import calibrate
-from alidade.pipelines.diagnostics.observability import assess
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods.los.recording import write_los
@@ -215,8 +214,7 @@ def test_a_bridge_that_is_not_there_is_waited_for() -> None:
 
 def _view(quantities: int) -> View:
     names = tuple(Quantity(f"p{i}", "rad", 0.1, 0.1, 1e-3) for i in range(quantities))
-    assessment = assess(names, np.eye(quantities) * 1e-8, None, None)
-    return View(3.0, 7, names, np.arange(float(quantities)), assessment, ())
+    return View(3.0, 7, names, np.arange(float(quantities)), np.eye(quantities) * 1e-8, ())
 
 
 @pytest.mark.parametrize("protocol", ["foxglove.sdk.v1", "foxglove.websocket.v1"])

@@ -15,8 +15,7 @@ from alidade.factors import so3
 from alidade.factors.turns import GyroRotationFactor
 from alidade.factors.vectorized import Ensemble
 from alidade.pipelines.config import load_config
-from alidade.pipelines.diagnostics.observability import Assessment, assess
-from alidade.pipelines.diagnostics.validation import rms
+from alidade.pipelines.diagnostics.cross_validation import rms
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods import simulate
@@ -47,6 +46,7 @@ from alidade.pipelines.solvers.assembly import CHUNK, Assembly
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import solve_incremental
 from datasets import imu_tk_xsens
+from tests.support.judged import Judged, judge
 
 # The default field prior leaves the magnetometer's scale at one per cent; here the field is known better, and is so.
 FIELD = {"field_e": 1e-8, "field_n": 1e-8, "field_u": 1e-8}
@@ -65,14 +65,14 @@ def _simulated(seed: int, **options: Any) -> tuple[CubeData, dict[str, float], C
     return data, truth, load_config(cube_config(scenario).encode())
 
 
-def _solved(data: CubeData, config: Config) -> tuple[Problem, Estimate, Assessment]:
+def _solved(data: CubeData, config: Config) -> tuple[Problem, Estimate, Judged]:
     built = problem(data, config)
     estimate = solve_batch(built)
-    return built, estimate, assess(built.quantities, estimate.covariance, estimate.chi_square, built.advice)
+    return built, estimate, judge(built.quantities, estimate.covariance, estimate.chi_square, built.advice)
 
 
 @cache
-def _with_known_field(seed: int) -> tuple[CubeData, dict[str, float], Config, Problem, Estimate, Assessment]:
+def _with_known_field(seed: int) -> tuple[CubeData, dict[str, float], Config, Problem, Estimate, Judged]:
     """A whole session and its solution, shared by the tests that only look at it."""
     data, truth, config = _simulated(seed, **NEAR_MODEL)
     config = config.model_copy(update={"priors": FIELD})
@@ -128,9 +128,9 @@ def test_three_poses_are_too_few_and_the_directions_are_named() -> None:
     data, _, config = _simulated(7, poses=3)
     _, _, judged = _solved(data, config)
     assert judged.status == "unobservable"
-    named = {name for d in judged.directions for name in d.weights}
+    named = {name for d in judged.directions for name in d.evidence["weights"]}
     assert any(name.startswith("accel_") for name in named)
-    assert any("add static poses" in d.advice for d in judged.directions)
+    assert any("add static poses" in d.evidence["advice"] for d in judged.directions)
 
 
 def test_axes_never_turned_are_named() -> None:
@@ -141,7 +141,7 @@ def test_axes_never_turned_are_named() -> None:
     assert {"gyro_k11", "gyro_k12", "gyro_k21", "gyro_k22"} <= weak
     sigma = dict(zip(estimate.names, judged.sigmas, strict=True))
     assert sigma["gyro_k33"] < 0.05 * sigma["gyro_k11"]
-    assert any("turn the cube between poses about its x" in d.advice for d in judged.directions)
+    assert any("turn the cube between poses about its x" in d.evidence["advice"] for d in judged.directions)
 
 
 def test_a_face_never_seen_is_known_by_its_prior_alone() -> None:

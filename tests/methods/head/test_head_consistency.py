@@ -15,8 +15,6 @@ from typer.testing import CliRunner
 from alidade.factors import so3
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.config import load_config
-from alidade.pipelines.diagnostics import noise_levels
-from alidade.pipelines.diagnostics.observability import Assessment, assess
 from alidade.pipelines.estimation.problem import Array, Estimate, Problem
 from alidade.pipelines.methods.head.graph import problem
 from alidade.pipelines.methods.head.recording import write_head
@@ -24,6 +22,7 @@ from alidade.pipelines.methods.head.simulation import HeadScenario, head_config,
 from alidade.pipelines.simulation.scenario import load_scenario
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import solve_incremental
+from tests.support.judged import Judged, judge
 
 Solve = Callable[[Problem], Estimate]
 SOLVERS = pytest.mark.parametrize("solve", [solve_batch, solve_incremental])
@@ -70,10 +69,9 @@ class Run:
         self.error = self.estimate.values - np.array([truth[name] for name in self.estimate.names])
 
     @property
-    def assessment(self) -> Assessment:
+    def assessment(self) -> Judged:
         e = self.estimate
-        decides = not noise_levels.asked(e.levels)
-        return assess(self.problem.quantities, e.covariance, e.chi_square, self.problem.advice, decides)
+        return judge(self.problem.quantities, e.covariance, e.chi_square, self.problem.advice, e.levels)
 
     @property
     def worst(self) -> float:
@@ -168,9 +166,9 @@ def test_without_platform_motion_only_the_product_of_the_mounts_is_known(solve: 
     run = Run(scenario(platform=None, priors=priors), 1, solve)
     assessment = run.assessment
     assert assessment.status == "unobservable"
-    named = {name for direction in assessment.directions for name in direction.weights}
+    named = {name for direction in assessment.directions for name in direction.evidence["weights"]}
     assert {f"camera_mount_{axis}" for axis in "xyz"} <= named
-    assert all("turn the platform" in direction.advice for direction in assessment.directions)
+    assert all("turn the platform" in direction.evidence["advice"] for direction in assessment.directions)
     time, _ = run.attitude_error()
     found = run.estimate.attitudes
     assert found is not None

@@ -14,7 +14,7 @@ from alidade.factors import so3
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.config import load_config
-from alidade.pipelines.diagnostics.validation import peak, rms
+from alidade.pipelines.diagnostics.cross_validation import peak, rms
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.head.graph import problem
 from alidade.pipelines.methods.head.recording import HeadData, write_head
@@ -45,7 +45,7 @@ def test_session_of_an_independent_simulator(shared_data: Path) -> None:
     true = np.array([truth.get(name, 0.0) for name in estimate.names])
     off = ((estimate.values - true) / estimate.sigmas)[known]
     assert np.abs(off).max() < 3.0
-    assert calibration.assessment.status == "calibrated"
+    assert calibration.status == "calibrated"
     found, true = estimate.attitudes, truth["_attitude"]
     assert found is not None
     time = found.time + (calibration.facts.epoch_ns - truth["_t0"] * 10**9) * 1e-9

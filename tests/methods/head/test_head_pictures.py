@@ -38,7 +38,7 @@ def sigmas_off(path: Path) -> tuple[np.ndarray, str]:
     assert calibration.truth is not None
     truth = np.array([calibration.truth[name] for name in calibration.estimate.names], dtype=float)
     off = (calibration.estimate.values - truth) / calibration.estimate.sigmas
-    return off, calibration.assessment.status
+    return off, calibration.status
 
 
 @pytest.fixture(scope="module")

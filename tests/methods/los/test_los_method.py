@@ -12,7 +12,6 @@ import pytest
 
 from alidade.factors.chi_square import quantile
 from alidade.pipelines.config import load_config
-from alidade.pipelines.diagnostics.observability import Assessment, assess
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array, Estimate, Problem
 from alidade.pipelines.methods.los.graph import problem
@@ -26,6 +25,7 @@ from alidade.pipelines.simulation.scenario import load_scenario
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import solve_incremental
 from tests.support.builders import IDEAL
+from tests.support.judged import Judged, judge
 
 # Sway swift enough for a short recording.
 BRISK = EulerMotion(
@@ -53,10 +53,10 @@ def _nees(estimate: Estimate, truth: dict[str, float]) -> float:
     return float(error @ np.linalg.solve(estimate.covariance, error))
 
 
-def _assess(data: LosData, config: Config) -> tuple[Estimate, Assessment]:
+def _assess(data: LosData, config: Config) -> tuple[Estimate, Judged]:
     made = problem(data, config)
     estimate = solve_batch(made)
-    return estimate, assess(made.quantities, estimate.covariance, estimate.chi_square, made.advice)
+    return estimate, judge(made.quantities, estimate.covariance, estimate.chi_square, made.advice)
 
 
 @pytest.mark.parametrize(
@@ -239,9 +239,9 @@ def test_pz_and_gz_cannot_be_told_apart() -> None:
     estimate, assessment = _assess(data, config)
     assert "delta_z" not in estimate.names
     assert assessment.status == "unobservable"
-    weights = assessment.directions[0].weights
+    weights = assessment.directions[0].evidence["weights"]
     assert weights["delta_pz"] == pytest.approx(weights["delta_gz"], rel=1e-3)
-    assert "ask for delta_z = delta_pz - delta_gz instead" in assessment.directions[0].advice
+    assert "ask for delta_z = delta_pz - delta_gz instead" in assessment.directions[0].evidence["advice"]
 
 
 @pytest.mark.slow
@@ -251,9 +251,9 @@ def test_without_azimuth_motion_px_is_weak_against_gx_and_gy() -> None:
     _, assessment = _assess(data, _config(scenario))
     assert assessment.status in ("weak", "unobservable")
     worst = assessment.directions[0]
-    assert abs(worst.weights["delta_px"]) > 0.5
-    assert abs(worst.weights["delta_gx"]) > 0.3
-    assert "sway the carrier in azimuth too" in worst.advice
+    assert abs(worst.evidence["weights"]["delta_px"]) > 0.5
+    assert abs(worst.evidence["weights"]["delta_gx"]) > 0.3
+    assert "sway the carrier in azimuth too" in worst.evidence["advice"]
 
 
 def test_gaps_of_gyro_and_gimbal_are_stepped_over() -> None:
@@ -301,7 +301,7 @@ def test_too_few_pictures_is_one_clear_line() -> None:
         problem(replace(data, gyro_t=data.gyro_t + 100.0, gimbal_t=data.gimbal_t + 100.0), Config())
 
 
-def _contract(path: Path, sensors: Sensors | None = None) -> tuple[Estimate, Assessment, Array]:
+def _contract(path: Path, sensors: Sensors | None = None) -> tuple[Estimate, Judged, Array]:
     recording = open_recording(path)
     config = load_config(recording.attachment("alidade.yaml"), Config(sensors=sensors) if sensors else None)
     estimate, assessment = _assess(read_los(recording, config), config)
@@ -316,9 +316,9 @@ def test_independent_recording(shared_data: Path) -> None:
     assert np.abs(z).max() < 3.0
     # Forty seconds do not tell mounting angles from a gyro of the usual grade.
     assert assessment.status == "weak"
-    because, state = assessment.headline.split("That is because of ")[1].split(": state ")
-    assert "gyro skew" in because
-    assert "sensors.gyro.skew (now 0.003)" in state
+    dominant = {f.evidence["figure"]: f.evidence["stated"] for f in assessment.findings if f.kind == "dominant_prior"}
+    assert dominant["gyro.skew"] == 0.003
+    assert "state sensors.gyro.skew (now 0.003)" in assessment.headline
     _, ideal, z = _contract(shared_data / "contract" / "los_nominal.mcap", IDEAL)
     assert np.abs(z).max() < 3.0
     assert ideal.status == "calibrated"

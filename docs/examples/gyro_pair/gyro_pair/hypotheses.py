@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from alidade.pipelines.diagnostics.fault_models import AXES, Hypotheses
+from alidade.pipelines.diagnostics.fault_models import AXES, FaultModel
 
-HYPOTHESES = Hypotheses(
+HYPOTHESES = FaultModel(
     streams={"a_t": ("a_gyro",), "b_t": ("b_gyro",)},
     signs={"a_gyro": ("gyro a", AXES), "b_gyro": ("gyro b", AXES)},
     offset=True,

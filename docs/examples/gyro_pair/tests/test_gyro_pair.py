@@ -14,9 +14,10 @@ from scipy.stats import chi2
 from alidade.factors import so3
 from alidade.factors.preintegration import GyroPath
 from alidade.factors.testing import assert_jacobians
-from alidade.pipelines.diagnostics.hypothesis_tests import find_causes
-from alidade.pipelines.diagnostics.observability import assess
+from alidade.pipelines.diagnostics.diagnose import diagnose
+from alidade.pipelines.diagnostics.hypothesis_tests import find_hypotheses
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.finding import status
 from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods.formula import apply
 from alidade.pipelines.settings import Config
@@ -137,27 +138,28 @@ def test_one_axis_leaves_the_rotation_about_it() -> None:
     session = simulated(name="gyro_pair_one_axis")
     graph = problem(session.data, Config())
     estimate = solve_batch(graph)
-    assessment = assess(graph.quantities, estimate.covariance, estimate.chi_square, graph.advice)
-    assert assessment.status == "weak"
+    findings = diagnose(estimate, graph.quantities, graph.advice)
+    assert status(findings) == "weak"
     # The others are known along an arc about it alone, which the numbers leave by more than is required.
-    direction, *along = assessment.directions
-    assert all(each.sigma_ratio < 0.05 * direction.sigma_ratio for each in along)
+    direction, *along = (finding.evidence for finding in findings if finding.kind == "direction")
+    assert all(each["sigma_ratio"] < 0.05 * direction["sigma_ratio"] for each in along)
     # About the axis of the motion, which is z of a: in b, where the rotation is perturbed, it is bRa z.
     tangent = np.linalg.solve(
         so3.right_jacobian_inverse(estimate.values[:3]),
-        [direction.weights.get(f"rotation_{axis}", 0.0) for axis in "xyz"],
+        [direction["weights"].get(f"rotation_{axis}", 0.0) for axis in "xyz"],
     )
     axis = so3.rotate(so3.inverse(so3.exp(estimate.values[:3])), [0.0, 0.0, 1.0])
     assert abs(tangent @ axis) / np.linalg.norm(tangent) > 0.98
-    assert "two axes" in direction.advice
+    assert "two axes" in direction["advice"]
 
 
 def test_a_wrong_sign_is_named() -> None:
     session = simulated()
     wrong = GyroPairData(**{**vars(session.data), "b_gyro": session.data.b_gyro * [1.0, 1.0, -1.0]})
-    causes = find_causes(METHOD, wrong, Config())
+    found = find_hypotheses(METHOD.graph, METHOD.hypotheses(), wrong, Config())
     # A mirrored triad is any one axis mirrored and turned.
-    assert any("sign of the gyro" in cause.label and "wrong" in cause.label for cause in causes)
+    labels = [label for each in found for label in (each.evidence["label"], *each.evidence["equivalents"])]
+    assert any("sign of the gyro" in label and "wrong" in label for label in labels)
 
 
 def test_windows_have_no_sample_in_common_and_stay() -> None:

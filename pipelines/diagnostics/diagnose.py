@@ -1,0 +1,199 @@
+"""From an estimate to findings, a pure function: nothing is solved here, nothing is put into words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from alidade.pipelines.diagnostics.error_budget import dominant_priors
+from alidade.pipelines.diagnostics.goodness_of_fit import Fit
+from alidade.pipelines.diagnostics.observability import Advise, weak_directions
+from alidade.pipelines.estimation.assumptions import pull as prior_z_score
+from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
+from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.problem import ChiSquare, Estimate, Quantity
+from alidade.pipelines.estimation.robust import robust_sigma
+
+NOTE, WEAK, INCONSISTENT = Severity.NOTE, Severity.WEAK, Severity.INCONSISTENT
+# Kinds about the residuals, as opposed to priors and requirements.
+_RESIDUAL = ("not_converged", "misfit", "noise", "correlation", "rejection")
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """When a departure counts. Shares are of a family of measurements or of the recording."""
+
+    rejected_note: float = 0.10
+    rejected: float = 0.25
+    min_family: int = 10  # fewer measurements have no share worth the name
+    noise_factor: float = 4.0  # a larger estimate over statement, by `noise_sigmas` of the estimate, is no noise
+    noise_sigmas: float = 3.0
+    noise_note: float = 2.0
+    noise_suspect: float = 1.5  # with correlated residuals
+    process_dof: float = 100.0  # processes with fewer are not tested
+    correlated: float = 0.10
+    prior_z: float = 4.0
+    far_from_prior: float = 5.0  # of a calibrated parameter, in prior sigmas
+    determined: float = 0.7  # posterior over prior sigma; above it a prior conflict is a note
+    inseparable: float = 0.9  # correlation
+    material: float = 0.5  # effect over requirement
+
+
+DEFAULT = Thresholds()
+
+
+def diagnose(
+    estimate: Estimate,
+    quantities: Sequence[Quantity],
+    advise: Advise | None = None,
+    change: Finding | None = None,
+    hypotheses: Sequence[Finding] = (),
+    limits: Thresholds = DEFAULT,
+) -> tuple[Finding, ...]:
+    """All findings, the most severe first; equally severe ones in the order of explanation, cause before symptom.
+
+    Args:
+        estimate: values (n,) with their final covariance (n, n).
+        quantities: of the estimate, in its order.
+        advise: weights of a direction -> motion that would determine it.
+        change: finding of `diagnostics.change_test`.
+        hypotheses: findings of `diagnostics.hypothesis_tests`, which run where `is_suspect` is true.
+        limits: thresholds.
+    """
+    published = estimate.solver == "published"  # a reference, judged by its own covariance alone
+    failure = Finding("not_converged", NOTE if published else INCONSISTENT, {"message": estimate.message})
+    if not estimate.converged and not published:
+        return by_severity([*hypotheses, failure, *_rejections(estimate, limits)])
+    directions = weak_directions(quantities, estimate.covariance, advise)
+    found = [*directions, *hypotheses, *([] if estimate.converged else [failure])]
+    if not published:
+        found += [*_prior_conflicts(estimate, quantities, limits), *([change] if change else [])]
+        found += [*_rejections(estimate, limits), *_noise(estimate, limits), *_correlations(estimate, limits)]
+    found += misfits(estimate.chi_square, estimate.levels, limits)
+    if any(finding.severity == WEAK for finding in directions):
+        found += dominant_priors(quantities, estimate.covariance)
+    if not published:
+        found += [*_far_from_prior(estimate, quantities, limits), *_ambiguity(estimate, quantities)]
+    return by_severity(found)
+
+
+def is_suspect(estimate: Estimate, findings: Sequence[Finding], limits: Thresholds = DEFAULT) -> bool:
+    """Whether faults of the data are to be tested as hypotheses, each by solving again."""
+    if estimate.solver == "published":
+        return False
+    correlated = estimate.colours.keys()
+    return any(finding.kind in _RESIDUAL and finding.severity == INCONSISTENT for finding in findings) or any(
+        level.contradicted and (level.found or 0.0) > factor
+        for level in estimate.levels
+        if (families := estimate.residuals.keys() & set(level.noise.families))
+        for factor in (limits.noise_suspect if correlated & families else limits.noise_factor,)
+    )
+
+
+def _prior_conflicts(estimate: Estimate, quantities: Sequence[Quantity], limits: Thresholds) -> Iterator[Finding]:
+    """Nuisance parameters, worst first, inseparable ones as one.
+
+    Fixing x_j at its prior mean m would shift x_i by -P_ij / P_jj (x_j - m): the effect of the conflict on x_i.
+    """
+    P, sigma, x = estimate.covariance, estimate.sigmas, estimate.values
+    nuisance = [j for j, q in enumerate(quantities) if q.assumed and sigma[j] > 0.0]
+    z = {j: prior_z_score(quantities[j], x[j], sigma[j], estimate.inflations[j]) or 0.0 for j in nuisance}
+    left = sorted((j for j in nuisance if abs(z[j]) > limits.prior_z), key=lambda j: -abs(z[j]))
+    while left:
+        j, worst = left[0], quantities[left[0]]
+        same = [k for k in nuisance if k != j and abs(P[j, k]) > limits.inseparable * sigma[j] * sigma[k]]
+        shift = P[:, j] / P[j, j] * (x[j] - worst.prior_mean)
+        effect = {q.name: float(shift[i]) for i, q in enumerate(quantities) if q.judged and shift[i]}
+        material = any(abs(effect.get(q.name, 0.0)) >= limits.material * q.require for q in quantities if q.judged)
+        severe = material and sigma[j] < limits.determined * worst.scale
+        others = tuple(sorted(quantities[k].name for k in same))
+        yield _prior_conflict(estimate, j, z[j], others, effect, INCONSISTENT if severe else NOTE)
+        left = [k for k in left[1:] if k not in same]
+
+
+def _far_from_prior(estimate: Estimate, quantities: Sequence[Quantity], limits: Thresholds) -> Iterator[Finding]:
+    """Calibrated parameters far from their priors, worst first: legitimate for a mount of 90 deg, and worth a note."""
+    z = {
+        j: float((estimate.values[j] - q.prior_mean) / q.prior_sigma)
+        for j, q in enumerate(quantities)
+        if q.prior_sigma and not q.assumed
+    }
+    for j in sorted(z, key=lambda j: -abs(z[j])):
+        if abs(z[j]) > limits.far_from_prior:
+            yield _prior_conflict(estimate, j, z[j], (), {}, NOTE)
+
+
+def _prior_conflict(
+    estimate: Estimate, j: int, z: float, others: tuple[str, ...], effect: dict[str, float], severity: Severity
+) -> Finding:
+    numbers = {"value": float(estimate.values[j]), "sigma": float(estimate.sigmas[j]), "z": float(z)}
+    evidence = {"parameter": estimate.names[j], **numbers, "inseparable": others, "effect": effect}
+    return Finding("prior_conflict", severity, evidence)
+
+
+def _rejections(estimate: Estimate, limits: Thresholds) -> list[Finding]:
+    shares = {f: float(np.mean(~r.used)) for f, r in estimate.residuals.items() if len(r.used) >= limits.min_family}
+    found = []
+    for family in sorted(shares, key=lambda family: -shares[family]):
+        if (share := shares[family]) > limits.rejected_note:
+            factor = robust_sigma(estimate.residuals[family].whitened)
+            evidence = {"family": family, "share": share, "noise_factor": factor}
+            found.append(Finding("rejection", INCONSISTENT if share > limits.rejected else NOTE, evidence))
+    return found
+
+
+def _noise(estimate: Estimate, limits: Thresholds) -> Iterator[Finding]:
+    """Statements that the recording contradicts; an estimate far above its statement is no noise."""
+    for level in estimate.levels:
+        least = -np.inf if level.sigma is None else (level.found or 0.0) - limits.noise_sigmas * level.sigma
+        no_noise = bool(level.noise.families) and least > limits.noise_factor
+        differs = level.contradicted or not 1.0 / limits.noise_note < level.scale < limits.noise_note
+        if level.noise.source != "default" and (no_noise or (differs and level.scale != 1.0)):
+            numbers = {"used": level.used, "factor": level.scale, "estimated_factor": level.found}
+            evidence = {"noise": level.noise.name, "unit": level.noise.unit, "source": level.noise.source, **numbers}
+            yield Finding("noise", INCONSISTENT if no_noise else NOTE, evidence)
+
+
+def _correlations(estimate: Estimate, limits: Thresholds) -> Iterator[Finding]:
+    """Residuals correlated for so long that they are no noise; a correlation length counts measurements."""
+    for family, length in estimate.colours.items():
+        share = length / len(estimate.residuals[family].time)
+        if share > limits.correlated:
+            yield Finding("correlation", INCONSISTENT, {"family": family, "share": share})
+
+
+def misfits(chi_square: ChiSquare | None, levels: Sequence[Level], limits: Thresholds = DEFAULT) -> list[Finding]:
+    """Chi-square of all residuals where the noise is known exactly; of single processes where levels are estimated."""
+    if chi_square is None:
+        return []
+    levels = levels if any(level.noise.estimated for level in levels) else ()
+    total, found = Fit.of(chi_square.value, chi_square.dof), []
+    too_large = not np.isfinite(total.value) or (total.value > total.high and not levels)
+    if too_large or total.value < total.low:
+        fits = {family: Fit.of(*sums) for family, sums in chi_square.families.items()} or {"all": total}
+        largest = max(fits, key=lambda family: fits[family].z if too_large else -fits[family].z)
+        found.append(_misfit(None, total, largest, fits[largest].noise_factor, INCONSISTENT if too_large else NOTE))
+    measured = {family for level in levels if level.least is None for family in level.noise.families}
+    for family, (value, dof) in chi_square.families.items() if levels else ():
+        if family not in measured and dof > limits.process_dof and value > limits.noise_factor**2 * dof:
+            fit = Fit.of(value, dof)
+            found.append(_misfit(family, fit, family, fit.noise_factor, INCONSISTENT))
+    return found
+
+
+def _misfit(family: str | None, fit: Fit, largest: str, noise_factor: float, severity: Severity) -> Finding:
+    evidence: dict[str, Any] = {"family": family, "chi_square": fit.value, "dof": fit.dof}
+    return Finding("misfit", severity, {**evidence, "largest": largest, "noise_factor": noise_factor})
+
+
+def _ambiguity(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:
+    """The second best solution where it is nearly as likely, the parameters that differ most first."""
+    if estimate.second is None:
+        return
+    there, scales = estimate.second.values, np.array([q.scale for q in quantities])
+    order = np.argsort(-np.abs(there - estimate.values) / scales)
+    values = {estimate.names[i]: (float(there[i]), float(estimate.values[i])) for i in order}
+    yield Finding("ambiguous_solution", NOTE, {"chi_square": estimate.second.chi_square, "values": values})

@@ -1,0 +1,186 @@
+"""Trial solutions: how well a recording fits after a change, and how well held-out measurements are predicted.
+
+The only place of this room that uses the parts of a solver rather than a solver.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.pipelines import deadline
+from alidade.pipelines.diagnostics.goodness_of_fit import Fit
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.problem import CHUNK, Array, ChiSquare, Estimate, Problem, Quantity
+from alidade.pipelines.estimation.robust import robust_sigma
+from alidade.pipelines.parallel import LostError
+from alidade.pipelines.settings import Config
+
+if TYPE_CHECKING:
+    from alidade.pipelines.solvers.linearization import Group
+
+Result = TypeVar("Result")
+# Builds the graph of a method's data.
+Build = Callable[[Any, Config], Problem]
+
+# A recording with more than this share rejected does not fit.
+_MAX_OUTLIERS = 0.1
+# Iterations after which a right model has long converged; a wrong one may wander for many times as long.
+_MAX_ITERATIONS = 15
+# Samples of trials that are solved at the same time.
+_MAX_SAMPLES = 10_000_000
+# Iterations of a score, and the largest damping: a right model needs no more, a wrong one is not pursued.
+_SCORE_ITERATIONS, _MAX_SCORE_DAMPING = 5, 1e-4
+# One chunk in so many is held out.
+_HELD_OUT = 5
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class TrialFit:
+    """How well a recording fits after a change: the solution, and the loss of the measurements it rejected.
+
+    Attributes:
+        quantities: of the problem.
+        estimate: the solution.
+        chi_square: of the measurements used.
+        lost: of the rejected measurements, each at the gate.
+        dof: degrees of freedom, the rejected rows among them.
+    """
+
+    quantities: tuple[Quantity, ...]
+    estimate: Estimate
+    chi_square: ChiSquare
+    lost: float
+    dof: float
+
+    @classmethod
+    def of(cls, problem: Problem, estimate: Estimate) -> TrialFit | None:
+        """None without chi-square."""
+        if estimate.chi_square is None or not np.isfinite(estimate.chi_square.value):
+            return None
+        rejected = {f: int((~r.used).sum()) for f, r in estimate.residuals.items()}
+        rows = sum(n * estimate.residuals[f].whitened.shape[1] for f, n in rejected.items())
+        gate = problem.loss.gate if problem.loss else 0.0
+        lost = gate**2 * sum(rejected.values())
+        return cls(problem.quantities, estimate, estimate.chi_square, lost, estimate.chi_square.dof + rows)
+
+    @property
+    def cost(self) -> float:
+        """Chi-square, the rejected measurements included."""
+        return self.chi_square.value + self.lost
+
+    @property
+    def factor(self) -> float:
+        """Factor on the noise used with which the recording would fit."""
+        return float(np.sqrt(self.cost / max(self.dof, 1.0)))
+
+    @property
+    def fits(self) -> bool:
+        """Whether chi-square lies within its interval with no more than a few outliers rejected."""
+        few = self.chi_square.dof > (1.0 - _MAX_OUTLIERS) * self.dof
+        return few and self.chi_square.value <= Fit.of(0.0, self.chi_square.dof).high
+
+
+def solve_trial(build: Build, data: Any, config: Config, label: str = "") -> TrialFit | None:
+    """The batch solution of changed data; None when there is none.
+
+    A trial has data and noise that nobody recorded: what it raises ends the trial alone, and is logged. A worker
+    process that is lost says nothing of the trial, and is raised.
+    """
+    return _tried(label, partial(_solution, build, data, config))
+
+
+def score_trial(build: Build, data: Any, config: Config, label: str = "") -> float:
+    """Median whitened residual of the measurements plus that of the processes, near the least-squares solution.
+
+    Infinite when there is no solution; exceptions as of `solve_trial`.
+    """
+    score = _tried(label, lambda: _score(build(data, config)))
+    return np.inf if score is None else score
+
+
+def _tried(label: str, trial: Callable[[], Result | None]) -> Result | None:
+    """The result of a trial; None without time left, or where it raises: logged, a program's defect as a warning."""
+    from alidade.pipelines.solvers.chain import IndeterminateError
+
+    if deadline.passed():
+        return None
+    try:
+        return trial()
+    except LostError:
+        raise
+    except (InputError, IndeterminateError) as error:
+        _log.info("trial (%s): %s", label or "as recorded", error)
+    except Exception as error:
+        _log.warning("trial (%s) failed: %s: %s", label or "as recorded", type(error).__name__, error)
+        _log.debug("trial (%s)", label or "as recorded", exc_info=True)
+    return None
+
+
+def _solution(build: Build, data: Any, config: Config) -> TrialFit | None:
+    from alidade.pipelines.solvers.batch import solve_batch
+
+    problem = build(data, config)
+    return TrialFit.of(problem, solve_batch(problem, _MAX_ITERATIONS))
+
+
+def max_concurrent(times: Sequence[Array]) -> int:
+    """Trials solved at the same time, by memory: each holds a graph of samples with these stamps."""
+    return max(_MAX_SAMPLES // max((len(time) for time in times), default=1), 1)
+
+
+def _score(problem: Problem) -> float:
+    from alidade.pipelines.solvers.engines import Compiled
+    from alidade.pipelines.solvers.levenberg import LevenbergConfig, minimize
+    from alidade.pipelines.solvers.linearization import NOT_MEASURED
+
+    compiled = Compiled.of(problem)
+    engine, config = compiled.engine.under(None), LevenbergConfig(_SCORE_ITERATIONS, max_damping=_MAX_SCORE_DAMPING)
+    whitened = list(
+        zip(engine.groups, engine.residuals(minimize(engine, compiled.initial, config).values), strict=True)
+    )
+    measured = [np.abs(r).ravel() for group, r in whitened if group.is_measurement]
+    processes = [r for group, r in whitened if not group.is_measurement and group.family not in NOT_MEASURED]
+    sizes = [np.sqrt((r**2).mean(axis=1)) for r in processes]
+    return sum(float(np.median(np.concatenate(each))) for each in (measured, sizes) if each)
+
+
+def held_out_residuals(problem: Problem) -> dict[str, float]:
+    """Family -> robust standard deviation of held-out measurements, over their noise.
+
+    One chunk in five is held out. Expected is 1, and a little more by the uncertainty of the prediction.
+    """
+    from alidade.pipelines.solvers.engines import Compiled
+    from alidade.pipelines.solvers.robust import RobustConfig, solve_robust
+
+    steps = list(problem.steps(CHUNK))
+    out = np.repeat(np.arange(len(steps)) % _HELD_OUT == _HELD_OUT - 1, [len(step.factors) for step in steps])
+    compiled = Compiled.of(problem, steps=steps)
+    measurements = [g for g in compiled.engine.groups if g.is_measurement]
+    if all(out[g.factors].all() for g in measurements):
+        return {}
+    kept = compiled.engine.with_groups([_without(g, out[g.factors]) for g in compiled.engine.groups])
+    solution = solve_robust(kept, compiled.initial, problem.loss, RobustConfig())
+    if not solution.converged:
+        return {}
+    found: dict[str, list[Array]] = {}
+    for group in measurements:
+        residuals = group.evaluate(solution.values)[0]
+        found.setdefault(group.family, []).append(residuals[out[group.factors]].ravel())
+    return {family: robust_sigma(np.concatenate(each)) for family, each in found.items()}
+
+
+def _without(group: Group, out: NDArray[np.bool_]) -> Group:
+    """A group without the measurements that are held out; processes and priors stay."""
+    if not group.is_measurement:
+        return group
+    weights = np.ones((len(out), group.model.rows)) if group.weights is None else group.weights
+    return replace(group, weights=weights * ~out[:, None])

@@ -1,0 +1,76 @@
+"""Findings: what a reader must know before using an estimate, as numbers; `reports/sentences.py` puts them in words.
+
+The status of a result is that of its most severe finding. All values are SI; sigmas are one standard deviation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Literal
+
+Status = Literal["calibrated", "weak", "inconsistent", "unobservable"]
+
+# Kind -> keys of its evidence, as in result.json. `share` is of a family or of the recording, `z` a z-score.
+KINDS: Mapping[str, tuple[str, ...]] = {
+    "not_converged": ("message",),
+    "direction": ("weights", "sigma_ratio", "advice"),  # unit vector in prior sigmas; posterior over prior sigma
+    "hypothesis": ("label", "chi_square_before", "chi_square_after", "dof", "equivalents"),
+    # Effect: required parameter -> shift if the parameter were at its prior mean.
+    "prior_conflict": ("parameter", "value", "sigma", "z", "inseparable", "effect"),
+    "change": ("time_s", "steps"),  # parameter -> (step, sigma)
+    "device_change": ("parameter", "step", "sigma", "recordings", "dates"),  # between two recordings
+    "rejection": ("family", "share", "noise_factor"),  # with noise_factor times the noise all of it would fit
+    "noise": (
+        "noise",
+        "unit",
+        "source",
+        "used",
+        "factor",
+        "estimated_factor",
+    ),  # used, and estimated alone, over stated
+    "correlation": ("family", "share"),
+    # Family None: all measurements, of which `largest` departs most; noise_factor times its noise would fit it.
+    "misfit": ("family", "chi_square", "dof", "largest", "noise_factor"),
+    "dominant_prior": ("figure", "stated", "share"),  # data-sheet figure: its share of a weak parameter's variance
+    "ambiguous_solution": ("chi_square", "values"),  # excess over the reported one; parameter -> (there, reported)
+    "solver_difference": ("parameter", "z", "sigma_ratio"),  # incremental less batch
+    "recording": ("recording", "findings"),  # those of one recording of a joint calibration by itself
+    "recordings_disagree": ("recordings", "dates", "chi_square", "dof"),  # dates: of two in a row, else none
+    "remark": ("text",),  # a premise of the method, a note of the reader
+}
+
+
+class Severity(IntEnum):
+    """In the contract's order of statuses; a NOTE leaves the status as it is."""
+
+    NOTE, WEAK, INCONSISTENT, UNOBSERVABLE = range(4)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A departure from the model, the priors or the requirements, with the numbers that show it.
+
+    Raises:
+        ValueError: the evidence is not that of its kind.
+    """
+
+    kind: str
+    severity: Severity
+    evidence: Mapping[str, Any]
+
+    def __post_init__(self) -> None:
+        if self.evidence.keys() != set(KINDS[self.kind]):
+            raise ValueError(f"evidence of {self.kind}: {', '.join(KINDS[self.kind])}; not {', '.join(self.evidence)}")
+
+
+def by_severity(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """The most severe first, equally severe ones in the order given."""
+    return tuple(sorted(findings, key=lambda finding: -finding.severity))
+
+
+def status(findings: Iterable[Finding]) -> Status:
+    """Of a result with these findings: that of the most severe one."""
+    statuses: tuple[Status, ...] = ("calibrated", "weak", "inconsistent", "unobservable")
+    return statuses[max((finding.severity for finding in findings), default=Severity.NOTE)]

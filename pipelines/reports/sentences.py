@@ -1,0 +1,278 @@
+"""Findings in words: headline, notes, next steps. The only place of the project with words about a result.
+
+    headline(findings, quantities, verdicts)
+
+Present tense, standard terms, numbers with units: those of `display/units.py`, to the digits of their sigma.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import groupby
+from typing import Any
+
+from alidade.pipelines.diagnostics.goodness_of_fit import Fit
+from alidade.pipelines.display.units import human_unit, noise_unit, rounded, to_digits_of
+from alidade.pipelines.estimation.finding import Finding, Severity, status
+from alidade.pipelines.estimation.problem import Quantity
+
+Quantities = Mapping[str, Quantity]
+
+# Findings of a kind, and parameters or recordings of a finding, that are named.
+_MAX_NAMED = 3
+_DIRECTIONS = {Severity.UNOBSERVABLE: "Not observable", Severity.WEAK: "Less accurate than required"}
+_NEXT = {
+    "calibrated": (
+        "Apply it: formulas, Python, C and ROS parameters are below, under How to apply it.",
+        "Later, `alidade validate RECORDING --calibration calibration.yaml` says whether it still holds.",
+    ),
+    "weak": ("Parameters that are observable can be applied as they are; for the others record again.",),
+    "unobservable": ("Record again with that; do not apply what is not observable.",),
+    "inconsistent": ("Do not apply it before the cause is found: see Goodness of fit below.",),
+}
+_WALK = "Calibrate the recordings after the last change together, or let the parameter walk: `share` in the config."
+_FAR = "check the orientation and the axis order of the sensor, or widen the prior"
+
+
+def headline(findings: Sequence[Finding], quantities: Quantities, verdicts: Mapping[str, str]) -> str:
+    """The status with all its reasons: the findings that make it, the most severe first.
+
+    Args:
+        findings: of a result, the most severe first.
+        quantities: by name.
+        verdicts: parameter -> verdict, of those with a required accuracy.
+    """
+    worst = max((finding.severity for finding in findings), default=Severity.NOTE)
+    if worst > Severity.NOTE:
+        # Weak directions of a recording that does not fit are no reason for anything.
+        return " ".join(
+            _sentences([f for f in findings if f.severity >= min(worst, Severity.INCONSISTENT)], quantities)
+        )
+    estimated = sum(verdict != "fixed" for verdict in verdicts.values())
+    by_prior = [name for name, verdict in verdicts.items() if verdict == "prior"]
+    but = f", {', '.join(by_prior)} by prior alone" if by_prior else ""
+    return f"{estimated} of {estimated} parameters meet the required accuracy{but}."
+
+
+def notes(findings: Sequence[Finding], quantities: Quantities) -> tuple[str, ...]:
+    """What a reader must know beside the headline, sentences without full stops."""
+    found = _sentences([finding for finding in findings if finding.severity == Severity.NOTE], quantities)
+    return tuple(text.removesuffix(".") for text in found)
+
+
+def next_steps(findings: Sequence[Finding]) -> tuple[str, ...]:
+    """What to do now, sentences."""
+    advice = [f"{capital(what)} ({labels})." for labels, what in by_advice(findings)]
+    walk = [_WALK] if any(finding.kind in ("device_change", "recordings_disagree") for finding in findings) else []
+    return (*advice, *walk, *_NEXT[status(findings)])
+
+
+def sentence(finding: Finding, quantities: Quantities) -> str:
+    """One finding in words."""
+    return _WORDS[finding.kind](finding.evidence, finding.severity, quantities)
+
+
+def cause(finding: Finding, quantities: Quantities) -> tuple[str, str] | None:
+    """Label and evidence of a finding that may explain the others; None of one that does not."""
+    if finding.kind not in _CAUSES or finding.severity == Severity.NOTE:
+        return None
+    return _CAUSES[finding.kind](finding.evidence, finding.severity, quantities)
+
+
+def label(weights: Mapping[str, float]) -> str:
+    """The parameters of a direction, which trade against each other."""
+    first, *others = weights
+    return f"{first} against {', '.join(others)}" if others else first
+
+
+def by_advice(findings: Sequence[Finding], *severities: Severity) -> list[tuple[str, str]]:
+    """(labels, advice) of directions of these severities (none: of all), those with the same advice together."""
+    labels: dict[str, list[str]] = {}
+    for finding in findings:
+        if finding.kind == "direction" and (not severities or finding.severity in severities):
+            labels.setdefault(finding.evidence["advice"], []).append(label(finding.evidence["weights"]))
+    return [("; ".join(dict.fromkeys(group)), advice) for advice, group in labels.items()]
+
+
+def capital(text: str) -> str:
+    """The text as the beginning of a sentence; names of parameters and topics stay as they are."""
+    first = text.split(" ", 1)[0]
+    return text if "_" in first or "/" in first else text[:1].upper() + text[1:]
+
+
+def _sentences(findings: Sequence[Finding], quantities: Quantities) -> Iterator[str]:
+    """In their order: directions by advice, of other kinds the first ones."""
+    for (kind, severity), group in groupby(findings, key=lambda finding: (finding.kind, finding.severity)):
+        each = list(group)
+        if kind == "direction":
+            for labels, advice in by_advice(each):
+                ratios = [f.evidence["sigma_ratio"] for f in each if f.evidence["advice"] == advice]
+                yield _weak(severity, labels, max(ratios), advice)
+            continue
+        yield from (sentence(finding, quantities) for finding in each[: None if kind == "remark" else _MAX_NAMED])
+        if kind != "remark" and len(each) > _MAX_NAMED:
+            yield f"{len(each) - _MAX_NAMED} more of this kind are in result.json."
+
+
+def _direction(e: Mapping[str, Any], severity: Severity, _: Quantities) -> str:
+    return _weak(severity, label(e["weights"]), e["sigma_ratio"], e["advice"])
+
+
+def _weak(severity: Severity, labels: str, sigma_ratio: float, advice: str) -> str:
+    return f"{_DIRECTIONS[severity]}: {labels} (sigma {sigma_ratio:.2g} of the prior). {capital(advice)}."
+
+
+def _not_converged(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
+    return f"No solution: {e['message']}. Do not use the values."
+
+
+def _hypothesis(e: Mapping[str, Any], severity: Severity, quantities: Quantities) -> str:
+    what, evidence = _corrected(e, severity, quantities)
+    equivalents = f" Equivalent: {'; '.join(e['equivalents'])}." if e["equivalents"] else ""
+    return f"Consistent with: {what} ({evidence}).{equivalents}"
+
+
+def _corrected(e: Mapping[str, Any], _: Severity, __: Quantities) -> tuple[str, str]:
+    before, after, dof = (rounded(e[key], 4) for key in ("chi_square_before", "chi_square_after", "dof"))
+    return e["label"], f"chi-square {before} -> {after}, dof {dof}"
+
+
+def _prior_conflict(e: Mapping[str, Any], severity: Severity, quantities: Quantities) -> str:
+    return f"{': '.join(_conflict(e, severity, quantities))}."
+
+
+def _conflict(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> tuple[str, str]:
+    q = quantities[e["parameter"]]
+    unit, factor = human_unit(q)
+    prior = f"prior {factor * q.prior_mean:.3g} ± {rounded(factor * q.scale)} {unit}".rstrip()
+    numbers = f"{_number(q, e['value'], e['sigma'])}, {prior} (z = {e['z']:.1f})"
+    if not q.assumed:
+        return f"{q.name} is far from its prior", f"{numbers}; {_FAR}"
+    inseparable = f" (or {', '.join(e['inseparable'])}, inseparable from it)" if e["inseparable"] else ""
+    what = f"{q.name} contradicts its {'data sheet' if q.sheet else 'prior'}{inseparable}"
+    # Its largest effect on another parameter, in units of the requirement.
+    shifts = {name: shift / quantities[name].require for name, shift in e["effect"].items() if name != q.name}
+    moved = max(shifts, key=lambda name: abs(shifts[name]), default="")
+    if not moved:
+        return what, numbers
+    unit, factor = human_unit(quantities[moved])
+    shift = f"{rounded(factor * abs(e['effect'][moved]))} {unit}".rstrip()
+    return what, f"{numbers}; its departure shifts {moved} by {shift}, {abs(shifts[moved]):.2g} of its requirement"
+
+
+def _change(e: Mapping[str, Any], severity: Severity, quantities: Quantities) -> str:
+    steps = [f"{name} by {_number(quantities[name], *step)}" for name, step in list(e["steps"].items())[:_MAX_NAMED]]
+    small = " Immaterial; included in the sigmas." if severity == Severity.NOTE else ""
+    return f"Change at {e['time_s']:.0f} s{': ' if steps else ''}{', '.join(steps)}.{small}"
+
+
+def _device_change(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> str:
+    step = _number(quantities[e["parameter"]], e["step"], e["sigma"])
+    return f"Change of the device {between(e['recordings'], e['dates'])}: {e['parameter']} by {step}."
+
+
+def _rejection(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
+    share = f"{100.0 * e['share']:.0f} % of {e['family']} measurements rejected"
+    return f"{share}; all would fit {e['noise_factor']:.2g} times the noise."
+
+
+def _noise(e: Mapping[str, Any], severity: Severity, _: Quantities) -> str:
+    unit, factor = noise_unit(e["noise"], e["unit"])
+    if severity > Severity.NOTE:
+        estimated = f"estimated {e['estimated_factor']:.2g} times the {e['source']}'s value"
+        return f"Noise {e['noise']}: {estimated}; not white noise: check the model or the unit."
+    used = f"{rounded(factor * e['used'], 3)} {unit}".strip()
+    return f"Noise {e['noise']}: {used} used, {e['factor']:.2g} times the {e['source']}'s value."
+
+
+def _correlation(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
+    return f"Residuals of {e['family']} are correlated over {100.0 * e['share']:.0f} % of the recording."
+
+
+def _misfit(e: Mapping[str, Any], severity: Severity, _: Quantities) -> str:
+    fit = Fit.of(e["chi_square"], e["dof"])
+    if fit.value != fit.value:
+        return "Chi-square is not a number: the solver has no usable estimate."
+    of = f" of {e['family']}" if e["family"] else ""
+    large = fit.value > fit.dof
+    bound = rounded(fit.high if large else fit.low, 4)
+    sums = f"chi-square {rounded(fit.value, 4)}, 99.9 % bound {bound} (dof {rounded(fit.dof, 4)})"
+    largest = f"; {'largest' if large else 'smallest'} for {e['largest']}, {e['noise_factor']:.2g} times its noise"
+    relation = "exceed" if severity > Severity.NOTE or large else "are smaller than"
+    return f"Residuals{of} {relation} the noise used: {sums}{largest}."
+
+
+def _dominant_prior(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
+    share, figure = f"{100.0 * e['share']:.0f} %", e["figure"]
+    what = figure.replace(".", " ").replace("_", " ")
+    return (
+        f"{share} of that variance comes from {what}: state sensors.{figure} (now {e['stated']:.2g}) if it is better."
+    )
+
+
+def _ambiguous_solution(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> str:
+    named = []
+    for name, (there, here) in list(e["values"].items())[:_MAX_NAMED]:
+        unit, factor = human_unit(quantities[name])
+        named.append(f"{name} {factor * there:.3g} instead of {factor * here:.3g} {unit}".rstrip())
+    higher = f"chi-square with priors is higher by {e['chi_square']:.1f}"
+    return f"A second solution is nearly as likely ({higher}): {', '.join(named)}; whole in second_best of result.json."
+
+
+def _solver_difference(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
+    return f"Batch on the same recording differs by up to {abs(e['z']):.1f} sigma ({e['parameter']}): use its result."
+
+
+def _recording(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> str:
+    own: Sequence[Finding] = e["findings"]
+    return f"{e['recording']} by itself: {' '.join(_sentences(own, quantities))}"
+
+
+def _recordings_disagree(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
+    sums = f"chi-square {e['chi_square']:.4g} (dof {e['dof']})"
+    if e["dates"]:
+        return f"All parameters together changed {between(e['recordings'], e['dates'])}: {sums}, none significantly."
+    return f"The recordings disagree about the device: {sums}."
+
+
+def _remark(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
+    return str(e["text"])
+
+
+_WORDS: Mapping[str, Callable[[Mapping[str, Any], Severity, Quantities], str]] = {
+    "not_converged": _not_converged,
+    "direction": _direction,
+    "hypothesis": _hypothesis,
+    "prior_conflict": _prior_conflict,
+    "change": _change,
+    "device_change": _device_change,
+    "rejection": _rejection,
+    "noise": _noise,
+    "correlation": _correlation,
+    "misfit": _misfit,
+    "dominant_prior": _dominant_prior,
+    "ambiguous_solution": _ambiguous_solution,
+    "solver_difference": _solver_difference,
+    "recording": _recording,
+    "recordings_disagree": _recordings_disagree,
+    "remark": _remark,
+}
+
+
+_CAUSES = {"hypothesis": _corrected, "prior_conflict": _conflict}
+
+
+def _number(q: Quantity, value: float, sigma: float) -> str:
+    """Value and sigma, SI, in the unit and with the digits that people read."""
+    unit, factor = human_unit(q)
+    number, spread = (to_digits_of(factor * each, factor * sigma) for each in (value, sigma))
+    return f"{number} ± {spread} {unit}".strip()
+
+
+def between(recordings: Sequence[str], dates: Sequence[str]) -> str:
+    """Two dates (ISO 8601) in words, or two recordings where these are of one day."""
+    first, second = (datetime.datetime.fromisoformat(date).date() for date in dates)
+    if first == second:
+        return f"between {recordings[0]} and {recordings[1]}"
+    return f"between {' and '.join(f'{date.day} {date:%B %Y}' for date in (first, second))}"
