@@ -261,7 +261,7 @@ def _solved_signs(system: ChainSystem, count: int) -> tuple[ChainSystem, Tangent
         shared=beside(system.shared),
     )
     factorization = ChainFactorization.of(wider)
-    known = len(factorization.root) - 1 - count
+    known = factorization.root.shape[1] - 1 - count
     R = factorization.root[:known]
     last = np.vstack([np.linalg.solve(R[:, :known], R[:, known:-1]), -np.eye(count)])
     states, nodes = factorization.propagate(last)
