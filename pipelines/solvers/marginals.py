@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.problem import Array, ChiSquare, Factor, History, Parameter, Problem
-from alidade.pipelines.solvers.chain import IndeterminateError
+from alidade.pipelines.solvers.chain import IndeterminateError as IndeterminateError
 
 if TYPE_CHECKING:
     from alidade.pipelines.solvers.system import Linear
