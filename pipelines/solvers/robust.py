@@ -20,8 +20,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from alidade.factors.loss import TruncatedLoss
-from alidade.pipelines.solvers.chain import Array
-from alidade.pipelines.solvers.layout import Values
+from alidade.pipelines.solvers.chain import Array, IndeterminateStateError
+from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import Engine, LevenbergConfig, Solution, minimize
 from alidade.pipelines.solvers.linearization import Group
 
@@ -34,14 +34,14 @@ class RobustConfig:
         minimizer: termination of every minimisation.
         rough_tolerance: decrease of chi-square per measurement at which plain least squares is near enough to begin
             with: residuals move by .05 sigma yet.
-        mu_step: factor from one surrogate to the next (Yang et al.: 1.4 with one iteration each; here two).
+        mu_step: factor from one surrogate to the next, with one reweighted step each (Yang et al.: 1.4).
         last_mu: of the last surrogate; its weights are 0 or 1 but for .1 % about the gate.
         max_chance: of a family that it loses more than half of its measurements to outliers.
     """
 
     minimizer: LevenbergConfig = field(default_factory=LevenbergConfig)
     rough_tolerance: float = 2e-3
-    mu_step: float = 4.0
+    mu_step: float = 2.5
     last_mu: float = 1e3
     max_chance: float = 1e-3
 
@@ -81,10 +81,13 @@ def _graduated(engine: Engine, values: Values, loss: TruncatedLoss, config: Robu
     if largest <= loss.gate:
         return values, 0
     mu, iterations = loss.gate**2 / max(2.0 * largest**2 - loss.gate**2, 1e-300), 0
-    step = replace(config.minimizer, max_iterations=2, cost_tolerance=config.rough_tolerance)
     while mu < config.last_mu:
-        relaxed = minimize(engine.under(replace(loss, mu=mu)), values, step)
-        values, iterations = relaxed.values, iterations + relaxed.iterations
+        relaxed = engine.under(replace(loss, mu=mu))
+        try:
+            step = Tangent(*relaxed.at(values)[0].eliminate().solve())
+        except (IndeterminateStateError, np.linalg.LinAlgError):
+            break
+        values, iterations = engine.layout.retract(values, step), iterations + 1
         mu *= config.mu_step
     return values, iterations
 
