@@ -24,8 +24,8 @@ Everything follows from the square-root information R u = d of the reported numb
 
 Limits: the first two or three attitudes of a triad whose gains are open by a half bend by more than second order: one
 recording of eight has a NEES of 70 to 460 of 10 numbers there, and the mean is outside its interval, as in no other
-case. Adding the variance of third order from slopes at half the way cured one of its three kinds of recording and spoilt
-two. Where no constrained minimum is found all that is calibrated has its prior.
+case. Adding the variance of third order from slopes at half the way cured one of its three kinds of recording and
+spoilt two. Where no constrained minimum is found all that is calibrated has its prior.
 """
 
 from __future__ import annotations
