@@ -34,6 +34,7 @@ class RobustConfig:
         minimizer: termination of every minimisation.
         rough_tolerance: decrease of chi-square per measurement at which plain least squares is near enough to begin
             with: residuals move by .05 sigma yet.
+        rough_iterations: of these at most: where they do not do outliers lead, and the surrogates begin anyhow.
         mu_step: factor from one surrogate to the next, with one reweighted step each (Yang et al.: 1.4).
         last_mu: of the last surrogate; its weights are 0 or 1 but for .1 % about the gate.
         max_chance: of a family that it loses more than half of its measurements to outliers.
@@ -41,6 +42,7 @@ class RobustConfig:
 
     minimizer: LevenbergConfig = field(default_factory=LevenbergConfig)
     rough_tolerance: float = 2e-3
+    rough_iterations: int = 8
     mu_step: float = 2.5
     last_mu: float = 1e3
     max_chance: float = 1e-3
@@ -52,7 +54,8 @@ def solve_robust(engine: Engine, values: Values, loss: TruncatedLoss | None, con
     if loss is None:
         return minimize(plain, values, config.minimizer)
     count = sum(len(group.model.time) for group in engine.groups if group.is_measurement)
-    rough = replace(config.minimizer, cost_tolerance=config.rough_tolerance * max(count, 1))
+    most = min(config.rough_iterations, config.minimizer.max_iterations)
+    rough = replace(config.minimizer, max_iterations=most, cost_tolerance=config.rough_tolerance * max(count, 1))
     found = minimize(plain, values, rough)
     iterations = found.iterations
     truncated = engine.under(loss)
