@@ -85,7 +85,7 @@ def test_compare_shows_truth_and_three_solvers(alidade: Command, brief: Path) ->
 def test_info_shows_topics_and_methods(alidade: Command, session: Path) -> None:
     run = alidade("info", session)
     assert run.code == 0
-    for word in ("/head/imu", "/vision/attitude", "head: yes", "los: no"):
+    for word in ("/head/imu", "/vision/attitude", "head: yes", "los: missing"):
         assert word in run.out
 
 
