@@ -3,7 +3,8 @@
     python -m docs._site.pictures [NAME...]      # all of them or some, into docs/pictures; minutes, needs a Chromium
 
 Recordings are simulated with fixed seeds. NAME.png has the top of the page at 1280 px and at 390 px, and its first
-sheet as printed; fault-NAME.png has one figure of the report of a faulty recording, 845 px wide.
+sheet as printed; report.png has the beginning of a report, fault-NAME.png one figure of the report of a faulty
+recording, 845 px wide.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ FOLDER = Path(__file__).parents[1] / "pictures"
 _METHODS = ("los", "indexer", "head", "cube", "tumble")
 # Of each look: width of the window, px, and the size it is brought to.
 _DESKTOP, _PHONE = (1280, (600, 560)), (390, (205, 560))
+_REPORT = (1020, (760, 860))
 _SHEET = (396, 560)
 _GAP, _COLOURS = 10, 48
 _DRAWN = "document.readyState == 'complete' && !document.querySelector('.plot:not([data-drawn])')"
@@ -51,6 +53,8 @@ def main(wanted: list[str]) -> None:
         for name, make in _pages(Path(scratch)).items():
             if not wanted or name in wanted:
                 _write(name, _looks(tab, make().as_uri(), Path(scratch)))
+        if not wanted or "report" in wanted:
+            _write_report(tab, Path(scratch))
         for name, (fault, figure) in _FAULTS.items():
             if not wanted or name in wanted:
                 _write_figure(tab, name, fault(Path(scratch)), figure)
@@ -97,6 +101,15 @@ def _pages(folder: Path) -> dict[str, Callable[[], Path]]:
         "certificate": certificate,
         "layout": layout,
     }
+
+
+def _write_report(tab: Tab, scratch: Path) -> None:
+    recording = _recording(scratch, "head", 1, "--scenario", "head_mounts")
+    _run("calibrate", recording, "--out", scratch / "mounts", "--quiet")
+    top = _screen(tab, (scratch / "mounts" / "report.html").as_uri(), _REPORT, scratch)
+    path = FOLDER.parent / "report.png"
+    top.quantize(_COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(path, optimize=True)
+    print(f"{path.name}: {path.stat().st_size / 1000:.0f} kB")
 
 
 def _faulty(folder: Path, where: Callable[[Array], NDArray[np.bool_]], by: Array) -> Path:

@@ -15,6 +15,7 @@ import pytest
 
 import alidade as door
 from alidade.pipelines.config import load_config
+from alidade.pipelines.estimation.finding import KINDS
 from docs._site.words import BUDGET, BUDGETS, counted, dialect, generated, prose, words
 from tests.install.walk import Step, difference, steps
 from tests.support.browser import DESKTOP, PHONE, look, needs_browser, running
@@ -155,6 +156,12 @@ def test_the_reference_has_every_name_of_the_public_door() -> None:
     page = (DOCS / "reference" / "python.md").read_text(encoding="utf-8")
     for name in set(door.__all__) - {"__version__"}:
         assert re.search(rf"^\.\. auto\w+:: alidade\.{name}\b", page, re.MULTILINE), name
+
+
+def test_every_kind_of_finding_is_on_the_page() -> None:
+    page = (DOCS / "reference" / "result-json.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| (`\w+`(?:, `\w+`)*) \|", page, re.MULTILINE)
+    assert {kind: tuple(re.findall(r"\w+", numbers)) for kind, numbers in rows} == KINDS
 
 
 def test_code_of_the_example_is_that_of_its_files() -> None:
