@@ -48,10 +48,10 @@ BUDGETS = {
     "howto": 4_800,
     "explanation": 1_950,
     "validation": 2_050,
-    "reference": 2_000,
+    "reference": 2_200,
 }
 # Of all pages with what the program writes; blocks of code do not count, and what autodoc adds (1,300) comes on top.
-BUDGET = 28_800
+BUDGET = 29_000
 
 
 def words(text: str) -> int:

@@ -8,14 +8,18 @@ import subprocess
 import sys
 import textwrap
 import tomllib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import alidade as door
+from alidade.pipelines import methods
 from alidade.pipelines.config import load_config
 from alidade.pipelines.estimation.finding import KINDS
+from alidade.pipelines.methods.meanings import COMMON as MEANINGS
+from docs._site.tables import arrays, commands, config_keys, data_sheets, noise, result_keys, scenarios
 from docs._site.words import BUDGET, BUDGETS, counted, dialect, generated, prose, words
 from tests.install.walk import Step, difference, steps
 from tests.support.browser import DESKTOP, PHONE, look, needs_browser, running
@@ -135,6 +139,29 @@ def test_page_opens_with_its_purpose_in_a_sentence(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=_name)
 def test_page_is_in_the_words_of_the_field(page: Path) -> None:
     assert list(dialect(prose(page.read_text(encoding="utf-8")))) == []
+
+
+def test_help_is_in_the_words_of_the_field_and_summaries_fit_a_line(
+    alidade: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert list(dialect("\n".join(commands()))) == []
+    monkeypatch.setenv("COLUMNS", "80")
+    assert not [line for line in alidade("-h").out.splitlines()[1:] if line.endswith("...")]
+
+
+@pytest.mark.parametrize("generate", [config_keys, result_keys, noise, data_sheets])
+def test_generated_reference_is_in_the_words_of_the_field(generate: Callable[[], Iterator[str]]) -> None:
+    assert list(dialect(prose("\n".join(generate())))) == []
+
+
+@pytest.mark.parametrize("method", ["los", "indexer", "head", "cube", "tumble"])
+def test_parameters_scenarios_and_arrays_are_in_the_words_of_the_field(method: str) -> None:
+    text = "\n".join([*scenarios(method), *arrays(method), *_meanings(method)])
+    assert list(dialect(prose(text))) == []
+
+
+def _meanings(method: str) -> list[str]:
+    return [*MEANINGS.values(), *methods.method(method).meanings.values()]
 
 
 def test_pages_keep_their_budgets() -> None:
