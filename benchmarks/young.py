@@ -32,7 +32,7 @@ from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.methods.tumble.scenario import TumbleScenario
 from alidade.pipelines.settings import Sensors
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
-from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, Run
+from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, IncrementalSolver
 
 HEAD = HeadScenario(
     duration_s=30.0,
@@ -255,7 +255,7 @@ def nees(values: Array, covariance: Array, truth: Array) -> tuple[float, int]:
 
 def followed(problem: Problem, truth: Array, moments: Array) -> Followed:
     """The incremental solver's errors at some times, s."""
-    run = Run(problem, DEFAULT_WINDOW)
+    run = IncrementalSolver(problem, DEFAULT_WINDOW)
     times: list[float] = []
     found: list[float] = []
     numbers, worst, messages = 0, 0.0, []

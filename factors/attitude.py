@@ -100,6 +100,7 @@ class VisionAttitudeFactor(Model):
     expected: Array | None = None
     elapsed: Array | None = None
     first: Array | None = None
+    shapes: ClassVar = {"measured": (4,), "sqrt_information": (3, 3)}
     rows: int = 3
     stacked: ClassVar = ("time", "measured", "sqrt_information", "anchor", "expected", "elapsed", "first")
 

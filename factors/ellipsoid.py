@@ -92,6 +92,7 @@ class StrengthFactor(Model):
     excess: Array
     symmetric: bool
     warmth: Array | None = None
+    shapes: ClassVar = {"raw": (3,), "sigma": ()}
     rows: int = 1
     stacked: ClassVar = ("time", "raw", "sigma", "excess", "warmth")
 
@@ -148,6 +149,7 @@ class DipFactor(Model):
     sigma: Array
     symmetric: tuple[bool, bool]
     warmth: Array | None = None
+    shapes: ClassVar = {"accel": (3,), "mag": (3,), "sigma": ()}
     rows: int = 1
     stacked: ClassVar = ("time", "accel", "mag", "sigma", "warmth")
 

@@ -165,6 +165,7 @@ class GyroIncrementFactor(Model):
     platform_turns: Increments | None = None
     platform: GyroPath | None = None
     share: float = 1.0
+    shapes: ClassVar = {"sigma": ()}
     rows: int = 3
     stacked: ClassVar = ("time", "turns", "sigma", "platform_turns")
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -268,6 +268,7 @@ class IndexerAverageFactor(Model):
     options: tuple[Option, ...] = ()
     theta_unit: float = 1.0
     warmth: Array | None = None
+    shapes: ClassVar = {"gyro": (3,)}
     rows: int = 3
 
     @classmethod

@@ -117,6 +117,7 @@ class LosDirectionFactor(Model):
     names: tuple[str, ...] = ("delta_px", "delta_gx", "delta_gy", "delta_z")
     around: Surroundings | None = None
     errors: int = 0
+    shapes: ClassVar = {"gimbal": (2,)}
     stacked: ClassVar = ("time", "measured", "sqrt_information", "gimbal", "around")
 
     @property
@@ -311,6 +312,7 @@ class LosRateFactor(Model):
     measured: Array
     H: Array
     sigma: Array
+    shapes: ClassVar = {"measured": (2,), "H": (2, 4), "sigma": ()}
     rows: int = 2
     blocks = (4,)
 

@@ -22,6 +22,11 @@ class TruncatedLoss:
     gate: float
     mu: float = np.inf
 
+    def __post_init__(self) -> None:
+        """Raises ValueError for a gate or a mu that is none."""
+        if not self.gate > 0.0 or not self.mu >= 0.0:
+            raise ValueError(f"TruncatedLoss: gate {self.gate:g} must be above 0, mu {self.mu:g} not below")
+
     def weight(self, square: Array) -> Array:
         """Weights in [0, 1] of measurements with squared norms `square`."""
         inside, outside = self._limits()

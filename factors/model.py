@@ -5,7 +5,7 @@ A model knows nothing of gtsam; `on` ties it to the variables of a graph.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import fields, replace
 from enum import Enum
 from itertools import chain
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.soundness import make_sound
 
 if TYPE_CHECKING:
     import gtsam
@@ -58,11 +59,19 @@ class Model:
     has d = 3, 6 (rotation first, as in gtsam) or d numbers; rotations and poses are perturbed on the right.
 
     A dataclass whose `stacked` names the fields that hold something for each measurement may be evaluated together with
-    others that agree in all other fields. Where `divisible` is false measurements of one factor are used or left out
-    together.
+    others that agree in all other fields; `shapes` says what that is, () a number. Where `divisible` is false
+    measurements of one factor are used or left out together.
+
+    Fields annotated as Array take lists too. A dataclass raises ValueError when it is made of numbers that are not
+    finite, of sigmas that are not above zero, or of arrays of other shapes.
     """
 
     divisible: ClassVar[bool] = True
+    shapes: ClassVar[Mapping[str, tuple[int, ...]]] = {}
+
+    def __post_init__(self) -> None:
+        """Of a dataclass, which calls it when it is made."""
+        make_sound(self, self.shapes, getattr(self, "stacked", ()))
 
     if TYPE_CHECKING:
 

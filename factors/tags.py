@@ -48,6 +48,7 @@ class TagAttitudeFactor(Model):
     BRC: Array
     placed: bool = False
     by_lens: Array | None = None
+    shapes: ClassVar = {"measured": (4, 2), "sqrt_information": (4, 2, 2), "corners": (4, 3)}
     rows: int = 8
     stacked: ClassVar = ("time", "measured", "sqrt_information", "corners", "bRt", "position", "by_lens")
     # Tags of one pose settle its place among themselves: alone each would fit.

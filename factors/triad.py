@@ -63,6 +63,7 @@ class TriadPriorFactor(Model):
     time: Array
     mean: Array
     sigma: Array
+    shapes: ClassVar = {"mean": (12,), "sigma": (12,)}
     rows: int = 12
     blocks = (12,)
 
@@ -94,6 +95,7 @@ class AccelFactor(Model):
     gravity: float
     curved: bool = False
     warmth: Array | None = None
+    shapes: ClassVar = {"raw": (3,), "sigma": (), "warmth": ()}
     rows: int = 3
     stacked: ClassVar = ("time", "raw", "sigma", "warmth")
 
@@ -145,6 +147,7 @@ class GyroStaticFactor(Model):
     earth_rate: Array
     gravity: float | None = None
     warmth: Array | None = None
+    shapes: ClassVar = {"raw": (3,), "sigma": (), "warmth": ()}
     rows: int = 3
     stacked: ClassVar = ("time", "raw", "sigma", "warmth")
 
@@ -185,6 +188,7 @@ class MagFactor(Model):
     time: Array
     raw: Array
     sigma: Array
+    shapes: ClassVar = {"raw": (3,), "sigma": ()}
     rows: int = 3
     blocks = (ROT3, 12, 3)
     stacked: ClassVar = ("time", "raw", "sigma")

@@ -1,9 +1,9 @@
 """Constant vectors of the level frame as a triad measures them at attitudes that a gyro carries.
 
-Frames: a inertial, n level (x to the east of the field, y along its horizontal part, z up), which turns with the earth,
-b the body. A triad has nominal = K raw + b, by rows of K and b (12 numbers), as in alidade.factors.ellipsoid; what is
-predicted is raw, whose noise is white. The gyro's own samples carry the attitude from the time of its variable to that
-of the measurement.
+Frames: a inertial, n level (x to the east of the field, y along its horizontal part, z up), which turns with the earth
+and coincides with a at the first keyframe, b the body. A triad has nominal = K raw + b, by rows of K and b (12
+numbers), as in alidade.factors.ellipsoid; what is predicted is raw, whose noise is white. The gyro's own samples carry
+the attitude from the time of its variable to that of the measurement.
 """
 
 from __future__ import annotations
@@ -30,44 +30,49 @@ class FieldFactor(Model):
     """The earth's field: raw = K^-1 (bRa(time + delay) aRn s (0, cos dip, -sin dip) - b).
 
     Blocks: attitude aRb at the anchor (rotations), gyro bias (3), triad (12), strength s (1), dip (1; rad, the field's
-    inclination, positive down), delay (1; s by which a reading was taken later than its stamp says) and, unless the
-    gyro is perfect, its errors (6 to 18), see alidade.factors.gyro.
+    inclination, positive down), delay (1; s by which a reading was taken later than its stamp says), unless the gyro is
+    perfect its errors (6 to 18), see alidade.factors.gyro, and, where the place is unknown, the earth's rate (3).
 
     Attributes:
         time: (n,) stamps, s.
         anchor: (n,) s, times of the attitudes.
         raw: (n, 3).
         sigma: (n,) per axis.
-        aRn: (n, 4) how the earth has turned.
+        elapsed: (n,) s since a and n coincided.
         gyro: whose bias_hat was taken off.
         errors: numbers of the gyro's errors, 0 for a perfect one.
+        earth: (3,) rate of n in a, rad/s; None: a block.
     """
 
     time: Array
     anchor: Array
     raw: Array
     sigma: Array
-    aRn: Array
+    elapsed: Array
     gyro: GyroPath
     errors: int = 0
+    earth: Array | None = None
+    shapes: ClassVar = {"raw": (3,), "sigma": ()}
     rows: int = 3
-    stacked: ClassVar = ("time", "anchor", "raw", "sigma", "aRn")
+    stacked: ClassVar = ("time", "anchor", "raw", "sigma", "elapsed")
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Attitude, bias, triad, strength, dip, delay and the gyro's errors."""
-        return ROT3, 3, 12, 1, 1, 1, *([self.errors] if self.errors else [])
+        """Attitude, bias, triad, strength, dip, delay, the gyro's errors and the earth's rate."""
+        return ROT3, 3, 12, 1, 1, 1, *([self.errors] if self.errors else []), *([] if self.earth is not None else [3])
 
     def __call__(
-        self, aRb: Array, bias: Array, triads: Array, strength: Array, dip: Array, delay: Array, *errors: Array
+        self, aRb: Array, bias: Array, triads: Array, strength: Array, dip: Array, delay: Array, *others: Array
     ) -> Residuals:
         """Residual (predicted - raw) / sigma, (n, 3)."""
         middle = 0.5 * (self.anchor + self.time)
-        own = errors[0] if errors else None
+        own = others[0] if self.errors else None
         dV, rate, by_gyro = carried(self.gyro, self.anchor, middle, self.time + delay[:, 0], bias, own)
-        bRn = so3.multiply(so3.inverse(so3.multiply(aRb, dV)), self.aRn)
+        aRn, by_earth = _earth_rotation(self.elapsed, self.earth, others)
+        bRn = so3.multiply(so3.inverse(so3.multiply(aRb, dV)), aRn)
         cosine, sine, none = np.cos(dip), np.sin(dip), np.zeros_like(dip)
-        unit = so3.rotate(bRn, np.concatenate([none, cosine, -sine], axis=1))
+        level = np.concatenate([none, cosine, -sine], axis=1)
+        unit = so3.rotate(bRn, level)
         lower = so3.rotate(bRn, np.concatenate([none, -sine, -cosine], axis=1))
         error, across, by_triad = _predicted(self.raw, self.sigma, triads, strength * unit)
 
@@ -82,6 +87,7 @@ class FieldFactor(Model):
                 across @ (strength * lower)[..., None],
                 by_attitude @ rate[..., None],
                 *by_errors,
+                *by_earth(across, bRn, strength * level),
             )
 
         return error, jacobians
@@ -92,11 +98,11 @@ class UpFactor(Model):
     """Specific force: raw = K^-1 (bRa(time) aRn (0, 0, s) + (w' x arm + w x (w x arm)) / unit - b + c warmth).
 
     Blocks: attitude aRb at the anchor (rotations), gyro bias (3), triad (12), strength s (1), unless the gyro is
-    perfect its errors (6 to 18), of a sensor that is swung about a point arm (3; in b, from there to the sensor) and,
-    where its temperature is known, c (3, in the unit of b per K).
+    perfect its errors (6 to 18), of a sensor that is swung about a point arm (3; in b, from there to the sensor), where
+    its temperature is known c (3, in the unit of b per K) and, where the place is unknown, the earth's rate (3).
 
     Attributes:
-        time, anchor, raw, sigma, aRn, gyro, errors: as of the field.
+        time, anchor, raw, sigma, elapsed, gyro, errors, earth: as of the field.
         unit: m/s^2, of the strength, of a sensor that is swung; None: it is at rest.
         warmth: (n,) K, temperature above that at which b is the offset; None: not known.
     """
@@ -105,27 +111,33 @@ class UpFactor(Model):
     anchor: Array
     raw: Array
     sigma: Array
-    aRn: Array
+    elapsed: Array
     gyro: GyroPath
     errors: int = 0
+    earth: Array | None = None
     unit: float | None = None
     warmth: Array | None = None
+    shapes: ClassVar = {"raw": (3,), "sigma": ()}
     rows: int = 3
-    stacked: ClassVar = ("time", "anchor", "raw", "sigma", "aRn", "warmth")
+    stacked: ClassVar = ("time", "anchor", "raw", "sigma", "elapsed", "warmth")
 
     @property
     def blocks(self) -> tuple[Block, ...]:
-        """Attitude, bias, triad, strength, the gyro's errors, the arm and the slope over temperature."""
+        """Attitude, bias, triad, strength, the gyro's errors, the arm, the slope over temperature, the earth's rate."""
         arm, slope = ([] if each is None else [3] for each in (self.unit, self.warmth))
-        return ROT3, 3, 12, 1, *([self.errors] if self.errors else []), *arm, *slope
+        earth = [] if self.earth is not None else [3]
+        return ROT3, 3, 12, 1, *([self.errors] if self.errors else []), *arm, *slope, *earth
 
     def __call__(self, aRb: Array, bias: Array, triads: Array, strength: Array, *others: Array) -> Residuals:
         """Residual (predicted - raw) / sigma, (n, 3)."""
         middle = 0.5 * (self.anchor + self.time)
         own = others[0] if self.errors else None
-        triads = drifted(triads, self.warmth, others)
+        slopes = others if self.earth is not None else others[:-1]
+        triads = drifted(triads, self.warmth, slopes)
         dV, _, by_gyro = carried(self.gyro, self.anchor, middle, self.time, bias, own)
-        up = strength * so3.rotate(so3.multiply(so3.inverse(so3.multiply(aRb, dV)), self.aRn), _UP)
+        aRn, by_earth = _earth_rotation(self.elapsed, self.earth, others)
+        bRn = so3.multiply(so3.inverse(so3.multiply(aRb, dV)), aRn)
+        up = strength * so3.rotate(bRn, _UP)
         swung, by_swing = (
             self._swung(bias, own, others[1 if self.errors else 0]) if self.unit else (np.zeros_like(up), None)
         )
@@ -142,7 +154,7 @@ class UpFactor(Model):
                 by_bias, *by_errors = (a + b for a, b in zip((by_bias, *by_errors), more, strict=True))
             numbers = by_triad()
             shared = by_bias, numbers, by_strength, *by_errors, *by_arm, *by_slope(numbers, self.warmth)
-            return by_attitude @ so3.matrix(so3.inverse(dV)), *shared
+            return by_attitude @ so3.matrix(so3.inverse(dV)), *shared, *by_earth(across, bRn, strength * _UP)
 
         return error, jacobians
 
@@ -168,6 +180,23 @@ class UpFactor(Model):
             return tuple(out)
 
         return per_unit * (so3.cross(change, arm) + so3.cross(rate, around)), derivatives
+
+
+def _earth_rotation(
+    elapsed: Array, earth: Array | None, others: tuple[Array, ...]
+) -> tuple[Array, Callable[[Array, Array, Array], tuple[Array, ...]]]:
+    """Rotation aRn (n, 4) after `elapsed` s, and a function that gives the Jacobian by the earth's rate, if a block.
+
+    A vector v of n is aRn v in a; with phi = elapsed w it moves by -aRn [v]x J_r(phi) elapsed dw (J_r: right Jacobian).
+    """
+    phi = elapsed[:, None] * (others[-1] if earth is None else earth)
+
+    def by_rate(across: Array, bRn: Array, level: Array) -> tuple[Array, ...]:
+        if earth is not None:
+            return ()
+        return (-elapsed[:, None, None] * (across @ so3.matrix(bRn) @ so3.hat(level) @ so3.right_jacobian(phi)),)
+
+    return so3.exp(phi), by_rate
 
 
 def _predicted(raw: Array, sigma: Array, triads: Array, nominal: Array) -> tuple[Array, Array, Callable[[], Array]]:

@@ -49,6 +49,7 @@ class GyroRotationFactor(Model):
     accel: list[Array] | None = None
     warmth: list[Array] | None = None
     drifts: bool = False
+    shapes: ClassVar = {"sigma": ()}
     rows: int = 3
     stacked: ClassVar = ("time", "stamps", "raw", "sigma", "accel", "warmth")
 

@@ -90,6 +90,8 @@ class VectorizedFactor:
     def _require_fit(self) -> None:
         """Raise ValueError unless model, blocks and keys belong together."""
         name, n = type(self.model).__name__, len(self.model.time)
+        if not (self.loss is None or isinstance(self.loss, TruncatedLoss)):
+            raise ValueError(f"{name}: the loss must be an alidade.factors.TruncatedLoss, not {self.loss!r}")
         kind = (type(self.model), self.model.rows, self.blocks)
         if kind not in _CHECKED:
             check(self.model)

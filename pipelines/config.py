@@ -17,12 +17,11 @@ from pydantic import BaseModel, ValidationError, create_model
 
 from alidade.pipelines import methods
 from alidade.pipelines.errors import InputError, nearest
+from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
 from alidade.pipelines.settings import ATTACHMENT, Config
 
 if TYPE_CHECKING:
     from alidade.pipelines.recording.reading import Recording
-
-_LONGEST = 1 << 20
 
 
 def recorded_config(recording: Recording, override: Path | Config | None = None) -> Config:
@@ -42,10 +41,7 @@ def load_config(attachment: bytes | None, override: Path | Config | None = None)
     if isinstance(override, Config):
         more, override = override.model_dump(exclude_unset=True), Path("config")
     elif override is not None:
-        try:
-            more = _read(override.read_bytes(), str(override))
-        except OSError as error:
-            raise InputError(f"{override}: cannot be opened ({error.strerror})") from error
+        more = _read(read_bytes(override, MAX_YAML_BYTES), str(override))
     try:
         config = model().model_validate(_merge(base, more))
     except ValidationError as error:
@@ -73,22 +69,7 @@ def model() -> type[Config]:
 
 
 def _read(data: bytes, where: str) -> dict[Any, Any]:
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import MarkedYAMLError, YAMLError
-
-    if len(data) > _LONGEST:
-        raise InputError(f"{where}: {len(data)} bytes, which is no config")
-    try:
-        content = YAML(typ="safe", pure=True).load(data.decode())
-    except UnicodeDecodeError as error:
-        raise InputError(f"{where}: not a YAML file, byte {error.start} is not UTF-8 text") from error
-    except RecursionError as error:
-        raise InputError(f"{where}: unreadable YAML: it is nested too deep") from error
-    except (YAMLError, ValueError) as error:
-        mark = error.problem_mark if isinstance(error, MarkedYAMLError) else None
-        line = f", line {mark.line + 1}" if mark else ""
-        problem = (error.problem if isinstance(error, MarkedYAMLError) else None) or str(error)
-        raise InputError(f"{where}: unreadable YAML{line}: {' '.join(problem.split())}") from error
+    content = load_yaml(data, where)
     if content is None:
         return {}
     if not isinstance(content, dict):

@@ -20,6 +20,7 @@ from pydantic import (
     Field,
     PlainValidator,
     PrivateAttr,
+    field_validator,
     model_serializer,
 )
 from pydantic import Tag as Case
@@ -48,11 +49,26 @@ def _date(value: object) -> object:
     return datetime.date.fromisoformat(value) if isinstance(value, str) else value
 
 
-Sigma = Annotated[float, Field(gt=0.0)]
-SigmaOrZero = Annotated[float, Field(ge=0.0)]
+# In whatever SI unit no figure of a sensor, a mount or a site is larger, and no sigma but 0 smaller: their squares and
+# products overflow or vanish, in native code without a word.
+_LARGEST, _LEAST_SIGMA = 1e9, 1e-15
+
+
+def _not_tiny(sigma: float) -> float:
+    if 0.0 < sigma < _LEAST_SIGMA:
+        raise ValueError(f"must be 0 or at least {_LEAST_SIGMA:g}")
+    return sigma
+
+
+Sigma = Annotated[float, Field(gt=0.0), AfterValidator(_not_tiny)]
+SigmaOrZero = Annotated[float, Field(ge=0.0), AfterValidator(_not_tiny)]
+# Beyond it native code that looks for the pose of a tag ends the process.
+TagSize = Annotated[float, Field(gt=0.0, le=100.0), AfterValidator(_not_tiny)]
+# Of a logarithm: beyond it e to the power of it overflows.
+LogSigma = Annotated[float, Field(ge=0.0, le=10.0)]
 # No sensor has more, in any of the units below; beyond it arithmetic overflows.
-NoiseSigma = Annotated[float, Field(gt=0.0, le=1e3)]
-NoiseOrZero = Annotated[float, Field(ge=0.0, le=1e3)]
+NoiseSigma = Annotated[float, Field(gt=0.0, le=1e3), AfterValidator(_not_tiny)]
+NoiseOrZero = Annotated[float, Field(ge=0.0, le=1e3), AfterValidator(_not_tiny)]
 Date = Annotated[datetime.date, BeforeValidator(_date)]
 Quaternion = Annotated[tuple[float, float, float, float], Field(strict=False), AfterValidator(_unit)]
 Vector = Annotated[tuple[float, float, float], Field(strict=False)]
@@ -62,6 +78,17 @@ class Section(BaseModel):
     """Keys and values: strict, unknown keys refused."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    @field_validator("*")
+    @classmethod
+    def _bounded(cls, value: object) -> object:
+        """Every figure, however deep in a list or a mapping it stands."""
+        if isinstance(value, float | int) and abs(value) > _LARGEST:
+            raise ValueError(f"must be between -{_LARGEST:g} and {_LARGEST:g}")
+        if isinstance(value, list | tuple | dict):
+            for one in value.values() if isinstance(value, dict) else value:
+                cls._bounded(one)
+        return value
 
 
 class Noise(Section):
@@ -224,7 +251,7 @@ SensorSheets = Annotated[Sensors, BeforeValidator(_ideal)]
 class Tag(Section):
     """A tag on a body."""
 
-    size: Sigma  # m: edge of the black square
+    size: TagSize  # m: edge of the black square
     rotation: Quaternion = (1.0, 0.0, 0.0, 0.0)  # bodyRtag as w, x, y, z
     position: Vector = (0.0, 0.0, 0.0)  # in the body, m
 
@@ -277,7 +304,9 @@ class Config(Section):
     topics: dict[str, TopicSource] = {}  # key of a topic: its name, or what it is made of
     columns: dict[str, TableTopic] = {}  # topic: the columns of a table that make it
     noise: Noise = Noise()  # of the sensors
-    noise_known: SigmaOrZero = 0.1  # how well figures under noise are known: sigma of the logarithm; 0: exactly
+    noise_known: Annotated[SigmaOrZero, Field(le=10.0)] = (
+        0.1  # how well figures under noise are known: sigma of the logarithm; 0: exactly
+    )
     priors: dict[str, PriorEntry] = {}  # parameter: sigma, or mean and sigma; 0 fixes it, null leaves it free
     share: dict[str, Share] = {}  # parameter or pattern: device, recording, walks, or how far in the root of a day
     require: dict[str, Sigma] = {}  # parameter: sigma wanted

@@ -46,7 +46,7 @@ BUDGETS = {
     "methods": 5_300,
     "tutorials": 360,
     "howto": 4_800,
-    "explanation": 1_950,
+    "explanation": 2_400,
     "validation": 2_050,
     "reference": 2_200,
 }

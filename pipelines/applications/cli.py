@@ -105,6 +105,7 @@ _Jobs = Annotated[int | None, typer.Option(help="Local worker processes [default
 _OwnJobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Processes [default: one per core].")]
 _Strict = Annotated[bool, typer.Option("--strict", help="Fail if any part of the recording is damaged or missing.")]
 _AutoTopics = Annotated[bool, typer.Option("--auto-topics", help="Use the topics that `info` proposes.")]
+_AutoColumns = Annotated[bool, typer.Option("--auto-columns", help="Use the columns of tables that `info` proposes.")]
 _NoCheck = Annotated[bool, typer.Option("--no-check", help="Skip the final comparison with the batch solution.")]
 _Prior = Annotated[
     Path | None, typer.Option(help="Earlier calibration (result.json or calibration.yaml) used as prior.")
@@ -122,6 +123,14 @@ def _version(wanted: bool) -> None:
         raise typer.Exit
 
 
+_TimeLimit = Annotated[
+    float | None,
+    typer.Option(
+        "--time-limit",
+        min=0.1,
+        help="Time limit of the solution, s [default: 60, or a tenth of the recording; online all of it].",
+    ),
+]
 _Version = Annotated[
     bool, typer.Option("--version", "-V", callback=_version, is_eager=True, help="Print the version and exit.")
 ]
@@ -149,9 +158,11 @@ def calibrate(
     out: Annotated[Path | None, typer.Option(help="Folder for the results [default: RECORDING-SOLVER].")] = None,
     strict: _Strict = False,
     auto_topics: _AutoTopics = False,
+    auto_columns: _AutoColumns = False,
     jobs: _OwnJobs = None,
     prior: _Prior = None,
     no_check: _NoCheck = False,
+    time_limit: _TimeLimit = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -161,7 +172,7 @@ def calibrate(
     """
     from tempfile import TemporaryDirectory
 
-    from alidade.pipelines import parallel, progress
+    from alidade.pipelines import deadline, parallel, progress
     from alidade.pipelines.applications.joint import calibrate_device
     from alidade.pipelines.applications.session import calibrate as run
     from alidade.pipelines.errors import InputError
@@ -178,7 +189,12 @@ def calibrate(
         if not as_json:
             terminal.say(f"{len(recordings)} recordings of one device: {told(recordings)}")
     require_room(folder)
-    with progress.shown(quiet or as_json), parallel.processes(jobs), TemporaryDirectory(prefix="alidade-") as parts:
+    with (
+        progress.shown(quiet or as_json),
+        parallel.processes(jobs),
+        deadline.within(time_limit),
+        TemporaryDirectory(prefix="alidade-") as parts,
+    ):
         if len(recordings) > 1:
             by_itself = partial(write_part, Path(parts))
             calibration = calibrate_device(recordings, method, config, strict, auto_topics, prior, by_itself)
@@ -193,11 +209,12 @@ def calibrate(
                 auto_topics,
                 not no_check,
                 prior,
+                auto_columns=auto_columns,
             )
         with progress.doing("writing"):
-            written = write_results(folder, calibration)
             if len(recordings) > 1:
                 adopt_parts(folder, Path(parts))
+            written = write_results(folder, calibration)
     _tell(calibration, folder, written, as_json)
 
 
@@ -262,6 +279,10 @@ def follow(
     checkpoint: Annotated[Path | None, typer.Option(help="File that saves the run, and from which it resumes.")] = None,
     serve: Annotated[bool, typer.Option("--serve", help="Serve live estimates over Foxglove's WebSocket.")] = False,
     port: Annotated[int, typer.Option(help="Port of --serve, on this machine only.")] = 8765,
+    allow_origin: Annotated[
+        list[str] | None,
+        typer.Option(help="Site that may read --serve beside Foxglove's, https://host; may be repeated."),
+    ] = None,
     page: Annotated[
         bool, typer.Option("--page", help="Serve a live page with the motion that is needed, for a phone.")
     ] = False,
@@ -289,7 +310,8 @@ def follow(
     for place in (folder, checkpoint and checkpoint.parent):
         require_room(place)
     settings = Settings(method, config, parse_window(window), patience, checkpoint, not no_check, prior)
-    calibration = run(source, settings, port if serve else None, record, as_json, (host, page_port) if page else None)
+    page_at = (host, page_port) if page else None
+    calibration = run(source, settings, port if serve else None, record, as_json, page_at, allow_origin or ())
     written = write_results(folder, calibration)
     _tell(calibration, folder, written, as_json)
 
@@ -443,6 +465,7 @@ def info(
     from alidade.pipelines import progress
     from alidade.pipelines.applications.discovery import suggestions, unused
     from alidade.pipelines.applications.session import checked_facts
+    from alidade.pipelines.applications.table_discovery import propose_columns, with_columns
     from alidade.pipelines.config import recorded_config
     from alidade.pipelines.recording.reading import open_recording
     from alidade.pipelines.reports import terminal
@@ -450,12 +473,15 @@ def info(
     with progress.shown(quiet), progress.doing("reading"):
         recording = open_recording(session, strict)
         settings = recorded_config(recording, config)
+        columns = None if settings.columns else propose_columns(recording)
+        if columns is not None and columns.columns:
+            settings = with_columns(recording, settings)
         facts = checked_facts(recording, settings)
         found, left = suggestions(recording, settings), unused(recording, settings)
     if as_json:
-        print(terminal.facts_json(facts, found, left))
+        print(terminal.facts_json(facts, found, left, columns))
     else:
-        terminal.show_facts(session.name, facts, found, left)
+        terminal.show_facts(session.name, facts, found, left, columns)
 
 
 @app.command()
@@ -465,6 +491,7 @@ def noise(
     out: Annotated[Path | None, typer.Option(help="Folder for noise.html and noise.json.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print noise.json only.")] = False,
     strict: _Strict = False,
+    auto_columns: _AutoColumns = False,
     quiet: Quiet = False,
 ) -> None:
     """Measure sensor noise at rest (Allan deviation).
@@ -477,7 +504,7 @@ def noise(
     from alidade.pipelines.reports.noise import noise_json, write_noise
 
     with progress.shown(quiet):
-        study = noise_of(session, strict, config)
+        study = noise_of(session, strict, config, auto_columns)
     written = () if out is None else write_noise(out, study)
     if as_json:
         print(noise_json(study), end="")
@@ -701,10 +728,18 @@ def main() -> None:
         if _interrupted(error):
             sys.exit(exit_codes.INTERRUPTED)
         code = _TROUBLE.get(type(error).__name__)
-        if code is None:
+        if code is None and not isinstance(error, OSError):
             raise
-        print(f"alidade: {error}", file=sys.stderr)
-        sys.exit(code)
+        print(f"alidade: {_of_system(error) if isinstance(error, OSError) else error}", file=sys.stderr)
+        sys.exit(exit_codes.BAD_INPUT if code is None else code)
+
+
+def _of_system(error: OSError) -> str:
+    """A file or a folder that the system refuses, TMPDIR without room among them, in one line."""
+    from alidade.pipelines.errors import printable
+
+    where = error.filename if isinstance(error.filename, str) else os.environ.get("TMPDIR", "/tmp")
+    return f"{printable(where)}: {error.strerror or printable(str(error))}"
 
 
 if __name__ == "__main__":

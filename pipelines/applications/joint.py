@@ -117,6 +117,11 @@ class Alone:
         return datetime.datetime.fromtimestamp(self.day * DAY_S, datetime.UTC)
 
     @property
+    def values(self) -> dict[str, float]:
+        """What it estimated by itself."""
+        return {name: p.value for name, p in self.calibration.parameters.items()}
+
+    @property
     def sigmas(self) -> dict[str, float]:
         """Of what it estimated by itself."""
         found = self.calibration.parameters
@@ -172,6 +177,8 @@ def calibrate_together(
         for i, read in enumerate(sessions):
             with progress.doing("reading"):
                 session = read()
+            if alone:
+                session = replace(session, near=alone[0].values)
             calibration = session.calibrated_beside(partial(_with_those_before, session, alone))
             alone.append(Alone.of(session, calibration, Path(folder) / str(i)))
             written(calibration)

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines import methods, progress
+from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import load_config
-from alidade.pipelines.diagnostics.sensor_noise import AxisNoise, axis_noise
+from alidade.pipelines.diagnostics.noise_spectrum import AxisNoise, axis_noise
 from alidade.pipelines.diagnostics.static_intervals import stretches_at_rest
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages
@@ -79,12 +80,13 @@ class _Device(NamedTuple):
     sensors: dict[str, Array]
 
 
-def noise_of(path: Path, strict: bool = False, config: Path | None = None) -> NoiseStudy:
+def noise_of(path: Path, strict: bool = False, config: Path | None = None, auto_columns: bool = False) -> NoiseStudy:
     """The noise of every gyro, accelerometer and magnetometer of a recording.
 
     Args:
         path: the recording.
         strict: refuse it if anything of it is lost.
+        auto_columns: take what `alidade info` concludes of the columns of tables, where the config describes none.
         config: YAML file with the columns of tables, topics made of others, and those with rates alone.
 
     Raises:
@@ -92,6 +94,8 @@ def noise_of(path: Path, strict: bool = False, config: Path | None = None) -> No
     """
     recording = open_recording(path, strict)
     rates = set() if config is None else _described(recording, config)
+    if auto_columns:
+        with_columns(recording, load_config(None, config))
     names = [
         name
         for name, topic in recording.topics.items()

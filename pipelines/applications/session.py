@@ -10,16 +10,18 @@ import hashlib
 import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from contextlib import AbstractContextManager
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
-from alidade.pipelines import methods, progress
+from alidade.pipelines import deadline, methods, progress
 from alidade.pipelines.applications.discovery import empty, idle, nearest_suggestion, suggestions, with_suggested
 from alidade.pipelines.applications.sharing import device_belief, walks
+from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import load_config, recorded_config
 from alidade.pipelines.diagnostics.change_test import Stability, change_finding, stability, with_change
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf, solve_segments, split_halves
@@ -45,6 +47,15 @@ from alidade.pipelines.simulation.simulated import Simulated
 from alidade.pipelines.solvers.window import check_window
 
 SOLVERS = ("batch", "incremental", "published")
+# Steps that a run takes whatever time it has: of fewer there may be no solution at all.
+_LEAST_STEPS = 20
+# What ends for want of time, in this order.
+_HYPOTHESES, _SEGMENTS, _COMPARISON, _SENSITIVITY = (
+    "the test of hypotheses",
+    "the solution of both sides of a change",
+    "the comparison with batch",
+    "the sensitivity to fixed inputs",
+)
 # Difference between incremental and batch that is worth a note, in sigmas.
 _NOTABLE_DIFFERENCE = 1.0
 
@@ -143,12 +154,18 @@ class Arrays:
 
 @dataclass(frozen=True, eq=False)
 class Session:
-    """Data as their method takes them, the config in force, and where both come from."""
+    """Data as their method takes them, the config in force, and where both come from.
+
+    Attributes:
+        method, data, config, origin: as above.
+        near: numbers that rotations are reported near of, as another recording of the device has them.
+    """
 
     method: Method
     data: Any
     config: Config
     origin: Origin
+    near: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def read(
@@ -158,9 +175,12 @@ class Session:
         config_file: Path | Config | None,
         auto_topics: bool = False,
         prior: Path | None = None,
+        auto_columns: bool = False,
     ) -> Session:
         """Read and check a recording (arguments and exceptions as `calibrate` has them)."""
         config = recorded_config(recording, config_file)
+        if auto_columns:
+            config = with_columns(recording, config)
         if auto_topics:
             config = with_suggested(recording, config, method_name)
         chosen = methods.method(resolve_method(method_name, recording, config))
@@ -205,7 +225,7 @@ class Session:
     def _problem(self) -> Problem:
         _check_sheets(self.method, self.config)
         with progress.doing("preparing the graph"):
-            return self.method.graph(self.data, self.config)
+            return self.method.graph(self.data, self.config).near(self.near)
 
     @cached_property
     def facts(self) -> SessionFacts:
@@ -244,7 +264,8 @@ class Session:
                 raise InputError(f"no solver {solver!r}; there are {', '.join(SOLVERS)}")
         check_window(window)
         solved = (self._solve(solver, window, report=report) for solver in solvers)
-        return self.judged(solved, seconds or {}, check, report)
+        with self.usual_time("incremental" in solvers):
+            return self.judged(solved, seconds or {}, check, report)
 
     def calibrated_beside(self, others: Callable[[Told], Mapping[str, float]]) -> Calibration:
         """The calibration by batch, what it says of its numbers linear where others have them. Raises as `calibrate`.
@@ -252,8 +273,15 @@ class Session:
         Args:
             others: of what the recording says, linear about its solution, the numbers as they are with the others.
         """
-        (calibration,) = self.judged([self._solve("batch", None, others)], {})
+        with self.usual_time():
+            (calibration,) = self.judged([self._solve("batch", None, others)], {})
         return calibration
+
+    def usual_time(self, online: bool = False) -> AbstractContextManager[None]:
+        """The time for a calibration, where no command has set one."""
+        stamps = [time for time in self.faults.times(self.data) if len(time)]
+        start = min((float(time[0]) for time in stamps), default=0.0)
+        return deadline.usual(max((float(time[-1]) for time in stamps), default=0.0) - start, online)
 
     def judged(
         self,
@@ -283,7 +311,7 @@ class Session:
             stable, change = self._change(estimate, quantities)
             if change is not None and change.severity == Severity.NOTE:
                 estimate = with_change(estimate, change)
-            difference = self._difference(estimate) if check else None
+            difference = self._difference(estimate) if check and not deadline.passed(_COMPARISON) else None
             found.append(
                 Calibration(
                     method=self.method,
@@ -293,6 +321,7 @@ class Session:
                         [
                             *self._findings(problem, estimate, quantities, change),
                             *_remarks(problem, estimate, difference),
+                            *_stopped(),
                         ]
                     ),
                     recording=self.origin.name,
@@ -325,10 +354,11 @@ class Session:
     ) -> tuple[Finding, ...]:
         """The findings on an estimate; hypotheses are tested where it is suspect."""
         findings = diagnose(estimate, quantities, problem.advice, change)
-        if not is_suspect(estimate, findings):
+        if not is_suspect(estimate, findings) or deadline.passed(_HYPOTHESES):
             return findings
         with progress.doing("testing hypotheses"):
             hypotheses = find_hypotheses(self.method.graph, self.faults, self.data, self.config, estimate)
+        deadline.passed(_HYPOTHESES)
         return diagnose(estimate, quantities, problem.advice, change, hypotheses)
 
     def _change(self, estimate: Estimate, quantities: Sequence[Quantity]) -> tuple[Stability | None, Finding | None]:
@@ -339,7 +369,7 @@ class Session:
         if stable is None or not stable.changed:
             return stable, None
         parts: Mapping[str, SplitHalf] = {}
-        if self.faults.cut:
+        if self.faults.cut and not deadline.passed(_SEGMENTS):
             with progress.doing("solving both sides of a change"):
                 parts = solve_segments(self.method.graph, self.faults, self.data, self.config, stable.time_s)
         return stable, change_finding(stable, parts, quantities)
@@ -378,6 +408,8 @@ class Session:
     def _changed(self) -> Iterator[tuple[str, Problem]]:
         """Each input that the graph takes for exact, and the graph with that input off by its step."""
         for exact in self.method.hypotheses().exact:
+            if deadline.passed(_SENSITIVITY):
+                return
             changed = exact.changed(self.data, self.config, exact.step)
             if changed is None:
                 continue
@@ -406,6 +438,7 @@ def calibrate(
     check: bool = False,
     prior: Path | None = None,
     report: bool = True,
+    auto_columns: bool = False,
 ) -> list[Calibration]:
     """One calibration a solver, from one reading of the recording.
 
@@ -417,6 +450,7 @@ def calibrate(
         window: s, of the incremental solver; None keeps the whole history.
         strict: refuse a recording of which anything is lost.
         auto_topics: take the topics that `alidade info` suggests where those of the method are not there.
+        auto_columns: take what `alidade info` concludes of the columns of tables where the config describes none.
         check: hold an incremental calibration against batch.
         prior: an earlier calibration of the device to begin from, result.json or calibration.yaml.
         report: with what only a report tells, see `Session.calibrate`.
@@ -427,7 +461,7 @@ def calibrate(
     """
     start = time.perf_counter()
     with progress.doing("reading"):
-        session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics, prior)
+        session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics, prior, auto_columns)
     return session.calibrations(solvers, window, {"read": time.perf_counter() - start}, check, report)
 
 
@@ -444,8 +478,8 @@ def checked_facts(recording: Recording, config: Config) -> SessionFacts:
     facts = session_facts(recording, config)
     by_name = {name: config.model_copy(update={"method": name}) for name, lacks in facts.missing.items() if lacks}
     asked = {name for name, own in by_name.items() if not missing_for(name, recording, own)}
-    said = {name: (f"`--method {name}`, by which it has to be asked for",) for name in asked}
-    facts = replace(facts, missing={**facts.missing, **said})
+    to_ask = {name: (f"`--method {name}`, by which it has to be asked for",) for name in asked}
+    facts = replace(facts, missing={**facts.missing, **to_ask})
     refused = {name: said for name in facts.methods if (said := _refused(methods.method(name), recording, config))}
     return replace(facts, missing={**facts.missing, **{name: (said,) for name, said in refused.items()}})
 
@@ -498,9 +532,9 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
 
 def _feed(digest: hashlib._Hash, data: Any) -> None:
     """The arrays and numbers of a dataclass, and of those inside it, with their names into a hash."""
-    for field in fields(data):
-        value = getattr(data, field.name)
-        digest.update(field.name.encode())
+    for one in fields(data):
+        value = getattr(data, one.name)
+        digest.update(one.name.encode())
         if is_dataclass(value):
             _feed(digest, value)
         elif isinstance(value, np.ndarray):
@@ -534,4 +568,12 @@ def _shown(problem: Problem, duration: float, chunk: int) -> Iterator[Step]:
     """The problem's steps; those fed one by one are shown as they are taken, by time in the recording."""
     if chunk > 1:
         return problem.steps(chunk)
-    return progress.track(problem.steps(chunk), "step by step", duration, lambda step: step.time)
+    name = "the run at {:.1f} s of {:.1f} s".format
+    steps = deadline.until_passed(problem.steps(chunk), lambda step: name(step.time, duration), _LEAST_STEPS)
+    return progress.track(steps, "step by step", duration, lambda step: step.time)
+
+
+def _stopped() -> list[Finding]:
+    """A note where something ended for want of time."""
+    text = deadline.stopped()
+    return [Finding("remark", Severity.NOTE, {"text": text})] if text else []

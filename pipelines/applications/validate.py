@@ -10,9 +10,8 @@ from alidade.pipelines import progress
 from alidade.pipelines.applications.session import Recorded, Session, resolve_method
 from alidade.pipelines.applications.sharing import device_belief, walks
 from alidade.pipelines.config import recorded_config
-from alidade.pipelines.diagnostics.calibration_check import Holding, Verdict, holding
-from alidade.pipelines.diagnostics.device_changes import Change
-from alidade.pipelines.diagnostics.validation import Validation
+from alidade.pipelines.diagnostics.cross_validation import Validation
+from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Change, Verdict, check_calibration
 from alidade.pipelines.display.units import human_unit, to_digits_of
 from alidade.pipelines.methods import method
 from alidade.pipelines.recording.reading import open_recording
@@ -44,7 +43,7 @@ class Validated:
     validations: Sequence[Validation]
     same_recording: bool
     lost: tuple[str, ...] = ()
-    held: Holding | None = None
+    held: CalibrationCheck | None = None
     device: Sequence[Validation] = ()
     best: Sequence[Validation] = ()
 
@@ -121,14 +120,14 @@ def validate(
     return Validated(calibration, path.name, validations, False, recording.notes, held, device, best)
 
 
-def _held(session: Session, known: Known) -> tuple[Holding | None, dict[str, float]]:
+def _held(session: Session, known: Known) -> tuple[CalibrationCheck | None, dict[str, float]]:
     """What the recording says of the calibration, and its own parameters; neither where it cannot be solved."""
     from alidade.pipelines.solvers.batch import solve_batch
     from alidade.pipelines.solvers.marginals import IndeterminateError
 
     if known.solver == "published":
         return None, {}
-    problem = session.problem()
+    problem = session.problem().near(dict(zip(known.belief.names, known.belief.mean.tolist(), strict=True)))
     device = walks(session.method, session.config, [q.name for q in problem.quantities])
     belief = device_belief(known, session.method, session.config, session.origin.sha256(), session.origin.epoch_ns)
     try:
@@ -140,10 +139,10 @@ def _held(session: Session, known: Known) -> tuple[Holding | None, dict[str, flo
     if not estimate.converged or estimate.told is None:
         return None, {}
     inflations = dict(zip(estimate.names, estimate.inflations.tolist(), strict=True))
-    return holding(belief, estimate.told, problem.quantities, inflations), own
+    return check_calibration(belief, estimate.told, problem.quantities, inflations), own
 
 
-def _stepped(step: Change, held: Holding) -> str:
+def _stepped(step: Change, held: CalibrationCheck) -> str:
     """A parameter that changed, in the unit people read."""
     unit, factor = human_unit(held.quantities[step.name])
     size, sigma = (to_digits_of(factor * x, factor * step.sigma) for x in (step.size, step.sigma))

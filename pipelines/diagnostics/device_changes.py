@@ -1,4 +1,4 @@
-"""Whether a device changed between recordings, by how much, and how it walks.
+"""Changes of a device between recordings: steps, random walk, and whether an earlier calibration still holds.
 
 A step of one of the device's numbers between two dates is another unknown of the joint system: added to the number in
 all recordings after it. Its estimate from the joint residuals and its sigma are those of least squares with that
@@ -14,16 +14,18 @@ the recordings is white they are then independent, and the rate is that of the l
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
 from alidade.factors.chi_square import quantile
-from alidade.pipelines.diagnostics.likelihood import likeliest
+from alidade.pipelines.belief import Belief
 from alidade.pipelines.estimation.assumptions import kind
-from alidade.pipelines.estimation.problem import Array
-from alidade.pipelines.solvers.joint import Joined
+from alidade.pipelines.estimation.problem import Array, Quantity, Told
+from alidade.pipelines.solvers.joint import Joined, join
+from alidade.pipelines.solvers.told import told_of
 
 # How often a history in which nothing changed is taken for one in which something did: by a number, by all at once.
 LEVEL, _JOINTLY = 0.05, 0.2
@@ -33,6 +35,10 @@ _AT_ONCE = 200
 # A step of a number is asked for where its sigma is less than this of the prior's.
 _TOLD = 1.0
 _MOST_STEPS = 20
+# A 95 % bound is where minus twice the log likelihood is larger by this: chi-square with one degree of freedom.
+_BOUND = 3.84
+# Grid of standard deviations, in scales.
+_MIN_SIGMA, _MAX_SIGMA, _GRID = 1e-3, 1e6, 400
 # Eigenvalues below this share of the largest are rounding.
 _ROUNDING = 1e-10
 
@@ -251,4 +257,91 @@ def _rate(squares: Array, information: Array) -> Rate:
         variance = 1.0 + rate**2 * information
         return float((np.log(variance) + squares / variance).sum())
 
-    return Rate(*likeliest(doubled, float(information.max()) ** -0.5))
+    return Rate(*maximum_likelihood_sigma(doubled, float(information.max()) ** -0.5))
+
+
+def maximum_likelihood_sigma(minus_two_log_likelihood: Callable[[float], float], scale: float) -> tuple[float, float]:
+    """The standard deviation of the largest likelihood, and its 95 % upper bound, which may be infinite.
+
+    Args:
+        minus_two_log_likelihood: of a standard deviation >= 0; it has one minimum.
+        scale: > 0, a standard deviation that is neither far too large nor far too small.
+    """
+    from scipy.optimize import brentq, minimize_scalar
+
+    grid = scale * np.geomspace(_MIN_SIGMA, _MAX_SIGMA, _GRID)
+    costs = np.array([minus_two_log_likelihood(each) for each in grid])
+    best, sigma, cost = int(costs.argmin()), 0.0, minus_two_log_likelihood(0.0)
+    if cost > costs[best]:
+        around = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, len(grid) - 1)])
+        found = minimize_scalar(
+            minus_two_log_likelihood, bounds=around, method="bounded", options={"xatol": 1e-9 * scale}
+        )
+        sigma, cost = float(found.x), float(found.fun)
+    beyond = np.flatnonzero((costs > cost + _BOUND) & (grid > sigma))
+    if not len(beyond):
+        return sigma, float("inf")
+    below = max(sigma, float(grid[beyond[0] - 1]) if beyond[0] else 0.0)
+    return sigma, float(brentq(lambda s: minus_two_log_likelihood(s) - cost - _BOUND, below, float(grid[beyond[0]])))
+
+
+Verdict = Literal["holds", "changed", "unknown", "same"]
+
+
+@dataclass(frozen=True)
+class CalibrationCheck:
+    """Whether an earlier calibration still holds on a recording.
+
+    Attributes:
+        changes: of the parameters between the two.
+        quantities: the parameters, by name.
+    """
+
+    changes: Changes
+    quantities: Mapping[str, Quantity]
+
+    @property
+    def verdict(self) -> Verdict:
+        """Unknown where the recording determines no parameter that could be compared."""
+        if not self.changes.steps:
+            return "unknown"
+        return "changed" if self.changes.any else "holds"
+
+    @property
+    def steps(self) -> Sequence[Change]:
+        """Of every parameter, those found as they are with all of them."""
+        found = {step.name: step for step in self.changes.found}
+        return [found.get(step.name, step) for step in self.changes.steps]
+
+    @property
+    def matters(self) -> bool:
+        """Whether a parameter that changed did by more than is required of it."""
+        return any(abs(step.size) > self.quantities[step.name].require for step in self.changes.found)
+
+
+def check_calibration(
+    known: Belief, told: Told, quantities: Sequence[Quantity], inflations: Mapping[str, float]
+) -> CalibrationCheck:
+    """Test an earlier calibration against a recording of the device, as two recordings of one device are.
+
+    The priors count once. The recording's own numbers, its bias and its time offset, are its own.
+
+    Args:
+        known: of the device, from the earlier calibration; no number is exactly known.
+        told: what the recording says.
+        quantities: of the recording's graph.
+        inflations: by what the recording's sigmas are larger because noise is coloured.
+    """
+    by_name = {q.name: q for q in quantities}
+    known = known.of(told.names)
+    rates = dict.fromkeys([*known.names, *_of_device(told)], 0.0)
+    before = told_of(known, [by_name[name].prior_scale for name in known.names])
+    joined = join([before, told], rates, [0.0, 1.0])
+    asked = {name for name in known.names if by_name[name].judged}
+    return CalibrationCheck(changes(joined, [0.0, 1.0], inflations, asked), by_name)
+
+
+def _of_device(told: Told) -> Collection[str]:
+    """The numbers whose priors are set apart."""
+    about = (told.prior_R != 0.0).any(axis=0)
+    return [name for name, yes in zip(told.names, about, strict=True) if yes]

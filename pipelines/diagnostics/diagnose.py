@@ -64,10 +64,11 @@ def diagnose(
         limits: thresholds.
     """
     published = estimate.solver == "published"  # a reference, judged by its own covariance alone
+    failure = Finding("not_converged", NOTE if published else INCONSISTENT, {"message": estimate.message})
     if not estimate.converged and not published:
-        return (*hypotheses, Finding("not_converged", INCONSISTENT, {"message": estimate.message}))
+        return by_severity([*hypotheses, failure, *_rejections(estimate, limits)])
     directions = weak_directions(quantities, estimate.covariance, advise)
-    found = [*directions, *hypotheses]
+    found = [*directions, *hypotheses, *([] if estimate.converged else [failure])]
     if not published:
         found += [*_prior_conflicts(estimate, quantities, limits), *([change] if change else [])]
         found += [*_rejections(estimate, limits), *_noise(estimate, limits), *_correlations(estimate, limits)]

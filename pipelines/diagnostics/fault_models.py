@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from alidade.pipelines.estimation.problem import Array
-
-if TYPE_CHECKING:
-    from alidade.pipelines.settings import Config
+from alidade.pipelines.settings import Config
 
 AXES = ("x", "y", "z")
 

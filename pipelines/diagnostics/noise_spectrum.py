@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors.chi_square import interval, quantile
-from alidade.pipelines.diagnostics.allan import NOISES
+from alidade.pipelines.diagnostics.allan import NOISES, AllanCurve, allan_curve, confidence
+from alidade.pipelines.diagnostics.spectral_lines import Line, find_lines, without_lines
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -44,6 +45,10 @@ _OFF, _ONCE_IN = 0.1, 3e6
 _LEAST_OCTAVES = 4.0
 # A noise counts as able to be told by a longer record up to this length, s.
 _LONGEST_RECORD = 30.0 * 86400.0
+# What is taken out with a sinusoid are its neighbours in the transform of the record, so many on either side.
+_BESIDE = 3.0
+# A sensor whose step is larger than so many times its noise repeats itself, and what it repeats is no noise.
+_COARSE = 2.0
 
 
 @dataclass(frozen=True)
@@ -121,30 +126,16 @@ def fit_noise(pieces: Sequence[Array], interval_s: float, lines: Sequence[tuple[
     return NoiseFit(found, squares, limits, limits[1] < 0.9 * top, off, where)
 
 
-def cosine_transform(x: Array) -> Array:
-    """Orthonormal DCT-II (n,) of x (n,). Makhoul, "A fast cosine transform", IEEE Trans. ASSP 1980."""
-    n = len(x)
-    folded = np.concatenate([x[::2], x[1::2][::-1]])
-    half = np.fft.rfft(folded)
-    k = np.arange(len(half))
-    turned = half * np.exp(-0.5j * np.pi * k / n)
-    out = np.empty(n)
-    out[: len(half)] = turned.real
-    # V[n - k] = conj(V[k]), turned by pi/2 less.
-    out[len(half) :] = -turned.imag[1 : n - len(half) + 1][::-1]
-    out *= np.sqrt(2.0 / n)
-    out[0] *= np.sqrt(0.5)
-    return out
-
-
 def _binned(pieces: Sequence[Array], interval_s: float, lines: Sequence[tuple[float, float]]) -> _Bins:
+    from scipy.fft import dct
+
     longest = max(len(piece) for piece in pieces)
     # Bin i begins at this part of half the sampling rate, the last one below the lowest frequency of all.
     edges = 2.0 ** (-np.arange(np.ceil(_PER_OCTAVE * np.log2(longest)) + 2.0)[::-1] / _PER_OCTAVE)
     count, power, hz = np.zeros((3, len(edges) - 1))
     for piece in pieces:
         n = len(piece)
-        square = cosine_transform(piece - piece.mean()) ** 2
+        square = dct(piece - piece.mean(), norm="ortho") ** 2
         f = np.arange(n) / (2.0 * n * interval_s)
         kept = np.ones(n)
         for low, high in lines:
@@ -336,3 +327,47 @@ def _worst_octave(bins: _Bins, variance: Array) -> tuple[float, float]:
         if beyond and abs(np.log(ratio)) > abs(np.log(worst)):
             worst, where = ratio, float(np.sqrt(bins.hz[start] * bins.hz[stop - 1]))
     return worst, where
+
+
+@dataclass(frozen=True, eq=False)
+class AxisNoise:
+    """Noise of one axis.
+
+    Attributes:
+        curve: its Allan deviation, sinusoids included.
+        low, high: 95 % interval of the deviation, (n,) each; dof: its equivalent degrees of freedom.
+        fit: the coefficients, sinusoids taken out.
+        lines: sinusoids, the strongest first.
+        coarse: the step of the readings where it hides the noise, else None.
+    """
+
+    curve: AllanCurve
+    low: Array
+    high: Array
+    dof: Array
+    fit: NoiseFit
+    lines: tuple[Line, ...]
+    coarse: float | None
+
+
+def axis_noise(pieces: Sequence[Array], interval_s: float) -> AxisNoise:
+    """The noise of one axis from pieces (n,) of a record at rest, each evenly spaced by interval_s."""
+    lines = find_lines(pieces, interval_s)
+    steady = without_lines(pieces, interval_s, lines) if lines else pieces
+    beside = _BESIDE / (interval_s * max(len(piece) for piece in pieces))
+    bands = [(line.hz - beside, line.hz + beside) for line in lines]
+    bands += [line.band_hz for line in find_lines(steady, interval_s)] if lines else []
+    fit = fit_noise(steady, interval_s, bands)
+    curve = allan_curve(pieces, interval_s)
+    dof, low, high = confidence(curve, fit.squares)
+    return AxisNoise(curve, low, high, dof, fit, lines, _coarse_step(pieces))
+
+
+def _coarse_step(pieces: Sequence[Array]) -> float | None:
+    """The smallest change of a reading, where it is no smaller than a couple of times the usual change."""
+    change = np.concatenate([np.abs(np.diff(piece)) for piece in pieces])
+    moved = change[change > 0.0]
+    if not len(moved):
+        return None
+    step = float(moved.min())
+    return step if step > _COARSE * float(np.sqrt(0.5 * np.mean(change**2))) else None

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from alidade.pipelines import deadline
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array, ChiSquare, Estimate, Factor, Problem, Quantity, Residuals
@@ -103,9 +104,11 @@ def score_trial(build: Build, data: Any, config: Config, label: str = "") -> flo
 
 
 def _tried(label: str, trial: Callable[[], Result | None]) -> Result | None:
-    """The result of a trial; None where it raises, logged as a warning where that is a defect of the program."""
+    """The result of a trial; None without time left, or where it raises: logged, a program's defect as a warning."""
     from alidade.pipelines.solvers.marginals import IndeterminateError
 
+    if deadline.passed():
+        return None
     try:
         return trial()
     except LostError:

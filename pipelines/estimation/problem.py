@@ -47,6 +47,29 @@ def rotation_vector_coordinates(values: gtsam.Values, key: int) -> tuple[Array, 
     return phi, so3.right_jacobian_inverse(phi)
 
 
+@dataclass(frozen=True)
+class NearRotationVector:
+    """Coordinates of a Rot3 variable: of the vectors of its rotation, a turn apart from each other, the nearest one.
+
+    Half a turn is +pi in one recording and -pi in the next; compared, joined or given a prior, both have to be one.
+
+    Attributes:
+        reference: rotation vector that the reported one is to be near, rad.
+    """
+
+    reference: tuple[float, float, float]
+
+    def __call__(self, values: gtsam.Values, key: int) -> tuple[Array, Array]:
+        """Rotation vector, rad, and its Jacobian by the variable."""
+        phi, J = rotation_vector_coordinates(values, key)
+        angle = float(np.linalg.norm(phi))
+        turns = round((float(phi @ self.reference) / angle - angle) / (2.0 * np.pi)) if angle > 0.0 else 0
+        if turns == 0:
+            return phi, J
+        phi = phi * (1.0 + 2.0 * np.pi * turns / angle)
+        return phi, so3.right_jacobian_inverse(phi)
+
+
 # A recording says what a number is when its sigma is below this share of the prior's.
 _DETERMINED = 0.5
 
@@ -107,6 +130,19 @@ class Parameter:
     key: int
     quantities: tuple[Quantity, ...]
     coordinates: Coordinates = vector_coordinates
+
+    @property
+    def is_rotation(self) -> bool:
+        """Whether it is a rotation, reported as a rotation vector."""
+        return self.coordinates is rotation_vector_coordinates or isinstance(self.coordinates, NearRotationVector)
+
+    def near(self, numbers: Mapping[str, float]) -> Parameter:
+        """The same; a rotation all of whose numbers are given is reported by the vector nearest to these."""
+        names = [q.name for q in self.quantities]
+        if not self.is_rotation or any(name not in numbers for name in names):
+            return self
+        x, y, z = (float(numbers[name]) for name in names)
+        return replace(self, coordinates=NearRotationVector((x, y, z)))
 
 
 @dataclass(frozen=True)
@@ -265,6 +301,17 @@ class Problem:
     keyframes: Keyframes | None = None
     elsewhere: Callable[[gtsam.Values], Iterator[gtsam.Values]] | None = None
     layout: ChainLayout | None = None
+
+    def near(self, numbers: Mapping[str, float]) -> Problem:
+        """The same problem; rotations are reported by the rotation vectors nearest to these numbers (rad, by name)."""
+        onward = self.onward
+
+        def grown(data: Any, time: float) -> Problem | None:
+            more = onward(data, time) if onward is not None else None
+            return None if more is None else more.near(numbers)
+
+        parameters = tuple(parameter.near(numbers) for parameter in self.parameters)
+        return replace(self, parameters=parameters, onward=None if onward is None else grown)
 
     def numbers(self, estimate: Estimate) -> dict[str, float]:
         """What formulas need, by name: an estimate's values and the constants."""

@@ -161,7 +161,7 @@ def too_fast(topic: str, t: Array, gyro: Array) -> str:
 
 def tracked(topic: str, wxyz: Array, dropped: dict[str, int]) -> Array:
     """Quaternions (N, 4), NaN in place of those that are all zero: a tracker that lost the body; counted."""
-    lost = ~wxyz.any(axis=1)
+    lost = np.asarray(~wxyz.any(axis=1))
     if lost.all() or not lost.any():
         return wxyz
     count(dropped, f"{topic}: a quaternion of zeros, as of a body that was not seen", int(lost.sum()))

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.arrays import ArrayContainer
 from alidade.pipelines.recording.container import sha256_of, sha256_together
@@ -21,7 +22,6 @@ from alidade.pipelines.recording.table_times import nanoseconds
 from alidade.pipelines.recording.tables import numbers, read_columns, table_form
 
 _DISTORTION = {"radial-tangential": "plumb_bob", "equidistant": "equidistant"}
-_LONGEST_YAML = 1 << 20
 
 
 def find_euroc(path: Path) -> Path | None:
@@ -121,16 +121,10 @@ def _camera_info(table: Path, t_ns: int, sensor: Mapping[str, Any]) -> series.Ca
 
 def _sensor(path: Path) -> dict[str, Any]:
     """What a sensor.yaml says; nothing if there is none."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
-    if not path.is_file() or path.stat().st_size > _LONGEST_YAML:
+    if not path.is_file() or path.stat().st_size > MAX_YAML_BYTES:
         return {}
-    try:
-        text = path.read_text(errors="replace").removeprefix("%YAML:1.0\n")
-        content = YAML(typ="safe", pure=True).load(text)
-    except (YAMLError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: unreadable YAML: {' '.join(str(error).split())[:200]}") from error
+    text = read_bytes(path, MAX_YAML_BYTES).decode(errors="replace").removeprefix("%YAML:1.0\n")
+    content = load_yaml(text, str(path))
     if not isinstance(content, dict):
         return {}
     for key in ("gyroscope_noise_density", "accelerometer_noise_density", "rate_hz"):

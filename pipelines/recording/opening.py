@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import hashlib
+import os
 import re
 import tempfile
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ from typing import Any
 import zstandard
 
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes, require_regular
 from alidade.pipelines.recording import ros1_bag
 from alidade.pipelines.recording.arrays import ArrayContainer
 from alidade.pipelines.recording.container import Container
@@ -34,7 +36,7 @@ _IDENTITY = {ros1_bag.MAGIC: (4096, 8192), _SQLITE: (100, 4096)}
 _USUAL_IDENTITY = (0, 4096)
 # A compressed file may unpack to so many times its size, beyond so many bytes.
 _LARGEST_RATIO, _SMALL = 100, 1 << 28
-METADATA, BAG, LONGEST_METADATA = "metadata.yaml", "rosbag2_bagfile_information", 1 << 24
+METADATA, BAG = "metadata.yaml", "rosbag2_bagfile_information"
 # What tells the parts of one recording from each other: their number, and their suffix.
 _PART_NAME = re.compile(r"(_\d+)?(\.[a-z0-9]+)+$")
 
@@ -90,7 +92,7 @@ def _together(paths: Sequence[Path], strict: bool, at: Path | None = None, remar
     """Several files as one recording."""
     if not paths:
         raise InputError("a recording of no files")
-    if len({path.resolve() for path in paths}) < len(paths):
+    if len({os.path.realpath(path) for path in paths}) < len(paths):
         raise InputError(f"{paths[0]}: the same file is named twice")
     parts = [_file(path, strict) for path in paths]
     if at is None:
@@ -102,6 +104,7 @@ def _together(paths: Sequence[Path], strict: bool, at: Path | None = None, remar
 
 def _file(path: Path, strict: bool) -> Container:
     """One file, by what it begins with."""
+    require_regular(path)
     try:
         with path.open("rb") as stream:
             start = stream.read(16)
@@ -238,32 +241,36 @@ def _tables_in(path: Path) -> list[Path]:
 
 def _metadata(path: Path) -> dict[str, Any]:
     """What a bag's metadata.yaml says; nothing if it is not there or is something else."""
-    if not path.is_file() or path.stat().st_size > LONGEST_METADATA:
+    if not path.is_file():
         return {}
-    return bag_metadata(path.read_text(errors="replace"))
-
-
-def bag_metadata(text: str) -> dict[str, Any]:
-    """What a bag's metadata.yaml says, by its text; nothing if that is something else."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
     try:
-        content = YAML(typ="safe", pure=True).load(text)
-        return dict(content[BAG])
-    except (YAMLError, ValueError, KeyError, TypeError, RecursionError):
+        return bag_metadata(read_bytes(path, MAX_YAML_BYTES))
+    except InputError:
         return {}
+
+
+def bag_metadata(text: bytes | str) -> dict[str, Any]:
+    """What a bag's metadata.yaml says, by its text; nothing if that is something else."""
+    try:
+        content = load_yaml(text, METADATA)
+    except InputError:
+        return {}
+    bag = content.get(BAG) if isinstance(content, dict) else None
+    return bag if isinstance(bag, dict) else {}
 
 
 def parts_of_bag(metadata: dict[str, Any]) -> list[str]:
-    """The files that it names, in their order."""
+    """The files that it names, in their order; what is no name of a file is none."""
     names = metadata.get("relative_file_paths")
-    return [Path(str(name)).name for name in names] if isinstance(names, list) else []
+    return [Path(name).name for name in names if isinstance(name, str)] if isinstance(names, list) else []
 
 
 def _stored(path: Path) -> Path | None:
     """The file of that name, compressed or not."""
-    return next((one for one in (path, path.with_name(f"{path.name}.zstd")) if one.is_file()), None)
+    try:
+        return next((one for one in (path, path.with_name(f"{path.name}.zstd")) if one.is_file()), None)
+    except (OSError, ValueError):  # no file can have such a name
+        return None
 
 
 def _part_of(paths: Sequence[Path]) -> Sequence[str]:

@@ -32,7 +32,8 @@ from alidade.pipelines.recording.opening import Where, open_container
 from alidade.pipelines.recording.plausibility import to_signed, wrapped_bits
 from alidade.pipelines.recording.sources import TopicSource, along, inverted, joined
 from alidade.pipelines.recording.stamps import jitter_ns
-from alidade.pipelines.recording.table_topics import TableTopic, described
+from alidade.pipelines.recording.table_topics import TableTopic, described, tables_of
+from alidade.pipelines.recording.tables import CsvFile
 
 # Pairs of frames an error lists.
 _MOST_PAIRS = 30
@@ -101,6 +102,10 @@ class Recording:
             self._container = described(self._container, columns)
             self._reader = MessageReader(self._container, str(self.path), self._epoch_ns)
         self._made = {source.name: source for source in sources if source.is_made}
+
+    def tables(self) -> dict[str, CsvFile]:
+        """The tables that no config describes yet, by the names of their files."""
+        return tables_of(self._container)
 
     def sha256(self) -> str:
         """SHA-256 of the file, hexadecimal."""

@@ -2,6 +2,9 @@
 
 SQLite has no checksum of what it stores: a file that is cut or whose structure is damaged is read up to there, and
 that is noted; a byte that is damaged within a message is not found.
+
+A file of SQLite can hold programs: views, virtual tables, columns that are computed. None of them is read, and a query
+that works without coming to a row is ended.
 """
 
 from __future__ import annotations
@@ -20,6 +23,8 @@ from alidade.pipelines.recording.data_loss import DataLoss
 
 # No message, definition or number of topics of a recording comes near these.
 _LARGEST, _MOST_TOPICS = 1 << 28, 10_000
+# Instructions of SQLite's machine without a row, of which a table of messages takes a dozen; looked at so often.
+_MOST_IDLE, _GLANCE = 10_000_000, 100_000
 # So many bytes or messages are read at a time.
 _BLOCK, _MOST = 1 << 22, 8192
 
@@ -41,6 +46,7 @@ class SqliteFile(Container):
         self.losses: list[DataLoss] = []
         self._keep_whole_pages()
         self._lost: dict[int, int] = {}
+        self._idle = 0  # instructions since the last row
         try:
             with self._open() as database:
                 self._check_tables(database)
@@ -70,6 +76,7 @@ class SqliteFile(Container):
                 except (sqlite3.Error, OverflowError, MemoryError) as error:
                     row, reason = None, str(error)
                 if row is not None:
+                    self._idle = 0
                     number, log_ns, data = row
                     if number not in left or not left[number]:
                         continue
@@ -107,6 +114,8 @@ class SqliteFile(Container):
                 database = sqlite3.connect(f"file:{quote(str(self.data.resolve()))}?{mode}", uri=True)
                 database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _LARGEST)
                 database.text_factory = lambda text: text.decode(errors="replace")
+                self._idle = 0
+                database.set_progress_handler(self._works_too_long, _GLANCE)
                 database.execute("PRAGMA trusted_schema=OFF")
                 database.execute("SELECT name FROM sqlite_master LIMIT 1").fetchone()
             except sqlite3.Error as error:
@@ -116,6 +125,11 @@ class SqliteFile(Container):
                 yield database
             return
         raise InputError(f"{self.path}: cannot be opened (SQLite says: {last})")
+
+    def _works_too_long(self) -> bool:
+        """Called by SQLite after each _GLANCE of its instructions; true ends the query."""
+        self._idle += _GLANCE
+        return self._idle > _MOST_IDLE
 
     def _keep_whole_pages(self) -> None:
         """Of a file that is cut read a copy with its whole pages, and their number in its head.
@@ -143,16 +157,21 @@ class SqliteFile(Container):
         self.losses.append(DataLoss("cut", whole * page, size - whole * page, reason="it is cut short"))
 
     def _check_tables(self, database: sqlite3.Connection) -> None:
-        """Real tables alone: a view could be anything, and last for ever."""
-        tables = {name for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table' LIMIT 100")}
+        """Real tables of stored columns alone: whatever is computed could be anything, and last for ever."""
+        found: list[Any] = database.execute("SELECT name, type, rootpage FROM sqlite_master LIMIT 100").fetchall()
+        tables = {str(name) for name, kind, page in found if kind == "table" and isinstance(page, int) and page > 0}
         if not {"topics", "messages"} <= tables:
             raise InputError(
                 f"{self.path}: a SQLite file that is no rosbag2 recording; its tables: {', '.join(sorted(tables))}"
             )
+        self._has_definitions = "message_definitions" in tables
+        for table in tables & {"topics", "messages", "message_definitions"}:
+            if any(row[6] > 1 for row in database.execute(f"PRAGMA table_xinfo({table})")):
+                raise InputError(f"{self.path}: table {table} has computed columns, which no recorder writes")
 
     def _definitions(self, database: sqlite3.Connection) -> tuple[dict[int, Channel], dict[int, Schema]]:
         texts: dict[str, tuple[str, bytes]] = {}
-        if database.execute("SELECT 1 FROM sqlite_master WHERE name = 'message_definitions'").fetchone():
+        if self._has_definitions:
             query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions LIMIT ?"
             for kind, encoding, text in database.execute(query, (_MOST_TOPICS,)):
                 texts[str(kind)] = str(encoding), str(text).encode()
@@ -163,9 +182,11 @@ class SqliteFile(Container):
         if len(found) > _MOST_TOPICS:
             raise InputError(f"{self.path}: more than {_MOST_TOPICS} topics, which no recording of sensors has")
         for i, (number, topic, kind, form) in enumerate(found):
+            if not isinstance(number, int):
+                raise InputError(f"{self.path}: a topic whose id is no number")
             encoding, text = texts.get(str(kind), ("ros2msg", b""))
             schemas[i] = Schema(i, str(kind), encoding, text)
-            channels[int(number)] = Channel(int(number), str(topic), str(form), i)
+            channels[number] = Channel(number, str(topic), str(form), i)
         return channels, schemas
 
     def _counted(self, database: sqlite3.Connection) -> dict[int, int]:
@@ -173,6 +194,7 @@ class SqliteFile(Container):
         counts: dict[int, int] = {}
         try:
             for (number,) in database.execute("SELECT topic_id FROM messages ORDER BY rowid"):
+                self._idle = 0
                 counts[number] = counts.get(number, 0) + 1
         except sqlite3.Error as error:
             self.losses.append(DataLoss("damage", 0, 0, reason=f"SQLite says: {error}"))

@@ -235,7 +235,7 @@ _NUMBERS = (
 
 def described(container: Container, columns: Mapping[str, TableTopic]) -> Container:
     """A container with its tables read as the config describes them. Raises InputError at a table that is not there."""
-    tables = _tables(container)
+    tables = tables_of(container)
     of: dict[str, dict[str, series.Topic]] = {name: {} for name in tables}
     remarks: list[str] = []
     for topic, table in columns.items():
@@ -253,12 +253,12 @@ def described(container: Container, columns: Mapping[str, TableTopic]) -> Contai
     return whole
 
 
-def _tables(container: Container) -> dict[str, CsvFile]:
+def tables_of(container: Container) -> dict[str, CsvFile]:
     """The CSV files in a container, by name."""
     if isinstance(container, CsvFile):
         return {container.path.name: container}
     parts = container.parts if isinstance(container, Parts) else ()
-    return {name: table for part in parts for name, table in _tables(part).items()}
+    return {name: table for part in parts for name, table in tables_of(part).items()}
 
 
 def _with_topics(container: Container, of: Mapping[str, Mapping[str, series.Topic]]) -> Container:

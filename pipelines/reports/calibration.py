@@ -19,7 +19,8 @@ from alidade.factors import so3
 from alidade.pipelines.diagnostics.observability import Verdict
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Status
-from alidade.pipelines.estimation.problem import Array, rotation_vector_coordinates
+from alidade.pipelines.estimation.problem import Array
+from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
 from alidade.pipelines.methods.formula import Formula, apply
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
@@ -184,20 +185,13 @@ def saved(calibration: Calibration) -> SavedCalibration:
 
 def load_calibration(path: Path, config: Config | None = None) -> SavedCalibration:
     """Read calibration.yaml, with the config that its formulas are for. Raises InputError when it cannot be used."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
+    data = read_bytes(path, MAX_YAML_BYTES)
     try:
-        content: Any = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
-        read = SavedCalibration.model_validate(content)
+        read = SavedCalibration.model_validate(load_yaml(data, str(path)))
         read._config = config or Config()
         return read
-    except OSError as error:
-        raise InputError(f"{path}: cannot be opened ({error.strerror})") from error
-    except (UnicodeDecodeError, YAMLError, RecursionError) as error:
-        raise InputError(
-            f"{path}: unreadable YAML; a calibration.yaml as `alidade calibrate` writes it is needed"
-        ) from error
+    except InputError as error:
+        raise InputError(f"{error}; a calibration.yaml as `alidade calibrate` writes it is needed") from error
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "the whole"
@@ -211,7 +205,7 @@ def _rotations(calibration: Calibration) -> dict[str, SavedRotation]:
     found = {}
     for parameter in calibration.problem.parameters:
         names = [q.name for q in parameter.quantities]
-        if parameter.coordinates is rotation_vector_coordinates and all(name in values for name in names):
+        if parameter.is_rotation and all(name in values for name in names):
             name = names[0].rsplit("_", 1)[0]
             w, x, y, z = (_rounded(v) for v in so3.exp(np.array([values[n] for n in names])).tolist())
             found[name] = SavedRotation(name=known.get(name, name), wxyz=(w, x, y, z))

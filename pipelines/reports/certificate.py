@@ -23,6 +23,7 @@ from alidade.factors.chi_square import student
 from alidade.pipelines.display.units import human_unit, to_digits_of
 from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.estimation.problem import Quantity
+from alidade.pipelines.files import MAX_RESULT_BYTES, MAX_YAML_BYTES, load_yaml, read_bytes
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.meanings import meaning
 from alidade.pipelines.reports.answer import Answer, Tone
@@ -187,10 +188,9 @@ def write_certificate(
 
 
 def _read_result(path: Path) -> _Result:
+    data = read_bytes(path, MAX_RESULT_BYTES)
     try:
-        result = _Result.model_validate_json(path.read_bytes())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be opened ({error.strerror})") from error
+        result = _Result.model_validate_json(data)
     except ValidationError as error:
         first = error.errors()[0]
         raise InputError(f"{path}: not a result.json: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
@@ -202,16 +202,9 @@ def _read_result(path: Path) -> _Result:
 def _read_fields(path: Path | None) -> Fields:
     if path is None:
         return Fields()
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
+    content = load_yaml(read_bytes(path, MAX_YAML_BYTES), str(path)) or {}
     try:
-        content: Any = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8")) or {}
         return Fields.model_validate(content)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be opened ({error.strerror})") from error
-    except (UnicodeDecodeError, YAMLError, RecursionError) as error:
-        raise InputError(f"{path}: unreadable YAML; the fields of a certificate are needed") from error
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "the whole"

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from alidade.pipelines.belief import Belief, independent
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Status
+from alidade.pipelines.files import MAX_RESULT_BYTES, read_bytes
 from alidade.pipelines.reports.calibration import SavedCalibration, SavedParameter, SavedRecording, load_calibration
 
 # A covariance is symmetric, and none of its eigenvalues negative, to this share.
@@ -116,10 +117,9 @@ class _Result(_Record):
 
 def load_known(path: Path) -> Known:
     """Read result.json or calibration.yaml. Raises InputError when the file cannot be used."""
+    data = read_bytes(path, MAX_RESULT_BYTES)
     try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be opened ({error.strerror})") from error
+        text = data.decode()
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: neither a result.json nor a calibration.yaml: it is no text") from error
     return _of_result(path, text) if text.lstrip().startswith("{") else _of_calibration(path)

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from alidade.pipelines.diagnostics.validation import peak, rms
+from alidade.pipelines.diagnostics.cross_validation import peak, rms
 from alidade.pipelines.reports.sentences import label
 
 if TYPE_CHECKING:

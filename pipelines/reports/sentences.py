@@ -134,8 +134,8 @@ def _hypothesis(e: Mapping[str, Any], severity: Severity, quantities: Quantities
 
 
 def _corrected(e: Mapping[str, Any], _: Severity, __: Quantities) -> tuple[str, str]:
-    fall = f"chi-square {e['chi_square_before']:.4g} -> {e['chi_square_after']:.4g}, dof {e['dof']:.4g}"
-    return e["label"], fall
+    before, after, dof = (rounded(e[key], 4) for key in ("chi_square_before", "chi_square_after", "dof"))
+    return e["label"], f"chi-square {before} -> {after}, dof {dof}"
 
 
 def _prior_conflict(e: Mapping[str, Any], severity: Severity, quantities: Quantities) -> str:
@@ -196,7 +196,8 @@ def _misfit(e: Mapping[str, Any], severity: Severity, _: Quantities) -> str:
         return "Chi-square is not a number: the solver has no usable estimate."
     of = f" of {e['family']}" if e["family"] else ""
     large = fit.value > fit.dof
-    sums = f"chi-square {fit.value:.5g}, 99.9 % bound {fit.high if large else fit.low:.5g} (dof {fit.dof:.5g})"
+    bound = rounded(fit.high if large else fit.low, 4)
+    sums = f"chi-square {rounded(fit.value, 4)}, 99.9 % bound {bound} (dof {rounded(fit.dof, 4)})"
     largest = f"; {'largest' if large else 'smallest'} for {e['largest']}, {e['noise_factor']:.2g} times its noise"
     relation = "exceed" if severity > Severity.NOTE or large else "are smaller than"
     return f"Residuals{of} {relation} the noise used: {sums}{largest}."

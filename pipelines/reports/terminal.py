@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.applications.discovery import Suggestion
     from alidade.pipelines.applications.noise import NoiseStudy
     from alidade.pipelines.applications.planning import Plan
+    from alidade.pipelines.applications.table_discovery import Columns
     from alidade.pipelines.estimation.finding import Finding
     from alidade.pipelines.recording.info import SessionFacts
     from alidade.pipelines.reports.result import Calibration, ParameterResult
@@ -114,7 +115,9 @@ def show_json(calibrations: Sequence[Calibration]) -> None:
     print(texts[0] if len(texts) == 1 else f"[{', '.join(texts)}]")
 
 
-def facts_json(facts: SessionFacts, found: Sequence[Suggestion], unused: Sequence[str]) -> str:
+def facts_json(
+    facts: SessionFacts, found: Sequence[Suggestion], unused: Sequence[str], columns: Columns | None = None
+) -> str:
     """What `info` tells, as JSON."""
     from alidade.pipelines.reports.plain_json import plain_json
 
@@ -132,12 +135,22 @@ def facts_json(facts: SessionFacts, found: Sequence[Suggestion], unused: Sequenc
         }
         for name, missing in told.pop("missing").items()
     }
+    if columns is not None:
+        tables = {topic: table.model_dump(exclude_defaults=True) for topic, table in columns.columns.items()}
+        told["columns"] = {"columns": tables, "reasons": list(columns.reasons), "doubts": list(columns.doubts)}
     return plain_json("info", told | {"unused": list(unused)})
 
 
-def show_facts(name: str, facts: SessionFacts, found: Sequence[Suggestion] = (), unused: Sequence[str] = ()) -> None:
+def show_facts(
+    name: str,
+    facts: SessionFacts,
+    found: Sequence[Suggestion] = (),
+    unused: Sequence[str] = (),
+    columns: Columns | None = None,
+) -> None:
     """What a recording can calibrate and with which topics, what each method lacks, then what there is."""
     say(f"{name}, {facts.duration_s:.1f} s")
+    _show_columns(columns)
     _show_methods(facts, found)
     proposed = {str(name) for each in found for source in each.topics.values() for _, name in source}
     if left := [name for name in unused if name not in proposed]:
@@ -169,6 +182,18 @@ def _say_wrapped(text: str) -> None:
     lines = textwrap.wrap(text, _WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False)
     for line in [text[: len(text) - len(text.lstrip())] + lines[0].lstrip(), *lines[1:]] if lines else []:
         say(line)
+
+
+def _show_columns(columns: Columns | None) -> None:
+    """The proposed section `columns`, with reasons and doubts."""
+    if columns is None:
+        return
+    if columns.columns:
+        console.print("[yellow]tables, proposed (use `calibrate --auto-columns` or paste into the config):[/]")
+        for line in columns.yaml.split("\n"):
+            say(f"  {line}")
+    for sentence in (*columns.reasons, *(f"in doubt: {doubt}" for doubt in columns.doubts)):
+        _say_wrapped(f"  {sentence}")
 
 
 def _show_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:

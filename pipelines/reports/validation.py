@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from alidade.pipelines.diagnostics.validation import Validation, peak, rms
+from alidade.pipelines.diagnostics.cross_validation import Validation, peak, rms
 from alidade.pipelines.display.figure import BEFORE, COLORS, Figure
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.meanings import meaning

@@ -1,14 +1,29 @@
-"""Files that belong together, written whole or not at all."""
+"""Files that belong together, written whole or not at all.
+
+Processes that write into one folder wait for each other: the files there are those of one of them, never of two. A
+process that is killed leaves those of before, or none.
+"""
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
+import sys
 import tempfile
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from alidade.pipelines.errors import InputError
+
+# Others are waited for so long, s: pages and tables are made in a few seconds. Looked at so often, s.
+_PATIENCE_S, _GLANCE_S = 60.0, 0.02
+_PART = ".alidade."
+# When this process began, and the files that it has written itself, with the time of the last change, ns.
+_BEGAN_NS = time.time_ns()
+_own: dict[Path, int] = {}
 
 
 def write_whole(out_dir: Path, names: Sequence[str], make: Callable[[Path], None]) -> tuple[Path, ...]:
@@ -24,23 +39,56 @@ def write_whole(out_dir: Path, names: Sequence[str], make: Callable[[Path], None
         make: writes the files.
 
     Raises:
-        InputError: out_dir is a file, or cannot be written to.
+        InputError: out_dir is a file, cannot be written to, or another process does not come to an end there.
     """
     new = not out_dir.exists()
     try:
-        out_dir.mkdir(parents=True, exist_ok=True)
-        part = Path(tempfile.mkdtemp(prefix=".alidade.", dir=out_dir))
-    except OSError as error:
-        raise InputError(f"{out_dir}: no folder to write results to ({error.strerror})") from error
-    try:
-        make(part)
-        return _move(part, out_dir, names)
+        with _alone(out_dir):
+            for left in out_dir.glob(f"{_PART}*"):  # of processes that were killed: nobody else is here
+                shutil.rmtree(left, ignore_errors=True)
+            part = Path(tempfile.mkdtemp(prefix=_PART, dir=out_dir))
+            try:
+                make(part)
+                return _move(part, out_dir, names)
+            finally:
+                shutil.rmtree(part, ignore_errors=True)
+                if new and not (out_dir / names[-1]).exists():
+                    shutil.rmtree(out_dir, ignore_errors=True)
     except OSError as error:
         raise InputError(f"{out_dir}: the results cannot be written ({error.strerror})") from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
-        if new and not (out_dir / names[-1]).exists():
-            shutil.rmtree(out_dir, ignore_errors=True)
+
+
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """The folder, made if need be, to this process alone; the lock goes with the process. Raises InputError."""
+    patience = time.monotonic() + _PATIENCE_S
+    while True:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        except OSError as error:
+            raise InputError(f"{folder}: no folder to write results to ({error.strerror})") from error
+        try:
+            if _locked(lock, patience, folder):
+                yield
+                return
+        finally:
+            os.close(lock)
+
+
+def _locked(lock: int, patience: float, folder: Path) -> bool:
+    """Whether the lock is had, and of the folder that has this name still."""
+    while True:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            if time.monotonic() > patience:
+                raise InputError(f"{folder}: another process is writing its results there; give another") from error
+            time.sleep(_GLANCE_S)
+            continue
+        except OSError:  # a file system without locks
+            return True
+        return folder.exists() and os.path.samestat(os.fstat(lock), folder.stat())
 
 
 def require_room(out_dir: Path | None) -> None:
@@ -61,9 +109,17 @@ def write_page(out_dir: Path, name: str, text: str) -> Path:
 
 
 def write_file(path: Path, content: str | bytes) -> None:
-    """A file that belongs to nothing else. Raises InputError when it cannot be written."""
+    """A file that belongs to nothing else, whole or not at all. Raises InputError when it cannot be written."""
     try:
-        _write(path, content)
+        if path.exists() and not path.is_file():  # a pipe, a terminal
+            _write(path, content)
+            return
+        part = path.with_name(f"{_PART}{os.getpid()}.{path.name}")
+        try:
+            _write(part, content)
+            os.replace(part, path)
+        finally:
+            part.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror})") from error
 
@@ -73,7 +129,10 @@ def _write(path: Path, content: str | bytes) -> None:
 
 
 def _move(part: Path, out_dir: Path, names: Sequence[str]) -> tuple[Path, ...]:
-    (out_dir / names[-1]).unlink(missing_ok=True)
+    last = (out_dir / names[-1]).absolute()
+    if last.exists() and last.stat().st_mtime_ns > max(_BEGAN_NS, _own.get(last, 0)):
+        print(f"alidade: {out_dir}: another process has written there meanwhile; it is replaced", file=sys.stderr)
+    last.unlink(missing_ok=True)
     written = []
     for name in names:
         if (part / name).exists():
@@ -81,4 +140,5 @@ def _move(part: Path, out_dir: Path, names: Sequence[str]) -> tuple[Path, ...]:
             written.append(out_dir / name)
         else:
             (out_dir / name).unlink(missing_ok=True)
+    _own[last] = last.stat().st_mtime_ns
     return tuple(written)

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
 from alidade.pipelines.errors import InputError, nearest, nearest_three
+from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -29,15 +30,10 @@ def load_scenario(model: type[Model], name_or_path: str | Path, folder: Path | N
     Raises:
         InputError: no such scenario, unreadable YAML, an unknown key or a value that does not fit.
     """
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
     path = _find(name_or_path, folder)
+    content = load_yaml(read_bytes(path, MAX_YAML_BYTES), str(path))
     try:
-        content = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
         return model.model_validate({} if content is None else content)
-    except (OSError, UnicodeDecodeError, YAMLError, RecursionError) as error:
-        raise InputError(f"{path}: cannot be read as YAML: {' '.join(str(error).split())}") from error
     except ValidationError as error:
         raise InputError(f"{path}: {explain(error.errors()[0], model)}") from error
 

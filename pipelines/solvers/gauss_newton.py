@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
+from alidade.pipelines import deadline
 from alidade.pipelines.solvers.marginals import IndeterminateError
 from alidade.pipelines.solvers.system import Linear, System
 
@@ -117,6 +118,8 @@ def minimize(
         if move.last or (damping == 0.0 and not move.halfway and enough):
             return Solution(system, values, True, f"converged after {iteration} iterations", iteration, on_floor)
         damping = damping / 10.0 if damping > 1e-6 else 0.0
+        if deadline.passed():
+            return Solution(system, values, False, f"not converged: {deadline.sentence()}", iteration)
     return Solution(system, values, False, f"not converged after {most} iterations", most)
 
 

@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from alidade.pipelines.applications.session import Session
+from alidade.pipelines.diagnostics.cross_validation import SplitHalf
 from alidade.pipelines.methods.head.recording import HeadData, write_head
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.simulation.scenario import load_scenario
@@ -80,6 +82,27 @@ def test_compare_shows_truth_and_three_solvers(alidade: Command, brief: Path) ->
     assert run.code == 0
     for word in ("truth", "published", "batch", "incremental", "time_offset"):
         assert word in run.out
+
+
+def test_compare_splits_the_recording_that_it_read(
+    alidade: Command, brief: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Halves were once read anew, without --auto-topics, --strict and --prior."""
+    opened: list[Session] = []
+
+    def cross_validate(self: Session) -> tuple[dict[str, SplitHalf], dict[str, float]]:
+        opened.append(self)
+        return real(self)
+
+    real = Session.cross_validate
+    monkeypatch.setattr(Session, "cross_validate", cross_validate)
+    renamed = tmp_path / "renamed.mcap"
+    renamed.write_bytes(brief.read_bytes().replace(b"/head/imu", b"/helm/imu"))
+    run = alidade("compare", renamed, "--method", "head", "--auto-topics", "--out", tmp_path / "out")
+    assert run.code == 0, run.err
+    assert (tmp_path / "out" / "compare.html").is_file()
+    assert len(opened) == 1
+    assert "head_imu" in opened[0].config.topics
 
 
 def test_info_shows_topics_and_methods(alidade: Command, session: Path) -> None:

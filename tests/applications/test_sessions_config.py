@@ -160,3 +160,26 @@ def test_configs_of_the_independent_recordings(shared_data: Path) -> None:
         assert (field_date(config) is not None) == (config.method == "cube")
     assert methods["head_mounts"] == "head"
     assert len(methods) == 6
+
+
+FIGURES = {
+    "noise_known: 1e300": "noise_known: must be less than or equal to 10",
+    "noise: {gyro_density: 1.0e-300}": "noise.gyro_density: must be 0 or at least 1e-15",
+    "noise: {gyro_density: 1.0e300}": "noise.gyro_density: must be less than or equal to 1000",
+    "priors: {delta_px: 1.0e-300}": "priors.delta_px: must be 0 or at least 1e-15",
+    "priors: {delta_px: {mean: 1.0e10, sigma: 1.0e-3}}": "priors.delta_px.mean: must be between -1e",
+    "require: {delta_px: 1.0e-300}": "require.delta_px: must be 0 or at least 1e-15",
+    "share: {delta_px: 1.0e300}": "share: must be between -1e",
+    "altitude_m: 1.0e300": "altitude_m: must be between -1e",
+    "cube: {tags: {1: {size: 1.0e300}}}": "cube.tags.1.size: must be less than or equal to 100",
+    "cube: {tags: {1: {size: 0.1, position: [1.0e300, 0, 0]}}}": "cube.tags.1.position: must be between -1e",
+    "cube: {camera: {focal: [1.0e300, 1.0], centre: [0.0, 0.0], distortion: []}}": "cube.camera.focal: must be between",
+}
+
+
+@pytest.mark.parametrize("text", FIGURES)
+def test_figures_beyond_all_range_are_refused_wherever_they_stand(text: str) -> None:
+    """Before they reach native code, which may end the process."""
+    with pytest.raises(InputError) as refused:
+        load_config(text.encode())
+    assert FIGURES[text] in str(refused.value)

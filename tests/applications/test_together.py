@@ -25,6 +25,7 @@ from alidade.pipelines.applications.session import Session
 from alidade.pipelines.applications.sharing import walks
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.finding import Severity
 from alidade.pipelines.estimation.problem import Array, Told
 from alidade.pipelines.recording.opening import recordings_of
 from alidade.pipelines.reports.over_time import forecasts, recordings_shown
@@ -245,6 +246,25 @@ def test_recordings_that_are_of_another_device_are_told() -> None:
     assert step["parameter"] == "theta_y"
     assert step["step"] < -4.0 * step["sigma"]
     assert "Change of the device between arrays and arrays: theta_y by -" in found.headline
+
+
+def test_a_joint_estimate_is_tested_for_prior_conflicts() -> None:
+    """Each of two recordings contradicts the gyro's data sheet: so does the joint estimate, and says so itself."""
+    short = {"duration_s": 20.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 15.0}
+    opened = []
+    for seed in (1, 2):
+        data = alidade.simulate("head", short, seed=seed).data
+        scaled = replace(data, head_gyro=data.head_gyro * [1.3, 1.0, 1.0])
+        opened.append(alidade.open(scaled, method="head"))
+    found = jointly(opened)
+    assert found.status == "inconsistent"
+    own = [finding for finding in found.findings if finding.kind == "prior_conflict"]
+    assert own[0].evidence["parameter"] == "gyro_scale_x"
+    assert own[0].severity == Severity.INCONSISTENT
+    of_recordings = [finding.evidence for finding in found.findings if finding.kind == "recording"]
+    assert len(of_recordings) == 2
+    assert all(each["findings"][0].evidence["parameter"] == "gyro_scale_x" for each in of_recordings)
+    assert {level.noise.name for level in found.estimate.levels} == {level.noise.name for level in found.problem.noises}
 
 
 def test_a_list_of_sources_is_calibrated_together() -> None:

@@ -13,8 +13,7 @@ from alidade import open as opened
 from alidade.pipelines.applications.sharing import device_belief, walks
 from alidade.pipelines.belief import Belief
 from alidade.pipelines.config import load_config
-from alidade.pipelines.diagnostics.calibration_check import Holding, holding
-from alidade.pipelines.diagnostics.device_changes import LEVEL
+from alidade.pipelines.diagnostics.device_changes import LEVEL, CalibrationCheck, check_calibration
 from alidade.pipelines.estimation.problem import Quantity, Told
 from alidade.pipelines.methods import method
 from alidade.pipelines.methods.indexer.recording import write_indexer
@@ -68,7 +67,7 @@ def test_it_does_not_hold_after_a_knock(calibrated: Path, tmp_path: Path, alidad
     assert "The calibration does not hold" in page
 
 
-def one(value: float, sigma: float, shift: float, rng: np.random.Generator) -> Holding:
+def one(value: float, sigma: float, shift: float, rng: np.random.Generator) -> CalibrationCheck:
     """A number known to sigma, and a recording that says as much of it, shifted."""
     quantity = Quantity("mount", "rad", 0.1, 0.1, 1e-2)
     own = Quantity("bias", "rad/s", 0.1, 0.1, 1e-2)
@@ -77,7 +76,7 @@ def one(value: float, sigma: float, shift: float, rng: np.random.Generator) -> H
     truth = np.array([value + shift, 0.02])
     prior = np.array([[10.0, 0.0]])
     told = Told(("mount", "bias"), truth, R, rng.standard_normal(2), prior, -prior @ truth, np.array([0.1, 0.1]))
-    return holding(known, told, (quantity, own), {})
+    return check_calibration(known, told, (quantity, own), {})
 
 
 def test_verdicts_are_as_sure_as_stated() -> None:
@@ -98,7 +97,7 @@ def test_a_recording_that_says_nothing_gives_no_verdict() -> None:
     quantity = Quantity("mount", "rad", 0.1, 0.1, 1e-2)
     known = Belief(("mount",), np.zeros(1), np.array([[1e-6]]), "march")
     nothing = Told(("mount",), np.zeros(1), np.empty((0, 1)), np.empty(0), np.eye(1) * 10.0, np.zeros(1), np.ones(1))
-    assert holding(known, nothing, (quantity,), {}).verdict == "unknown"
+    assert check_calibration(known, nothing, (quantity,), {}).verdict == "unknown"
 
 
 def test_head_mounts_that_turned_are_noticed(tmp_path: Path) -> None:
@@ -117,7 +116,7 @@ def test_head_mounts_that_turned_are_noticed(tmp_path: Path) -> None:
         belief = device_belief(load_known(tmp_path / "result.json"), session.method, session.config, "another", 0)
         estimate = solve_batch(problem, device=device)
         assert estimate.told is not None
-        verdicts.append(holding(belief, estimate.told, problem.quantities, {}))
+        verdicts.append(check_calibration(belief, estimate.told, problem.quantities, {}))
     assert [each.verdict for each in verdicts] == ["holds", "changed"]
     assert any(s.name == "helmet_mount_y" and abs(np.rad2deg(s.size) - 0.3) < 0.12 for s in verdicts[1].changes.found)
 

@@ -8,11 +8,9 @@ import allantools
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.fft import dct
 
 from alidade.pipelines.diagnostics.allan import NOISES, allan_curve, allan_variance, confidence
-from alidade.pipelines.diagnostics.noise_spectrum import Coefficient, cosine_transform, fit_noise
-from alidade.pipelines.diagnostics.sensor_noise import axis_noise
+from alidade.pipelines.diagnostics.noise_spectrum import Coefficient, axis_noise, fit_noise
 from alidade.pipelines.diagnostics.spectral_lines import find_lines
 from tests.support import noises
 
@@ -80,12 +78,6 @@ def test_allan_variance_of_each_noise_and_its_interval(name: str, make: Callable
     assert covered.min() >= 0.88
     # The longest averages of a quantised integral get wider intervals than they need.
     assert 0.92 < covered.mean() < (1.0 if name == "Q" else 0.98)
-
-
-@pytest.mark.parametrize("n", [2, 3, 64, 65, 1001])
-def test_cosine_transform(n: int) -> None:
-    x = np.random.default_rng(n).normal(size=n)
-    assert cosine_transform(x) == pytest.approx(dct(x, norm="ortho"), abs=1e-12)
 
 
 MIXES: dict[str, tuple[int, dict[str, float]]] = {

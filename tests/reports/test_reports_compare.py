@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from alidade.pipelines.diagnostics.cross_validation import Halves
+from alidade.pipelines.diagnostics.cross_validation import SplitHalf
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.reports.compare import compare_html, write_compare
 from alidade.pipelines.reports.plots import common_plots
@@ -36,7 +36,7 @@ def test_differences_are_in_sigmas_of_batch() -> None:
 
 
 def test_truth_halves_and_held_out_measurements_are_told() -> None:
-    halves = {"time_offset": Halves(0.010, 0.003, 0.020, 0.004)}
+    halves = {"time_offset": SplitHalf(0.010, 0.003, 0.020, 0.004)}
     page = Page(compare_html(solvers({"time_offset": 0.0125}), halves, {"vision": 1.06}))
     assert "error of batch, σ" in page.text
     assert "Does the recording agree with itself? yes Its two halves" in page.text
@@ -45,7 +45,7 @@ def test_truth_halves_and_held_out_measurements_are_told() -> None:
 
 
 def test_halves_that_differ_by_more_than_chance_are_told() -> None:
-    halves = {"time_offset": Halves(0.010, 0.003, 0.040, 0.004), "gyro_bias_x": Halves(0.0, 1e-3, 1e-4, 1e-3)}
+    halves = {"time_offset": SplitHalf(0.010, 0.003, 0.040, 0.004), "gyro_bias_x": SplitHalf(0.0, 1e-3, 1e-4, 1e-3)}
     page = Page(compare_html(solvers(), halves, {}))
     assert "Does the recording agree with itself? no" in page.text
     assert "time_offset (+6.0)" in page.text
@@ -70,5 +70,5 @@ def test_what_cannot_be_written_is_bad_input(tmp_path: Path) -> None:
 
 @needs_browser
 def test_a_browser_draws_it_without_complaint(tmp_path: Path) -> None:
-    text = compare_html(solvers(), {"time_offset": Halves(0.010, 0.003, 0.020, 0.004)}, {"vision": 1.06})
+    text = compare_html(solvers(), {"time_offset": SplitHalf(0.010, 0.003, 0.020, 0.004)}, {"vision": 1.06})
     assert drawn(text, tmp_path) == text.count('class="plot"') >= 2

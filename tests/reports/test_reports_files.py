@@ -129,11 +129,14 @@ def test_truth_stands_under_its_own_key() -> None:
     assert content["truth"]["pinned"]["error_sigmas"] is None
 
 
-def test_what_the_solver_complains_of_is_noted() -> None:
+def test_no_convergence_is_the_reason_in_the_headline() -> None:
     rejected = {"vision": Residuals(np.arange(10.0), np.full((10, 3), 5.0), np.arange(10) < 4)}
     content = strict(result_json(make_calibration(converged=False, message="stuck", residuals=rejected)))
-    assert any("stuck" in note for note in content["notes"])
-    assert any("60 % of the vision" in note for note in content["notes"])
+    assert [(each["kind"], each["severity"]) for each in content["findings"]] == [
+        ("not_converged", "inconsistent"),
+        ("rejection", "inconsistent"),
+    ]
+    assert content["headline"].startswith("No solution: stuck. Do not use the values. 60 % of vision measurements")
 
 
 def load_from(folder: Path, calibration: Calibration) -> SavedCalibration:

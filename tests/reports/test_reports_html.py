@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import alidade
 from alidade.factors import so3
 from alidade.pipelines.diagnostics.observability import weak_directions
 from alidade.pipelines.display.units import human_unit, to_digits_of
@@ -201,6 +202,21 @@ def test_parameters_of_a_partial_estimate_keep_their_units() -> None:
     )
     assert [q.unit for q in quantities_of(calibration.problem, calibration.estimate)] == ["s"]
     assert "Correlation" not in Page(report_html(calibration)).text
+
+
+def test_the_page_solves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside an incremental estimate stands the published one, which the session has solved before."""
+    opened = alidade.open(alidade.simulate("los", {"duration_s": 6.0, "gyro_rate_hz": 50.0}, seed=1))
+    calibration = opened.calibrate("incremental")
+    assert calibration.beside is not None
+    assert opened.calibrate("incremental", report=False).beside is None
+
+    def solves(*_: object) -> None:
+        raise AssertionError("a page solves a problem")
+
+    monkeypatch.setattr(type(opened.method), "published", solves)
+    monkeypatch.setattr(type(opened.method), "graph", solves)
+    assert "dotted is the published solver" in Page(report_html(calibration)).text
 
 
 @needs_browser

@@ -9,6 +9,7 @@ import numpy as np
 
 from alidade.factors import so3
 from alidade.pipelines.diagnostics.diagnose import diagnose
+from alidade.pipelines.diagnostics.observability import finite_covariance
 from alidade.pipelines.estimation.problem import (
     Attitudes,
     ChiSquare,
@@ -73,11 +74,13 @@ def make_calibration(**changes: object) -> Calibration:
     )
     estimate = replace(estimate, **{k: v for k, v in changes.items() if hasattr(estimate, k)})  # type: ignore[arg-type]
     problem = make_problem()
+    quantities = quantities_of(problem, estimate)
+    estimate = replace(estimate, covariance=finite_covariance(quantities, estimate.covariance))
     calibration = Calibration(
         method=method("head"),
         problem=problem,
         estimate=estimate,
-        findings=diagnose(estimate, quantities_of(problem, estimate)),
+        findings=diagnose(estimate, quantities),
         recording="ride.mcap",
         sha256="ab" * 32,
         facts=SessionFacts(

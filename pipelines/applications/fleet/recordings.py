@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 from alidade.pipelines.applications.fleet import require_extra
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.recording.opening import BAG, LONGEST_METADATA, METADATA, bag_metadata, parts_of_bag
+from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes
+from alidade.pipelines.recording.opening import BAG, METADATA, bag_metadata, parts_of_bag
 
 if TYPE_CHECKING:
     from fsspec.core import OpenFile
@@ -85,7 +86,7 @@ def _parts(fs: Any, folder: str) -> set[str]:
     """Where the files of a bag are, its metadata.yaml among them; nothing if the folder is none."""
     at = f"{folder}/" if folder else ""
     try:
-        text = fs.cat_file(at + METADATA, end=LONGEST_METADATA).decode(errors="replace")
+        text = fs.cat_file(at + METADATA, end=MAX_YAML_BYTES + 1)
     except FileNotFoundError:
         return set()
     names = parts_of_bag(bag_metadata(text))
@@ -153,7 +154,7 @@ def from_metadata(path: Path) -> dict[str, str]:
     Any MCAP metadata record with a key `unit` or `date`, or the custom data of rosbag2 (`ros2 bag record --custom-data
     unit=U17`), of a folder that in its metadata.yaml.
     """
-    found = _custom((path / METADATA).read_text(errors="replace")) if path.is_dir() else _recorded(path)
+    found = _custom(read_bytes(path / METADATA, MAX_YAML_BYTES)) if path.is_dir() else _recorded(path)
     return {key: found[key] for key in ("unit", "date") if found.get(key)}
 
 
@@ -182,18 +183,15 @@ def as_date(text: str) -> datetime.datetime:
     return date if date.tzinfo else date.replace(tzinfo=datetime.UTC)
 
 
-def _custom(text: str) -> dict[str, str]:
+def _custom(text: bytes | str) -> dict[str, str]:
     """rosbag2's custom data, in YAML: in a metadata record or a metadata.yaml. All of it is text, `unit: 007` too."""
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
     try:
-        content = YAML(typ="base", pure=True).load(text)
-    except YAMLError:
+        content = load_yaml(text, METADATA, as_text=True)
+    except InputError:
         return {}
     content = content.get(BAG, content) if isinstance(content, dict) else {}
     custom = content.get("custom_data") if isinstance(content, dict) else None
-    return custom if isinstance(custom, dict) else {}
+    return {key: value for key, value in custom.items() if isinstance(value, str)} if isinstance(custom, dict) else {}
 
 
 def _is_local(file: OpenFile) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors.chi_square import quantile, student
-from alidade.pipelines.diagnostics.likelihood import likeliest
+from alidade.pipelines.diagnostics.device_changes import maximum_likelihood_sigma
 
 Array = NDArray[np.float64]
 
@@ -203,7 +203,7 @@ def _component(values: Array, sigmas: Array, groups: NDArray[np.intp]) -> Compon
         mean = sums(w * values) / total
         return float(np.log(total).sum() - np.log(w).sum() + (w * (values - mean[groups]) ** 2).sum())
 
-    tau, upper = likeliest(doubled, float(np.median(sigmas)))
+    tau, upper = maximum_likelihood_sigma(doubled, float(np.median(sigmas)))
     w = 1.0 / (sigmas**2 + tau**2)
     one, two, three = sums(w), sums(w**2), sums(w**3)
     information = 0.5 * float((two - 2.0 * three / one + (two / one) ** 2).sum())  # of tau squared

@@ -1,7 +1,11 @@
-"""What is finished, kept as it comes: a line of JSON a result, so that an interrupted run goes on where it stopped."""
+"""What is finished, kept as it comes: a line of JSON a result, so that an interrupted run goes on where it stopped.
+
+A line that is none, whatever it holds, is passed over: that result is made again.
+"""
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
@@ -9,6 +13,8 @@ import re
 import tempfile
 from pathlib import Path
 from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from alidade.pipelines.errors import InputError
 
@@ -25,35 +31,55 @@ def settings_key(*settings: Any) -> str:
 class Store:
     """Results by name in `results.jsonl` of a folder; only those of the same settings count.
 
-    Raises InputError when the folder cannot be written to.
+    Raises InputError when the folder cannot be written to, or another process keeps its results there.
     """
 
     def __init__(self, folder: Path, settings: str) -> None:
         self._path, self._settings = folder / FILE, settings
         self.results: dict[str, Result] = {}
         require_writable(folder)
-        if self._path.exists():
-            self._load()
+        try:
+            self._stream = self._path.open("a+b")
+            fcntl.flock(self._stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(f"{folder}: another process keeps its results there; give another folder") from error
+        except OSError as error:
+            raise InputError(f"{self._path}: cannot be written ({error.strerror})") from error
+        self._load()
 
     def add(self, name: str, result: Result) -> None:
         """Keep a result, in the file before this returns."""
         line = json.dumps({"settings": self._settings, "name": name, "result": result}, allow_nan=False)
-        with self._path.open("a", encoding="utf-8") as stream:
-            stream.write(line + "\n")
+        try:
+            self._stream.write(line.encode() + b"\n")
+            self._stream.flush()
+        except OSError as error:
+            raise InputError(f"{self._path}: cannot be written ({error.strerror}); the same command goes on") from error
         self.results[name] = result
 
     def _load(self) -> None:
-        line = "\n"
-        with self._path.open("r+", encoding="utf-8") as stream:
-            for line in stream:
-                try:
-                    entry = json.loads(line)
-                except json.JSONDecodeError:
-                    continue  # cut off when the machine went down; that one is done again
-                if entry["settings"] == self._settings:
-                    self.results[entry["name"]] = entry["result"]
-            if not line.endswith("\n"):
-                stream.write("\n")
+        line = b"\n"
+        self._stream.seek(0)
+        for line in self._stream:
+            try:
+                entry = _Entry.model_validate_json(line)
+            except ValidationError:
+                continue  # cut off when the machine went down, or another's; that one is done again
+            if entry.settings == self._settings:
+                self.results[entry.name] = entry.result
+        if not line.endswith(b"\n"):
+            self._stream.write(b"\n")
+            self._stream.flush()
+
+
+class _Entry(BaseModel):
+    """A line of the file."""
+
+    model_config = ConfigDict(strict=True)
+
+    settings: str
+    name: str
+    result: Result
 
 
 def require_writable(folder: Path) -> None:

@@ -10,16 +10,22 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+# What text begins with that spreadsheets take for a formula (OWASP, CSV injection); an apostrophe before it says text.
+_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n")
 Cell = str | int | float | None
 Row = Mapping[str, Cell]
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """Numbers with all their digits; empty where a row has nothing."""
+    """Numbers with all their digits; empty where a row has nothing; text that is no formula to any spreadsheet."""
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.DictWriter(stream, columns(rows), restval="", lineterminator="\n")
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows({name: _inert(cell) for name, cell in row.items()} for row in rows)
+
+
+def _inert(cell: Cell) -> Cell:
+    return f"'{cell}" if isinstance(cell, str) and cell.startswith(_FORMULA) else cell
 
 
 def write_parquet(path: Path, rows: Sequence[Row]) -> None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 
 from alidade.pipelines.applications.fleet.analysis import Population, table
@@ -12,42 +11,29 @@ from alidade.pipelines.applications.fleet.histories import History, change_table
 from alidade.pipelines.applications.fleet.montecarlo import Study, run_table, summary_table
 from alidade.pipelines.applications.fleet.pages import fleet_html, study_html
 from alidade.pipelines.applications.fleet.tables import write_csv, write_parquet
-from alidade.pipelines.errors import InputError
+from alidade.pipelines.reports.whole import write_whole
 
 
 def write_fleet(out: Path, outcome: Outcome, fleet: Sequence[Population], found: Sequence[History]) -> tuple[Path, ...]:
-    """fleet.html, fleet.csv, fleet.parquet and changes.csv; returns their paths."""
+    """fleet.html, fleet.csv, fleet.parquet and changes.csv, whole or not at all; returns their paths."""
     rows = table(outcome.results, fleet)
     page = fleet_html(outcome, fleet, found)
-    return _write(
-        {
-            out / "fleet.html": partial(_write_text, text=page),
-            out / "fleet.csv": partial(write_csv, rows=rows),
-            out / "fleet.parquet": partial(write_parquet, rows=rows),
-            out / "changes.csv": partial(write_csv, rows=change_table(found)),
-        }
-    )
+
+    def make(folder: Path) -> None:
+        write_csv(folder / "fleet.csv", rows)
+        write_parquet(folder / "fleet.parquet", rows)
+        write_csv(folder / "changes.csv", change_table(found))
+        (folder / "fleet.html").write_text(page, encoding="utf-8")
+
+    return write_whole(out, ["fleet.csv", "fleet.parquet", "changes.csv", "fleet.html"], make)
 
 
 def write_study(out: Path, study: Study) -> tuple[Path, ...]:
-    """montecarlo.html, runs.csv and summary.csv; returns their paths."""
-    return _write(
-        {
-            out / "montecarlo.html": partial(_write_text, text=study_html(study)),
-            out / "runs.csv": partial(write_csv, rows=run_table(study)),
-            out / "summary.csv": partial(write_csv, rows=summary_table(study)),
-        }
-    )
+    """montecarlo.html, runs.csv and summary.csv, whole or not at all; returns their paths."""
 
+    def make(folder: Path) -> None:
+        write_csv(folder / "runs.csv", run_table(study))
+        write_csv(folder / "summary.csv", summary_table(study))
+        (folder / "montecarlo.html").write_text(study_html(study), encoding="utf-8")
 
-def _write(files: Mapping[Path, Callable[[Path], None]]) -> tuple[Path, ...]:
-    for path, write in files.items():
-        try:
-            write(path)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be written ({error.strerror})") from error
-    return tuple(files)
-
-
-def _write_text(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
+    return write_whole(out, ["runs.csv", "summary.csv", "montecarlo.html"], make)

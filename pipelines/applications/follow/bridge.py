@@ -1,6 +1,7 @@
 """A Foxglove WebSocket bridge as a source: its sensors' messages, written down as MCAP.
 
 The bridge is asked for what a method can read and nothing else. Whenever it drops the connection it is called again.
+Messages that are none are refused and counted, and cost nothing else.
 """
 
 from __future__ import annotations
@@ -11,12 +12,22 @@ import json
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from mcap.writer import Writer
 
-from alidade.pipelines.applications.follow.protocol import MESSAGE_DATA, MESSAGE_HEAD, SUBPROTOCOLS, websockets
+from alidade.pipelines.applications.follow.protocol import (
+    MESSAGE_DATA,
+    MESSAGE_HEAD,
+    SUBPROTOCOLS,
+    RefusedError,
+    read_id,
+    read_message,
+    websockets,
+)
 from alidade.pipelines.applications.follow.sources import Stream
+from alidade.pipelines.applications.follow.spool import Spool
+from alidade.pipelines.errors import printable
 from alidade.pipelines.recording.channel_format import ChannelFormat
 from alidade.pipelines.recording.container import Channel, Schema
 from alidade.pipelines.recording.messages import SENSORS
@@ -37,6 +48,10 @@ _PAUSE, _PATIENCE = 0.5, 5.0
 _GLANCE, _FLUSH = 0.1, 0.01
 # No message of a sensor is larger.
 _LARGEST = 1 << 26
+# Channels that are written down: more than any device has sensors.
+MAX_CHANNELS = 1000
+# What describes a channel as the protocol has it; all are text.
+_DESCRIPTION = ("topic", "encoding", "schemaName", "schemaEncoding", "schema")
 
 
 class Bridge(Stream):
@@ -50,10 +65,11 @@ class Bridge(Stream):
 
     def __init__(self, url: str, folder: Path | None, say: Callable[[str], None]) -> None:
         self._connect = websockets().sync.client.connect
-        super().__init__(url, folder)
-        self._url, self._say, self._told = url, say, ""
+        super().__init__(url, folder, say)
+        self._url, self._told = url, ""
+        self.refused = 0
 
-    def _write(self, out: BinaryIO) -> None:
+    def _write(self, out: Spool) -> None:
         from websockets.exceptions import InvalidURI, WebSocketException
 
         record = _Record(out)
@@ -73,8 +89,10 @@ class Bridge(Stream):
                 break
             except (OSError, WebSocketException) as error:
                 self._tell(f"{self._url}: no connection ({' '.join(str(error).split())}); trying again")
-            time.sleep(_PAUSE)
+            self._over.wait(_PAUSE)
         record.close()
+        if self.refused > 1:
+            self._say(f"{self._url}: {self.refused} messages refused")
 
     def _tell(self, sentence: str) -> None:
         """Say it, but not twice in a row."""
@@ -84,7 +102,7 @@ class Bridge(Stream):
 
     def _listen(self, connection: Any, record: _Record) -> None:
         """Take what one connection brings, until it closes."""
-        wanted: dict[int, dict[str, Any]] = {}  # by subscription, which are numbered as the bridge's channels
+        wanted: dict[int, dict[str, str]] = {}  # by subscription, which are numbered as the bridge's channels
         while not self._over.is_set():
             try:
                 data = connection.recv(_GLANCE)
@@ -92,32 +110,76 @@ class Bridge(Stream):
                 record.flush()
                 continue
             if isinstance(data, bytes):
-                if len(data) >= MESSAGE_HEAD.size and data[0] == MESSAGE_DATA:
-                    _, subscription, log_ns = MESSAGE_HEAD.unpack_from(data)
-                    if subscription in wanted:
-                        record.add(wanted[subscription], log_ns, data[MESSAGE_HEAD.size :])
+                self._take(data, wanted, record)
                 continue
-            new = {number: one for number, one in _advertised(data).items() if number not in wanted}
-            if new:
+            new = {number: one for number, one in self._advertised(data) if number not in wanted}
+            if new and len(wanted) + len(new) <= MAX_CHANNELS:
                 wanted |= new
                 subscriptions = [{"id": number, "channelId": number} for number in new]
                 connection.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
+            elif new:
+                self._refuse(f"more than {MAX_CHANNELS} channels")
+
+    def _take(self, data: bytes, wanted: dict[int, dict[str, str]], record: _Record) -> None:
+        if len(data) < MESSAGE_HEAD.size or data[0] != MESSAGE_DATA:
+            return
+        _, subscription, log_ns = MESSAGE_HEAD.unpack_from(data)
+        if subscription not in wanted:
+            return
+        try:
+            record.add(wanted[subscription], log_ns, data[MESSAGE_HEAD.size :])
+        except RefusedError as error:
+            self._refuse(str(error))
+
+    def _advertised(self, text: str) -> list[tuple[int, dict[str, str]]]:
+        """The channels that a bridge tells of in a message and that are of use, with its numbers."""
+        found = []
+        try:
+            told = read_message(text)
+            channels = told.get("channels") if told.get("op") == "advertise" else []
+            if not isinstance(channels, list):
+                raise RefusedError("channels that are no list")
+        except RefusedError as error:
+            self._refuse(str(error))
+            return []
+        for channel in channels:
+            try:
+                number, described = _described(channel)
+                if _is_of_use(described):
+                    found.append((number, described))
+            except RefusedError as error:
+                self._refuse(str(error))
+        return found
+
+    def _refuse(self, why: str) -> None:
+        self.refused += 1
+        if self.refused == 1:
+            self._say(f"{self._url}: a message refused ({why}); more are counted")
 
 
 class _Record:
     """An MCAP file of what comes, readable up to the last message at any time."""
 
-    def __init__(self, out: BinaryIO) -> None:
-        self._out, self._writer = out, Writer(out, use_chunking=False)
+    def __init__(self, out: Spool) -> None:
+        self._out, self._writer = out, Writer(out, use_chunking=False)  # type: ignore[arg-type]
         self._channels: dict[tuple[str, ...], int] = {}
+        self._types: dict[str, tuple[str, ...]] = {}  # by topic: a recording in which they change is of no use
         self._flushed = time.monotonic()
 
-    def add(self, channel: dict[str, Any], log_ns: int, data: bytes) -> None:
-        """A message of a channel as the bridge describes it."""
-        key = tuple(str(channel[name]) for name in ("topic", "encoding", "schemaName", "schema"))
+    def add(self, channel: dict[str, str], log_ns: int, data: bytes) -> None:
+        """A message of a channel as the bridge describes it. Raises RefusedError when its topic had another type."""
+        if self._out.is_full:
+            self.flush()
+        if self._out.is_full:
+            self._out.drop()
+            return
+        key = tuple(channel[name] for name in _DESCRIPTION)
         if not self._channels:
             self._writer.start("", "alidade")
         if key not in self._channels:
+            kind = channel["encoding"], channel["schemaEncoding"], channel["schemaName"]
+            if self._types.setdefault(channel["topic"], kind) != kind or len(self._channels) >= MAX_CHANNELS:
+                raise RefusedError(f"topic {printable(channel['topic'])} with messages of another type")
             schema = self._writer.register_schema(channel["schemaName"], channel["schemaEncoding"], _schema(channel))
             self._channels[key] = self._writer.register_channel(channel["topic"], channel["encoding"], schema)
         self._writer.add_message(self._channels[key], log_ns, data, log_ns)
@@ -136,33 +198,27 @@ class _Record:
         self._out.flush()
 
 
-def _advertised(text: str) -> dict[int, dict[str, Any]]:
-    """The channels that a bridge tells of in a message and that are of use, by its numbers."""
-    try:
-        told = json.loads(text)
-        channels = told["channels"] if told["op"] == "advertise" else []
-        found = {}
-        for channel in channels:
-            encoding = channel["encoding"]
-            given = {name: value for name, value in channel.items() if value}
-            whole = {"schema": "", "schemaName": "", "schemaEncoding": _SCHEMAS.get(encoding, encoding), **given}
-            if _is_of_use(whole):
-                found[int(whole["id"])] = whole
-    except (ValueError, KeyError, TypeError, AttributeError):
-        return {}
-    return found
+def _described(channel: Any) -> tuple[int, dict[str, str]]:
+    """A channel's number and description, with what a bridge may leave out. Raises RefusedError."""
+    if not isinstance(channel, dict):
+        raise RefusedError("a channel that is no object")
+    given = {name: channel[name] for name in _DESCRIPTION if channel.get(name)}
+    if not all(isinstance(value, str) for value in given.values()) or not {"topic", "encoding"} <= given.keys():
+        raise RefusedError("a channel without topic or encoding, or whose description is no text")
+    usual = {"schema": "", "schemaName": "", "schemaEncoding": _SCHEMAS.get(given["encoding"], given["encoding"])}
+    return read_id(channel.get("id")), usual | given
 
 
-def _schema(channel: dict[str, Any]) -> bytes:
-    text = str(channel["schema"])
+def _schema(channel: dict[str, str]) -> bytes:
+    text = channel["schema"]
     return base64.b64decode(text, validate=True) if channel["schemaEncoding"] in _BYTES else text.encode()
 
 
-def _is_of_use(channel: dict[str, Any]) -> bool:
-    """Whether the messages are a sensor's, and can be read."""
+def _is_of_use(channel: dict[str, str]) -> bool:
+    """Whether the messages are a sensor's, and can be read. Raises RefusedError."""
     try:
-        schema = Schema(1, str(channel["schemaName"]), channel["schemaEncoding"], _schema(channel))
-    except binascii.Error:
-        return False
-    form = ChannelFormat(Channel(1, str(channel["topic"]), channel["encoding"], 1), schema)
+        schema = Schema(1, channel["schemaName"], channel["schemaEncoding"], _schema(channel))
+    except (binascii.Error, ValueError) as error:
+        raise RefusedError("a schema that is no base64") from error
+    form = ChannelFormat(Channel(1, channel["topic"], channel["encoding"], 1), schema)
     return form.is_readable and form.type in SENSORS

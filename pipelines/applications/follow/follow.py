@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
@@ -20,6 +20,8 @@ from alidade.pipelines.applications.follow.sources import source_of
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.terminal import console
 
+_STOPPING = "stopping: what is there is solved now; Ctrl-C again ends at once, without a result"
+
 
 def follow(
     what: str,
@@ -28,10 +30,12 @@ def follow(
     record: Path | None = None,
     on_stderr: bool = False,
     page_at: tuple[str, int] | None = None,
+    origins: Sequence[str] = (),
 ) -> Calibration:
     """Follow a recording until it ends, shown in the terminal, with a port served on it, and on a page.
 
-    The first Ctrl-C ends it with what is there, the second at once. Raises as `source_of` and `Follower.follow` do.
+    The first Ctrl-C ends it with what is there, the second at once. A server or page that fails is given up, and costs
+    nothing else. Raises as `source_of` and `Follower.follow` do.
 
     Args:
         what: a path, ws://host:port, or - for standard input.
@@ -40,11 +44,12 @@ def follow(
         record: folder where streams are kept.
         on_stderr: show it there, for standard output is a program's.
         page_at: host and port of the page; None: there is none.
+        origins: pages of other sites that may read what the server serves.
     """
     with ExitStack() as stack:
-        server = None if port is None else stack.enter_context(LiveServer(port))
-        stopped = stack.enter_context(_interrupted())
+        server = None if port is None else stack.enter_context(LiveServer(port, origins))
         screen = stack.enter_context(Screen(Console(stderr=True, highlight=False) if on_stderr else console))
+        stopped = stack.enter_context(_interrupted(lambda: screen.say(_STOPPING)))
         if server is not None:
             screen.say(f"estimates live at {server.url} (Foxglove: open connection)")
 
@@ -54,32 +59,38 @@ def follow(
             if page.is_open:
                 screen.show_address(page.url)
 
+        watching: list[LiveServer | LivePage] = [each for each in (server, page) if each is not None]
+
         def show(view: View) -> None:
             screen.show(view)
-            for each in (server, page):
-                if each is not None:
+            for each in list(watching):
+                try:
                     each.show(view)
+                except Exception as error:  # whoever looks on must not end the run
+                    watching.remove(each)
+                    screen.say(f"{each.url} shows nothing new any more ({type(error).__name__}: {error})")
 
         def say(sentence: str) -> None:
             screen.say(sentence)
-            if page is not None:
+            if page in watching and page is not None:
                 page.say(sentence)
 
         source = stack.enter_context(source_of(what, record, say))
         calibration = Follower(source, settings, show, say, stopped.is_set).follow()
-        if page is not None:
+        if page in watching and page is not None:
             page.end(calibration)
         return calibration
 
 
 @contextmanager
-def _interrupted() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; the next one is as ever."""
+def _interrupted(answer: Callable[[], None]) -> Iterator[threading.Event]:
+    """An event that the first Ctrl-C sets, answered at once; the next one is as ever."""
     event = threading.Event()
 
     def heard(_: int, __: FrameType | None) -> None:
-        event.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)
+        event.set()
+        threading.Thread(target=answer, daemon=True).start()  # the screen may be drawn right now
 
     before = signal.signal(signal.SIGINT, heard)
     try:

@@ -6,12 +6,14 @@
 One document without anything from elsewhere, and server-sent events that each have the whole state, so that whoever
 comes late, or comes back, has it at once. On the loopback interface whoever asks is answered if they ask for this
 machine by name, lest other pages in the browser read along. On any other address only who has come by the one-time
-token is; what it was traded for is kept in a cookie.
+token is; what it was traded for is kept in a cookie. Connections are bounded in number, and in time until they have
+shown that they may read; wrong tokens are counted by address.
 """
 
 from __future__ import annotations
 
 import asyncio
+import base64
 import ipaddress
 import json
 import math
@@ -23,7 +25,9 @@ from collections.abc import AsyncIterator, Callable
 from importlib.resources import files
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
+from alidade.pipelines.applications.follow.gate import HANDSHAKE_TIME_S, Attempts, Gate
 from alidade.pipelines.applications.follow.guidance import View
 from alidade.pipelines.display.units import human_unit, to_digits_of
 from alidade.pipelines.errors import InputError
@@ -86,6 +90,7 @@ class LivePage:
         self._port = self._socket.getsockname()[1]
         self.is_open = not _is_loopback(self._socket.getsockname()[0])
         self._token, self._key = _token(), secrets.token_urlsafe(32)
+        self._gate, self._attempts = Gate(), Attempts()
         self._histories: dict[str, list[tuple[float, float]]] = {}
         self._state: dict[str, Any] = {"name": name, "notes": [], "over": None}
         self._noted: list[tuple[float, str]] = []  # when, and what
@@ -100,7 +105,13 @@ class LivePage:
         )
         self._server = uvicorn.Server(
             uvicorn.Config(
-                app, log_config=None, log_level="critical", lifespan="off", ws="none", timeout_graceful_shutdown=1
+                app,
+                http=_bounded(self._gate),
+                log_config=None,
+                log_level="critical",
+                lifespan="off",
+                ws="none",
+                timeout_graceful_shutdown=1,
             )
         )
         self._thread = threading.Thread(
@@ -210,10 +221,27 @@ class LivePage:
     # -- answers
 
     def _may(self, request: Request) -> bool:
-        """Whether whoever asks is to be answered."""
-        if self.is_open:
-            return secrets.compare_digest(request.cookies.get(self._cookie, ""), self._key)
-        return request.url.hostname in {"localhost", self._host, self._socket.getsockname()[0]}
+        """Whether whoever asks is to be answered; its connection is trusted then."""
+        known = self._asks_for_this_machine(request) and (
+            not self.is_open or _equal(request.cookies.get(self._cookie, ""), self._key)
+        )
+        if known and request.client is not None:
+            self._gate.trust(tuple(request.client))
+        return known
+
+    def _asks_for_this_machine(self, request: Request) -> bool:
+        """Whether the Host header is this machine's, not a name that was made to lead here.
+
+        A name that somebody else's DNS has made to lead here is no address, and none of this machine's.
+        """
+        try:
+            host = urlsplit(f"//{request.headers.get('host', '')}").hostname or ""
+        except ValueError:
+            return False
+        if host in {"localhost", self._host.lower(), self._socket.getsockname()[0]}:
+            return True
+        own = socket.gethostname().lower()
+        return self.is_open and (_is_address(host) or host.removesuffix(".local") == own.removesuffix(".local"))
 
     @property
     def _cookie(self) -> str:
@@ -225,19 +253,25 @@ class LivePage:
 
         if self._may(request):
             return HTMLResponse(_html(), headers=_HEADERS)
-        if self.is_open and secrets.compare_digest(request.query_params.get("token", ""), self._token):
-            self._token = _token()
-            self._say(f"page opened from {request.client.host if request.client else '?'}; next device: {self.url}")
-            answer = RedirectResponse("/", 303)
-            answer.set_cookie(self._cookie, self._key, httponly=True, samesite="lax")
-            return answer
-        return PlainTextResponse(_REFUSED, 403)
+        token, client = request.query_params.get("token"), request.client.host if request.client else "?"
+        if not self.is_open or token is None or not self._asks_for_this_machine(request):
+            return PlainTextResponse(_REFUSED, 403, _HEADERS)
+        if not self._attempts.allowed(client):
+            return PlainTextResponse(_TOO_MANY, 429, _HEADERS)
+        if not _equal(token, self._token):
+            self._attempts.failed(client)
+            return PlainTextResponse(_REFUSED, 403, _HEADERS)
+        self._token = _token()
+        self._say(f"page opened from {client}; next device: {self.url}")
+        answer = RedirectResponse("/", 303)
+        answer.set_cookie(self._cookie, self._key, httponly=True, samesite="lax")
+        return answer
 
     async def _events(self, request: Request) -> Response:
         from starlette.responses import PlainTextResponse, StreamingResponse
 
         if not self._may(request):
-            return PlainTextResponse(_REFUSED, 403)
+            return PlainTextResponse(_REFUSED, 403, _HEADERS)
         return StreamingResponse(self._stream(), media_type="text/event-stream", headers=_HEADERS)
 
     async def _stream(self) -> AsyncIterator[str]:
@@ -261,6 +295,7 @@ class LivePage:
 _REFUSED = (
     "This address was used before, or is none of this page. The terminal in which alidade runs shows the next one.\n"
 )
+_TOO_MANY = "Too many wrong addresses from this device: wait a minute.\n"
 
 
 def _html() -> str:
@@ -279,9 +314,42 @@ def _is_loopback(address: str) -> bool:
     return ipaddress.ip_address(address).is_loopback
 
 
+def _is_address(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def _equal(given: str, secret: str) -> bool:
+    """In a time that does not depend on where they differ."""
+    return secrets.compare_digest(given.encode(errors="replace"), secret.encode())
+
+
 def _token() -> str:
-    """To be typed on a phone; good for one use, it need not be long."""
-    return secrets.token_hex(5)
+    """128 bits, in letters and digits that can be typed on a phone; good for one use."""
+    return base64.b32encode(secrets.token_bytes(16)).decode().rstrip("=").lower()
+
+
+def _bounded(gate: Gate) -> type[Any]:
+    """Uvicorn's protocol, each connection of which passes the gate."""
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+
+    class BoundedProtocol(H11Protocol):
+        """One connection."""
+
+        def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+            super().connection_made(transport)
+            peer = self.client or ("?", id(self))
+            gate.admit(peer, peer[0], transport.abort)
+            self.loop.call_later(HANDSHAKE_TIME_S, gate.close_untrusted, peer)
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            gate.release(self.client or ("?", id(self)))
+            super().connection_lost(exc)
+
+    return BoundedProtocol
 
 
 def _outward() -> str:

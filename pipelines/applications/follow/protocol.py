@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import struct
-from typing import Any
+from typing import Any, NoReturn
 
 from alidade.pipelines.errors import InputError
 
@@ -11,6 +12,36 @@ SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 # Binary: opcode, subscription, time in ns, then the message.
 MESSAGE_DATA = 1
 MESSAGE_HEAD = struct.Struct("<BIQ")
+# Channels and subscriptions are numbered with 32 bits.
+LARGEST_ID = (1 << 32) - 1
+
+
+class RefusedError(Exception):
+    """A message of the other side that is none; the text says why."""
+
+
+def read_message(text: str) -> dict[str, Any]:
+    """A text message: a JSON object of numbers and Unicode text. Raises RefusedError."""
+    try:
+        content = json.loads(text, parse_constant=_refuse_constant)
+        if "\\u" in text:
+            json.dumps(content, ensure_ascii=False).encode()  # half of a surrogate pair is no text
+    except (ValueError, RecursionError) as error:
+        raise RefusedError(f"no JSON ({type(error).__name__})") from error
+    if not isinstance(content, dict):
+        raise RefusedError("no JSON object")
+    return content
+
+
+def read_id(value: Any) -> int:
+    """The number of a channel or a subscription. Raises RefusedError."""
+    if type(value) is not int or not 0 <= value <= LARGEST_ID:
+        raise RefusedError("a number of a channel that is none")
+    return value
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no JSON")
 
 
 def websockets() -> Any:

@@ -2,25 +2,42 @@
 
 One topic per parameter, `/estimate/<parameter>`, with the fields of estimates.mcap (value, sigma, lower, upper) so that
 one layout shows both, and what is required; `/status` says the rest in words. JSON messages with a schema. Whoever
-comes late, or reads slowly, gets the last message of each topic.
+comes late, or reads slowly, gets the last message of each topic. Pages of other sites are refused by their Origin.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import socket
 import threading
+from collections.abc import Sequence
 from contextlib import suppress
 from types import TracebackType
 from typing import Any, NamedTuple
 
+from alidade.pipelines.applications.follow.gate import HANDSHAKE_TIME_S, Gate
 from alidade.pipelines.applications.follow.guidance import View
-from alidade.pipelines.applications.follow.protocol import MESSAGE_DATA, MESSAGE_HEAD, SUBPROTOCOLS, websockets
+from alidade.pipelines.applications.follow.protocol import (
+    MESSAGE_DATA,
+    MESSAGE_HEAD,
+    SUBPROTOCOLS,
+    RefusedError,
+    read_id,
+    read_message,
+    websockets,
+)
 from alidade.pipelines.errors import InputError
 
 # Others on the network have no business with a calibration bench.
 HOST = "127.0.0.1"
 PORT = 8765  # Foxglove's own
+# Pages that may read the estimates: Foxglove's. Programs that are no browser send no Origin.
+ORIGINS = ("https://app.foxglove.dev", "https://studio.foxglove.dev")
+# Every connection has two threads; one client subscribes to each topic once, of which there are some hundred at most.
+MAX_CLIENTS, MAX_SUBSCRIPTIONS = 32, 4096
+# A subscription to thousands of channels in one message, bytes.
+MAX_MESSAGE_BYTES = 1 << 18
 
 # Whoever calls and says no WebSocket is no news for the person recording.
 _SILENT = logging.Logger("alidade.serve", logging.CRITICAL + 1)
@@ -49,18 +66,33 @@ class LiveServer:
     """A server on the loopback interface; a context.
 
     Raises InputError when websockets is not installed or the port is taken.
+
+    Args:
+        port: 0: any that is free.
+        origins: pages of other sites that may read it, beside Foxglove's: `https://example.org`.
     """
 
-    def __init__(self, port: int = PORT) -> None:
+    def __init__(self, port: int = PORT, origins: Sequence[str] = ()) -> None:
         serve = websockets().sync.server.serve
         self._changed = threading.Condition()
         self._channels: dict[str, dict[str, Any]] = {}  # topic -> how it is advertised
         self._last: dict[int, _Last] = {}  # by channel
         self._over = False
         try:
-            self._server = serve(self._client, HOST, port, subprotocols=SUBPROTOCOLS, logger=_SILENT)
+            self._server = serve(
+                self._client,
+                HOST,
+                port,
+                subprotocols=SUBPROTOCOLS,
+                origins=[None, *ORIGINS, *origins],
+                open_timeout=HANDSHAKE_TIME_S,
+                max_size=MAX_MESSAGE_BYTES,
+                logger=_SILENT,
+            )
         except (OSError, OverflowError) as error:
             raise InputError(f"--port {port}: no server can be started there ({error}); give another") from error
+        self._gate, self._handle = Gate(MAX_CLIENTS, MAX_CLIENTS), self._server.handler
+        self._server.handler = self._bounded
         self._advertise("/status", _STATUS, {})
 
     @property
@@ -123,9 +155,18 @@ class LiveServer:
 
     # -- one client: this thread listens, another one sends
 
+    def _bounded(self, connected: socket.socket, address: tuple[Any, ...]) -> None:
+        """A connection, as long as there is room for it."""
+        self._gate.admit(address, str(address[0]), lambda: _hang_up(connected))
+        try:
+            self._handle(connected, address)
+        finally:
+            self._gate.release(address)
+
     def _client(self, connection: Any) -> None:
         from websockets.exceptions import ConnectionClosed as Closed
 
+        self._gate.trust(connection.remote_address)
         client = _Client()
         sender = threading.Thread(target=self._send, args=(connection, client), daemon=True)
         sender.start()
@@ -189,15 +230,24 @@ class _Client:
         self.gone = False
 
     def take(self, text: str | bytes) -> None:
-        """What it asks for; what else it says is nothing to us."""
+        """What it asks for, up to MAX_SUBSCRIPTIONS; what else it says is nothing to us."""
+        if isinstance(text, bytes):
+            return
         try:
-            told = json.loads(text)
-            subscribed = {int(one["id"]): int(one["channelId"]) for one in told.get("subscriptions", [])}
-            unsubscribed = [int(number) for number in told.get("subscriptionIds", [])]
-        except (ValueError, KeyError, TypeError, AttributeError):
+            told = read_message(text)
+            subscribed = {read_id(one["id"]): read_id(one["channelId"]) for one in told.get("subscriptions", [])}
+            unsubscribed = [read_id(number) for number in told.get("subscriptionIds", [])]
+        except (RefusedError, KeyError, TypeError):
             return
         for number in (*subscribed, *unsubscribed):
             self.wanted.pop(number, None)
             self.sent.pop(number, None)
         if told.get("op") == "subscribe":
-            self.wanted |= subscribed
+            room = MAX_SUBSCRIPTIONS - len(self.wanted)
+            self.wanted |= dict(list(subscribed.items())[:room])
+
+
+def _hang_up(connected: socket.socket) -> None:
+    """From any thread: the one that reads or writes finds the connection closed."""
+    with suppress(OSError):
+        connected.shutdown(socket.SHUT_RDWR)

@@ -8,12 +8,14 @@ from __future__ import annotations
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
 
+from alidade.pipelines.applications.follow.spool import RETRY_PERIOD_S, Spool
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording.mcap_records import MAGIC
 from alidade.pipelines.recording.opening import Where, is_closed, parts_in
@@ -55,7 +57,10 @@ class Source(AbstractContextManager["Source"]):
     def is_finished(self) -> bool:
         """Whether the recording is closed: a file by its closing mark, a folder when its metadata.yaml is there too."""
         parts = self.parts
-        closed = bool(parts) and is_closed(parts[-1])
+        try:
+            closed = bool(parts) and is_closed(parts[-1])
+        except OSError:  # gone since, or no more files may be opened: nothing tells
+            return False
         return closed and (not self.path.is_dir() or (self.path / "metadata.yaml").is_file())
 
     def __exit__(
@@ -70,17 +75,22 @@ class Stream(Source):
     Args:
         name: what it is called.
         folder: where to; None: a temporary one.
+        say: is told what goes wrong.
+
+    Raises InputError when the folder cannot be made.
     """
 
-    def __init__(self, name: str, folder: Path | None) -> None:
-        self._stack = ExitStack()
+    def __init__(self, name: str, folder: Path | None, say: Callable[[str], None]) -> None:
+        self._stack, self._say = ExitStack(), say
         self._ended = threading.Event()
-        if folder is None:
-            folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="alidade-")))
         try:
+            if folder is None:
+                folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="alidade-")))
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"{folder}: cannot be written ({error.strerror})") from error
+            raise InputError(
+                f"{folder or 'TMPDIR'}: {name} cannot be written down there ({error.strerror}); give another --record"
+            ) from error
         super().__init__(folder, name)
         before = len(list(folder.glob(_PART.format("*"))))
         self._file = folder / _PART.format(f"{before:04d}")
@@ -108,13 +118,16 @@ class Stream(Source):
         self._stack.close()
 
     def _run(self) -> None:
+        spool = Spool(self._file, self._say)
         try:
-            with self._file.open("wb") as out:
-                self._write(out)
+            self._write(spool)
+        except Exception as error:  # nobody else would say it
+            self._say(f"{self.name}: no more is read ({type(error).__name__}: {' '.join(str(error).split())})")
         finally:
+            spool.close()
             self._ended.set()
 
-    def _write(self, out: BinaryIO) -> None:
+    def _write(self, out: Spool) -> None:
         """Write down what comes until it ends, or `_over`."""
         raise NotImplementedError
 
@@ -122,15 +135,18 @@ class Stream(Source):
 class StandardInput(Stream):
     """An MCAP file that comes in on standard input."""
 
-    def __init__(self, folder: Path | None, stream: BinaryIO | None = None) -> None:
-        super().__init__("standard input", folder)
+    def __init__(self, folder: Path | None, stream: BinaryIO | None = None, say: Callable[[str], None] = print) -> None:
+        super().__init__("standard input", folder, say)
         self._stream = stream or sys.stdin.buffer
 
-    def _write(self, out: BinaryIO) -> None:
+    def _write(self, out: Spool) -> None:
         read = getattr(self._stream, "read1", self._stream.read)
         while not self._over.is_set() and (piece := read(_PIECE)):
             out.write(piece)
             out.flush()
+            while out.is_full and not self._over.is_set():  # whoever writes into the pipe waits
+                time.sleep(RETRY_PERIOD_S)
+                out.flush()
 
 
 def source_of(what: str, folder: Path | None = None, say: Callable[[str], None] = print) -> Source:
@@ -139,13 +155,13 @@ def source_of(what: str, folder: Path | None = None, say: Callable[[str], None] 
     Args:
         what: its name.
         folder: where streams are kept; None: nowhere.
-        say: is told of connections.
+        say: is told of connections, and what goes wrong with them.
 
     Raises:
         InputError: a folder cannot be written, or a library is not installed.
     """
     if what == "-":
-        return StandardInput(folder)
+        return StandardInput(folder, say=say)
     if what.startswith(("ws://", "wss://")):
         from alidade.pipelines.applications.follow.bridge import Bridge
 

@@ -9,7 +9,7 @@ import numpy as np
 from alidade.factors import so3
 from alidade.factors.earth import gravity
 from alidade.factors.preintegration import GyroPath
-from alidade.pipelines.diagnostics.validation import Validation
+from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.cube.compensation import calibrated, calibrated_rates
 from alidade.pipelines.methods.cube.data import CubeData, local_field, nominal

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from alidade.factors import so3
 from alidade.factors.preintegration import GyroPath
-from alidade.pipelines.diagnostics.validation import Validation
+from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.head.recording import HeadData

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.gyro import symmetric
 from alidade.factors.indexer import mounting
-from alidade.pipelines.diagnostics.validation import Validation
+from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.indexer.attitude import carrier
 from alidade.pipelines.methods.indexer.groups import Group, groups_of

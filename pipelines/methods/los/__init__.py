@@ -10,8 +10,8 @@ from alidade.pipelines.methods import Method, Scenario
 
 if TYPE_CHECKING:
     from alidade.pipelines.diagnostics.checklist import ChecklistItem
+    from alidade.pipelines.diagnostics.cross_validation import Validation
     from alidade.pipelines.diagnostics.fault_models import FaultModel
-    from alidade.pipelines.diagnostics.validation import Validation
     from alidade.pipelines.estimation.problem import Estimate, Findings, Problem
     from alidade.pipelines.methods.formula import Formula
     from alidade.pipelines.methods.los.recording import LosData

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from alidade.factors import so3
 from alidade.factors.gimbal import GimbalPath, command
-from alidade.pipelines.diagnostics.validation import Validation
+from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.methods.los.corrected import rates
 from alidade.pipelines.methods.los.guess import los_direction, los_error

@@ -23,7 +23,7 @@ from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.tumble.model import Model, Sensor
 from alidade.pipelines.methods.tumble.parameters import DIP_KEY, SLOPE_KEY, STRENGTH_KEYS, TRIAD_KEYS, Variable
 from alidade.pipelines.methods.tumble.recording import TumbleData
-from alidade.pipelines.methods.tumble.turning import DELAY_KEY, Rows, Seen, Turning, turning
+from alidade.pipelines.methods.tumble.turning import DELAY_KEY, FieldGuess, Rows, Seen, Turning, turning
 from alidade.pipelines.settings import Config
 
 FAMILIES = {"accel": "accelerometer", "mag": "magnetometer"}
@@ -43,14 +43,14 @@ class _Graph:
 
 def chained(data: TumbleData, config: Config, model: Model, shared: tuple[Variable, ...]) -> Problem:
     """The graph with the gyro that the model says how it is mounted."""
-    assert model.mounted is not None
+    assert model.guess is not None
     assert model.dip is not None
     sensors = {sensor.name: sensor for sensor in model.sensors}
     accel = sensors.get("accel")
     turned = turning(
         data,
         config,
-        model.mounted,
+        model.guess,
         _seen(sensors["mag"], data.mag),
         None if accel is None else _seen(accel, data.accel),
         model.declination,
@@ -67,10 +67,17 @@ def chained(data: TumbleData, config: Config, model: Model, shared: tuple[Variab
         advice=advice,
         dropped=model.dropped,
         premises=model.premises,
-        noises=(*(Level(sensor.noise) for sensor in model.sensors), *turned.levels),
+        noises=(*(_level(sensor, model.guess) for sensor in model.sensors), *turned.levels),
         constants=temperature.constants(temperature.reference(data.temperature)),
         layout=LAYOUT,
     )
+
+
+def _level(sensor: Sensor, guess: FieldGuess) -> Level:
+    """A noise to begin with: that of the first guess for a magnetometer whose noise nobody states."""
+    if sensor.name != "mag" or sensor.noise.source != "default" or sensor.noise.known == 0.0:
+        return Level(sensor.noise)
+    return Level(sensor.noise, max(1.0, guess.sigma / float(np.median(sensor.sigma))))
 
 
 def _seen(sensor: Sensor, whole: Array | None) -> Seen:
@@ -119,8 +126,8 @@ def _field(graph: _Graph, keyframes: range) -> list[Factor]:
     seen, sensor = turned.mag.of(keyframes), graph.sensors["mag"]
     if not len(seen.row):
         return []
-    factor = FieldFactor(*_measured(turned, sensor, seen), chain.gyro, turned.errors)
-    keys = TRIAD_KEYS["mag"], STRENGTH_KEYS["mag"], DIP_KEY, DELAY_KEY, *chain.error_keys
+    factor = FieldFactor(*_measured(turned, sensor, seen), chain.gyro, turned.errors, turned.earth)
+    keys = TRIAD_KEYS["mag"], STRENGTH_KEYS["mag"], DIP_KEY, DELAY_KEY, *chain.error_keys, *_earth_key(turned)
     states = [chain.state(int(k)) for k in seen.keyframe]
     return [Factor.of(FAMILIES["mag"], factor.on(states, chain.bias_keys(seen.keyframe), *keys, loss=graph.loss))]
 
@@ -133,23 +140,28 @@ def _up(graph: _Graph, keyframes: range) -> list[Factor]:
     sensor = graph.sensors["accel"]
     measured = _measured(turned, sensor, seen)
     warmth = None if sensor.warmth is None else sensor.warmth[seen.row]
-    factor = UpFactor(*measured, chain.gyro, turned.errors, None if turned.arm is None else sensor.strength, warmth)
+    unit = None if turned.arm is None else sensor.strength
+    factor = UpFactor(*measured, chain.gyro, turned.errors, turned.earth, unit, warmth)
     arm = [] if turned.arm is None else [turned.arm.key]
     slope = [] if warmth is None else [SLOPE_KEY]
-    keys = TRIAD_KEYS["accel"], STRENGTH_KEYS["accel"], *chain.error_keys, *arm, *slope
+    keys = TRIAD_KEYS["accel"], STRENGTH_KEYS["accel"], *chain.error_keys, *arm, *slope, *_earth_key(turned)
     states = [chain.state(int(k)) for k in seen.keyframe]
     return [Factor.of(FAMILIES["accel"], factor.on(states, chain.bias_keys(seen.keyframe), *keys, loss=graph.loss))]
 
 
+def _earth_key(turned: Turning) -> list[int]:
+    return [] if turned.earth_rate is None else [turned.earth_rate.key]
+
+
 def _measured(turned: Turning, sensor: Sensor, seen: Rows) -> tuple[Array, Array, Array, Array, Array]:
-    """Stamps, times of the keyframes, readings and their sigmas without unit, and how the earth has turned."""
+    """Stamps, times of the keyframes, readings and their sigmas without unit, and s since the first keyframe."""
     time = sensor.time[seen.row]
     return (
         time,
         turned.chain.time[seen.keyframe],
         sensor.scaled[seen.row],
         sensor.sigma[seen.row],
-        turned.aRn(time),
+        turned.elapsed(time),
     )
 
 
@@ -158,7 +170,7 @@ def _trajectory(graph: _Graph, keyframes: Sequence[int], values: gtsam.Values) -
     chain, rows = graph.turning.chain, list(keyframes)
     aRb = so3.from_gtsam([values.atRot3(chain.state(k)) for k in rows])
     time = chain.time[rows]
-    return Attitudes(time, so3.multiply(so3.inverse(graph.turning.aRn(time)), aRb))
+    return Attitudes(time, so3.multiply(so3.inverse(graph.turning.aRn(time, values)), aRb))
 
 
 def advice(weights: Mapping[str, float]) -> Motion:

@@ -50,10 +50,10 @@ def problem(data: TumbleData, config: Config) -> Problem:
     """
     model = prepare(data, config)
     found = variables(model, config)
-    sensors = model.sensors if model.mounted is not None else tuple(map(unturned, model.sensors))
+    sensors = model.sensors if model.guess is not None else tuple(map(unturned, model.sensors))
     for sensor in sensors:
         check_turned(sensor, config)
-    if model.mounted is not None:
+    if model.guess is not None:
         return chained(data, config, model, found)
     model = replace(model, sensors=sensors)
     noises = [Level(sensor.noise) for sensor in model.sensors]

@@ -26,7 +26,7 @@ from alidade.pipelines.methods.static_intervals import quiet_intervals
 from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.methods.tumble.published import FEWEST, ellipsoid
 from alidade.pipelines.methods.tumble.recording import ACCEL_SLOPE, NO_RATE, TumbleData
-from alidade.pipelines.methods.tumble.turning import Mounted, mounted
+from alidade.pipelines.methods.tumble.turning import FieldGuess, field_guess
 from alidade.pipelines.settings import Config
 
 # Typical norms, SI, by which counts are told; of a sensor with its offset.
@@ -119,7 +119,10 @@ class Sensor:
 
 @dataclass(frozen=True, eq=False)
 class Dip:
-    """The field's inclination: first guess, rad, and by the field model, rad, with how well that is known, or None."""
+    """The field's inclination: first guess, rad, and by the field model, rad, with how well that is known, or None.
+
+    A magnetometer alone at an unknown place has none: the level frame is defined by the field, with sigma 0.
+    """
 
     start: float
     model: tuple[float, float] | None
@@ -152,7 +155,7 @@ class Model:
         sensors: accelerometer first.
         dip: None where a sensor is alone.
         moments: what the sensors measured together, where no gyro ties them.
-        mounted: how the gyro is mounted that chains the attitudes; None: these are eliminated.
+        guess: of the magnetometer in the axes of the gyro that chains the attitudes; None: these are eliminated.
         declination: of the field, rad east, where the place is known.
         premises: what has to be told.
         dropped: what was left out.
@@ -161,7 +164,7 @@ class Model:
     sensors: tuple[Sensor, ...]
     dip: Dip | None
     moments: Moments | None
-    mounted: Mounted | None
+    guess: FieldGuess | None
     declination: float
     premises: tuple[str, ...]
     dropped: Mapping[str, int]
@@ -185,18 +188,17 @@ def prepare(data: TumbleData, config: Config) -> Model:
                 "No position, so that the field's strength is unknown and called 1: K and b give the field in units of "
                 "it; state latitude_deg and longitude_deg in the config for T."
             )
-    gyro, more = _gyro(data, sensors, field)
+    gyro, more = _gyro(data, sensors)
     premises += more
     if sensors[0].name == "accel" and not sensors[0].rested:
         done = _AT_REST if gyro is None else _SWUNG
         premises.append(f"The accelerometer has fewer than {_FEWEST_RESTS} rests: {done}.")
     dip = moments = None
+    modelled = None if field is None else _modelled(config, field)
     if gyro is not None:
-        assert field is not None
-        sensors, dip, gyro, more = _chained(sensors, gyro, _modelled(config, field))
+        sensors, dip, gyro, more = _chained(sensors, gyro, modelled)
         premises += more
     elif len(sensors) > 1:
-        modelled = None if field is None else _modelled(config, field)
         sensors[1], dip, moments, more = _together(data, config, sensors[0], sensors[1], rests, modelled)
         premises += more
     declination = 0.0 if field is None else float(np.arctan2(field[0], field[1]))
@@ -209,37 +211,53 @@ def _modelled(config: Config, field: Array) -> tuple[float, float]:
     return float(np.arcsin(-field[2] / strength)), sheet(config, FIELD) / strength
 
 
-def _gyro(data: TumbleData, sensors: list[Sensor], field: Array | None) -> tuple[Mounted | None, list[str]]:
-    """How the gyro is mounted, and why it is not used though it is there."""
+def _gyro(data: TumbleData, sensors: list[Sensor]) -> tuple[FieldGuess | None, list[str]]:
+    """The magnetometer in the gyro's axes, and why the gyro is not used though it is there."""
     if any(reason.endswith(NO_RATE) for reason in data.dropped):
         return None, ["The gyro is not used: it reads more than rad/s can be; is it in deg/s, or in counts?"]
     if data.gyro is None or data.mag is None:
         return None, []
-    if field is None:
-        return None, ["The gyro is not used: that needs latitude_deg and longitude_deg, for the earth turns beside it."]
-    mag = sensors[-1]
-    found = mounted(data, mag.time, _directions(mag))
+    found = field_guess(data, sensors[-1].time, sensors[-1].raw)
     if found is None:
         return None, ["The gyro is not used: it does not turn as the field does; are its axes and clock right?"]
     return found, []
 
 
 def _chained(
-    sensors: list[Sensor], gyro: Mounted, model: tuple[float, float]
-) -> tuple[list[Sensor], Dip, Mounted, list[str]]:
+    sensors: list[Sensor], gyro: FieldGuess, model: tuple[float, float] | None
+) -> tuple[list[Sensor], Dip, FieldGuess, list[str]]:
     """Sensors in the gyro's axes, and the dip."""
     *beside, mag = sensors
     beside = [replace(each, symmetric=False, start=each.start @ entries(True).T) for each in map(_of_hand, beside)]
-    sine, premises = np.sin(model[0]), []
+    sine, premises, found = 0.0 if model is None else np.sin(model[0]), [], _of_guess(mag, gyro)
     if beside:
         accel = beside[0]
         rows = np.clip(np.searchsorted(mag.time, accel.time), 0, len(mag.time) - 1)
-        sine = -float(np.mean((accel.directions * (_directions(mag)[rows] @ gyro.Q.T)).sum(axis=1)))
-        if _contradicts(sine, model[0]):
-            gyro, sine = replace(gyro, Q=-gyro.Q), -sine
+        sine = -float(np.mean((accel.directions * found.directions[rows]).sum(axis=1)))
+        if model is not None and _contradicts(sine, model[0]):
+            gyro, sine = gyro.mirrored, -sine
+            found = _of_guess(mag, gyro)
             premises.append(_LEFT_HANDED)
+    elif model is None:
+        model = 0.0, 0.0
     dip = Dip(float(np.arcsin(np.clip(sine, -0.99, 0.99))), model)
-    return [*beside, _turned(mag, gyro.Q)], dip, gyro, premises
+    return [*beside, found], dip, gyro, premises
+
+
+def _of_guess(mag: Sensor, guess: FieldGuess) -> Sensor:
+    """The magnetometer with a guess for its start, whose K has a determinant of one without unit."""
+    radius = float(np.abs(np.linalg.det(guess.K))) ** (-1.0 / 3.0)
+    scale = mag.radius / radius
+    start = np.append(radius * guess.K, guess.b)
+    return replace(
+        mag,
+        radius=radius,
+        sigma=scale * mag.sigma,
+        believed=scale * mag.believed,
+        symmetric=False,
+        start=start,
+        turned=guess.mount,
+    )
 
 
 def _of_hand(accel: Sensor) -> Sensor:
@@ -252,11 +270,6 @@ def _of_hand(accel: Sensor) -> Sensor:
 def _contradicts(sine: float, dip: float) -> bool:
     """Whether the sine of a dip has the wrong sign."""
     return bool(abs(np.sin(dip)) > _SINE and sine * np.sin(dip) < 0.0)
-
-
-def _directions(mag: Sensor) -> Array:
-    """(n, 3) of the field in the axes in which K is symmetric, whatever those of its start are."""
-    return np.asarray(mag.directions @ mag.turned)
 
 
 def _turned(mag: Sensor, rotation: Array) -> Sensor:

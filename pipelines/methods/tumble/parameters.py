@@ -17,7 +17,7 @@ from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Quant
 from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.methods.tumble.model import Model, Sensor, nearest_axes
 from alidade.pipelines.methods.tumble.recording import ACCEL_SLOPE, SLOPES
-from alidade.pipelines.methods.tumble.turning import ARM, BIAS, DELAY, SCALE, SENSITIVITY
+from alidade.pipelines.methods.tumble.turning import ARM, BIAS, DELAY, EARTH, SCALE, SENSITIVITY
 from alidade.pipelines.settings import Config, check_names
 
 TRIAD_KEYS = {"accel": int(gtsam.symbol("A", 0)), "mag": int(gtsam.symbol("M", 0))}
@@ -62,7 +62,7 @@ def variables(model: Model, config: Config) -> tuple[Variable, ...]:
         mean, sigma = model.dip.model or (0.0, _ANY_DIP)
         wanted = config.require.get(_DIP, _REQUIRE_DIP)
         known = config.prior(_DIP, sigma)
-        quantity = Quantity(_DIP, "rad", known, sigma, wanted, prior_mean=mean, nuisance=True)
+        quantity = Quantity(_DIP, "rad", known, sigma or _ANY_DIP, wanted, prior_mean=mean, nuisance=True)
         found.append(_variable(DIP_KEY, (quantity,), np.ones(1), np.array([model.dip.start])))
     slopes = (sensor for sensor in model.sensors if sensor.warmth is not None)
     found += [
@@ -135,6 +135,7 @@ def _check_names(config: Config) -> None:
         _DIP,
         *BIAS,
         *ARM,
+        *EARTH,
         *chain.from_iterable(each.names for each in (*SCALE, SENSITIVITY, DELAY, *SLOPES)),
     ]
     check_names(config.priors, known, "priors")

@@ -30,8 +30,8 @@ Array = NDArray[np.float64]
 
 # Half the step of the differences that an acceleration is made of, s.
 _STEP = 1e-3
-# A field where nobody says, T in n.
-_FIELD = np.array([0.0, 2.2e-5, -4.2e-5])
+# Field, T in n, and latitude, rad, of a place that the recording does not name.
+_FIELD, _LATITUDE = np.array([0.0, 2.2e-5, -4.2e-5]), np.deg2rad(45.0)
 
 
 def simulated(scenario: TumbleScenario, seed: int, images: bool = False) -> Simulated:
@@ -59,7 +59,7 @@ def simulated(scenario: TumbleScenario, seed: int, images: bool = False) -> Simu
     truth |= slopes
     g = 9.80665 if place is None else float(gravity(float(place[0]), 0.0))
     if (gyro := scenario.gyro) is not None:
-        earth = np.zeros(3) if place is None else earth_rate(float(place[0]))
+        earth = earth_rate(_LATITUDE if place is None else float(place[0]))
         t, raw, own = _gyro(motion, gyro, scenario.accelerometer, earth, g, rng)
         raw = raw + drift(scenario.temperature, "gyro", slopes, t)
         found |= {"gyro_t": t, "gyro": raw, "gyro_density": gyro.density}
@@ -84,9 +84,21 @@ def simulated(scenario: TumbleScenario, seed: int, images: bool = False) -> Simu
         truth |= _truth("mag", K, b, symmetric=accel is None and gyro is None)
         truth |= {"field_strength": float(np.linalg.norm(field)) / unit}
         if accel is not None or gyro is not None:
-            truth |= {"field_dip": float(np.arcsin(-field[2] / np.linalg.norm(field)))}
+            truth |= _level_frame(field, gyro is not None and place is None, accel is None)
     found |= {"temperature": measured(scenario.temperature, motion.duration)}
     return Simulated(TumbleData(EPOCH_NS, **found), truth, tumble_config(scenario))  # type: ignore[arg-type]
+
+
+def _level_frame(field: Array, nowhere: bool, alone: bool) -> dict[str, float]:
+    """Dip and, at an unknown place beside a gyro, the earth's rate; a magnetometer alone defines y by the field."""
+    dip = float(np.arcsin(-field[2] / np.linalg.norm(field)))
+    if not nowhere:
+        return {"field_dip": dip}
+    to_frame = so3.exp(np.array([dip if alone else 0.0, 0.0, 0.0]))
+    rate = so3.rotate(to_frame, earth_rate(_LATITUDE))
+    return {"field_dip": 0.0 if alone else dip} | {
+        f"earth_rate_{a}": float(w) for a, w in zip("xyz", rate, strict=True)
+    }
 
 
 def _slopes(scenario: TumbleScenario, rng: np.random.Generator) -> dict[str, float]:

@@ -6,14 +6,14 @@ gyro's own errors are symmetric.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.earth import earth_rate
+from alidade.factors.earth import EARTH_RATE, earth_rate
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.estimation.assumptions import (
     Assumption,
@@ -26,6 +26,7 @@ from alidade.pipelines.estimation.assumptions import (
 from alidade.pipelines.estimation.gyro_chain import GyroChain, shared_keyframes
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import Array, Parameter, Quantity
+from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.estimation.walking_bias import FIRST
 from alidade.pipelines.methods.noise import sampled, stated, walking
 from alidade.pipelines.methods.tumble.recording import GYRO_SLOPE, TumbleData
@@ -40,17 +41,20 @@ SCALE = scale_assumptions("gyro", "gyro", 1e-2)
 SENSITIVITY = sensitivity_assumption("gyro", "gyro", 2e-4)
 DELAY = Assumption(("mag_delay",), "s", "mag", "delay", 1e-2)
 ARM = tuple(f"accel_arm_{axis}" for axis in "xyz")
-DELAY_KEY, ARM_KEY, _ERRORS_KEY = (int(gtsam.symbol(letter, 0)) for letter in "drG")
+EARTH = tuple(f"earth_rate_{axis}" for axis in "xyz")
+DELAY_KEY, ARM_KEY, _ERRORS_KEY, _EARTH_KEY = (int(gtsam.symbol(letter, 0)) for letter in "drGe")
 # m; of the hand that turns a device.
 _ARM_PRIOR = 0.3
 _BIAS_PRIOR, _BIAS_REQUIRE = 0.05, 2e-3
 
 # Readings share a keyframe within this time, s, and keyframes are never farther apart than this, s.
 _SHARED, _APART = 0.1, 0.2
-# For the first guess attitudes are compared over this time, s, where they turned by at least this, rad.
-_SPAN, _TURNED = 0.3, 0.05
-# The second-best mounting has to fit this many times worse, with so many windows.
-_CLEAR, _FEWEST = 2.0, 30
+# For the first guess attitudes are compared over these times, s, where they turned by at least this, rad: short ones
+# keep errors of the gyro small, long ones those of the magnetometer.
+_SPANS, _TURNED = (0.3, 1.0, 3.0, 10.0), 0.05
+# Windows needed; sigmas by which the misfit of the second-best guess exceeds that of the best (relative sampling error
+# of a mean square of n: sqrt(2 / n)); share of the field's change that the gyro may leave unexplained.
+_FEWEST, _CHANCE, _UNEXPLAINED = 30, 3.0, 0.25
 _ROUNDS = 3
 # What part of the field's direction the first guess of attitudes takes at each keyframe.
 _GAIN = 0.2
@@ -91,11 +95,27 @@ class Rows:
 
 
 @dataclass(frozen=True, eq=False)
-class Mounted:
-    """First guesses: Q (3, 3) with field in b = Q field in the magnetometer's axes, and the gyro's bias (3,), rad/s."""
+class FieldGuess:
+    """First guess: unit field in b = K raw + b, K (3, 3) and b (3,), and the gyro's bias (3,), rad/s.
 
-    Q: Array
+    sigma: noise of K raw per axis, robust, that of the gyro over the windows included.
+    """
+
+    K: Array
+    b: Array
     bias: Array
+    sigma: float
+
+    @property
+    def mount(self) -> Array:
+        """(3, 3) the rotation of the polar decomposition of K, a mirror where K is left-handed."""
+        u, _, vt = np.linalg.svd(self.K)
+        return np.asarray(u @ vt)
+
+    @property
+    def mirrored(self) -> FieldGuess:
+        """The other solution: the opposite field, of a magnetometer with left-handed axes."""
+        return replace(self, K=-self.K, b=-self.b)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,83 +124,127 @@ class Turning:
 
     Attributes:
         chain: the keyframes, joined by the gyro.
-        earth: (3,) rate of n in a, rad/s.
+        earth: (3,) rate of n in a, rad/s; None: unknown, a parameter.
         mag, accel: rows of the sensors' readings that are used, and the keyframe of each, in time order.
         bias, delay: parameters; the delay may be fixed.
         arm: that of an accelerometer which is used while it moves: m, in b, to it from the point about which the
             device is turned; None at rest.
+        earth_rate: parameter, rad/s, in the axes of n at the first keyframe; None where the place is known.
         levels: of the gyro's noises.
     """
 
     chain: GyroChain
-    earth: Array
+    earth: Array | None
     mag: Rows
     accel: Rows
     bias: Parameter
     delay: Parameter
     arm: Parameter | None
+    earth_rate: Parameter | None
     levels: tuple[Level, ...]
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """In reporting order."""
-        return tuple(each for each in (self.bias, self.chain.errors, self.delay, self.arm) if each is not None)
+        return tuple(
+            each for each in (self.bias, self.chain.errors, self.delay, self.arm, self.earth_rate) if each is not None
+        )
 
     @property
     def errors(self) -> int:
         """Numbers of the gyro's errors."""
         return 0 if self.chain.errors is None else len(self.chain.errors.quantities)
 
-    def aRn(self, time: Array) -> Array:
-        """(n, 4) how the earth has turned."""
-        return so3.exp((time - self.chain.time[0])[:, None] * self.earth)
+    def elapsed(self, time: Array) -> Array:
+        """(n,) s since the first keyframe, at which a and n coincide."""
+        return np.asarray(time - self.chain.time[0])
+
+    def aRn(self, time: Array, values: gtsam.Values) -> Array:
+        """(n, 4) how the earth has turned, by its rate as known or as estimated."""
+        earth = self.earth
+        if earth is None:
+            assert self.earth_rate is not None
+            earth = values.atVector(self.earth_rate.key)
+        return so3.exp(self.elapsed(time)[:, None] * earth)
 
 
-def mounted(data: TumbleData, time: Array, field: Array) -> Mounted | None:
-    """The gyro against the magnetometer, from how the field turns in the axes of both; None where motion does not tell.
+def field_guess(data: TumbleData, time: Array, raw: Array) -> FieldGuess | None:
+    """Magnetometer against gyro without knowing the ellipsoid: K, b and the gyro's bias by linear least squares.
 
-    Of a field that stays, field_i = dR_ij field_j: linear in the entries of Q, and for small ones in the bias.
+    The field stays while the device turns by dR from time i to time j: K raw_i + b = dR (K raw_j + b), linear and
+    homogeneous in K and b. b is eliminated; K is the smallest right singular vector of the rest, which is total least
+    squares for white noise of the readings (integrated form of m' = -w x m: Rodriguez-Martinez and Troni, "Full
+    magnetometer and gyroscope bias estimation using angular rates", IEEE J. Oceanic Eng. 2024). Motion about one axis
+    leaves K undetermined along it; there K is taken for a rotation of readings on the sphere nearest to them.
 
     Args:
         data: with a gyro.
-        time: (n,) s.
-        field: (n, 3) its direction then, in axes at right angles.
+        time: (n,) s, of the readings.
+        raw: (n, 3) readings.
+
+    Returns:
+        None where the gyro does not turn as the field does, or too few windows turn.
     """
+    guesses = (_guess_over(data, time, raw, span) for span in _SPANS)
+    return max(filter(None, guesses), key=lambda each: each[0], default=(0.0, None))[1]
+
+
+def _guess_over(data: TumbleData, time: Array, raw: Array, span: float) -> tuple[float, FieldGuess] | None:
+    """A guess from pairs of readings a span (s) apart, and by what factor the second-best one fits worse."""
     assert data.gyro_t is not None
     assert data.gyro is not None
-    inside = np.flatnonzero((time >= data.gyro_t[0]) & (time <= data.gyro_t[-1]))
-    stride = max(1, round(_SPAN / max(float(np.median(np.diff(time))), 1e-3)))
-    first, last = inside[:-stride], inside[stride:]
-    near = time[last] - time[first] < 2.0 * max(_SPAN, float(np.median(np.diff(time))))
-    first, last = first[near], last[near]
-    bias = np.zeros(3)
+    first, last = _pairs(time, span, data.gyro_t)
+    centre, radius = raw.mean(axis=0), max(float(raw.std()), np.finfo(float).tiny)
+    x, bias = (raw - centre) / radius, np.zeros(3)
     for _ in range(_ROUNDS):
         dR = GyroPath(data.gyro_t, data.gyro, bias).increments(time[first], time[last])
         turned = np.linalg.norm(so3.log(dR.wxyz), axis=1) > _TURNED
         if turned.sum() < _FEWEST:
             return None
-        R, before, after = so3.matrix(dR.wxyz[turned]), field[first[turned]], field[last[turned]]
-        rows = np.einsum("ac,nb->nacb", np.eye(3), before) - np.einsum("nac,nb->nacb", R, after)
-        _, sizes, axes = np.linalg.svd(rows.reshape(-1, 9), full_matrices=False)
-        if sizes[-2] < _CLEAR * sizes[-1]:
-            return None
-        M = axes[-1].reshape(3, 3)
-        u, _, vt = np.linalg.svd(M if np.linalg.det(M) > 0.0 else -M)
-        Q = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-        # dR Exp(J db) Q field: what is left is linear in db.
-        left = before @ Q.T - np.einsum("nij,nj->ni", R, after @ Q.T)
-        by_bias = -R @ so3.hat(after @ Q.T) @ dR.bias_jacobian[turned]
+        R, before, after = so3.matrix(dR.wxyz[turned]), x[first[turned]], x[last[turned]]
+        K, b, gap = _homogeneous(R, before, after)
+        at_first, at_last = before @ K.T + b, after @ K.T + b
+        left = at_first - np.einsum("nij,nj->ni", R, at_last)
+        by_bias = -R @ so3.hat(at_last) @ dR.bias_jacobian[turned]
         bias = bias + np.linalg.lstsq(by_bias.reshape(-1, 3), left.ravel())[0]
-    return Mounted(Q, bias)
+    independent = 3.0 * turned.sum() * min(1.0, float(np.median(np.diff(time))) / span)
+    if (
+        gap < 1.0 + _CHANCE * np.sqrt(2.0 / independent)
+        or (left**2).sum() > _UNEXPLAINED * ((at_first - at_last) ** 2).sum()
+    ):
+        return None
+    size = float(np.linalg.norm(at_first, axis=1).mean()) * (1.0 if np.linalg.det(K) > 0.0 else -1.0)
+    sigma = robust_sigma(left) / abs(size) / 2.0**0.5
+    return gap, FieldGuess(K / (size * radius), (b - K @ centre / radius) / size, bias, sigma)
+
+
+def _pairs(time: Array, span: float, gyro: Array) -> tuple[Index, Index]:
+    """Readings about a span (s) apart, both within the gyro's record and without a gap between them."""
+    inside, interval = _inside(time, gyro), float(np.median(np.diff(time)))
+    stride = max(1, round(span / max(interval, 1e-3)))
+    first, last = inside[:-stride], inside[stride:]
+    near = time[last] - time[first] < 2.0 * max(span, interval)
+    return first[near], last[near]
+
+
+def _homogeneous(R: Array, before: Array, after: Array) -> tuple[Array, Array, float]:
+    """K (3, 3) of unit norm, b (3,): K before + b = R (K after + b); and second-smallest over smallest misfit."""
+    gains = np.einsum("ac,nb->nacb", np.eye(3), before) - np.einsum("nac,nb->nacb", R, after)
+    gains, offsets = gains.reshape(-1, 9), (np.eye(3) - R).reshape(-1, 3)
+    by_gain = np.linalg.lstsq(offsets, gains)[0]
+    left = gains - offsets @ by_gain
+    sizes, axes = np.linalg.eigh(left.T @ left)
+    K = axes[:, 0]
+    return K.reshape(3, 3), -by_gain @ K, float(np.sqrt(max(sizes[1], 0.0) / max(sizes[0], np.finfo(float).tiny)))
 
 
 def turning(
-    data: TumbleData, config: Config, guess: Mounted, mag: Seen, accel: Seen | None, declination: float, dip: float
+    data: TumbleData, config: Config, guess: FieldGuess, mag: Seen, accel: Seen | None, declination: float, dip: float
 ) -> Turning:
     """The chain of attitudes.
 
     Args:
-        data: with gyro and latitude.
+        data: with a gyro.
         config: in force.
         guess: of mounting and bias.
         mag, accel: what the sensors measured.
@@ -189,7 +253,6 @@ def turning(
     """
     assert data.gyro_t is not None
     assert data.gyro is not None
-    assert data.latitude is not None
     density = sampled(stated("gyro_density", config, data.gyro_density, ("gyro",)), data.gyro_t, data.gyro)
     walk = walking(config)
     drivers: dict[Assumption, Array] = {}
@@ -218,14 +281,29 @@ def turning(
     )
     return Turning(
         chain=chain,
-        earth=so3.rotate(so3.exp(np.array([0.0, 0.0, declination])), earth_rate(data.latitude)),
+        earth=None if data.latitude is None else _earth(data.latitude, declination),
         mag=Rows(inside, np.repeat(np.arange(len(time)), np.diff(begins))),
         accel=rested or Rows(np.empty(0, dtype=np.intp), np.empty(0, dtype=np.intp)),
         bias=Parameter(FIRST, known),
         delay=Parameter(DELAY_KEY, quantities(DELAY, config)),
         arm=_arm(config) if accel is not None and accel.swung else None,
+        earth_rate=_earth_rate(config) if data.latitude is None else None,
         levels=(density, walk),
     )
+
+
+def _earth(latitude: float, declination: float) -> Array:
+    """(3,) rad/s, rate of n, whose y axis points along the field's horizontal part."""
+    return np.asarray(so3.rotate(so3.exp(np.array([0.0, 0.0, declination])), earth_rate(latitude)))
+
+
+def _earth_rate(config: Config) -> Parameter:
+    """The earth's rate at an unknown place: of known size, in any direction."""
+    known = (
+        Quantity(name, "rad/s", config.prior(name, EARTH_RATE), EARTH_RATE, np.inf, group="assumption")
+        for name in EARTH
+    )
+    return Parameter(_EARTH_KEY, tuple(known))
 
 
 def _arm(config: Config) -> Parameter:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from alidade.pipelines.diagnostics.validation import Validation
+from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.temperature import FIRST
 from alidade.pipelines.methods.triads import triad_of

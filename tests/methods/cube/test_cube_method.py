@@ -15,7 +15,7 @@ from alidade.factors import so3
 from alidade.factors.turns import GyroRotationFactor
 from alidade.factors.vectorized import Ensemble
 from alidade.pipelines.config import load_config
-from alidade.pipelines.diagnostics.validation import rms
+from alidade.pipelines.diagnostics.cross_validation import rms
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Estimate, Problem
 from alidade.pipelines.methods import simulate

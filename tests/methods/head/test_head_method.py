@@ -14,7 +14,7 @@ from alidade.factors import so3
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.applications.session import calibrate
 from alidade.pipelines.config import load_config
-from alidade.pipelines.diagnostics.validation import peak, rms
+from alidade.pipelines.diagnostics.cross_validation import peak, rms
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.head.graph import problem
 from alidade.pipelines.methods.head.recording import HeadData, write_head

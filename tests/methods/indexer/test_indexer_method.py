@@ -12,7 +12,7 @@ from alidade.factors import so3
 from alidade.factors.chi_square import quantile
 from alidade.factors.indexer import mounting
 from alidade.pipelines.config import load_config
-from alidade.pipelines.diagnostics.validation import rms
+from alidade.pipelines.diagnostics.cross_validation import rms
 from alidade.pipelines.estimation.assumptions import pull
 from alidade.pipelines.estimation.problem import Estimate, Quantity
 from alidade.pipelines.methods.indexer.graph import problem

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from alidade.pipelines.config import load_config
-from alidade.pipelines.diagnostics.validation import peak, rms
+from alidade.pipelines.diagnostics.cross_validation import peak, rms
 from alidade.pipelines.methods.los.graph import problem
 from alidade.pipelines.methods.los.simulation import LosNoise, LosScenario, los_config, simulate_los
 from alidade.pipelines.methods.los.validation import validate

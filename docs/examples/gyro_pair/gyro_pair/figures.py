@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from alidade.pipelines.diagnostics.validation import rms
+from alidade.pipelines.diagnostics.cross_validation import rms
 from alidade.pipelines.display.figure import COLORS, Figure
 from alidade.pipelines.reports.result import Calibration, Plot
 from gyro_pair.recording import GyroPairData

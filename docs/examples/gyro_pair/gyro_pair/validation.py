@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from alidade.factors import so3
 from alidade.factors.preintegration import GyroPath
-from alidade.pipelines.diagnostics.validation import Validation
+from alidade.pipelines.diagnostics.cross_validation import Validation
 from alidade.pipelines.settings import Config
 from gyro_pair.graph import windows
 from gyro_pair.recording import GyroPairData

@@ -1,0 +1,125 @@
+"""Which connections a server of `follow` keeps: so many in all and from one address, whether they may read or not.
+
+    gate.admit(connection, address, close)    # may close another one
+    gate.trust(connection)                    # it has shown that it may read
+    gate.release(connection)
+
+Those that have shown nothing yet and those that may read are counted apart, and of too many the oldest goes: idle
+connections, however many, keep nobody out who says at once what it wants, nor do streams that a lost network left.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import threading
+import time
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+
+# Connections of either kind in all and from one address: a dozen devices, and what a lost network left of some; far
+# below the 1024 files that a process may have open.
+MAX_CONNECTIONS, MAX_PER_ADDRESS = 64, 16
+# A connection that has not shown in this time that it may read is closed, s.
+HANDSHAKE_TIME_S = 5.0
+# Wrong tokens of one address at once, and s for each further one; addresses that are remembered.
+MAX_ATTEMPTS, ATTEMPT_PERIOD_S, MAX_ADDRESSES = 10, 10.0, 1024
+
+
+@dataclass
+class _Admitted:
+    address: str
+    close: Callable[[], None]
+    trusted: bool = False
+
+
+class Gate:
+    """Bounds the connections of a server; for any thread.
+
+    Args:
+        most: connections of either kind.
+        per_address: of these, from one address.
+    """
+
+    def __init__(self, most: int = MAX_CONNECTIONS, per_address: int = MAX_PER_ADDRESS) -> None:
+        self._most, self._per_address = most, per_address
+        self._admitted: dict[Hashable, _Admitted] = {}  # the oldest first
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self._admitted)
+
+    def admit(self, connection: Hashable, address: str, close: Callable[[], None]) -> None:
+        """Take a connection in, which has shown nothing yet; closes the oldest such one when they are too many."""
+        with self._lock:
+            admitted = self._admitted[connection] = _Admitted(network_of(address), close)
+            gone = self._surplus(admitted)
+        if gone is not None:
+            gone.close()
+
+    def trust(self, connection: Hashable) -> None:
+        """A connection may read; closes the oldest such one when they are too many."""
+        with self._lock:
+            admitted = self._admitted.pop(connection, None)
+            if admitted is None:
+                return
+            admitted.trusted = True
+            self._admitted[connection] = admitted
+            gone = self._surplus(admitted)
+        if gone is not None:
+            gone.close()
+
+    def close_untrusted(self, connection: Hashable) -> None:
+        """Close a connection that has not shown by now that it may read."""
+        with self._lock:
+            each = self._admitted.get(connection)
+            gone = self._admitted.pop(connection) if each is not None and not each.trusted else None
+        if gone is not None:
+            gone.close()
+
+    def release(self, connection: Hashable) -> None:
+        """A connection is closed."""
+        with self._lock:
+            self._admitted.pop(connection, None)
+
+    def _surplus(self, new: _Admitted) -> _Admitted | None:
+        """Take out what is too many with a new one, if anything is."""
+        same = [key for key, each in self._admitted.items() if each.trusted == new.trusted]
+        own = [key for key in same if self._admitted[key].address == new.address]
+        if len(own) > self._per_address:
+            return self._admitted.pop(own[0])
+        return self._admitted.pop(same[0]) if len(same) > self._most else None
+
+
+class Attempts:
+    """Wrong tokens by address: a few at once, then one now and then."""
+
+    def __init__(self) -> None:
+        self._left: dict[str, tuple[float, float]] = {}  # attempts left, and when that was
+
+    def allowed(self, address: str) -> bool:
+        """Whether the address may try a token now."""
+        return self._at(network_of(address)) >= 1.0
+
+    def failed(self, address: str) -> None:
+        """The address has tried a wrong one."""
+        address = network_of(address)
+        left = self._at(address) - 1.0
+        self._left.pop(address, None)
+        if len(self._left) >= MAX_ADDRESSES:
+            del self._left[next(iter(self._left))]
+        self._left[address] = left, time.monotonic()
+
+    def _at(self, address: str) -> float:
+        left, when = self._left.get(address, (float(MAX_ATTEMPTS), 0.0))
+        return min(float(MAX_ATTEMPTS), left + (time.monotonic() - when) / ATTEMPT_PERIOD_S)
+
+
+def network_of(address: str) -> str:
+    """An address as one that owns it counts: IPv6 by its network of 64 bits."""
+    try:
+        found = ipaddress.ip_address(address.partition("%")[0])
+    except ValueError:
+        return address
+    if isinstance(found, ipaddress.IPv4Address):
+        return str(found)
+    return str(found.ipv4_mapped or ipaddress.IPv6Network((found, 64), strict=False).network_address)

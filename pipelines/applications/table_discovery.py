@@ -1,0 +1,376 @@
+"""What the columns of tables are, concluded from their headers and numbers, for people to put under `columns:`.
+
+Names say what a column is; where there are none, numbers do as far as they can: gravity and the earth's field have
+sizes that tell an accelerometer or a magnetometer and its unit. Nothing is taken silently: a proposal comes with its
+reasons, and with what could not be concluded.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.recording.checks import MAX_RATE_RAD_S, SLOWEST_S
+from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, lacks_gravity
+from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.sources import TopicSource
+from alidade.pipelines.recording.table_topics import TableTopic
+from alidade.pipelines.recording.table_units import TIME_UNITS, UNITS, unit_hinted, unit_named, unit_of
+from alidade.pipelines.recording.tables import CsvFile, TableForm, numbers, read_columns, table_form
+from alidade.pipelines.settings import Config
+
+Array = NDArray[np.float64]
+
+# What the names of three columns along x, y and z begin with or are, lower case; `gx` is a gyro's as often as not.
+_WORDS = {
+    "gyro": r"gyr|angular.?(vel|rate)|omega|rotation.?rate|^w(?=_|$)|^g(?=_|$)|ang.?vel|\brate",
+    "accel": r"acc|^a(?=_|$)|specific.?force|^f(?=_|$)",
+    "field": r"mag|^m(?=_|$)|^b(?=_|$)|^h(?=_|$)|field",
+}
+_LINEAR = re.compile(r"lin|free|user|without.?g|gravity|acceleration.?no.?g")
+_TIME = re.compile(
+    r"^t_|^(t|ts|time|timestamp|stamp|sec|secs|seconds|s|ms|us|ns|millis|micros|clock|epoch|datetime|date)$"
+    r"|time|stamp|elapsed|utc|millis|micros"
+)
+_RATE = re.compile(r"(?:rate|\bfs\b|freq\w*|sampling)\W*([0-9]+(?:\.[0-9]+)?)\s*(?:hz)?", re.IGNORECASE)
+_VISION = re.compile(r"vision|pose|mocap|vicon|optitrack|tracker|ground|trajectory")
+# Median norms, in a unit; of an accelerometer gravity, of a magnetometer the earth's field and some iron.
+_SIZES: Mapping[str, Mapping[str, tuple[float, float]]] = {
+    "accel": {"m/s^2": (8.0, 12.0), "g": (0.8, 1.25), "mg": (800.0, 1250.0)},
+    "field": {"uT": (15.0, 120.0), "G": (0.15, 1.2), "mG": (150.0, 1200.0), "T": (1.5e-5, 1.2e-4)},
+}
+# Without names these alone are taken: others are counts as often as not.
+_UNNAMED = {"accel": ("m/s^2", "g"), "field": ("uT",)}
+_JOINTS = {"/gimbal/joint_states": ("azimuth", "elevation"), "/indexer/joint_states": ("outer_x", "inner_z")}
+_QUATERNION = re.compile(r"(q|quat|orientation|rot|attitude)\w*w$|^w$")
+_YAML_WORDS = ("y", "n", "yes", "no", "on", "off", "true", "false", "null")
+# Unix time of the years 1985 to 2128, s.
+_UNIX_S = (0.5e9, 5e9)
+# The axes of a device that is turned about vary by so much of what it feels (all directions alike: 0.58).
+_TURNED = 0.1
+# Rows looked at.
+_ROWS = 20_000
+# Rates beyond a gyro's in rad/s are in deg/s up to what a gyro of 4000 deg/s may read on three axes; beyond, counts.
+_MOST_DEG_S = 7000.0
+
+
+@dataclass(frozen=True)
+class Columns:
+    """What tables hold, as far as it can be concluded.
+
+    Attributes:
+        columns: topic -> its columns, as under `columns:`.
+        topics: key -> its source, where a gyro and an accelerometer are in two tables.
+        reasons: sentences about what was concluded.
+        doubts: sentences about what could not be, or is assumed.
+    """
+
+    columns: dict[str, TableTopic]
+    topics: dict[str, TopicSource]
+    reasons: tuple[str, ...]
+    doubts: tuple[str, ...]
+
+    @property
+    def yaml(self) -> str:
+        """The sections to paste."""
+        lines = ["columns:"]
+        for topic, table in self.columns.items():
+            given = {k: v for k, v in table.model_dump(exclude_defaults=True).items() if v is not None}
+            lines.append(f"  {topic}: {_flow(given)}")
+        if self.topics:
+            lines.append("topics:")
+            lines += [f"  {key}: {_flow(source.model_dump())}" for key, source in self.topics.items()]
+        return "\n".join(lines)
+
+
+def propose_columns(recording: Recording) -> Columns | None:
+    """What the tables of a recording hold that no config describes; None where there is no such table."""
+    tables = recording.tables()
+    if not tables:
+        return None
+    found = [_Table(table, len(tables) > 1) for table in tables.values()]
+    columns: dict[str, TableTopic] = {}
+    for one in found:
+        for topic, table in one.topics().items():
+            columns[_free(topic, one.path, columns)] = table
+    gyros = [name for name, table in columns.items() if table.gyro and not table.accel]
+    accels = [name for name, table in columns.items() if table.accel and not table.gyro]
+    topics = {"imu": TopicSource(gyro=gyros[0], accel=accels[0])} if len(gyros) == len(accels) == 1 else {}
+    reasons = tuple(reason for one in found for reason in one.reasons)
+    return Columns(columns, topics, reasons, tuple(doubt for one in found for doubt in one.doubts))
+
+
+def with_columns(recording: Recording, config: Config) -> Config:
+    """The config with the columns that are proposed, where it has none; remarked in the recording.
+
+    Raises InputError where nothing can be concluded.
+    """
+    if config.columns:
+        return config
+    found = propose_columns(recording)
+    if found is None:
+        return config
+    if not found.columns:
+        raise InputError(f"{recording.path}: no columns could be concluded: {'; '.join(found.doubts)}")
+    more = config.model_copy(update={"columns": found.columns, "topics": {**found.topics, **config.topics}})
+    recording.use(more.topics.values(), more.columns)
+    recording.remark(f"columns taken as concluded: {'; '.join((*found.reasons, *found.doubts))}")
+    return more
+
+
+class _Table:
+    """What one table holds."""
+
+    def __init__(self, table: CsvFile, is_named: bool) -> None:
+        self.path, self._data = table.path, table.data
+        self._form: TableForm = table_form(table.path, table.data)
+        self._file = table.path.name if is_named else None
+        self.reasons: list[str] = []
+        self.doubts: list[str] = []
+        names = [f"column {i + 1}" for i in range(len(self._form.names))]
+        texts, _ = read_columns(table.path, table.data, names)
+        self._texts = [texts[name][:_ROWS] for name in names]
+        self._values = [self._numbers(i) for i in range(len(names))]
+
+    def topics(self) -> dict[str, TableTopic]:
+        """Topic -> columns."""
+        time = self._time()
+        triads = self._triads()
+        named = {kind: columns for kind, columns in triads.items() if kind in _WORDS}
+        out: dict[str, TableTopic] = {}
+
+        def add(topic: str, **given: Any) -> None:
+            chosen = {key: value for key, value in given.items() if value}
+            try:
+                out[topic] = TableTopic(file=self._file, **time, **chosen)
+            except ValueError as error:
+                self.doubts.append(f"{self.path.name}: {topic}: {error}")
+
+        if not time:
+            rate = next((found[1] for line in self._form.preamble if (found := _RATE.search(line))), None)
+            time = {"rate": float(rate or 100.0)}
+            if rate is None:
+                self.doubts.append(f"{self.path.name}: no column of time, no rate stated: 100 Hz assumed; state `rate`")
+            else:
+                self.reasons.append(f"{self.path.name}: no column of time; {rate} Hz by its preamble")
+        units = {kind: self._unit(kind, columns) for kind, columns in named.items()}
+        imu = {kind: self._names(columns) for kind, columns in named.items() if kind != "field"}
+        if imu:
+            both = {kind: unit for kind, unit in units.items() if kind in imu and unit and UNITS[unit] != 1.0}
+            alone = {"gyro": "/imu/gyro", "accel": "/imu/accel"} if self._file else {}
+            add(alone.get("".join(imu), "/imu"), **imu, units=both)
+        if "field" in named:
+            unit = units["field"]
+            add("/mag", field=self._names(named["field"]), units={"field": unit} if unit and UNITS[unit] != 1.0 else {})
+        wxyz = self._quaternion()
+        if wxyz:
+            is_vision = _VISION.search(self.path.stem.lower())
+            add("/vision/attitude" if is_vision else "/attitude", wxyz=wxyz)
+        for topic, joints in _JOINTS.items():
+            there = {joint: column for joint in joints if (column := self._called(rf"^{joint}")) is not None}
+            if len(there) == len(joints):
+                stated = {unit_hinted(name) for name in there.values()}
+                add(topic, joints=there, units={"joints": "deg"} if stated == {"deg"} else {})
+        place = {key: self._called(word) for key, word in (("latitude_deg", r"^lat"), ("longitude_deg", r"^lon|^lng"))}
+        if all(place.values()):
+            add("/fix", **place, height=self._called(r"^(alt|height|elev)") or "")
+        for topic, table in out.items():
+            kinds = [kind for kind in (*_WORDS, "wxyz", "joints", "latitude_deg") if getattr(table, kind)]
+            self.reasons.append(f"{self.path.name}: {topic} has {' and '.join(kinds)}")
+        if not out:
+            self.doubts.append(f"{self.path.name}: nothing known in {', '.join(self._form.names[:20])}")
+        return out
+
+    def _numbers(self, i: int) -> Array:
+        try:
+            return numbers(self.path, {"c": self._texts[i]}, ["c"])[:, 0]
+        except InputError:
+            return np.full(len(self._texts[i]), np.nan)
+
+    def _names(self, columns: Sequence[int]) -> list[str]:
+        """Names of columns, by number where a name is there twice."""
+        names = self._form.names
+        return [names[i] if names.count(names[i]) == 1 else f"column {i + 1}" for i in columns]
+
+    def _called(self, word: str) -> str | None:
+        found = [i for i, name in enumerate(self._form.names) if re.search(word, name.strip().lower())]
+        return self._names(found[:1])[0] if found else None
+
+    def _time(self) -> dict[str, Any]:
+        """Column and unit of the time: by its name, and that it increases; without names the first that does."""
+        increasing = [i for i in range(len(self._values)) if self._increases(i)]
+        called = [i for i in increasing if _TIME.search(_bare(self._form.names[i]))]
+        unnamed = self._form.names[0] == "column 1"
+        chosen: int | None = next(iter(called), 0 if unnamed and increasing[:1] == [0] else None)
+        if chosen is None:
+            return {}
+        name = self._names([chosen])[0]
+        if ":" in str(self._texts[chosen][0]):
+            self.reasons.append(f"{self.path.name}: {name} is the time, as a date or clock time")
+            return {"time": name}
+        full = self._form.names[chosen]
+        stated = self._form.units[chosen] or unit_hinted(full) or _unit_word(_bare(full))
+        unit = stated if stated in TIME_UNITS else _time_unit(self._values[chosen])
+        by = "header" if stated == unit else "steps"
+        self.reasons.append(f"{self.path.name}: {name} is the time, in {unit} by its {by}")
+        return {"time": name} if unit == "s" else {"time": name, "unit": unit}
+
+    def _increases(self, i: int) -> bool:
+        if ":" in str(self._texts[i][0] if len(self._texts[i]) else ""):
+            return True
+        values = self._values[i][np.isfinite(self._values[i])]
+        steps = np.diff(values)
+        # A counter may run over, a logger start again, two sensors share a stamp.
+        return len(steps) > 2 and bool(np.mean(steps >= 0.0) > 0.99) and bool(np.mean(steps > 0.0) > 0.4)
+
+    def _triads(self) -> dict[str, tuple[int, ...]]:
+        """Kind -> columns along x, y and z: by names, and without a header by numbers."""
+        out: dict[str, tuple[int, ...]] = {}
+        if self._form.names[0] == "column 1":
+            first = 1 if self._increases(0) else 0
+            for i in range(first, len(self._values) - 2, 3):
+                columns: tuple[int, ...] = (i, i + 1, i + 2)
+                if not self._moves(columns):
+                    continue
+                sized = {kind for kind, units in _UNNAMED.items() if self._size(kind, columns) in units}
+                for kind in sized - out.keys():
+                    out[kind] = columns
+                    where = f"{self.path.name}: columns {i + 1} to {i + 3}"
+                    self.doubts.append(f"{where} are {kind} by their size: check it")
+            return out
+        for name, columns in _along_axes(self._form.names):
+            name = name or self.path.stem.lower()  # x, y, z alone: the file is named after the sensor
+            kind = next((kind for kind, words in _WORDS.items() if re.search(words, name)), "")
+            if kind == "accel" and (_LINEAR.search(name) or self._lacks_gravity(columns)):
+                self.doubts.append(f"{self.path.name}: {self._form.names[columns[0]]} is not used: {GRAVITY_REMOVED}")
+            elif kind and kind not in out:
+                out[kind] = columns
+            elif kind:
+                more = ", ".join(self._names(columns))
+                self.doubts.append(f"{self.path.name}: {more} are another {kind}, not used: name them instead if meant")
+        return out
+
+    def _norms(self, columns: Sequence[int]) -> Array:
+        norms = np.linalg.norm(np.stack([self._values[i] for i in columns]), axis=0)
+        return norms[np.isfinite(norms)]
+
+    def _moves(self, columns: Sequence[int]) -> bool:
+        """Whether what three columns read turned: each changes by a good part of their norm."""
+        norms = self._norms(columns)
+        spread = min(float(np.nanstd(self._values[i])) for i in columns) if len(norms) else 0.0
+        return bool(spread > _TURNED * float(np.median(norms))) if len(norms) else False
+
+    def _lacks_gravity(self, columns: Sequence[int]) -> bool:
+        norms = self._norms(columns)
+        return bool(len(norms)) and lacks_gravity(norms)
+
+    def _size(self, kind: str, columns: Sequence[int]) -> str:
+        """The unit in which a sensor of that kind reads what is there; empty where there is none."""
+        norms = self._norms(columns)
+        norm = float(np.median(norms)) if len(norms) else 0.0
+        return next((unit for unit, (low, high) in _SIZES[kind].items() if low < norm < high), "")
+
+    def _unit(self, kind: str, columns: Sequence[int]) -> str:
+        """The unit of three columns: by their header, else by their numbers; empty for counts."""
+        stated = {unit_of(kind, self._form.units[i] or unit_hinted(self._form.names[i])) for i in columns}
+        (unit,) = stated if len(stated) == 1 else ("",)
+        if unit in UNITS:
+            self.reasons.append(f"{self.path.name}: {kind} is in {unit} by its header")
+            return unit
+        if kind == "gyro":
+            norms = self._norms(columns)
+            most = float(norms.max()) if len(norms) else 0.0
+            found = "rad/s" if most < MAX_RATE_RAD_S else "deg/s" if most < _MOST_DEG_S else ""
+        else:
+            found = self._size(kind, columns)
+        self.doubts.append(f"{self.path.name}: {kind} is in {found or 'counts'} by its size: check it")
+        return found
+
+    def _quaternion(self) -> list[str]:
+        """Columns w, x, y, z, which have unit norm."""
+        names = [_bare(name) for name in self._form.names]
+        for stem in {name[:-1] for name in names if _QUATERNION.search(name)}:
+            if all(f"{stem}{axis}" in names for axis in "wxyz"):
+                columns = [names.index(f"{stem}{axis}") for axis in "wxyz"]
+                if abs(float(np.median(self._norms(columns))) - 1.0) < 0.01:
+                    return self._names(columns)
+        return []
+
+
+def _bare(name: str) -> str:
+    """A column's name without its unit, lower case."""
+    plain = name.strip().lower()
+    return re.sub(r"\s*[(\[{][^()\[\]{}]*[)\]}]$", "", plain) if unit_hinted(name) else plain
+
+
+def _unit_word(name: str) -> str:
+    """The unit of time in a name that is one: millis, seconds_elapsed."""
+    words = (unit_named(word) for word in re.split(r"[_ ]", name))
+    return next((unit for unit in words if unit in TIME_UNITS), "")
+
+
+def _time_unit(values: Array) -> str:
+    """The unit of times: by their size where they are Unix time, else by their usual step."""
+    values = values[np.isfinite(values)]
+    steps = np.diff(values)
+    step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
+    for unit, size in TIME_UNITS.items():
+        second = 1e9 / size
+        if _UNIX_S[0] * second < float(np.median(values)) < _UNIX_S[1] * second and step < SLOWEST_S * second:
+            return unit
+    if step < 0.9:
+        return "s"
+    return "ms" if step < 500.0 else "us" if step < 5e5 else "ns"
+
+
+def _along_axes(names: Sequence[str]) -> list[tuple[str, tuple[int, ...]]]:
+    """Names without their axis, lower case, and columns of those that differ in x, y, z, or 0, 1, 2, alone."""
+    there = {name: i for i, name in reversed(list(enumerate(names)))}
+    found: list[tuple[str, tuple[int, ...]]] = []
+    for name in names:
+        for at, letter in enumerate(name):
+            axes = {"x": "xyz", "X": "XYZ", "0": "012"}.get(letter)
+            if axes is None:
+                continue
+            three = [f"{name[:at]}{axis}{name[at + 1 :]}" for axis in axes]
+            fourth = f"{name[:at]}{'W' if letter == 'X' else 'w'}{name[at + 1 :]}"
+            # Of a quaternion the last three are no vector.
+            if all(one in there for one in three) and fourth not in there:
+                stem = f"{name[:at]}{name[at + 1 :]}"
+                found.append((_bare(stem).strip(" _.-[]"), tuple(there[one] for one in three)))
+                break
+    return found
+
+
+def _free(topic: str, path: Path, taken: Mapping[str, TableTopic]) -> str:
+    """The topic's name, with the table's where another table has made one of that name."""
+    return topic if topic not in taken else f"{topic}/{re.sub(r'[^a-z0-9]+', '_', path.stem.lower())}"
+
+
+def _flow(value: object) -> str:
+    """In one line of YAML."""
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{_word(str(key))}: {_flow(one)}' for key, one in value.items())}}}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_flow, value))}]"
+    return f"{value:g}" if isinstance(value, float) else _word(str(value))
+
+
+def _word(text: str) -> str:
+    """Quoted where YAML would take it for something else."""
+    plain = re.fullmatch(r"[A-Za-z_/][A-Za-z0-9_/. ^-]*", text) and text.lower() not in (
+        "y",
+        "n",
+        "yes",
+        "no",
+        "on",
+        "off",
+    )
+    return text if plain else '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

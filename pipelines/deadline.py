@@ -1,0 +1,91 @@
+"""When a calibration is to be done: what works long asks, and stops with what it has.
+
+    with deadline.within(60.0):                     # the command, or a session where no command has
+        ...
+        if deadline.passed("the search for causes"):    # what works long; told in `stopped()`
+            return ()
+
+Minimisations end after their iteration, runs after their step, trials before they begin: the solution first, trials
+last, and a result in any case. The deadline is that of the thread, and of the processes that are forked from it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+Item = TypeVar("Item")
+
+# Batch has the greater of these: s, and a share of the recording's length; online the recording's length itself.
+LEAST_S, SHARE = 60.0, 0.1
+
+
+@dataclass
+class _Deadline:
+    limit: float  # s
+    until: float  # time.monotonic()
+    stopped: list[str] = field(default_factory=list)
+
+
+_deadline: ContextVar[_Deadline | None] = ContextVar("deadline", default=None)
+
+
+@contextmanager
+def within(limit: float | None) -> Iterator[None]:
+    """The block has so many seconds from now; None sets no deadline, and leaves one that is set."""
+    if limit is None:
+        yield
+        return
+    token = _deadline.set(_Deadline(limit, time.monotonic() + limit))
+    try:
+        yield
+    finally:
+        _deadline.reset(token)
+
+
+@contextmanager
+def usual(duration: float, online: bool = False) -> Iterator[None]:
+    """The usual time for a recording of so many seconds, where no deadline is set."""
+    unset = _deadline.get() is None
+    with within(max(LEAST_S, duration if online else SHARE * duration) if unset else None):
+        yield
+
+
+def passed(what: str = "") -> bool:
+    """Whether there is no time left; `what` names what ends for that."""
+    deadline = _deadline.get()
+    if deadline is None or time.monotonic() < deadline.until:
+        return False
+    if what and what not in deadline.stopped:
+        deadline.stopped.append(what)
+    return True
+
+
+def until_passed(items: Iterable[Item], name: Callable[[Item], str], least: int = 0) -> Iterator[Item]:
+    """The items for which there is time, and `least` of them in any case.
+
+    `name` says where it stopped, from the first that is not taken.
+    """
+    for number, item in enumerate(items):
+        if number >= least and passed() and passed(name(item)):
+            return
+        yield item
+
+
+def sentence() -> str:
+    """Says that an iteration ended for want of time."""
+    deadline = _deadline.get()
+    return "" if deadline is None else f"stopped by the time limit of {deadline.limit:.3g} s"
+
+
+def stopped() -> str:
+    """A sentence about all that ended for want of time; empty if nothing did."""
+    deadline = _deadline.get()
+    if deadline is None or not deadline.stopped:
+        return ""
+    what = " and ".join(deadline.stopped)
+    return f"The time limit of {deadline.limit:.3g} s stopped {what}; --time-limit gives more time."

@@ -1,0 +1,137 @@
+"""How files that a user names are read: regular ones, no longer than they can be, YAML of any make refused in one line.
+
+    data = read_bytes(path, MAX_YAML_BYTES)
+    content = load_yaml(data, str(path))
+
+All raise InputError.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import sys
+from pathlib import Path
+from typing import Any
+
+from alidade.pipelines.errors import InputError
+
+# A config, a scenario or a bag's metadata.yaml.
+MAX_YAML_BYTES = 1 << 20
+# A result.json with the covariance of a thousand numbers.
+MAX_RESULT_BYTES = 1 << 28
+# Values and keys of a YAML file, and the same with its aliases written out: pure Python reads 8,000 a second.
+MAX_YAML_NODES, MAX_EXPANDED_NODES = 50_000, 500_000
+MAX_YAML_DEPTH = 50
+
+
+def require_regular(path: Path) -> None:
+    """Raise InputError when a path is neither a regular file nor a link to one: a device or a pipe may never end."""
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError) as error:
+        raise _cannot_open(path, error) from error
+    if not stat.S_ISREG(mode):
+        what = "a folder" if stat.S_ISDIR(mode) else "a device or a pipe"
+        raise InputError(f"{path}: cannot be opened ({what}, and no regular file)")
+
+
+def read_bytes(path: Path, most: int) -> bytes:
+    """The bytes of a regular file, or of standard input where it is named `-`; InputError for more than `most`."""
+    try:
+        if str(path) == "-":
+            data = sys.stdin.buffer.read(most + 1)
+        else:
+            # Without waiting for somebody who writes into it, should it be a pipe.
+            with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as stream:
+                require_regular(path)
+                data = stream.read(most + 1)
+    except (OSError, ValueError) as error:
+        raise _cannot_open(path, error) from error
+    if len(data) > most:
+        raise InputError(f"{path}: over {most} bytes, which is more than any file of its kind has")
+    return data
+
+
+def load_yaml(data: bytes | str, where: str, as_text: bool = False) -> Any:
+    """The one document of a YAML file.
+
+    Args:
+        data: its content, UTF-8.
+        where: it stands, for what is said about it.
+        as_text: leave all scalars text.
+
+    Raises:
+        InputError: no UTF-8, no YAML, values that are not what their tags say, aliases that multiply.
+    """
+    from ruamel.yaml.error import MarkedYAMLError
+
+    if len(data) > MAX_YAML_BYTES:
+        raise InputError(f"{where}: {len(data)} bytes, which is no config")
+    try:
+        text = data.decode() if isinstance(data, bytes) else data
+        constructor, parser = _bounded("base" if as_text else "safe").get_constructor_parser(text)
+        try:
+            node = constructor.composer.get_single_node()
+            if node is None:
+                return None
+            if _nodes(node, {}) > MAX_EXPANDED_NODES:
+                raise _TooLargeError(f"its aliases stand for over {MAX_EXPANDED_NODES} values")
+            return constructor.construct_document(node)
+        finally:
+            parser.dispose()
+    except _TooLargeError as error:
+        raise InputError(f"{where}: unreadable YAML: {error}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{where}: not a YAML file, byte {error.start} is not UTF-8 text") from error
+    except MarkedYAMLError as error:
+        line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
+        raise InputError(
+            f"{where}: unreadable YAML{line}: {' '.join((error.problem or str(error)).split())}"
+        ) from error
+    except Exception as error:  # the library's constructors raise anything where a value is not what its tag says
+        said = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{where}: unreadable YAML: a value that is not what its tag says ({said})") from error
+
+
+class _TooLargeError(Exception):
+    """More values than any file has that people or programs write for this one."""
+
+
+def _bounded(kind: str) -> Any:
+    """A reader of YAML that stops at MAX_YAML_NODES and MAX_YAML_DEPTH."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.composer import Composer
+
+    class BoundedComposer(Composer):
+        """Counts the nodes that it makes."""
+
+        made = depth = 0
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            self.made, self.depth = self.made + 1, self.depth + 1
+            if self.made > MAX_YAML_NODES:
+                raise _TooLargeError(f"over {MAX_YAML_NODES} values")
+            if self.depth > MAX_YAML_DEPTH:
+                raise _TooLargeError("it is nested too deep")
+            node = super().compose_node(parent, index)
+            self.depth -= 1
+            return node
+
+    yaml = YAML(typ=kind, pure=True)
+    yaml.Composer = BoundedComposer
+    return yaml
+
+
+def _nodes(node: Any, known: dict[int, float]) -> float:
+    """Nodes of a tree with all aliases written out; infinite for one that holds itself."""
+    if id(node) not in known:
+        known[id(node)] = float("inf")
+        children = node.value if isinstance(node.value, list) else []
+        parts = (part for child in children for part in (child if isinstance(child, tuple) else (child,)))
+        known[id(node)] = 1.0 + sum(_nodes(part, known) for part in parts)
+    return known[id(node)]
+
+
+def _cannot_open(path: Path, error: Exception) -> InputError:
+    return InputError(f"{path}: cannot be opened ({getattr(error, 'strerror', None) or error})")

@@ -1,0 +1,143 @@
+"""What tables hold, concluded from headers and numbers, as phones, loggers and export tools write them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alidade.pipelines.applications.table_discovery import propose_columns
+from alidade.pipelines.recording.reading import open_recording
+from tests.support.command import Command
+
+RNG = np.random.default_rng(5)
+N = 400
+DIRECTIONS = RNG.normal(size=(N, 3))
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1)[:, None]
+RATES = 0.5 * RNG.normal(size=(N, 3))
+
+
+def write(path: Path, header: str, *columns: object) -> Path:
+    numbers = np.column_stack([np.asarray(column, dtype=float) for column in columns])
+    lines = [",".join(f"{x:.17g}" for x in row) for row in numbers.tolist()]
+    path.write_text("\n".join([*([header] if header else []), *lines]), encoding="utf-8")
+    return path
+
+
+SECONDS = 0.01 * np.arange(N)
+CASES = {
+    "phyphox": (
+        '"Time (s)","Acceleration x (m/s^2)","Acceleration y (m/s^2)","Acceleration z (m/s^2)"',
+        (SECONDS, 9.81 * DIRECTIONS),
+        {"/imu": {"time": "Time (s)", "accel": [f"Acceleration {a} (m/s^2)" for a in "xyz"]}},
+    ),
+    "Sensor Logger": (
+        "time,seconds_elapsed,z,y,x",
+        (1.79e18 + 1e7 * np.arange(N), SECONDS, DIRECTIONS),
+        {},
+    ),
+    "blackbox": (
+        "loopIteration,time (us),gyroADC[0],gyroADC[1],gyroADC[2],accSmooth[0],accSmooth[1],accSmooth[2]",
+        (np.arange(N), 1e4 * np.arange(N), 20.0 * RATES + 50.0, 2048 * DIRECTIONS),
+        {
+            "/imu": {
+                "time": "time (us)",
+                "unit": "us",
+                "gyro": [f"gyroADC[{i}]" for i in range(3)],
+                "accel": [f"accSmooth[{i}]" for i in range(3)],
+                "units": {"gyro": "deg/s"},
+            }
+        },
+    ),
+    "SD logger": (
+        "millis,ax,ay,az,gx,gy,gz,mx,my,mz",
+        (10 * np.arange(N), DIRECTIONS, np.rad2deg(2.0 * RATES), 45.0 * DIRECTIONS),
+        {
+            "/imu": {
+                "time": "millis",
+                "unit": "ms",
+                "gyro": ["gx", "gy", "gz"],
+                "accel": ["ax", "ay", "az"],
+                "units": {"gyro": "deg/s", "accel": "g"},
+            },
+            "/mag": {"time": "millis", "unit": "ms", "field": ["mx", "my", "mz"], "units": {"field": "uT"}},
+        },
+    ),
+    "units in names": (
+        "t_ns,acc_x_mg,acc_y_mg,acc_z_mg,gyro_x_dps,gyro_y_dps,gyro_z_dps",
+        (1e7 * np.arange(N), 1000 * DIRECTIONS, RATES),
+        {
+            "/imu": {
+                "time": "t_ns",
+                "unit": "ns",
+                "gyro": [f"gyro_{a}_dps" for a in "xyz"],
+                "accel": [f"acc_{a}_mg" for a in "xyz"],
+                "units": {"gyro": "deg/s", "accel": "mg"},
+            }
+        },
+    ),
+    "no header": (
+        "",
+        (SECONDS, 9.81 * DIRECTIONS),
+        {"/imu": {"time": "column 1", "accel": ["column 2", "column 3", "column 4"]}},
+    ),
+    "no time": (
+        "mx,my,mz",
+        (48.0 * DIRECTIONS,),
+        {"/mag": {"rate": 100.0, "field": ["mx", "my", "mz"], "units": {"field": "uT"}}},
+    ),
+    "a pose": (
+        "timestamp,qw,qx,qy,qz",
+        (1.79e9 + SECONDS, np.tile([0.5, 0.5, 0.5, 0.5], (N, 1))),
+        {"/attitude": {"time": "timestamp", "wxyz": ["qw", "qx", "qy", "qz"]}},
+    ),
+    "linear acceleration": (
+        "Time (s),Linear Acceleration x (m/s^2),Linear Acceleration y (m/s^2),Linear Acceleration z (m/s^2)",
+        (SECONDS, 0.1 * DIRECTIONS),
+        {},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_columns_are_concluded(name: str, tmp_path: Path) -> None:
+    header, columns, expected = CASES[name]
+    found = propose_columns(open_recording(write(tmp_path / "x.csv", header, *columns)))
+    assert found is not None
+    plain = {topic: json.loads(table.model_dump_json(exclude_defaults=True)) for topic, table in found.columns.items()}
+    assert plain == expected
+    assert found.reasons or found.doubts
+
+
+def test_a_file_is_named_after_its_sensor(tmp_path: Path) -> None:
+    header = "time,seconds_elapsed,z,y,x"
+    path = write(tmp_path / "Gyroscope.csv", header, 1.79e18 + 1e7 * np.arange(N), SECONDS, RATES)
+    found = propose_columns(open_recording(path))
+    assert found is not None
+    assert found.columns["/imu"].gyro == ("x", "y", "z")
+    assert (found.columns["/imu"].time, found.columns["/imu"].unit) == ("time", "ns")
+
+
+def test_a_phones_files_of_one_sensor_each_are_one_imu(tmp_path: Path) -> None:
+    write(tmp_path / "Accelerometer.csv", "Time (s),acc x (g),acc y (g),acc z (g)", SECONDS, DIRECTIONS)
+    write(tmp_path / "Gyroscope.csv", "Time (s),gyr x (rad/s),gyr y (rad/s),gyr z (rad/s)", SECONDS, RATES)
+    found = propose_columns(open_recording(tmp_path))
+    assert found is not None
+    assert found.columns.keys() == {"/imu/accel", "/imu/gyro"}
+    assert found.topics["imu"].parts == ("/imu/gyro", "/imu/accel")
+
+
+def test_one_command_calibrates_a_phones_table(tmp_path: Path, alidade: Command) -> None:
+    field = 45.0 * DIRECTIONS @ np.diag([1.05, 0.97, 1.0]) + [12.0, -30.0, 7.0] + 0.1 * RNG.normal(size=(N, 3))
+    header = ",".join(["Time (s)", *(f"Magnetic Field {axis} (µT)" for axis in "xyz")])
+    path = write(tmp_path / "phone.csv", header, SECONDS, field)
+    shown = alidade("info", str(path))
+    assert '/mag: {time: "Time (s)", field:' in shown.out
+    done = alidade("calibrate", str(path), "--auto-columns", "--json", "--out", str(tmp_path / "out"))
+    result = json.loads(done.out)
+    assert result["status"] == "calibrated"
+    assert any(
+        note.startswith("columns taken as concluded: phone.csv: Time (s) is the time") for note in result["notes"]
+    )

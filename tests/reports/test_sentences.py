@@ -1,0 +1,242 @@
+"""Findings in words: one golden text of every kind, and headlines that keep all their reasons."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from alidade.pipelines.diagnostics.diagnose import diagnose
+from alidade.pipelines.estimation.finding import KINDS, Finding, Severity, status
+from alidade.pipelines.estimation.noise import Level, Noise
+from alidade.pipelines.estimation.problem import ChiSquare, Estimate, Quantity, Residuals
+from alidade.pipelines.reports.html import report_html
+from alidade.pipelines.reports.result import finding_json, result_json
+from alidade.pipelines.reports.sentences import cause, headline, notes, sentence
+from tests.support.builders import make_calibration
+from tests.support.pages import Page
+
+NOTE, WEAK, INCONSISTENT, UNOBSERVABLE = Severity
+MOUNT = Quantity("helmet_mount_z", "rad", 0.35, 0.35, 1e-2)
+SCALE = Quantity("gyro_scale_x", "", 1e-2, 1e-2, np.inf, group="assumption", sheet="gyro.scale")
+QUANTITIES = {q.name: q for q in (MOUNT, SCALE)}
+CONFLICT = {"parameter": SCALE.name, "value": 0.06, "sigma": 1e-3, "z": 6.0}
+REJECTED = Finding("rejection", INCONSISTENT, {"family": "vision", "share": 0.31, "noise_factor": 4.12})
+
+GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
+    ("not_converged", INCONSISTENT, {"message": "stuck"}, "No solution: stuck. Do not use the values."),
+    (
+        "direction",
+        UNOBSERVABLE,
+        {"weights": {"delta_px": 0.7, "delta_gx": -0.7}, "sigma_ratio": 0.981, "advice": "sway by 2 deg"},
+        "Not observable: delta_px against delta_gx (sigma 0.98 of the prior). Sway by 2 deg.",
+    ),
+    (
+        "direction",
+        WEAK,
+        {"weights": {"delta_px": 1.0}, "sigma_ratio": 0.2, "advice": "delta_px wants sway"},
+        "Less accurate than required: delta_px (sigma 0.2 of the prior). delta_px wants sway.",
+    ),
+    (
+        "hypothesis",
+        INCONSISTENT,
+        {"label": "x inverted", "chi_square_before": 9.1e4, "chi_square_after": 5512.0, "dof": 5397.0}
+        | {"equivalents": ["y and z inverted"]},
+        "Consistent with: x inverted (chi-square 91000 -> 5512, dof 5397). Equivalent: y and z inverted.",
+    ),
+    (
+        "prior_conflict",
+        INCONSISTENT,
+        {**CONFLICT, "inseparable": ("gyro_scale_y",), "effect": {"helmet_mount_z": 7e-3}},
+        "gyro_scale_x contradicts its data sheet (or gyro_scale_y, inseparable from it): 60000 ± 1000 ppm, prior 0 ± "
+        "10000 ppm (z = 6.0); its departure shifts helmet_mount_z by 0.40 deg, 0.7 of its requirement.",
+    ),
+    (
+        "prior_conflict",
+        NOTE,
+        {"parameter": "helmet_mount_z", "value": 3.1, "sigma": 1e-3, "z": 8.9, "inseparable": (), "effect": {}},
+        "helmet_mount_z is far from its prior: 177.617 ± 0.057 deg, prior 0 ± 20 deg (z = 8.9); check the orientation "
+        "and the axis order of the sensor, or widen the prior.",
+    ),
+    (
+        "change",
+        INCONSISTENT,
+        {"time_s": 42.2, "steps": {"helmet_mount_z": (8.9e-3, 7e-4)}},
+        "Change at 42 s: helmet_mount_z by 0.510 ± 0.040 deg.",
+    ),
+    ("change", NOTE, {"time_s": 42.2, "steps": {}}, "Change at 42 s. Immaterial; included in the sigmas."),
+    (
+        "device_change",
+        INCONSISTENT,
+        {"parameter": "helmet_mount_z", "step": 8.9e-3, "sigma": 7e-4, "recordings": ("a.mcap", "b.mcap")}
+        | {"dates": ("2026-03-02T10:00:00+00:00", "2026-06-03T10:00:00+00:00")},
+        "Change of the device between 2 March 2026 and 3 June 2026: helmet_mount_z by 0.510 ± 0.040 deg.",
+    ),
+    (
+        "rejection",
+        INCONSISTENT,
+        REJECTED.evidence,  # type: ignore[list-item]
+        "31 % of vision measurements rejected; all would fit 4.1 times the noise.",
+    ),
+    (
+        "noise",
+        INCONSISTENT,
+        {"noise": "vision_attitude", "unit": "rad", "source": "config", "used": 0.078}
+        | {"factor": 9.0, "estimated_factor": 9.02},
+        "Noise vision_attitude: estimated 9 times the config's value; not white noise: check the model or the unit.",
+    ),
+    (
+        "noise",
+        NOTE,
+        {"noise": "vision_attitude", "unit": "rad", "source": "config", "used": 0.0087}
+        | {"factor": 3.0, "estimated_factor": 3.0},
+        "Noise vision_attitude: 0.498 deg used, 3 times the config's value.",
+    ),
+    (
+        "correlation",
+        INCONSISTENT,
+        {"family": "vision", "share": 0.24},
+        "Residuals of vision are correlated over 24 % of the recording.",
+    ),
+    (
+        "misfit",
+        INCONSISTENT,
+        {"family": None, "chi_square": 71571.0, "dof": 5397.0, "largest": "vision", "noise_factor": 3.64},
+        "Residuals exceed the noise used: chi-square 71570, 99.9 % bound 5745 (dof 5397); largest for vision, 3.6 "
+        "times its noise.",
+    ),
+    (
+        "misfit",
+        NOTE,
+        {"family": None, "chi_square": 1040.0, "dof": 2000.0, "largest": "vision", "noise_factor": 0.2},
+        "Residuals are smaller than the noise used: chi-square 1040, 99.9 % bound 1798 (dof 2000); smallest for "
+        "vision, 0.2 times its noise.",
+    ),
+    (
+        "dominant_prior",
+        WEAK,
+        {"figure": "gyro.scale", "stated": 0.01, "share": 0.83},
+        "83 % of that variance comes from gyro scale: state sensors.gyro.scale (now 0.01) if it is better.",
+    ),
+    (
+        "ambiguous_solution",
+        NOTE,
+        {"chi_square": 2.31, "values": {"helmet_mount_z": (0.1, 0.5)}},
+        "A second solution is nearly as likely (chi-square with priors is higher by 2.3): helmet_mount_z 5.73 instead "
+        "of 28.6 deg; whole in second_best of result.json.",
+    ),
+    (
+        "solver_difference",
+        NOTE,
+        {"parameter": "helmet_mount_z", "z": -1.52, "sigma_ratio": 0.9},
+        "Batch on the same recording differs by up to 1.5 sigma (helmet_mount_z): use its result.",
+    ),
+    (
+        "recording",
+        INCONSISTENT,
+        {"recording": "a.mcap", "findings": (REJECTED,)},
+        "a.mcap by itself: 31 % of vision measurements rejected; all would fit 4.1 times the noise.",
+    ),
+    (
+        "recordings_disagree",
+        INCONSISTENT,
+        {"recordings": ("a.mcap", "b.mcap"), "dates": (), "chi_square": 99.0, "dof": 3},
+        "The recordings disagree about the device: chi-square 99 (dof 3).",
+    ),
+    ("remark", NOTE, {"text": "No platform IMU."}, "No platform IMU."),
+]
+
+
+@pytest.mark.parametrize(("kind", "severity", "evidence", "text"), GOLDEN, ids=[f"{g[0]}-{g[1].name}" for g in GOLDEN])
+def test_sentence_of_every_kind(kind: str, severity: Severity, evidence: dict[str, Any], text: str) -> None:
+    finding = Finding(kind, severity, evidence)
+    assert sentence(finding, QUANTITIES) == text
+    json.dumps(finding_json(finding), allow_nan=False)
+
+
+def test_every_kind_has_a_golden_sentence() -> None:
+    assert {golden[0] for golden in GOLDEN} == set(KINDS)
+
+
+def test_evidence_of_another_kind_is_refused() -> None:
+    with pytest.raises(ValueError, match="evidence of correlation: family, share"):
+        Finding("correlation", NOTE, {"family": "vision"})
+
+
+def inconsistent(sigma: float) -> tuple[Estimate, list[Quantity]]:
+    """A conflict that matters, noise far above its statement, a rejected third and correlated residuals."""
+    quantities = [Quantity("helmet_mount_z", "rad", 0.35, 0.35, 1e-4), SCALE]
+    covariance = np.array([[sigma**2, 0.5 * sigma * 1e-3], [0.5 * sigma * 1e-3, 1e-6]])
+    used = np.arange(300) % 3 > 0
+    level = Level(Noise("vision_attitude", 1e-3, "config", 0.1, ("vision",)), 9.0, 9.0, 0.1)
+    estimate = Estimate(
+        "batch",
+        ("helmet_mount_z", "gyro_scale_x"),
+        np.array([0.0, 0.06]),
+        covariance,
+        True,
+        "",
+        residuals={"vision": Residuals(np.arange(300.0), np.ones((300, 3)), used)},
+        chi_square=ChiSquare(900.0, 900.0, {"vision": (900.0, 900.0)}),
+        levels=(level,),
+        colours={"vision": 72.0},
+    )
+    return estimate, quantities
+
+
+def test_a_headline_keeps_all_its_reasons() -> None:
+    """With a cause the others once stood nowhere in words."""
+    estimate, quantities = inconsistent(1e-5)
+    hypothesis = Finding(*GOLDEN[3][:3])
+    findings = diagnose(estimate, quantities, None, None, [hypothesis])
+    assert status(findings) == "inconsistent"
+    text = headline(findings, {q.name: q for q in quantities}, {})
+    reasons = [
+        "Consistent with: x inverted",
+        "gyro_scale_x contradicts its data sheet",
+        "33 % of vision measurements rejected",
+        "Noise vision_attitude: estimated 9 times",
+        "Residuals of vision are correlated over 24 %",
+    ]
+    places = [text.index(reason) for reason in reasons]
+    assert places == sorted(places)
+
+
+def test_what_is_not_observable_comes_before_a_prior_conflict() -> None:
+    """The headline once said of an unobservable result only that a scale is not what was assumed."""
+    estimate, quantities = inconsistent(0.35)
+    findings = diagnose(estimate, quantities)
+    assert status(findings) == "unobservable"
+    text = headline(findings, {q.name: q for q in quantities}, {})
+    assert text.startswith("Not observable: helmet_mount_z ")
+    assert "gyro_scale_x contradicts its data sheet" in text
+
+
+def test_many_of_a_kind_are_counted() -> None:
+    found = [replace(REJECTED, evidence={**REJECTED.evidence, "family": f"f{i}"}, severity=NOTE) for i in range(5)]
+    assert len(notes(found, QUANTITIES)) == 4
+    assert notes(found, QUANTITIES)[-1] == "2 more of this kind are in result.json"
+
+
+def test_causes_are_those_that_explain() -> None:
+    conflict = Finding("prior_conflict", INCONSISTENT, GOLDEN[4][2])
+    found = cause(conflict, QUANTITIES)
+    assert found is not None
+    assert found[0] == "gyro_scale_x contradicts its data sheet (or gyro_scale_y, inseparable from it)"
+    assert cause(replace(conflict, severity=NOTE), QUANTITIES) is None
+    assert cause(REJECTED, QUANTITIES) is None
+
+
+def test_result_json_has_findings_and_tables() -> None:
+    calibration = replace(make_calibration(), findings=(REJECTED,), tables={"static_poses": [{"pose": 1}]})
+    content = json.loads(result_json(calibration))
+    assert content["findings"] == [
+        {"kind": "rejection", "severity": "inconsistent", "family": "vision", "share": 0.31, "noise_factor": 4.12}
+    ]
+    assert content["tables"] == {"static_poses": [{"pose": 1}]}
+    assert content["status"] == "inconsistent"
+    page = Page(report_html(calibration)).text
+    assert page.count("31 % of vision measurements rejected") == 1

@@ -1,0 +1,105 @@
+"""Files that belong together: of one writer, whole or absent, whoever else writes there and whenever one is killed."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from alidade.pipelines.errors import InputError
+from alidade.pipelines.reports import whole
+from alidade.pipelines.reports.whole import write_file, write_whole
+
+NAMES = ("a", "b", "c", "result")
+# Writes rounds of files that all hold the same, one file after the other and slowly.
+WRITER = """
+import sys, time
+from pathlib import Path
+from alidade.pipelines.reports.whole import write_whole
+who, folder, rounds = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])
+def make(part):
+    for name in ("a", "b", "c", "result"):
+        (part / name).write_text(f"{who} {i}")
+for i in range(rounds):
+    write_whole(folder, ("a", "b", "c", "result"), make)
+    print(i, flush=True)
+"""
+
+
+def _writer(who: str, folder: Path, rounds: int) -> subprocess.Popen[str]:
+    command = [sys.executable, "-c", WRITER, who, str(folder), str(rounds)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def _state(folder: Path) -> set[str]:
+    """What the files hold; nothing where there is no result."""
+    if not (folder / "result").exists():
+        return set()
+    return {(folder / name).read_text() for name in NAMES}
+
+
+def test_two_processes_never_mix(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    writers = [_writer(who, folder, 150) for who in "xy"]
+    said = [writer.communicate(timeout=120)[1] for writer in writers]
+    assert [writer.returncode for writer in writers] == [0, 0], said
+    (state,) = _state(folder)
+    assert state in ("x 149", "y 149")
+    assert sorted(path.name for path in folder.iterdir()) == sorted(NAMES)
+    assert any("another process has written there meanwhile; it is replaced" in text for text in said)
+
+
+@pytest.mark.parametrize("rounds", [15, pytest.param(200, marks=pytest.mark.slow)])
+def test_a_process_that_is_killed_leaves_results_whole_or_absent(rounds: int, tmp_path: Path) -> None:
+    folder, rng, kept = tmp_path / "out", np.random.default_rng(0), 0
+    for _ in range(rounds):
+        writer = _writer("x", folder, 10_000)
+        assert writer.stdout is not None
+        writer.stdout.readline()
+        time.sleep(rng.uniform(0.0, 0.01))
+        writer.send_signal(signal.SIGKILL)
+        writer.communicate()
+        assert len(_state(folder)) <= 1
+        kept += len(_state(folder))
+
+    def make(part: Path) -> None:
+        for name in NAMES:
+            (part / name).write_text("last")
+
+    write_whole(folder, NAMES, make)
+    assert _state(folder) == {"last"}
+    assert sorted(path.name for path in folder.iterdir()) == sorted(NAMES), "what was left of the killed is gone"
+    assert kept
+
+
+def test_who_does_not_get_the_folder_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(whole, "_PATIENCE_S", 0.1)
+    held = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(held, fcntl.LOCK_EX)
+    try:
+        with pytest.raises(InputError, match="another process is writing its results there"):
+            write_whole(tmp_path, ["x"], lambda _: None)
+    finally:
+        os.close(held)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_by_itself_is_whole_or_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "x.txt"
+    write_file(path, "before")
+
+    def fails(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", fails)
+    with pytest.raises(InputError, match="No space left on device"):
+        write_file(path, "after")
+    assert path.read_text() == "before"
+    assert list(tmp_path.iterdir()) == [path]
