@@ -50,8 +50,8 @@ BUDGETS = {
     "validation": 2_050,
     "reference": 2_200,
 }
-# Of all pages with what the program writes; blocks of code do not count, and what autodoc adds (1,300) comes on top.
-BUDGET = 29_000
+# Of all pages with what the program writes; blocks of code do not count, nor what autodoc adds (900).
+BUDGET = 29_100
 
 
 def words(text: str) -> int:
