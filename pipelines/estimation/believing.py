@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from alidade.pipelines.belief import Belief, root_of_information
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.priors import pinned
-from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Problem, Step
+from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Problem, Quantity, Step
 
 # Gives the steps before some.
 Earlier = Callable[[], Iterable[Step]]
