@@ -87,7 +87,7 @@ def test_what_is_suggested_reads_as_the_recording_did_under_its_own_names(simula
         "  vision_attitude: {topic: /tracker/pose, invert: true}",
         "  platform_imu: /vehicle/imu",
     ]
-    assert "as the inverse of the attitude meant" in head.reasons[0]
+    assert head.reasons[0].endswith(", inverted")
     assert unused(recording, NONE) == ("/tracker/pose", "/vehicle/imu", "/xsens/data")
     assert load_config(head.yaml.encode()).topics == head.topics
     config = with_suggested(recording, NONE)
