@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.methods import names as methods
     from alidade.pipelines.reports.result import Calibration
     from alidade.pipelines.simulation.simulated import Simulated
-    from alidade.pipelines.solvers.marginals import IndeterminateError
+    from alidade.pipelines.solvers.chain import IndeterminateError
 
 __all__ = [
     "Calibration",
@@ -48,7 +48,7 @@ __all__ = [
 _MODULES = {
     "Calibration": "alidade.pipelines.reports.result",
     "Config": "alidade.pipelines.applications.api",
-    "IndeterminateError": "alidade.pipelines.solvers.marginals",
+    "IndeterminateError": "alidade.pipelines.solvers.chain",
     "InputError": "alidade.pipelines.errors",
     "Method": "alidade.pipelines.methods",
     "Session": "alidade.pipelines.applications.session",

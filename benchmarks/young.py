@@ -1,8 +1,9 @@
-"""The incremental solver while little is known: python -m benchmarks.young METHOD [--only CASE ...] [--seeds N] ...
+"""Consistency while little is known: python -m benchmarks.young METHOD [--only CASE ...] [--solver SOLVER] [--seeds N]
 
-Recordings that begin badly, with mounts and errors of the sensors drawn from their priors: at rest, about one axis,
-slowly, with mounts that nobody knows, without pictures, among outliers. At ten moments of each the joint error is taken
-in units of the joint covariance (NEES); its mean over the seeds is to be the number of parameters.
+Recordings that begin badly, with mounts and sensor errors drawn from their priors: at rest, about one axis, slowly,
+with mounts without a prior, without pictures, among outliers. At ten moments of each recording the joint error is
+compared with the joint covariance (NEES), online and in batch. The mean NEES over the seeds must lie inside a two-sided
+99.9 % interval about the number of parameters: above it sigmas are too small, below it they are too large.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ import json
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ from alidade.factors import so3
 from alidade.factors.indexer import mounting_angles
 from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Session
-from alidade.pipelines.estimation.problem import Array, Problem, rotation_vector_coordinates
+from alidade.pipelines.estimation.problem import Array, Estimate, Problem, Step, rotation_vector_coordinates
 from alidade.pipelines.methods.cube.scenario import CubeScenario
 from alidade.pipelines.methods.head.simulation import HeadScenario
 from alidade.pipelines.methods.indexer.simulation import IndexerScenario, Position
@@ -32,6 +34,7 @@ from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.methods.tumble.scenario import TumbleScenario
 from alidade.pipelines.settings import Sensors
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
+from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, IncrementalSolver
 
 HEAD = HeadScenario(
@@ -62,29 +65,31 @@ BIAS, SEEN = 0.02, 5.0
 # Shares of a recording's motion, or of the rest before it, at which errors are looked at.
 _LATER = np.array([0.04, 0.07, 0.1, 0.15, 0.2, 0.3, 0.4, 0.55, 0.75, 0.97])
 _BEFORE, _AFTER = np.array([0.15, 0.5, 0.95]), np.array([0.07, 0.1, 0.15, 0.25, 0.4, 0.6, 0.97])
-LEVEL = 0.99
-# What is added to the name of a case.
-AS_DRAWN = ", priors as drawn"
+# Probability of the two-sided interval of the mean NEES.
+LEVEL = 0.999
+SOLVERS = ("online", "batch")
 
 Case = Callable[[int], tuple[Any, Array]]
 
 
 @dataclass(frozen=True)
 class Followed:
-    """What came out of one recording.
+    """Joint errors of one recording.
 
     Attributes:
-        moments: s, at which the errors were looked at.
-        nees: joint errors there, in sigmas squared.
+        moments: s, at which the errors were evaluated.
+        nees: joint errors there, squared sigmas.
         numbers: of free parameters.
-        worst: the largest error there of a parameter alone, in its sigmas.
+        bounded: of those with a prior; the others have no true distribution, so that only the upper bound counts them.
+        worst: the largest error of a single parameter, in its sigmas.
         message: of a run that did not converge; empty: it did.
-        before: the joint error of the priors' means in their sigmas, sigmas squared: that while nothing is told.
+        before: joint error of the priors' means in their sigmas, squared sigmas.
     """
 
     moments: list[float]
     nees: list[float]
     numbers: int
+    bounded: int
     worst: float
     message: str
     before: float
@@ -92,10 +97,11 @@ class Followed:
 
 @dataclass(frozen=True)
 class Found(Followed):
-    """The same with which recording it was, and seconds of the processor."""
+    """The same with its recording and solver, and seconds of CPU time."""
 
     method: str
     case: str
+    solver: str
     seed: int
     seconds: float
 
@@ -234,7 +240,7 @@ CASES: dict[str, dict[str, Case]] = {
 def made(method: str, settings: Any, seed: int) -> tuple[Problem, Array]:
     """The graph of a simulated recording and the true values (n,) of its parameters.
 
-    What is added to sigmas for what the simulation does not have is left out.
+    Errors that the simulation does not have are not added to the sigmas.
     """
     chosen = methods.method(method)
     simulated = chosen.simulate(settings, seed)
@@ -253,32 +259,66 @@ def nees(values: Array, covariance: Array, truth: Array) -> tuple[float, int]:
     return float(error @ np.linalg.solve(covariance[np.ix_(free, free)] / np.outer(sigma, sigma), error)), len(error)
 
 
+@dataclass(frozen=True)
+class _Errors:
+    """Errors collected at some moments of one recording."""
+
+    problem: Problem
+    truth: Array
+    moments: list[float] = field(default_factory=list)
+    nees: list[float] = field(default_factory=list)
+    worst: list[float] = field(default_factory=list)
+    messages: list[str] = field(default_factory=list)
+
+    def add(self, time: float, estimate: Estimate) -> None:
+        """Compare an estimate with the truth."""
+        true, sigmas = _nearest(self.problem, self.truth, estimate.values), estimate.sigmas
+        free = sigmas > 0.0
+        self.moments.append(time)
+        self.nees.append(nees(estimate.values, estimate.covariance, true)[0])
+        self.worst.append(float(np.max(np.abs(estimate.values - true)[free] / sigmas[free])))
+        self.messages.extend([] if estimate.converged else [estimate.message])
+
+    def result(self) -> Followed:
+        """All of them."""
+        quantities = self.problem.quantities
+        priors = [q.prior_sigma for q in quantities]
+        off = [(v - q.prior_mean) / q.prior_sigma for v, q in zip(self.truth, quantities, strict=True) if q.prior_sigma]
+        return Followed(
+            self.moments,
+            self.nees,
+            sum(prior != 0.0 for prior in priors),
+            sum(bool(prior) for prior in priors),
+            max(self.worst, default=0.0),
+            "; ".join(self.messages),
+            float(np.square(off).sum()),
+        )
+
+
 def followed(problem: Problem, truth: Array, moments: Array) -> Followed:
-    """The incremental solver's errors at some times, s."""
-    run = IncrementalSolver(problem, DEFAULT_WINDOW)
-    times: list[float] = []
-    found: list[float] = []
-    numbers, worst, messages = 0, 0.0, []
+    """Errors of the incremental solver at some moments, s."""
+    run, errors = IncrementalSolver(problem, DEFAULT_WINDOW), _Errors(problem, truth)
     for step in problem.steps(1):
         run.add_step(step)
-        if len(found) < len(moments) and step.time >= moments[len(found)]:
-            values, covariance = run.values(), run.covariance()
-            true = _nearest(problem, truth, values)
-            size, numbers = nees(values, covariance, true)
-            times.append(step.time)
-            found.append(size)
-            sigma = np.sqrt(np.diag(covariance))
-            worst = max(worst, float(np.max(np.abs(values - true)[sigma > 0.0] / sigma[sigma > 0.0])))
-            estimate = run.estimate()
-            messages += [] if estimate.converged else [estimate.message]
+        if len(errors.nees) < len(moments) and step.time >= moments[len(errors.nees)]:
+            errors.add(step.time, run.estimate())
     final = run.finish(0.0)
-    messages += [] if final.converged else [final.message]
-    off = [
-        (value - q.prior_mean) / q.prior_sigma
-        for value, q in zip(truth, problem.quantities, strict=True)
-        if q.prior_sigma
-    ]
-    return Followed(times, found, numbers, worst, "; ".join(messages), float(np.square(off).sum()))
+    errors.messages.extend([] if final.converged else [final.message])
+    return errors.result()
+
+
+def solved(problem: Problem, truth: Array, moments: Array) -> Followed:
+    """Errors of the batch solver on the recording until some moments, s."""
+    errors, steps = _Errors(problem, truth), list(problem.steps(1))
+    for moment in moments:
+        end = next((i for i, step in enumerate(steps) if step.time >= moment), len(steps) - 1)
+        errors.add(steps[end].time, solve_batch(_of_steps(problem, steps[: end + 1])))
+    return errors.result()
+
+
+def _of_steps(problem: Problem, steps: Sequence[Step]) -> Problem:
+    """The problem of these steps alone."""
+    return replace(problem, steps=lambda _: iter(steps))
 
 
 def _nearest(problem: Problem, truth: Array, values: Array) -> Array:
@@ -293,46 +333,48 @@ def _nearest(problem: Problem, truth: Array, values: Array) -> Array:
     return found
 
 
-def run(method: str, case: str, seed: int, drawn: bool = False) -> Found:
-    """Simulate and follow one recording; `drawn`: with priors that its truths are drawn from."""
+def run(method: str, case: str, seed: int, solver: str = "online") -> Found:
+    """Simulate one recording and evaluate its errors; the priors are those that its truths are drawn from."""
     # No two cases of a method draw the same.
     number = 1000 * list(CASES[method]).index(case) + seed
     settings, moments = CASES[method][case](number)
-    if drawn:
-        settings = settings.model_copy(update={"priors": {**DRAWN[method](settings), **settings.priors}})
-        case += AS_DRAWN
+    settings = settings.model_copy(update={"priors": {**DRAWN[method](settings), **settings.priors}})
     problem, truth = made(method, settings, number)
     if moments[-1] <= 1.0:
         moments = moments * [step.time for step in problem.steps(1)][-1]
     begun = time.process_time()
-    found = followed(problem, truth, moments)
-    return Found(**asdict(found), method=method, case=case, seed=seed, seconds=time.process_time() - begun)
+    found = (solved if solver == "batch" else followed)(problem, truth, moments)
+    seconds = time.process_time() - begun
+    return Found(**asdict(found), method=method, case=case, solver=solver, seed=seed, seconds=seconds)
 
 
 def report(found: Sequence[Found]) -> Iterator[str]:
-    """A table with the mean NEES at each moment, per case, and how it stands to its interval."""
+    """A table with the mean NEES at each moment, per case and solver, and how it compares with its interval."""
     yield (
-        "| case | recordings | numbers | joint NEES of the priors | mean of it at the ten moments | 99 % interval | "
-        "outside | worst alone, sigmas | not converged |"
+        f"| case | solver | recordings | numbers | joint NEES of the priors | mean of it at the ten moments | "
+        f"{100.0 * LEVEL:.1f} % interval | below | above | worst alone, sigmas | not converged |"
     )
-    yield "| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
-    for case in dict.fromkeys(f.case for f in found):
-        of = [f for f in found if f.case == case]
+    yield "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"
+    for case, solver in dict.fromkeys((f.case, f.solver) for f in found):
+        of = [f for f in found if (f.case, f.solver) == (case, solver)]
         few = min(len(f.nees) for f in of)
         mean = np.mean([f.nees[:few] for f in of], axis=0)
-        numbers = of[0].numbers
-        low, high = interval(numbers, len(of))
-        outside = int(((mean < low) | (mean > high)).sum())
+        low, high = interval(of[0].bounded, of[0].numbers, len(of))
         before, at = np.mean([f.before for f in of]), ", ".join(f"{x:.1f}" for x in mean)
         yield (
-            f"| {case} | {len(of)} | {numbers} | {before:.1f} | {at} | {low:.1f} to {high:.1f} | "
-            f"{outside} | {max(f.worst for f in of):.1f} | {sum(bool(f.message) for f in of)} |"
+            f"| {case} | {solver} | {len(of)} | {of[0].numbers} | {before:.1f} | {at} | {low:.1f} to {high:.1f} | "
+            f"{int((mean < low).sum())} | {int((mean > high).sum())} | {max(f.worst for f in of):.1f} | "
+            f"{sum(bool(f.message) for f in of)} |"
         )
 
 
-def interval(numbers: int, recordings: int) -> tuple[float, float]:
-    """Of the mean NEES of so many recordings, if the covariances are true."""
-    low, high = chi2.ppf([0.5 - 0.5 * LEVEL, 0.5 + 0.5 * LEVEL], numbers * recordings) / recordings
+def interval(bounded: int, numbers: int, recordings: int) -> tuple[float, float]:
+    """Two-sided interval of the mean NEES of so many recordings under a true covariance.
+
+    The lower bound counts the numbers that have a prior, the upper one all.
+    """
+    low = chi2.ppf(0.5 - 0.5 * LEVEL, bounded * recordings) / recordings
+    high = chi2.ppf(0.5 + 0.5 * LEVEL, numbers * recordings) / recordings
     return float(low), float(high)
 
 
@@ -341,22 +383,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.young", description=__doc__.split("\n\n")[1])
     parser.add_argument("method", choices=CASES)
     parser.add_argument("--only", nargs="+", metavar="CASE", help="default: all")
+    parser.add_argument("--solver", nargs="+", choices=SOLVERS, default=SOLVERS, help="default: both")
     parser.add_argument("--seeds", type=int, default=50)
-    parser.add_argument("--drawn", action="store_true", help="tell the priors that the truths are drawn from")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="where to write what came out, a line each (JSON)")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="file for the errors, a line each (JSON)")
     options = parser.parse_args(arguments)
     found: list[Found] = []
     if options.out is not None and options.out.exists():
         found = [Found(**json.loads(line)) for line in options.out.read_text().splitlines()]
-    done = {(f.method, f.case, f.seed) for f in found}
-    for seed in range(options.seeds):
-        for case in options.only or CASES[options.method]:
-            if (options.method, case + AS_DRAWN * options.drawn, seed) in done:
-                continue
-            found.append(run(options.method, case, seed, options.drawn))
-            if options.out is not None:
-                with options.out.open("a") as lines:
-                    lines.write(json.dumps(asdict(found[-1])) + "\n")
+    done = {(f.method, f.case, f.solver, f.seed) for f in found}
+    for seed, case, solver in product(range(options.seeds), options.only or CASES[options.method], options.solver):
+        if (options.method, case, solver, seed) in done:
+            continue
+        found.append(run(options.method, case, seed, solver))
+        if options.out is not None:
+            with options.out.open("a") as lines:
+                lines.write(json.dumps(asdict(found[-1])) + "\n")
     print("\n".join(report([f for f in found if f.method == options.method])))
     return 0
 

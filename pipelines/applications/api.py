@@ -10,7 +10,7 @@ from dataclasses import MISSING, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import NoneType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from alidade.pipelines.applications.session import Arrays, Session
 from alidade.pipelines.config import load_config
 from alidade.pipelines.config import model as _config_model
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.problem import EngineName
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.checks import (
     SLOWEST_GYRO_S,
@@ -130,8 +131,11 @@ def calibrate(
     config: Settings = None,
     window: float | None = 1.0,
     prior: str | Path | None = None,
+    engine: EngineName = "auto",
 ) -> Calibration:
     """Open and calibrate in one go (arguments as `open` and `Session.calibrate` have them).
+
+    `engine` eliminates batch's linear systems: "chain" (numpy), "gtsam", or "auto", the chain where the problem is one.
 
     A list of sources is several recordings of one device, calibrated together by batch; the files of one recording are
     opened first: `open([...]).calibrate()`.
@@ -143,10 +147,14 @@ def calibrate(
     if isinstance(source, list | tuple):
         if solver != "batch":
             raise InputError(f"solver {solver!r}: several recordings are calibrated together by batch alone")
+        if engine != "auto":
+            raise InputError(f"engine {engine!r}: of several recordings each has the one that fits it; leave it out")
         from alidade.pipelines.applications.joint import calibrate_together
 
         return calibrate_together([partial(open, each, method, config, prior=prior) for each in source])
-    return open(source, method, config, prior=prior).calibrate(solver, window)
+    if engine not in get_args(EngineName):
+        raise InputError(f"no engine {engine!r}; there are {', '.join(get_args(EngineName))}")
+    return replace(open(source, method, config, prior=prior), engine=engine).calibrate(solver, window)
 
 
 def load(path: str | Path, config: Settings = None) -> SavedCalibration:

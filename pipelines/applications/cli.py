@@ -86,6 +86,14 @@ class Solver(StrEnum):
     published = "published"
 
 
+class Engine(StrEnum):
+    """Linear solvers of batch."""
+
+    auto = "auto"
+    chain = "chain"
+    gtsam = "gtsam"
+
+
 _METHODS = "los, indexer, head, cube, tumble or an installed plug-in"
 _MethodName = Annotated[
     str | None,
@@ -162,6 +170,9 @@ def calibrate(
     jobs: _OwnJobs = None,
     prior: _Prior = None,
     no_check: _NoCheck = False,
+    engine: Annotated[
+        Engine, typer.Option(help="Linear solver of batch: by chain elimination, or gtsam.")
+    ] = Engine.auto,
     time_limit: _TimeLimit = None,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -185,6 +196,8 @@ def calibrate(
     if len(recordings) > 1:
         if solver != Solver.batch:
             raise InputError(f"--solver {solver.value}: several recordings are calibrated together by batch alone")
+        if engine != Engine.auto:
+            raise InputError(f"--engine {engine.value}: with several recordings each uses the engine that fits it")
         folder = out or _beside(sessions[0], "device")
         if not as_json:
             terminal.say(f"{len(recordings)} recordings of one device: {told(recordings)}")
@@ -209,6 +222,7 @@ def calibrate(
                 auto_topics,
                 not no_check,
                 prior,
+                engine=engine.value,
                 auto_columns=auto_columns,
             )
         with progress.doing("writing"):

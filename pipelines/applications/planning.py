@@ -200,7 +200,7 @@ def _predicted(
     """Of one draw."""
     from alidade.pipelines.applications.session import Session
     from alidade.pipelines.solvers.batch import solve_batch
-    from alidade.pipelines.solvers.marginals import IndeterminateError
+    from alidade.pipelines.solvers.chain import IndeterminateError
 
     method = methods.method(method_name)
     session = Session.of(method, method.simulate(method.scenario.model_validate(scenario), seed), config_file)

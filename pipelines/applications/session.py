@@ -21,7 +21,7 @@ import numpy as np
 from alidade.pipelines import deadline, methods, progress
 from alidade.pipelines.applications.discovery import empty, idle, nearest_suggestion, suggestions, with_suggested
 from alidade.pipelines.applications.sharing import device_belief, walks
-from alidade.pipelines.applications.table_discovery import with_columns
+from alidade.pipelines.applications.table_discovery import propose_columns, with_columns
 from alidade.pipelines.config import load_config, recorded_config
 from alidade.pipelines.diagnostics.change_test import Stability, change_finding, stability, with_change
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf, solve_segments, split_halves
@@ -33,11 +33,13 @@ from alidade.pipelines.diagnostics.observability import finite_covariance
 from alidade.pipelines.diagnostics.trial_fit import held_out_residuals
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
-from alidade.pipelines.estimation.problem import Estimate, Problem, Quantity, Step, Told
+from alidade.pipelines.estimation.problem import EngineName, Estimate, Problem, Quantity, Step, Told
 from alidade.pipelines.methods import Method
+from alidade.pipelines.recording.checks import COPIED, OVERTAKEN
 from alidade.pipelines.recording.info import SessionFacts, facts_of, lacking
 from alidade.pipelines.recording.message_reader import ENCODING
 from alidade.pipelines.recording.opening import Where
+from alidade.pipelines.recording.placeholders import HELD
 from alidade.pipelines.recording.reading import Recording, open_recording
 from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, wanted
 from alidade.pipelines.reports.known import load_known
@@ -158,6 +160,7 @@ class Session:
 
     Attributes:
         method, data, config, origin: as above.
+        engine: that eliminates batch's linear systems.
         near: numbers that rotations are reported near of, as another recording of the device has them.
     """
 
@@ -165,6 +168,7 @@ class Session:
     data: Any
     config: Config
     origin: Origin
+    engine: EngineName = "auto"
     near: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
@@ -191,7 +195,9 @@ class Session:
                 raise
             nearest = nearest_suggestion(suggestions(recording, config, [chosen.name]))
             raise InputError(f"{error}{f'; nearest is {nearest}' if nearest else ''}") from error
-        for sentence in (*idle(recording, config, chosen.name), *empty(recording, config, chosen.name)):
+        noted = (COPIED, OVERTAKEN, HELD, "not believed (kept)")
+        many = [f"{reason}: {n}" for reason, n in getattr(data, "dropped", {}).items() if reason.endswith(noted)]
+        for sentence in (*many, *idle(recording, config, chosen.name), *empty(recording, config, chosen.name)):
             recording.remark(sentence)
         session = cls(chosen, data, config, Recorded(recording))
         return session if prior is None else session.beginning_from(prior)
@@ -403,7 +409,10 @@ class Session:
         device = walks(self.method, self.config, [q.name for q in problem.quantities])
         with progress.doing("solving"):
             changed = self._changed() if report else ()
-            return solve_batch(problem, budget=report, changed=changed, device=device, elsewhere=others), problem
+            estimate = solve_batch(
+                problem, budget=report, changed=changed, device=device, elsewhere=others, engine=self.engine
+            )
+            return estimate, problem
 
     def _changed(self) -> Iterator[tuple[str, Problem]]:
         """Each input that the graph takes for exact, and the graph with that input off by its step."""
@@ -438,6 +447,7 @@ def calibrate(
     check: bool = False,
     prior: Path | None = None,
     report: bool = True,
+    engine: EngineName = "auto",
     auto_columns: bool = False,
 ) -> list[Calibration]:
     """One calibration a solver, from one reading of the recording.
@@ -454,6 +464,7 @@ def calibrate(
         check: hold an incremental calibration against batch.
         prior: an earlier calibration of the device to begin from, result.json or calibration.yaml.
         report: with what only a report tells, see `Session.calibrate`.
+        engine: that eliminates batch's linear systems: "chain", "gtsam", or "auto".
 
     Raises:
         InputError: recording or config cannot be used, or there is no such solver.
@@ -462,7 +473,8 @@ def calibrate(
     start = time.perf_counter()
     with progress.doing("reading"):
         session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics, prior, auto_columns)
-    return session.calibrations(solvers, window, {"read": time.perf_counter() - start}, check, report)
+    seconds = {"read": time.perf_counter() - start}
+    return replace(session, engine=engine).calibrations(solvers, window, seconds, check, report)
 
 
 def session_facts(recording: Recording, config: Config) -> SessionFacts:
@@ -523,6 +535,18 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
     if able:
         raise InputError(f"{recording.path}: the topics serve {' and '.join(able)}; choose with --method")
     nearest = nearest_suggestion(suggestions(recording, config))
+    by_name = [
+        name for name in methods.names() if not missing_for(name, recording, config.model_copy(update={"method": name}))
+    ]
+    if by_name:
+        options = " or ".join(f"--method {name}" for name in by_name)
+        raise InputError(f"{recording.path}: what is there serves only a method that is asked for: {options}")
+    columns = propose_columns(recording)
+    if columns is not None and columns.columns:
+        concluded = f"`--auto-columns` takes {', '.join(columns.reasons)}"
+        raise InputError(
+            f"{recording.path}: no `columns:` in the config; {concluded}; `alidade info` shows them to paste"
+        )
     raise InputError(
         f"{recording.path}: no usable topics for any method; {recording.there()}; needed are ROS 2 messages "
         f"({ENCODING}): `alidade info` tells which for each method, `topics:` in the config can rename"

@@ -123,7 +123,7 @@ def validate(
 def _held(session: Session, known: Known) -> tuple[CalibrationCheck | None, dict[str, float]]:
     """What the recording says of the calibration, and its own parameters; neither where it cannot be solved."""
     from alidade.pipelines.solvers.batch import solve_batch
-    from alidade.pipelines.solvers.marginals import IndeterminateError
+    from alidade.pipelines.solvers.chain import IndeterminateError
 
     if known.solver == "published":
         return None, {}

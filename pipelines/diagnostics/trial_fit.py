@@ -7,19 +7,23 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from alidade.pipelines import deadline
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Array, ChiSquare, Estimate, Factor, Problem, Quantity, Residuals
+from alidade.pipelines.estimation.problem import CHUNK, Array, ChiSquare, Estimate, Problem, Quantity
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.parallel import LostError
 from alidade.pipelines.settings import Config
+
+if TYPE_CHECKING:
+    from alidade.pipelines.solvers.linearization import Group
 
 Result = TypeVar("Result")
 # Builds the graph of a method's data.
@@ -74,6 +78,12 @@ class TrialFit:
         return self.chi_square.value + self.lost
 
     @property
+    def cost_with_priors(self) -> float:
+        """The same with how far the solution is from its priors: what weighs corrections that fit alike."""
+        found = zip(self.quantities, self.estimate.values.tolist(), strict=True)
+        return self.cost + sum(((x - q.prior_mean) / q.prior_sigma) ** 2 for q, x in found if q.prior_sigma)
+
+    @property
     def factor(self) -> float:
         """Factor on the noise used with which the recording would fit."""
         return float(np.sqrt(self.cost / max(self.dof, 1.0)))
@@ -105,7 +115,7 @@ def score_trial(build: Build, data: Any, config: Config, label: str = "") -> flo
 
 def _tried(label: str, trial: Callable[[], Result | None]) -> Result | None:
     """The result of a trial; None without time left, or where it raises: logged, a program's defect as a warning."""
-    from alidade.pipelines.solvers.marginals import IndeterminateError
+    from alidade.pipelines.solvers.chain import IndeterminateError
 
     if deadline.passed():
         return None
@@ -134,19 +144,19 @@ def max_concurrent(times: Sequence[Array]) -> int:
 
 
 def _score(problem: Problem) -> float:
-    from alidade.pipelines.solvers.assembly import CHUNK, Assembly
-    from alidade.pipelines.solvers.system import residuals_of
-    from alidade.pipelines.solvers.weighing import optimize
+    from alidade.pipelines.solvers.engines import Compiled
+    from alidade.pipelines.solvers.levenberg import LevenbergConfig, minimize
+    from alidade.pipelines.solvers.linearization import NOT_MEASURED
 
-    whole = Assembly.of(problem.steps(CHUNK))
-    factors, shared = whole.factors, whole.shared(problem)
-    values = optimize(factors, whole.initial, shared, None, _SCORE_ITERATIONS, _MAX_SCORE_DAMPING).values
-    measured = np.concatenate(
-        [np.abs(r.whitened).ravel() for r in residuals_of(factors, values).values()] or [np.zeros(1)]
+    compiled = Compiled.of(problem)
+    engine, config = compiled.engine.under(None), LevenbergConfig(_SCORE_ITERATIONS, max_damping=_MAX_SCORE_DAMPING)
+    whitened = list(
+        zip(engine.groups, engine.residuals(minimize(engine, compiled.initial, config).values), strict=True)
     )
-    processes = [f.factor for f in factors if f.measurement is None and f.family not in ("prior", "definition")]
-    sizes = [np.sqrt(2.0 * f.error(values) / f.dim()) for f in processes]
-    return float(np.median(measured) + (np.median(sizes) if sizes else 0.0))
+    measured = [np.abs(r).ravel() for group, r in whitened if group.is_measurement]
+    processes = [r for group, r in whitened if not group.is_measurement and group.family not in NOT_MEASURED]
+    sizes = [np.sqrt((r**2).mean(axis=1)) for r in processes]
+    return sum(float(np.median(np.concatenate(each))) for each in (measured, sizes) if each)
 
 
 def held_out_residuals(problem: Problem) -> dict[str, float]:
@@ -154,21 +164,29 @@ def held_out_residuals(problem: Problem) -> dict[str, float]:
 
     One chunk in five is held out. Expected is 1, and a little more by the uncertainty of the prediction.
     """
-    from alidade.pipelines.solvers.assembly import CHUNK, Assembly
-    from alidade.pipelines.solvers.system import residuals_of
-    from alidade.pipelines.solvers.weighing import optimize
+    from alidade.pipelines.solvers.engines import Compiled
+    from alidade.pipelines.solvers.robust import RobustConfig, solve_robust
 
     steps = list(problem.steps(CHUNK))
-    whole = Assembly.of(steps)
-    out: list[Factor] = [
-        f for step in steps[_HELD_OUT - 1 :: _HELD_OUT] for f in step.factors if f.measurement is not None
-    ]
-    left = {id(f) for f in out}
-    kept = [f for f in whole.factors if id(f) not in left]
-    if not any(f.measurement is not None for f in kept):
+    out = np.repeat(np.arange(len(steps)) % _HELD_OUT == _HELD_OUT - 1, [len(step.factors) for step in steps])
+    compiled = Compiled.of(problem, steps=steps)
+    measurements = [g for g in compiled.engine.groups if g.is_measurement]
+    if all(out[g.factors].all() for g in measurements):
         return {}
-    solution = optimize(kept, whole.initial, whole.shared(problem), problem.loss, held=problem.assumed)
+    kept = compiled.engine.with_groups([_without(g, out[g.factors]) for g in compiled.engine.groups])
+    solution = solve_robust(kept, compiled.initial, problem.loss, RobustConfig())
     if not solution.converged:
         return {}
-    found: dict[str, Residuals] = residuals_of(out, solution.values)
-    return {family: robust_sigma(r.whitened) for family, r in found.items()}
+    found: dict[str, list[Array]] = {}
+    for group in measurements:
+        residuals = group.evaluate(solution.values)[0]
+        found.setdefault(group.family, []).append(residuals[out[group.factors]].ravel())
+    return {family: robust_sigma(np.concatenate(each)) for family, each in found.items()}
+
+
+def _without(group: Group, out: NDArray[np.bool_]) -> Group:
+    """A group without the measurements that are held out; processes and priors stay."""
+    if not group.is_measurement:
+        return group
+    weights = np.ones((len(out), group.model.rows)) if group.weights is None else group.weights
+    return replace(group, weights=weights * ~out[:, None])

@@ -28,6 +28,11 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+# What eliminates the linear systems of the batch solver, see solvers.engines.
+EngineName = Literal["auto", "chain", "gtsam"]
+# Frames in one vectorised factor of a gtsam graph: past this the Jacobians' zeros cost more than the calls they save.
+CHUNK = 20
+
 # What a method found beside its parameters: name of a table -> its rows, plain numbers and words in SI.
 Findings = Mapping[str, Sequence[Mapping[str, object]]]
 
@@ -186,7 +191,7 @@ class Factor:
     @property
     def keys(self) -> list[int]:
         """The variables."""
-        return list(self.native.keys()) if self.vectorized is None else self.vectorized.keys
+        return list(self.factor.keys()) if self.vectorized is None else self.vectorized.keys
 
     @property
     def vectorized(self) -> VectorizedFactor | None:
@@ -316,6 +321,17 @@ class Problem:
     def numbers(self, estimate: Estimate) -> dict[str, float]:
         """What formulas need, by name: an estimate's values and the constants."""
         return {**self.constants, **dict(zip(estimate.names, estimate.values.tolist(), strict=True))}
+
+    def graph(self) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+        """The problem as gtsam has it, for its own optimizers, Marginals and ISAM2: factors and first values."""
+        import gtsam
+
+        graph, initial = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for step in self.steps(CHUNK):
+            initial.insert(step.initial)
+            for factor in step.factors:
+                graph.add(factor.factor)
+        return graph, initial
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:

@@ -1,265 +1,341 @@
-"""Batch: all steps in one graph, solved once."""
+"""Batch calibration: the maximum a-posteriori estimate of all parameters from a whole recording.
+
+Outliers are found by graduated non-convexity (`robust`), noise levels by restricted maximum likelihood
+(`noise_estimation`), other minima are looked at where a method says that they may be, weak directions stay at their
+priors (`weak_directions`). What is reported follows from one factorisation at the end (`posterior`).
+
+Of two minima whose measurements are explained alike only their priors tell which is meant. The likelihood ratio of two
+points that are not nested has no distribution of its own; `BatchConfig.close` is where one number off by its prior
+would be excluded at one percent.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Any
 
-import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.problem import Array, Course, Estimate, Factor, History, Minimum, Problem, Pull, Told
-from alidade.pipelines.solvers.assembly import CHUNK, Assembly, StepBoundary
-from alidade.pipelines.solvers.coloured import added_variance, coloured, inflations
-from alidade.pipelines.solvers.curvature import second_order
-from alidade.pipelines.solvers.gauss_newton import MOST_ITERATIONS, Solution, minimize
-from alidade.pipelines.solvers.history import sequential_history
-from alidade.pipelines.solvers.influence import Influence, influence, strongest, uncertainty_budget
-from alidade.pipelines.solvers.marginals import chi_square, joint_covariance, reported, smoothed
-from alidade.pipelines.solvers.minima import likeliest
-from alidade.pipelines.solvers.noise_levels import weigh
-from alidade.pipelines.solvers.pull import without_pull
-from alidade.pipelines.solvers.spurious import Spurious, information_of_noise
-from alidade.pipelines.solvers.system import Linear, without_rejected
-from alidade.pipelines.solvers.told import told
-from alidade.pipelines.solvers.weighing import linearized, optimize, with_levels
+from alidade.pipelines.estimation.problem import (
+    Array,
+    Attitudes,
+    EngineName,
+    Estimate,
+    History,
+    Minimum,
+    Problem,
+    Residuals,
+    Told,
+)
+from alidade.pipelines.solvers.chain import ChainFactorization, ChainSystem
+from alidade.pipelines.solvers.engines import Compiled
+from alidade.pipelines.solvers.error_budget import (
+    Influence,
+    added_variance,
+    autocorrelations,
+    error_budget,
+    inflation,
+    most_influential,
+)
+from alidade.pipelines.solvers.layout import Layout, Values
+from alidade.pipelines.solvers.levenberg import Engine, LevenbergConfig, Solution, minimize
+from alidade.pipelines.solvers.linearization import Group, Linearization
+from alidade.pipelines.solvers.noise_estimation import apply_levels, estimate_noise, group_weights
+from alidade.pipelines.solvers.posterior import Reported, chi_square, expected_squares, leverages, sqrt_information
+from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed_bias
+from alidade.pipelines.solvers.robust import RobustConfig, solve_robust
+from alidade.pipelines.solvers.weak_directions import Posterior, constrained_solution
 
-# The measurements that matter most are so many.
-_STRONGEST = 20
+
+@dataclass(frozen=True)
+class BatchConfig:
+    """Options of the batch solver.
+
+    Attributes:
+        robust: how minima and outliers are looked for.
+        close: chi-square above the least below which another minimum is told: 99 % quantile of one degree of freedom.
+        followed: chi-square above the least up to which values are followed to their minimum, which takes off far less.
+        different: part of its prior scale by which a number of another solution differs.
+        influential: number of the most influential measurements that are told.
+    """
+
+    robust: RobustConfig = field(default_factory=RobustConfig)
+    close: float = 6.635
+    followed: float = 3.0 * 6.635
+    different: float = 0.1
+    influential: int = 20
+
+    @classmethod
+    def of(cls, max_iterations: int) -> BatchConfig:
+        """The defaults with other iterations of each minimisation."""
+        return cls(RobustConfig(LevenbergConfig(max_iterations=max_iterations)))
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """A solution with everything that is asked of it later.
+
+    Attributes:
+        compiled: the problem.
+        solution: with the noise levels in force.
+        levels: of the noises.
+        posterior: of the reported numbers, weak directions at their priors.
+        second: the second best solution, if it is close.
+    """
+
+    compiled: Compiled
+    solution: Solution
+    levels: tuple[Level, ...]
+    posterior: Posterior
+    second: Minimum | None = None
+
+    @property
+    def engine(self) -> Engine:
+        """With the loss and the weights in force."""
+        return self.solution.engine
+
+    @property
+    def values(self) -> Values:
+        """Of all variables, weak directions at their priors."""
+        return self.posterior.values
+
+
+def minimum(compiled: Compiled, levels: Sequence[Level]) -> Solution:
+    """The solution with noise levels that are known, rejected measurements left out."""
+    engine = apply_levels(compiled.engine, levels)
+    solution = solve_robust(engine, compiled.initial, compiled.problem.loss, RobustConfig())
+    return replace(solution, engine=without_rejected(solution.engine, solution.values))
+
+
+def solve(compiled: Compiled, config: BatchConfig | None = None, levels: tuple[Level, ...] | None = None) -> Solved:
+    """Solve a compiled problem.
+
+    Args:
+        compiled: the problem.
+        config: options.
+        levels: of the noises, where they are known; None: from the recording.
+
+    Raises:
+        IndeterminateStateError: states other than the parameters are not determined.
+    """
+    config, problem = config or BatchConfig(), compiled.problem
+    start = problem.noises if levels is None else levels
+    engine: Engine = compiled.engine
+    solution = solve_robust(apply_levels(engine, start), compiled.initial, problem.loss, config.robust)
+    if levels is None:
+        solution, start = estimate_noise(engine, solution, start, problem.loss, config.robust, expected_squares)
+    solution, second = _best(compiled, solution, config)
+    posterior = constrained_solution(
+        problem, without_rejected(solution.engine, solution.values), solution.values, compiled.current_keys
+    )
+    return Solved(compiled, solution, start, posterior, second)
 
 
 def solve_batch(
     problem: Problem,
-    most: int = MOST_ITERATIONS,
+    max_iterations: int = LevenbergConfig.max_iterations,
     budget: bool = False,
     changed: Iterable[tuple[str, Problem]] = (),
     device: Collection[str] = (),
     elsewhere: Callable[[Told], Mapping[str, float]] | None = None,
+    engine: EngineName = "auto",
 ) -> Estimate:
     """The maximum a-posteriori estimate with the joint marginal covariance of its parameters.
 
-    Outliers are found by graduated non-convexity on the problem's truncated loss: the final solution is plain least
-    squares on the measurements inside the gate, so its covariance and chi-square mean what they say.
-
     Args:
         problem: to be solved.
-        most: iterations of each minimisation, after which it counts as not converged.
+        max_iterations: of each minimisation, after which it counts as not converged.
         budget: also where the variance of each number comes from, which measurements move it most, and by how much it
             is elsewhere in the `changed` graphs.
         changed: names and graphs of the same recording in which something is a little different.
         device: names of the numbers whose priors are not the recording's; asks for what it says without them.
         elsewhere: of what it says, linear about its solution, the numbers about which it is to be linear instead.
+        engine: that eliminates the linear systems.
 
     Raises:
-        IndeterminateError: states other than the parameters are not determined; names the variable.
+        IndeterminateStateError: states other than the parameters are not determined.
     """
-    start = time.perf_counter()
-    whole = Assembly.of(problem.steps(CHUNK))
+    begin = time.perf_counter()
+    compiled = Compiled.of(problem, engine)
     built = time.perf_counter()
-    found = _found(problem, whole, most)
-    solved = time.perf_counter()
-    solution, about, keys = found.solution, found.about, whole.current_keys
-    values, system = solution.values, solution.system
-    marginal = _covariance(problem, found, keys)
-    residuals = system.residuals(values)
-    with system.at(values):
-        summary = chi_square(problem, system.factors, values, marginal, found.expected)
-        colours = coloured(system.factors, values) if found.levels else {}
-    weights = _Weights(np.ones(len(marginal)))
-    if budget or colours:
-        weights = _weights(problem, found, keys, marginal, colours, budget, changed)
-    smooth = _smoothed(problem, about, whole.boundaries, marginal)
+    config = BatchConfig.of(max_iterations)
+    solved = solve(compiled, config)
+    found = time.perf_counter()
+    estimate = _estimate(solved, config, budget, changed)
+    if device:
+        estimate = replace(estimate, told=_told(solved, device, elsewhere))
     done = time.perf_counter()
-    return Estimate(
+    return replace(estimate, seconds={"build": built - begin, "solve": found - built, "marginals": done - found})
+
+
+def without_rejected(engine: Engine, values: Values) -> Engine:
+    """The measurements that count at some values, in full, whatever they are elsewhere."""
+    return engine.with_groups([_counting(group, values) for group in engine.groups])
+
+
+def _counting(group: Group, values: Values) -> Group:
+    if group.loss is None:
+        return group
+    used = group.used(group.evaluate(values)[0]) > 0.5
+    return replace(group, loss=None, weights=group_weights(group) * used[:, None])
+
+
+def _best(compiled: Compiled, solution: Solution, config: BatchConfig) -> tuple[Solution, Minimum | None]:
+    """The solution or, if another minimum is deeper, that one; and the second best if it is close."""
+    problem, layout = compiled.problem, compiled.layout
+    if problem.elsewhere is None or not solution.converged:
+        return solution, None
+    engine, found = solution.engine, [solution]
+    for other in problem.elsewhere(layout.to_gtsam(solution.values)):
+        values = layout.from_gtsam(other)
+        if engine.cost(values) - solution.cost < config.followed:
+            minimum = minimize(engine, values, config.robust.minimizer)
+            found += [minimum] if minimum.converged else []
+    best, *others = sorted(found, key=lambda each: each.cost)
+    here = _numbers(compiled, best.values)
+    scales = np.array([q.scale for q in problem.quantities])
+    for each in others:
+        there = _numbers(compiled, each.values)
+        if (np.abs(there - here) > config.different * scales).any():
+            above = each.cost - best.cost
+            return best, Minimum(there, above) if above < config.close else None
+    return best, None
+
+
+def _numbers(compiled: Compiled, values: Values) -> Array:
+    """(n,) reported numbers at some values."""
+    return Reported.of(compiled.problem, compiled.layout, values, compiled.current_keys).numbers
+
+
+def _estimate(solved: Solved, config: BatchConfig, budget: bool, changed: Iterable[tuple[str, Problem]]) -> Estimate:
+    """Everything that is reported of a solution."""
+    compiled, engine, values, posterior = solved.compiled, solved.engine, solved.values, solved.posterior
+    problem, found = compiled.problem, solved.posterior.factorization
+    names = tuple(q.name for q in problem.quantities)
+    correlations = autocorrelations(engine, values) if solved.levels else {}
+    influence, added = None, dict[str, Array]()
+    if budget or correlations:
+        influence = Influence.of(posterior.reported, posterior.directions, engine, found, values)
+        added = added_variance(influence, correlations)
+    by = inflation(names, posterior.covariance, influence.names if influence else (), added)
+    covariance = posterior.covariance * np.outer(by, by)
+    system = engine.at(values)[0]
+    course = None
+    if isinstance(engine, Linearization) and isinstance(system, ChainSystem) and isinstance(found, ChainFactorization):
+        course = posterior_history(problem, engine, system, found, values, compiled.current_keys, engine.time)
+    residuals = residuals_by_family(engine, values)
+    out = Estimate(
         solver="batch",
-        names=tuple(q.name for q in problem.quantities),
-        values=reported(problem, values, keys),
-        covariance=marginal * np.outer(weights.inflation, weights.inflation),
-        inflation=weights.inflation,
-        colours={family: 1.0 + 2.0 * float(lags.sum()) for family, lags in colours.items()},
-        converged=solution.converged,
-        message=solution.message,
+        names=names,
+        values=posterior.reported.numbers,
+        covariance=covariance,
+        inflation=by,
+        colours={family: 1.0 + 2.0 * float(lags.sum()) for family, lags in correlations.items()},
+        converged=solved.solution.converged,
+        message=solved.solution.message,
         residuals=residuals,
-        chi_square=summary,
-        history=None if found.course is None else found.course.history.inflated(weights.inflation),
-        course=found.course,
-        smoothed=smooth,
-        attitudes=problem.attitudes(whole.keyframes, values) if problem.attitudes else None,
-        budget=weights.budget,
-        moved=weights.moved,
-        strongest=weights.strongest,
+        chi_square=chi_square(leverages(engine, found, values)),
+        history=None if course is None else course.history.inflated(by),
+        course=course,
+        smoothed=_smoothed(solved, covariance),
+        attitudes=_attitudes(solved) if problem.attitudes else None,
         rejected={family: int((~r.used).sum()) for family, r in residuals.items()},
-        levels=found.levels,
-        told=_told(problem, about, keys, device, elsewhere) if device else None,
-        second=found.second,
-        seconds={"build": built - start, "solve": solved - built, "marginals": done - solved},
+        levels=solved.levels,
+        second=solved.second,
+    )
+    if not budget or influence is None:
+        return out
+    sigmas = {q.name: sigma for q, sigma in zip(problem.quantities, out.sigmas.tolist(), strict=True) if not q.assumed}
+    return replace(
+        out,
+        budget=error_budget(influence, added, covariance),
+        moved={name: moves for name, other in changed if (moves := _moves(solved, influence, other))},
+        strongest=most_influential(influence, sigmas, config.influential),
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """A solution, and what its linear system says.
-
-    Attributes:
-        solution: of the graph with these noise levels.
-        levels: of the noises.
-        second: the second best one, if it is close.
-        about: the system linearised there.
-        expected: squares of its residuals by family and row.
-        course: what was known at some moments.
-        marginal: (n, n) covariance of the reported numbers at the end.
-        noise: what of their information is noise.
-    """
-
-    solution: Solution
-    levels: tuple[Level, ...]
-    second: Minimum | None
-    about: Linear
-    expected: dict[tuple[str, int], float]
-    course: Course | None
-    marginal: Array
-    noise: Spurious | None
+def _attitudes(solved: Solved) -> Attitudes | None:
+    """The trajectory."""
+    compiled = solved.compiled
+    attitudes = compiled.problem.attitudes
+    return None if attitudes is None else attitudes(compiled.keyframes, compiled.layout.to_gtsam(solved.values))
 
 
-def _found(problem: Problem, whole: Assembly, most: int) -> _Found:
-    """The likeliest solution with the noise levels that the recording tells, which noise does not pull."""
-    shared, keys = whole.shared(problem), whole.current_keys
-    weighed = weigh(whole.factors, problem.noises)
-    solution = optimize(
-        weighed, whole.initial, shared, problem.loss, most, held=problem.assumed, boundaries=whole.boundaries
-    )
-    # As large as the solution, and of no more use.
-    whole.initial, whole.timestamps = gtsam.Values(), {}
-    solution, levels, about, expected = with_levels(problem, whole.factors, solution, problem.noises, most)
-    best, second = likeliest(problem, solution, minimize, keys)
-    if best is not solution:
-        solution, (about, expected) = best, linearized(best)
-    course, marginal, noise = _known(problem, about, keys)
-    if solution.converged:
-        unpulled = without_pull(problem, solution, noise, keys, most)
-        if unpulled is not solution:
-            solution, (about, expected) = unpulled, linearized(unpulled)
-            course, marginal, noise = _known(problem, about, keys)
-    return _Found(solution, levels, second, about, expected, course, marginal, noise)
+def residuals_by_family(engine: Engine, values: Values) -> dict[str, Residuals]:
+    """Family -> whitened residuals of its measurements at some values, in the order of the problem's factors."""
+    parts: dict[str, list[tuple[NDArray[Any], ...]]] = {}
+    for group in engine.groups:
+        if group.is_measurement:
+            residuals = group.evaluate(values)[0]
+            each = group.factors, group.model.time, group.weighted(residuals), group.used(residuals) > 0.5
+            parts.setdefault(group.family, []).append(each)
+    out = {}
+    for family, found in parts.items():
+        factors, times, whitened, used = (np.concatenate(column) for column in zip(*found, strict=True))
+        order = np.argsort(factors, kind="stable")
+        out[family] = Residuals(times[order], whitened[order], used[order])
+    return out
 
 
-def _covariance(problem: Problem, found: _Found, current_keys: Mapping[int, int]) -> Array:
-    """Of the reported numbers (n, n), without information that is noise, and with what is of second order."""
-    marginal, about = found.marginal, found.about
-    if found.noise is not None:
-        marginal = joint_covariance(problem, about, current_keys, found.noise.information)
-    bent = second_order(problem, about, marginal, current_keys)
-    return marginal if bent is None else marginal + bent.covariance
-
-
-@dataclass(frozen=True, eq=False)
-class _Weights:
-    """By what single measurements and inputs move the reported numbers; all but the first None unless asked for.
-
-    Attributes:
-        inflation: (n,) of the sigmas, by noise that is not white.
-        budget: where variances come from.
-        moved: by name of what is changed, by how much each number is elsewhere then.
-        strongest: the measurements that matter most.
-    """
-
-    inflation: Array
-    budget: Mapping[str, Mapping[str, float]] | None = None
-    moved: Mapping[str, Mapping[str, float]] | None = None
-    strongest: tuple[Pull, ...] | None = None
-
-
-def _weights(
-    problem: Problem,
-    found: _Found,
-    current_keys: Mapping[int, int],
-    marginal: Array,
-    colours: Mapping[str, Array],
-    budget: bool,
-    changed: Iterable[tuple[str, Problem]],
-) -> _Weights:
-    """Influence of the measurements, and what follows from it."""
-    weight = influence(problem, found.about, current_keys)
-    added = added_variance(weight, colours)
-    inflation = inflations(problem, marginal, weight.names, added)
-    if not budget:
-        return _Weights(inflation)
-    sigmas = zip(problem.quantities, inflation * np.sqrt(np.diag(marginal)), strict=True)
-    return _Weights(
-        inflation,
-        uncertainty_budget(problem, weight, added),
-        {name: moves for name, other in changed if (moves := _moves(other, found.solution, found.levels, weight))},
-        strongest(weight, {q.name: sigma for q, sigma in sigmas if not q.assumed}, _STRONGEST),
-    )
-
-
-def _smoothed(problem: Problem, about: Linear, boundaries: Sequence[StepBoundary], marginal: Array) -> History | None:
-    """The reported numbers over time, where other variables hold them before the end than after it."""
-    # Times from which on other variables held the parameters than before; after the last one they are those reported.
-    changes = [
-        (b.time, b.current_keys)
-        for i, b in enumerate(boundaries)
-        if i == 0 or b.current_keys != boundaries[i - 1].current_keys
-    ]
-    if len(changes) <= 2:
+def _smoothed(solved: Solved, covariance: Array) -> History | None:
+    """The reported numbers over time where a bias walks: of its nodes from the whole recording."""
+    compiled, layout = solved.compiled, solved.compiled.layout
+    *_, count, c, _ = layout.sizes
+    if count < 3 or c == 0:
         return None
-    return smoothed(problem, about.triangular.tree, about.values, changes[:-1], marginal)
+    engine, values, factorization = solved.engine, solved.values, solved.posterior.factorization
+    if not isinstance(factorization, ChainFactorization):
+        return None
+    moving = [p for p in compiled.problem.parameters if p.key in compiled.current_keys]
+    if len(moving) != 1:
+        return None
+    (parameter,) = moving
+    keys = np.array([_node_key(layout, parameter.key, j) for j in range(count)])
+    begins = engine.time[np.searchsorted(engine.piece, np.arange(count))]
+    part = slice(0, len(parameter.quantities))
+    bias = smoothed_bias(layout, factorization, values, begins, keys, part)
+    names = [q.name for q in compiled.problem.quantities]
+    at = [names.index(q.name) for q in parameter.quantities]
+    whole = np.tile(solved.posterior.reported.numbers, (count, 1)), np.tile(np.sqrt(np.diag(covariance)), (count, 1))
+    whole[0][:, at], whole[1][:, at] = bias.values, bias.sigmas
+    return History(begins, *whole)
 
 
-def _known(
-    problem: Problem, about: Linear, current_keys: Mapping[int, int]
-) -> tuple[Course | None, Array, Spurious | None]:
-    """What was known at some moments, covariance of the reported numbers at the end, and what of that is noise."""
-    system, values = about.system, about.values
-    course = sequential_history(
-        problem, about.graph, system.ordering, values, about.boundaries, system.boundaries[0].time
-    )
-    marginal = joint_covariance(problem, about, current_keys) if course is None else course.covariance[-1]
-    return course, marginal, information_of_noise(problem, about, marginal, current_keys)
+def _node_key(layout: Layout, first: int, node: int) -> int:
+    """The variable of a bias in force at a node; `first` is that of the first one."""
+    if node == 0:
+        return first
+    return int(layout.key[(layout.node == node) & (layout.part == 0)][0])
 
 
-def _told(
-    problem: Problem,
-    about: Linear,
-    current_keys: Mapping[int, int],
-    device: Collection[str],
-    elsewhere: Callable[[Told], Mapping[str, float]] | None,
-) -> Told:
-    """What a graph says, linear about its solution or where the reported numbers are to be."""
-    values = about.values
-    own = told(problem, about, current_keys, device)
-    wanted = {} if elsewhere is None else elsewhere(own)
-    if not wanted:
-        return own
-    moves = {}
-    for p in problem.parameters:
-        key = current_keys.get(p.key, p.key)
-        numbers, J = p.coordinates(values, key)
-        to = [wanted.get(q.name, number) for q, number in zip(p.quantities, numbers, strict=True)]
-        moves[key] = np.linalg.pinv(J) @ (np.array(to) - numbers)
-    there = values.retract(about.holding(moves).solution())
-    return told(problem, about.system.linearized(there), current_keys, device)
-
-
-def _moves(changed: Problem, solution: Solution, levels: tuple[Level, ...], found: Influence) -> dict[str, float]:
+def _moves(solved: Solved, influence: Influence, changed: Problem) -> dict[str, float]:
     """By how much the numbers are elsewhere in a graph that is a little different, empty where its variables differ.
 
     Noise levels, and which measurements are rejected, are those of the solution.
     """
-    system, values = solution.system, solution.values
-    factors = weigh(Assembly.of(changed.steps(CHUNK)).factors, levels)
-    factors += system.factors[len(factors) :]  # what balances the pull of noise
-    if [_shape(f) for f in factors] != [_shape(f) for f in system.factors]:
+    own, values = solved.engine, solved.values
+    other = Compiled.of(changed, "gtsam" if solved.compiled.problem.layout is None else "auto")
+    engine = apply_levels(other.engine, solved.levels)
+    shapes = [[(g.family, g.target, len(g.model.time), g.model.rows) for g in e.groups] for e in (own, engine)]
+    if not np.array_equal(other.layout.key, solved.compiled.layout.key) or shapes[0] != shapes[1]:
         return {}
-    with system.at(values):
-        kept = [without_rejected(f, own, values) for f, own in zip(factors, system.factors, strict=True)]
-    moves = found.moves(system.made_of(kept).under(None).linearized(values))
-    return dict(zip(found.names, moves.tolist(), strict=True))
+    kept = [
+        replace(new, loss=None, weights=group_weights(new) * (g.used(g.evaluate(values)[0]) > 0.5)[:, None])
+        for g, new in zip(own.groups, engine.groups, strict=True)
+    ]
+    moves = influence.moves(engine.with_groups(kept))
+    return dict(zip(influence.names, moves.tolist(), strict=True))
 
 
-def _shape(factor: Factor) -> tuple[str, list[int], int]:
-    """What the factors of two graphs of one recording have in common: family, variables, how many measurements."""
-    vectorized = factor.vectorized
-    return factor.family, factor.factor.keys(), 0 if vectorized is None else len(vectorized.model.time)
+def _told(solved: Solved, device: Collection[str], elsewhere: Callable[[Told], Mapping[str, float]] | None) -> Told:
+    """What a graph says, linear about its solution or where the reported numbers are to be."""
+    compiled, engine, values = solved.compiled, solved.engine, solved.values
+    own = sqrt_information(compiled.problem, engine, values, compiled.current_keys, device)
+    wanted = {} if elsewhere is None else elsewhere(own)
+    if not wanted:
+        return own
+    return sqrt_information(compiled.problem, engine, values, compiled.current_keys, device, wanted)

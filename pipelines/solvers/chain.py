@@ -9,8 +9,9 @@ scales). A bias that walks is a coarser chain above: node z_j (c numbers) is in 
 
 The chain is cut into segments that are eliminated in lockstep from their last states backward, one numpy.linalg.qr for
 one state of each. A segment leaves rows about its last state, that of the segment before and the border (z_j, shared):
-a chain again. Once a piece is one segment its node joins the state: (attitude at the cut, bias). The last few dozen
-states go in time order, so that what is known after each of them is at hand.
+a chain again. The last few dozen states go in time order, each node with the last state of its piece, so that what is
+known after each of them is at hand. Of more pieces than that nodes join the states once a piece is one segment:
+(attitude at the cut, bias).
 
 Nothing is squared: R's diagonal gives the determinant, its last column the minimum. Golub, Plemmons, "Large-scale
 geodetic least-squares adjustment by dissection and orthogonal decomposition", Lin. Alg. Appl. 34 (1980).
@@ -22,7 +23,8 @@ numpy.linalg.LinAlgError.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +38,14 @@ SEQUENTIAL_STATES = 96
 RANK_TOLERANCE = 1e-13
 
 
-class IndeterminateStateError(Exception):
+UNDETERMINED = "a state is not determined: no measurement and no process constrains it"
+
+
+class IndeterminateError(Exception):
+    """The recording does not determine what it has to, for anything to be estimated."""
+
+
+class IndeterminateStateError(IndeterminateError):
     """A state is determined neither by measurements nor by its neighbours."""
 
 
@@ -74,10 +83,39 @@ class ChainSystem:
         """Columns beside the states', right side included: c + s + 1."""
         return int(self.measured.shape[2]) - self.d
 
+    @property
+    def squares(self) -> float:
+        """Sum of squares of the right side: what no step at all leaves."""
+        parts = [self.measured, self.between, self.beside, self.shared, *([] if self.walk is None else [self.walk])]
+        return sum(float(np.square(rows[..., -1]).sum()) for rows in parts)
+
+    def eliminate(self, damping: float = 0.0) -> ChainFactorization:
+        """R of the system, damped as `damped` has it. Raises IndeterminateStateError."""
+        return ChainFactorization.of(self.damped(damping) if damping > 0.0 else self)
+
+    def damped(self, damping: float) -> ChainSystem:
+        """The system with so many times the information of every unknown by itself added, at zero (Marquardt)."""
+        d, c, root = self.d, self.c, np.sqrt(damping)
+        states = np.square(self.measured[..., :d]).sum(axis=1) + np.square(self.between[..., :d]).sum(axis=1)
+        states[:-1] += np.square(self.between[1:, :, d : 2 * d]).sum(axis=1)
+        shared = np.square(self.shared[:, :-1]).sum(axis=0)
+        for rows in (self.measured, self.between, self.beside):
+            shared = shared + np.square(rows[..., rows.shape[2] - len(shared) - 1 : -1]).sum(axis=(0, 1))
+        measured = np.concatenate([self.measured, np.zeros((len(states), d, self.measured.shape[2]))], axis=1)
+        measured[:, np.arange(-d, 0), np.arange(d)] = root * np.sqrt(states)
+        prior = np.vstack([self.shared, np.pad(np.diag(root * np.sqrt(shared)), ((0, 0), (0, 1)))])
+        walk = self.walk
+        if walk is not None:
+            nodes = np.square(walk[..., :c]).sum(axis=1)
+            nodes[:-1] += np.square(walk[1:, :, c : 2 * c]).sum(axis=1)
+            walk = np.concatenate([walk, np.zeros((len(nodes), c, 2 * c + 1))], axis=1)
+            walk[:, np.arange(-c, 0), np.arange(c)] = root * np.sqrt(nodes)
+        return replace(self, measured=measured, shared=prior, walk=walk)
+
     def segments(self) -> Index:
         """(B,) last states of segments, none of which spans two pieces."""
         n = len(self.measured)
-        index, length = np.arange(n), max(2, int(np.ceil(n / max((2.0 * n) ** 0.5, SEQUENTIAL_STATES / 2.0))))
+        index, length = np.arange(n), max(2, int(n / max((2.0 * n) ** 0.5, SEQUENTIAL_STATES / 2.0)))
         if self.piece is None:
             return np.flatnonzero((n - 1 - index) % length == 0)
         last = np.flatnonzero(np.diff(self.piece, append=self.piece[-1] + 1) > 0)
@@ -160,17 +198,13 @@ class ChainFactorization:
     c: int
     root: Array
     _levels: list[_Level | None]  # None: from there on nodes are part of the states
-    # Of the last few dozen states: keyframe, R, rows about it by itself and all before it, rows left about shared.
-    _keyframes: Index
-    _rows: list[Array]
-    _heads: list[Array]
-    _piles: list[Array]
+    _ends: _TimeOrder
 
     @classmethod
     def of(cls, chain: ChainSystem) -> ChainFactorization:
         """Eliminate all but the shared unknowns and the last node. Raises IndeterminateStateError."""
         own, tail, levels, keyframes = chain.d, chain.c, list[_Level | None](), np.arange(len(chain.measured))
-        while chain.walk is not None or len(chain.measured) > SEQUENTIAL_STATES:
+        while len(chain.measured) > SEQUENTIAL_STATES or (own == 0 and chain.walk is not None):
             if chain.walk is not None and len(chain.measured) == len(chain.walk):
                 chain = chain.with_nodes_as_states()
                 levels.append(None)
@@ -178,19 +212,8 @@ class ChainFactorization:
                 level, chain, lasts = _Level.eliminate(chain)
                 levels.append(level)
                 keyframes = keyframes[lasts]
-        d, w, carried = chain.d, chain.border, np.zeros((1, 0, chain.d + chain.border))
-        alone = np.delete(chain.between[0], np.s_[d : 2 * d], axis=1)
-        rows, heads, piles = list[Array](), list[Array](), [np.concatenate([chain.shared, chain.beside[0]])]
-        for k, measured in enumerate(chain.measured):
-            heads.append(np.concatenate([alone if k == 0 else carried[0], measured]))
-            if k < len(chain.measured) - 1:
-                ahead = _swapped(chain.between[k + 1], d)
-                (R,), carried, (rest,) = _step(heads[-1][None], measured[None, :0], ahead[None], d, 0)
-                rows.append(R)
-                piles.append(np.concatenate([rest, chain.beside[k + 1]]))
-        R = _root([heads[-1], *piles], d + w)
-        rows.append(_determined(R[None, :own])[0])
-        return cls(own, tail, R[own:, own:], levels, keyframes, rows, heads, piles)
+        ends, root = _TimeOrder.eliminate(chain, keyframes, own)
+        return cls(own, tail, root, levels, ends)
 
     @property
     def minimum(self) -> float:
@@ -201,7 +224,7 @@ class ChainFactorization:
     def log_determinant(self) -> float:
         """Of the information A'A."""
         parts = [each.rows for each in self._levels if each is not None] + [
-            R[None] for R in (*self._rows, self.root[:-1])
+            R[None] for R in (*self._ends.rows, self.root[:-1])
         ]
         pivots = np.abs(np.concatenate([np.diagonal(R, axis1=1, axis2=2).ravel() for R in parts]))
         return 2.0 * float(np.log(pivots[pivots > 0.0]).sum())  # rows of the segments' last states are empty
@@ -227,29 +250,122 @@ class ChainFactorization:
 
     def prefix_roots(self) -> tuple[Index, list[Array]]:
         """(M,) keyframes, and R of (their node, shared, right side) by all until then; few rows at first."""
-        roots, known = list[Array](), np.zeros((0, 1))
-        for head, pile in zip(self._heads, self._piles, strict=True):
-            known = _root([known, pile], pile.shape[1])
+        ends, roots, known = self._ends, list[Array](), np.zeros((0, 1))
+        for k, (head, pile) in enumerate(zip(ends.heads, ends.piles, strict=True)):
+            known = _root([known, pile] if k and ends.piece[k] == ends.piece[k - 1] else [pile], pile.shape[1])
             roots.append(_root([head, known], head.shape[1])[self.d :, self.d :])
-        return self._keyframes, roots
+        return ends.keyframes, roots
 
     def _back(self, last: Array, right: float, generator: np.random.Generator | None = None) -> tuple[Array, Array]:
-        n, own, d, last = last.shape[1], self.d, self.d + self.c, np.pad(last, ((0, 1), (0, 0)), constant_values=right)
-        shared, x, nodes = last[self.c :], np.zeros((len(self._rows), d, n)), np.zeros((0, self.c, n))
-        x[-1, own:] = last[: self.c]
-        x[-1, :own] = _solved(self._rows[-1][:, :own], self._rows[-1][:, own:] @ last, generator)
-        for k in range(len(self._rows) - 2, -1, -1):
-            R = self._rows[k]
-            x[k] = _solved(R[:, :d], R[:, d : 2 * d] @ x[k + 1] + R[:, 2 * d :] @ shared, generator)
+        last = np.pad(last, ((0, 1), (0, 0)), constant_values=right)
+        x, nodes = self._ends.back(last, self.c, generator)
+        shared = last[self.c :]
         for level in reversed(self._levels):
             if level is None:
-                x, nodes = x[:, :own], x[:, own:]
+                x, nodes = x[:, : self.d], x[:, self.d :]
             elif level.piece is None:
                 x = level.back(x, shared[None], generator)
             else:
                 of = nodes[level.piece]
                 x = level.back(x, np.concatenate([of, np.repeat(shared[None], len(of), axis=0)], axis=1), generator)
         return x, nodes
+
+
+@dataclass(frozen=True, eq=False)
+class _TimeOrder:
+    """The last few dozen states, eliminated in time order.
+
+    Attributes:
+        d, c: numbers of a state, and of a node where these are no part of the states.
+        keyframes: (M,) of the states.
+        rows: R of each state, columns: it, the next state, node, shared; with the last state of a piece goes its node:
+            (state, node), (next state, next node), shared; of the last state: it, node, shared.
+        piece: (M,) node in force at each.
+        heads: rows [state | node | shared | right side] about each by itself and all before it.
+        piles: rows [node | shared | right side] left by the state before; at the begin of a piece by all before.
+    """
+
+    d: int
+    c: int
+    keyframes: Index
+    rows: list[Array]
+    piece: Index
+    heads: list[Array]
+    piles: list[Array]
+
+    @classmethod
+    def eliminate(cls, chain: ChainSystem, keyframes: Index, own: int) -> tuple[_TimeOrder, Array]:
+        """The states of a chain, and R of (last node, shared unknowns, right side); the first `own` numbers go last."""
+        d, c, w, count = chain.d, chain.c, chain.border, len(chain.measured)
+        piece = np.zeros(count, dtype=np.intp) if chain.piece is None else chain.piece
+        rows, heads, piles, begin = list[Array](), list[Array](), list[Array](), 0
+        left = _below([chain.shared, *([] if chain.walk is None else [_about_node(chain.walk[0], w)])], w)
+        carried = np.delete(chain.between[0], np.s_[d : 2 * d], axis=1)
+        for k, measured in enumerate(chain.measured):
+            heads.append(np.concatenate([carried, measured]))
+            piles.append(np.concatenate([left, chain.beside[k]]))
+            if k == count - 1:
+                break
+            between = _swapped(chain.between[k + 1], d)
+            if piece[k + 1] == piece[k]:
+                (R,), (carried,), (left,) = _step(heads[-1][None], measured[None, :0], between[None], d, 0)
+            else:
+                assert chain.walk is not None
+                known = _root(piles[begin:], w)
+                R, carried, left = _last_of_piece(heads[-1], known, between, chain.walk[piece[k + 1]], d, c)
+                begin = k + 1
+            rows.append(R)
+        R = _root([heads[-1], *piles[begin:]], d + w)
+        rows.append(_determined(R[None, :own])[0])
+        return cls(d, c, keyframes, rows, piece, heads, piles), R[own:, own:]
+
+    def back(self, last: Array, tail: int, generator: np.random.Generator | None) -> tuple[Array, Array]:
+        """States (M, d, n) and nodes (J, c, n), given the last node (`tail` numbers) and the shared unknowns."""
+        d, c, n, count = self.d, self.c, last.shape[1], len(self.rows)
+        x, nodes, shared = np.zeros((count, d, n)), np.zeros((int(self.piece[-1]) + 1, c, n)), last[tail:]
+        own = len(self.rows[-1])
+        x[-1, own:], nodes[-1] = last[: d - own], last[:c]
+        x[-1, :own] = _solved(self.rows[-1][:, :own], self.rows[-1][:, own:] @ last, generator)
+        for k in range(count - 2, -1, -1):
+            R, j = self.rows[k], self.piece[k + 1]
+            following = np.concatenate([x[k + 1], nodes[j], shared])
+            found = _solved(R[:, : len(R)], R[:, len(R) :] @ following, generator)
+            x[k] = found[:d]
+            if len(R) > d:
+                nodes[self.piece[k]] = found[d:]
+        return x, nodes
+
+
+def _last_of_piece(
+    head: Array, known: Array, between: Array, walk: Array, d: int, c: int
+) -> tuple[Array, Array, Array]:
+    """Eliminate a state and its node: R, rows carried to the next state, rows about the next node and shared unknowns.
+
+    Columns: head [x | z | rest], known [z | rest], between [x | x' | z' | rest], walk [z' | z | right side].
+    """
+    e, rest = d + c, np.arange(2 * (d + c), d + c + head.shape[1])
+    x, z, x_next, z_next = np.arange(d), np.arange(d, e), np.arange(e, e + d), np.arange(e + d, 2 * e)
+    parts = (
+        (head, [x, z, rest]),
+        (known, [z, rest]),
+        (between, [x, x_next, z_next, rest]),
+        (walk, [z_next, z, rest[-1:]]),
+    )
+    stack = np.zeros((max(sum(len(rows) for rows, _ in parts), 2 * e), rest[-1] + 1))
+    begin = 0
+    for rows, columns in parts:
+        stack[begin : begin + len(rows), np.concatenate(columns)] = rows
+        begin += len(rows)
+    R = _triangle(stack)
+    return _determined(R[None, :e])[0], R[e : e + d, e:], R[e + d :, e + d :]
+
+
+def _about_node(walk: Array, columns: int) -> Array:
+    """Rows about the first node, [z | previous node | right side], among those of node and shared unknowns."""
+    c = walk.shape[1] // 2
+    out = np.zeros((len(walk), columns))
+    out[:, :c], out[:, -1] = walk[:, :c], walk[:, -1]
+    return out
 
 
 def _swapped(rows: Array, d: int) -> Array:
@@ -284,12 +400,27 @@ def _reduced(piles: list[Array], columns: int) -> Array:
 def _triangle(rows: Array) -> Array:
     """R (..., r, columns) of rows (..., m, columns), without the copies that numpy's mode "r" makes."""
     R: Array = np.swapaxes(np.linalg.qr(rows, mode="raw")[0], -1, -2)[..., : min(rows.shape[-2:]), :]
-    return R * np.tri(*R.shape[:-3:-1]).T
+    return R * _upper(R.shape[-2], R.shape[-1])
 
 
 def _root(rows: list[Array], columns: int) -> Array:
     """R of several rows, of which those with fewer columns are about the last ones."""
-    return _triangle(np.concatenate([np.pad(each, ((0, 0), (columns - each.shape[1], 0))) for each in rows]))
+    return _triangle(_below(rows, columns))
+
+
+def _below(rows: list[Array], columns: int) -> Array:
+    """Rows one below the other, those with fewer columns about the last ones."""
+    out, begin = np.zeros((sum(map(len, rows)), columns)), 0
+    for each in rows:
+        out[begin : begin + len(each), columns - each.shape[1] :] = each
+        begin += len(each)
+    return out
+
+
+@cache
+def _upper(rows: int, columns: int) -> Array:
+    """1 on and above the diagonal, 0 below."""
+    return np.triu(np.ones((rows, columns)))
 
 
 def _solved(R: Array, right: Array, generator: np.random.Generator | None) -> Array:
@@ -303,5 +434,5 @@ def _determined(R: Array) -> Array:
     triangle = R[..., : R.shape[1]]
     pivots = np.abs(np.diagonal(triangle, axis1=1, axis2=2))
     if not (pivots > RANK_TOLERANCE * np.linalg.norm(triangle, axis=1)).all():
-        raise IndeterminateStateError("a state is not determined: no measurement and no process constrains it")
+        raise IndeterminateStateError(UNDETERMINED)
     return R

@@ -19,10 +19,10 @@ import numpy as np
 from alidade.pipelines.belief import Belief
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import Array, Problem, Told
-from alidade.pipelines.solvers.assembly import CHUNK, Assembly
-from alidade.pipelines.solvers.noise_levels import weigh
-from alidade.pipelines.solvers.told import fewest, told
-from alidade.pipelines.solvers.weighing import optimize
+from alidade.pipelines.solvers.batch import minimum
+from alidade.pipelines.solvers.engines import Compiled
+from alidade.pipelines.solvers.posterior import sqrt_information
+from alidade.pipelines.solvers.told import fewest
 
 # Two dates are never nearer than this, days.
 _LEAST_DAYS = 1e-6
@@ -217,20 +217,9 @@ def tell(problem: Problem, levels: Sequence[Level], device: Collection[str]) -> 
     Raises:
         IndeterminateError: a state is not determined.
     """
-    whole = Assembly.of(problem.steps(CHUNK))
-    factors = weigh(whole.factors, levels or problem.noises)
-    solution = optimize(
-        factors,
-        whole.initial,
-        whole.shared(problem),
-        problem.loss,
-        held=problem.assumed,
-        boundaries=whole.boundaries,
-    )
-    # The solution is where its error is, to 0.005 sigmas; a last step is nearer to where it is linear about.
-    system = solution.system
-    values = solution.values.retract(system.linearized(solution.values).solution())
-    return told(problem, system.linearized(values), whole.current_keys, device)
+    compiled = Compiled.of(problem)
+    solution = minimum(compiled, tuple(levels) or problem.noises)
+    return sqrt_information(problem, solution.engine, solution.values, compiled.current_keys, device)
 
 
 def join(tellings: Sequence[Told], rates: Mapping[str, float], days: Sequence[float]) -> Joined:

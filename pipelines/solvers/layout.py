@@ -10,7 +10,7 @@ those of node z_j = (delta_j, mu_j), z_0 = 0. Variables of a state that a keyfra
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.model import POSE3, ROT3, Block, dimension, retract
+from alidade.factors.model import POSE3, ROT3, Block, dimension, retract, width
 from alidade.pipelines.estimation.problem import ChainLayout
 from alidade.pipelines.solvers.chain import Array, Index
 
@@ -81,45 +81,40 @@ class Layout:
     kept: tuple[NDArray[np.bool_], NDArray[np.bool_]]
 
     @classmethod
-    def of(cls, layout: ChainLayout, initial: gtsam.Values) -> tuple[Layout, Values]:
-        """The layout of the variables of some values, and these."""
+    def of(
+        cls, layout: ChainLayout | None, initial: gtsam.Values, shared: Collection[int] = ()
+    ) -> tuple[Layout, Values]:
+        """The layout of the variables of some values, and these.
+
+        Args:
+            layout: how they are a chain; None: they are none, and every variable is a state by itself.
+            initial: the values.
+            shared: variables that are shared where there is no chain: those that are reported.
+        """
         key = np.array(initial.keys(), dtype=np.uint64).astype(np.intp)
-        letter, index = key >> 56, key & ((1 << 56) - 1)
-        code = np.zeros((8, len(key)), dtype=np.intp)
-        kind, row, keyframe, offset, shared, node, part, size = code
-        code[2:7] = -1
-        offset[:], part[:] = 0, 0
-        blocks: list[Block] = []
+        letter, index, n = key >> 56, key & ((1 << 56) - 1), len(key)
+        kind, row, size = np.zeros((3, n), dtype=np.intp)
         parts: dict[Block, list[Array]] = {}
         for some in _alike(initial, key, letter):
             block, values = _read(initial, key[some])
-            if block not in blocks:
-                blocks.append(block)
             own = parts.setdefault(block, [])
-            kind[some], size[some] = blocks.index(block), dimension(block)
+            kind[some], size[some] = list(parts).index(block), dimension(block)
             row[some] = sum(map(len, own)) + np.arange(len(values))
             own.append(values)
-        is_state = np.isin(letter, [ord(c) for c in layout.states])
-        frames, keyframe[is_state] = np.unique(index[is_state], return_inverse=True)
-        d = 0
-        for c in layout.states:
-            some = letter == ord(c)
-            offset[some] = d
-            d += int(size[some].max(initial=0))
-        is_node = np.isin(letter, [ord(c) for c in layout.nodes])
-        first, count, c = _nodes(layout, letter, index, is_node, node, part, size)
-        own = ~is_state & (~is_node | (np.arange(len(key)) == first))
-        shared[own] = np.cumsum(size[own]) - size[own]
+        keyframe, offset, d = _states(layout, key, letter, index, size, shared)
+        node, part, first, (count, c) = _nodes(layout, letter, index, size)
+        own_columns = (keyframe < 0) & ((node < 0) | (np.arange(n) == first))
+        begin = np.where(own_columns, np.cumsum(np.where(own_columns, size, 0)) - size, -1)
         if first >= 0:
-            shared[is_node] = shared[first]
-        n = len(frames) if len(frames) else count
-        kept = _kept((n, d), keyframe, offset, size), _kept((count if c else 0, c), node, part, size)
+            begin[node >= 0] = begin[first]
+        frames = int(keyframe.max(initial=-1)) + 1 or max(count, 1)
+        kept = _kept((frames, d), keyframe, offset, size), _kept((count if c else 0, c), node, part, size)
         if c:
             kept[1][0] = False
-        sizes = n, d, count if c else 0, c, int(size[own].sum())
-        if not c:
+        else:
             node[:] = -1
-        out = cls(key, kind, tuple(blocks), row, keyframe, offset, shared, node, part, sizes, kept)
+        sizes = frames, d, count if c else 0, c, int(size[own_columns].sum())
+        out = cls(key, kind, tuple(parts), row, keyframe, offset, begin, node, part, sizes, kept)
         return out, Values({block: np.concatenate(each) for block, each in parts.items()})
 
     def at(self, keys: Sequence[int] | Index) -> Index:
@@ -130,8 +125,12 @@ class Layout:
             raise NotAChainError("a factor is about a variable without a first value")
         return found
 
+    def size(self, at: int) -> int:
+        """Numbers of the tangent of the variable at a position."""
+        return dimension(self.blocks[self.block[at]])
+
     def roles(self, columns: Sequence[int | list[int]]) -> tuple[tuple[bool, bool, bool], ...]:
-        """Whether each block of a factor is one variable that all measurements share, whether a state, whether a node."""
+        """Whether each block of a factor is one variable for all its measurements, whether a state, whether a node."""
         at = self.at([column if isinstance(column, int) else column[0] for column in columns])
         of = zip(columns, self.keyframe[at] >= 0, self.node[at] >= 0, strict=True)
         return tuple((isinstance(column, int), bool(state), bool(node)) for column, state, node in of)
@@ -147,7 +146,7 @@ class Layout:
         at_shared = (N * d + J * c + self.shared[some])[:, None] + span
         at_node = (N * d + self.node[some] * c + self.part[some])[:, None] + span
         one = np.where((self.keyframe[some] >= 0)[:, None], at_state, at_shared)
-        return one, np.where((self.node[some] >= 0)[:, None], at_node, end)
+        return one, np.where((self.node[some] > 0)[:, None], at_node, end)
 
     def tangents(self, step: Tangent) -> Array:
         """A step laid flat, zero at the end: (unknowns + 1, ...)."""
@@ -181,6 +180,16 @@ class Layout:
             block = self.blocks[self.block[at]]
             insert_value(out, int(self.key[at]), block, values.arrays[block][self.row[at]])
         return out
+
+    def from_gtsam(self, values: gtsam.Values) -> Values:
+        """The values of all variables as gtsam has them."""
+        arrays = {}
+        for i, block in enumerate(self.blocks):
+            some = np.flatnonzero(self.block == i)
+            found = np.empty((len(some), width(block)))
+            found[self.row[some]] = _read(values, self.key[some])[1]
+            arrays[block] = found
+        return Values(arrays)
 
     def root_columns(self, key: int) -> Array:
         """(d, c + s) by which a variable's tangent follows from the last node and the shared unknowns.
@@ -240,21 +249,43 @@ def insert_value(values: gtsam.Values, key: int, block: Block, value: Array) -> 
         values.insert(key, value)
 
 
+def _states(
+    layout: ChainLayout | None, key: Index, letter: Index, index: Index, size: Index, shared: Collection[int]
+) -> tuple[Index, Index, int]:
+    """Keyframe of each variable, -1 of no state; first of its numbers in the state; the numbers of a state."""
+    keyframe, offset = np.full(len(key), -1), np.zeros(len(key), dtype=np.intp)
+    if layout is None:
+        some = ~np.isin(key, list(shared))
+        keyframe[some] = np.arange(np.count_nonzero(some))
+        return keyframe, offset, int(size[some].max(initial=0))
+    some = np.isin(letter, [ord(c) for c in layout.states])
+    keyframe[some] = np.unique(index[some], return_inverse=True)[1]
+    d = 0
+    for name in layout.states:
+        of = letter == ord(name)
+        offset[of] = d
+        d += int(size[of].max(initial=0))
+    return keyframe, offset, d
+
+
 def _nodes(
-    layout: ChainLayout, letter: Index, index: Index, is_node: NDArray[np.bool_], node: Index, part: Index, size: Index
-) -> tuple[int, int, int]:
-    """Place nodes and means; the position of the first node, -1 without any, the number of nodes, their numbers."""
-    if not is_node.any():
-        return -1, 1, 0
-    biases = np.flatnonzero(letter == ord(layout.nodes[0]))
+    layout: ChainLayout | None, letter: Index, index: Index, size: Index
+) -> tuple[Index, Index, int, tuple[int, int]]:
+    """Node of each variable, -1 of none; first of its numbers there; position of the first node; count and size."""
+    node, part = np.full(len(letter), -1), np.zeros(len(letter), dtype=np.intp)
+    names = "" if layout is None else layout.nodes
+    some = np.isin(letter, [ord(c) for c in names])
+    if not some.any():
+        return node, part, -1, (0, 0)
+    biases = np.flatnonzero(letter == ord(names[0]))
     if not len(biases):
         raise NotAChainError("the nodes of a bias that walks are not there")
-    begin, count = int(index[biases[0]]), int(np.ptp(index[biases])) + 1
-    node[is_node] = index[is_node] - begin
-    width = int(size[biases[0]])
-    for i, c in enumerate(layout.nodes):
-        part[letter == ord(c)] = i * width
-    return int(biases[0]), count, len(layout.nodes) * width if count > 1 else 0
+    first, width = int(biases[0]), int(size[biases[0]])
+    node[some] = index[some] - index[first]
+    for i, name in enumerate(names):
+        part[letter == ord(name)] = i * width
+    count = int(node.max()) + 1
+    return node, part, first, (count, len(names) * width if count > 1 else 0)
 
 
 def _kept(shape: tuple[int, int], place: Index, offset: Index, size: Index) -> NDArray[np.bool_]:

@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.model import (
@@ -37,11 +38,13 @@ from alidade.factors.model import (
 from alidade.factors.vectorized import VectorizedFactor
 from alidade.pipelines.estimation.problem import Factor
 from alidade.pipelines.solvers.chain import Array, ChainSystem, Index
-from alidade.pipelines.solvers.layout import Layout, NotAChainError, Values, insert_value
+from alidade.pipelines.solvers.layout import Layout, NotAChainError, Tangent, Values, insert_value
 
 if TYPE_CHECKING:
     import gtsam
 
+# Families whose residuals say nothing about the noise of the recording.
+NOT_MEASURED = ("prior", "definition")
 # The shared variables of a row about nodes alone cancel to this share of its largest coefficient.
 CANCELLED = 1e-9
 
@@ -87,11 +90,14 @@ class Group:
         is_measurement: whether they may be outliers, and not processes or priors.
         beside: (n,) what a unit of the noise beside their own adds to whitened residuals, or None.
         gather: for each block its kind and the rows (n or 1,) of its variables in that kind's array.
+        at: for each block the positions (n or 1,) of its variables in the layout.
         target: "state": rows about one keyframe; "pair": rows that join it to the one before; "walk": rows about nodes
-            alone; "shared": rows about shared unknowns.
+            alone; "shared": rows about shared unknowns; "": there is no chain.
         place: (n,) keyframe, of "walk" the node.
         row: (n,) first row of each among those of its place.
-        columns: for each block, of (n or 1, dim) columns each, those that its Jacobian is added to.
+        columns: for each block those (n or 1, dim) that its Jacobian is added to: of a bias node the shared ones of the
+            first node and those of its deviation from that.
+        deviates: for each block (n or 1,) whether it is a later node than the first.
     """
 
     family: str
@@ -102,10 +108,12 @@ class Group:
     is_measurement: bool
     beside: Array | None
     gather: list[tuple[Block, Index]]
+    at: list[Index]
     target: str
     place: Index
     row: Index
     columns: list[list[Index]]
+    deviates: list[NDArray[np.bool_]]
 
     def evaluate(self, values: Values) -> Residuals:
         """Whitened residuals (n, m), unweighted, and their Jacobians on demand."""
@@ -131,21 +139,26 @@ class Group:
             return np.ones(len(residuals))
         return self.loss.weight(np.einsum("nm,nm->n", *(2 * [self.weighted(residuals)])))
 
-    def rows(self, values: Values, width: int) -> tuple[Array, float]:
-        """(n, m, width) rows on the columns of their target, right side last, and the cost."""
+    def whitened(self, values: Values) -> tuple[Array, tuple[Array, ...], float]:
+        """Right side (n, m), Jacobian (n, m, dim) by each block, both under loss and weights; and the cost."""
         residuals, linearize = self.evaluate(values)
-        n, m = residuals.shape
-        factor = np.broadcast_to(np.sqrt(self.used(residuals))[:, None], (n, m))
+        factor = np.broadcast_to(np.sqrt(self.used(residuals))[:, None], residuals.shape)
         if self.weights is not None:
             factor = factor * self.weights
-        out = np.zeros((n, m, width))
-        out[..., -1] = -factor * residuals
         plain = self.weights is None and self.loss is None
-        for places, jacobian in zip(self.columns, linearize(), strict=True):
-            weighted = jacobian if plain else factor[..., None] * jacobian
-            for columns in places:
-                _add(out, columns, weighted)
-        return out, self.cost(residuals)
+        jacobians = tuple(J if plain else factor[..., None] * J for J in linearize())
+        return -factor * residuals, jacobians, self.cost(residuals)
+
+    def rows(self, values: Values, width: int) -> tuple[Array, float]:
+        """(n, m, width) rows on the columns of their target, right side last, and the cost."""
+        right, jacobians, cost = self.whitened(values)
+        out = np.zeros((*right.shape, width))
+        out[..., -1] = right
+        for places, jacobian, deviates in zip(self.columns, jacobians, self.deviates, strict=True):
+            _add(out, places[0], jacobian)
+            for columns in places[1:]:
+                _add(out, columns, jacobian if deviates.all() else deviates[:, None, None] * jacobian)
+        return out, cost
 
 
 def _add(out: Array, columns: Index, jacobian: Array) -> None:
@@ -174,17 +187,17 @@ class Linearization:
     sizes: tuple[int, int]
 
     @classmethod
-    def of(cls, factors: Sequence[Factor], layout: Layout) -> Linearization:
-        """Compile factors. Raises NotAChainError where they do not fit the chain."""
+    def of(cls, factors: Sequence[Factor], layout: Layout, chain: bool = True) -> Linearization:
+        """Compile factors. Raises NotAChainError where they do not fit the chain; without `chain` nothing has to."""
         kinds: dict[Hashable, list[tuple[int, Factor, VectorizedFactor]]] = {}
         for i, factor in enumerate(factors):
             v = factor.vectorized or _native(factor, layout)
             key = stacking_key(v.model), layout.roles(v.columns), factor.family, factor.measurement is None
             kinds.setdefault((*key, v.loss is None, factor.beside is None), []).append((i, factor, v))
-        drafts = [_Draft.of(kind, layout) for kind in kinds.values()]
-        piece = _pieces(drafts, layout)
+        drafts = [_Draft.of(kind, layout, chain) for kind in kinds.values()]
+        piece = _pieces(drafts, layout) if chain else np.zeros(layout.sizes[0], dtype=np.intp)
         used = np.zeros((2, layout.sizes[0]), dtype=np.intp)
-        groups = [draft.placed(layout, piece, used) for draft in drafts]
+        groups = [draft.placed(layout, piece, used, chain) for draft in drafts]
         absent = int((~layout.kept[0]).sum(axis=1).max(initial=0))
         return cls(layout, groups, piece, (int(used[0].max()) + absent, int(used[1].max())))
 
@@ -220,6 +233,32 @@ class Linearization:
     def residuals(self, values: Values) -> list[Array]:
         """(n, m) weighted whitened residuals of each group, outliers included."""
         return [group.weighted(group.evaluate(values)[0]) for group in self.groups]
+
+    def with_groups(self, groups: Sequence[Group]) -> Linearization:
+        """The same with other measurements in the same places."""
+        return replace(self, groups=groups)
+
+    def products(self, group: Group, values: Values, tangent: Tangent) -> tuple[Array, Array]:
+        """A x (n, m, k) of a group's whitened rows with k tangent vectors, and its right side (n, m)."""
+        flat = self.layout.tangents(tangent)
+        right, jacobians, _ = group.whitened(values)
+        out = np.zeros((*right.shape, flat.shape[1]))
+        for at, J in zip(group.at, jacobians, strict=True):
+            one, two = self.layout.flat(at)
+            out += J @ (flat[one] + flat[two])
+        return out, right
+
+    @property
+    def time(self) -> Array:
+        """(N,) s of the keyframes: of what joins each to the one before, else of the last measurement there."""
+        out = np.full(self.layout.sizes[0], -np.inf)
+        for target in ("state", "pair", ""):
+            known = np.full(len(out), -np.inf)
+            for group in self.groups:
+                if group.target == target and group.family not in NOT_MEASURED and (group.place >= 0).all():
+                    np.maximum.at(known, group.place, group.model.time)
+            out = np.where(known > -np.inf, known, out)
+        return np.maximum.accumulate(out)
 
     def under(self, loss: TruncatedLoss | None) -> Linearization:
         """The same with another loss for measurements that have one."""
@@ -295,7 +334,7 @@ class _Draft:
     whole: list[bool]
 
     @classmethod
-    def of(cls, kind: Sequence[tuple[int, Factor, VectorizedFactor]], layout: Layout) -> _Draft:
+    def of(cls, kind: Sequence[tuple[int, Factor, VectorizedFactor]], layout: Layout, chain: bool) -> _Draft:
         _, first, v = kind[0]
         model, lengths = stack_models([each.model for *_, each in kind]), [len(each.model.time) for *_, each in kind]
         n = sum(lengths)
@@ -325,9 +364,9 @@ class _Draft:
         span = last - np.min(frames, axis=0) if frames else np.zeros(n, dtype=np.intp)
         node = np.max(nodes, axis=0) if nodes else np.full(n, -1)
         reach = node - np.min(nodes, axis=0) if nodes else np.zeros(n, dtype=np.intp)
-        if span.max(initial=0) > 1 or (frames and np.min(frames) < 0):
+        if chain and (span.max(initial=0) > 1 or (frames and np.min(frames) < 0)):
             raise NotAChainError(f"{first.family}: a factor joins keyframes that are not neighbours")
-        if reach.max(initial=0) > (0 if frames else 1):
+        if chain and reach.max(initial=0) > (0 if frames else 1):
             raise NotAChainError(f"{first.family}: a factor joins bias nodes that are not neighbours")
         return cls(
             family=first.family,
@@ -345,11 +384,13 @@ class _Draft:
             whole=whole,
         )
 
-    def placed(self, layout: Layout, piece: Index, used: Index) -> Group:
+    def placed(self, layout: Layout, piece: Index, used: Index, chain: bool) -> Group:
         """The group, its rows below those of others that are already there."""
         c, n = layout.sizes[3], len(self.model.time)
         target, place, row = "shared", np.full(n, -1), np.zeros(n, dtype=np.intp)
-        if self.last.max(initial=-1) >= 0:
+        if not chain:
+            target, place = "shared" if self.last.max() < 0 and self.node.max() <= 0 else "", self.last
+        elif self.last.max(initial=-1) >= 0:
             target, place = ("pair" if (self.count > 1).any() else "state"), self.last
         elif c and self._is_walk(layout):
             target, place = "walk", self.node
@@ -368,10 +409,12 @@ class _Draft:
             is_measurement=self.is_measurement,
             beside=self.beside,
             gather=[(layout.blocks[layout.block[each[0]]], layout.row[each]) for each in self.at],
+            at=self.at,
             target=target,
             place=place,
             row=row,
-            columns=[self._columns(i, layout, target, piece) for i in range(len(self.at))],
+            columns=[self._columns(i, layout, target, piece) for i in range(len(self.at))] if target else [],
+            deviates=[layout.node[each] > 0 for each in self.at],
         )
 
     def _is_walk(self, layout: Layout) -> bool:

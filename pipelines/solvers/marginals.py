@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.problem import Array, ChiSquare, Factor, History, Parameter, Problem
+from alidade.pipelines.solvers.chain import IndeterminateError
 
 if TYPE_CHECKING:
     from alidade.pipelines.solvers.system import Linear
@@ -22,10 +23,6 @@ _UNKNOWN = 1e4
 HELD = "held"
 # Families whose residuals say nothing about the noise of the recording.
 _NO_MEASUREMENTS = ("prior", "definition", HELD)
-
-
-class IndeterminateError(Exception):
-    """States other than the calibration parameters are not determined by the recording."""
 
 
 def reported(problem: Problem, values: gtsam.Values, current_keys: Mapping[int, int]) -> Array:

@@ -8,6 +8,7 @@ import pytest
 
 from alidade.pipelines.estimation.problem import Factor
 from alidade.pipelines.solvers.chain import ChainFactorization
+from alidade.pipelines.solvers.gtsam_engine import GtsamEngine
 from alidade.pipelines.solvers.layout import Layout, Tangent, Values
 from alidade.pipelines.solvers.linearization import Linearization
 from tests.support.problems import SCENARIOS, problem
@@ -60,3 +61,24 @@ def test_step_covariance_and_minimum_are_those_of_gtsams_linearisation(name: str
     assert found.minimum == pytest.approx(R[-1, -1] ** 2, rel=1e-9)
     assert cost == pytest.approx(error, rel=1e-9)
     assert linearization.cost(values) == pytest.approx(cost, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_gtsam_engine_gives_what_the_chain_gives(name: str) -> None:
+    _, factors, _, layout, values = parts(name)
+    chain, engine = (kind.of(factors, layout).under(None) for kind in (Linearization, GtsamEngine))
+    (system, cost), (other, other_cost) = chain.at(values), engine.at(values)
+    assert other_cost == pytest.approx(cost, rel=1e-12)
+    assert other.squares == pytest.approx(system.squares, rel=1e-12)
+    found, theirs = system.eliminate(), other.eliminate()
+    sigma = np.linalg.norm(np.linalg.inv(found.root[:-1, :-1]), axis=1)
+    information = found.root.T @ found.root
+    scale = np.append(sigma, 1.0 / np.sqrt(information[-1, -1]))
+    assert theirs.minimum == pytest.approx(found.minimum, rel=1e-9)
+    assert np.abs((theirs.root.T @ theirs.root - information) * np.outer(scale, scale)).max() < 1e-7
+    assert theirs.log_determinant == pytest.approx(found.log_determinant, rel=1e-9)
+    flat, other_flat = (layout.tangents(Tangent(*each.solve())) for each in (found, theirs))
+    draws = layout.tangents(Tangent(*found.sample(50, np.random.default_rng(0)))).std(axis=1)
+    assert (np.abs(flat - other_flat) <= 1e-7 * draws).all()
+    if layout.sizes[3] == 0:  # the chain damps deviations of nodes, gtsam the nodes
+        assert other.eliminate(0.1).minimum == pytest.approx(system.eliminate(0.1).minimum, rel=1e-9)

@@ -26,7 +26,7 @@ from alidade.pipelines.methods.triads import triad_names
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import solve_incremental
-from alidade.pipelines.solvers.system import System
+from alidade.pipelines.solvers.linearization import Group
 from tests.support.judged import judge
 
 SWAY = EulerMotion(
@@ -141,7 +141,7 @@ def test_an_estimate_that_is_no_solution_is_never_calibrated(monkeypatch: pytest
     data, truth = simulate_los(LOS, 1)
     write_los(tmp_path / "s.mcap", data, truth, los_config(LOS))
     # What gtsam's own optimizers return silently as if it was a solution.
-    monkeypatch.setattr(System, "error", lambda *_: np.nan)
+    monkeypatch.setattr(Group, "cost", lambda *_: np.nan)
     (found,) = calibrate(tmp_path / "s.mcap", ["batch"])
     assert found.status == "inconsistent"
     assert [finding.kind for finding in found.findings] == ["not_converged"]

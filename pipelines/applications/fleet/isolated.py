@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 def run_isolated(summarise: Callable[[Calibration], Result], calibrate: Callable[[], Calibration]) -> Result:
     """Status, exit code, reason, seconds of wall time, and what `summarise` takes of the calibration. Never raises."""
-    from alidade.pipelines.solvers.marginals import IndeterminateError
+    from alidade.pipelines.solvers.chain import IndeterminateError
 
     try:
         calibration = calibrate()

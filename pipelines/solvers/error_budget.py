@@ -1,0 +1,259 @@
+"""Influence of every measurement on the reported numbers, and what follows from it.
+
+That is the error budget, the most influential measurements, the effect of fixed inputs, and the inflation by residuals
+that are correlated in time. At the minimum a small change r of the whitened residuals moves the numbers by L r,
+
+    L = P J N^-1 A',    N = A'A
+
+A the linearised, whitened system, J the Jacobian of the numbers, P the projection on the directions that are not weak
+(`weak_directions`): weak ones stay at their priors. The squares of a row of L are the parts of the residuals in a
+number's variance. One column N^-1 J'P' a number is kept for all unknowns; L follows group by group as A x.
+
+Noise of a family whose autocorrelation at lag k is g(k) adds 2 sum_k g(k) sum_i L_i+k L_i to a variance (Newey, West,
+"A simple, positive semi-definite, heteroskedasticity and autocorrelation consistent covariance matrix", Econometrica
+1987, with influence functions in place of regressors). Each family's correlation counts for its own residuals alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.pipelines.estimation.problem import Pull
+from alidade.pipelines.solvers.chain import Array
+from alidade.pipelines.solvers.layout import Tangent, Values
+from alidade.pipelines.solvers.levenberg import Engine, Factorization
+from alidade.pipelines.solvers.linearization import Group
+from alidade.pipelines.solvers.posterior import Reported, counted, responses
+from alidade.pipelines.solvers.weak_directions import WeakDirections
+
+# Fewer measurements show no autocorrelation.
+MIN_MEASUREMENTS = 100
+# Sigmas of zero below which an autocorrelation has died out, and above which the first one has to be.
+DIED_OUT, CORRELATED = 2.0, 4.0
+# Longest lag, share of the recording.
+MAX_LAG = 0.25
+# Coefficients of a prior's row below this share of its largest are rounding.
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Influence:
+    """Influence of all residuals on the free reported numbers.
+
+    Attributes:
+        engine: of all factors.
+        values: at which it is linearised.
+        reported: the numbers there.
+        step: (m) columns N^-1 J'P' of all unknowns.
+        weak: (m, m) covariance of the numbers from the weak directions, which have their priors.
+        from_priors: (m, m) square root of it, a column for each number's prior.
+    """
+
+    engine: Engine
+    values: Values
+    reported: Reported
+    step: Tangent
+    weak: Array
+    from_priors: Array
+
+    @classmethod
+    def of(
+        cls,
+        reported: Reported,
+        directions: WeakDirections,
+        engine: Engine,
+        factorization: Factorization,
+        values: Values,
+    ) -> Influence:
+        """The influence at an estimate.
+
+        Raises:
+            LinAlgError: the shared unknowns are not determined.
+        """
+        scale, strong, weak = reported.scale, directions.strong, directions.weak
+        J = reported.jacobian[reported.free] / scale[:, None]
+        projected = scale[:, None] * (strong @ (strong.T @ J))
+        of_weak = scale[:, None] * (weak @ directions.prior_covariance @ weak.T)
+        root = of_weak * np.sqrt(np.diag(reported.prior))
+        step = responses(factorization, projected)
+        return cls(engine, values, reported, step, of_weak * scale, root)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(m,) of the numbers."""
+        return tuple(self.reported.names[i] for i in self.reported.free)
+
+    def rows(self, group: Group) -> tuple[Array, Array]:
+        """L (n, rows, m) of a group, and minus its weighted residuals (n, rows)."""
+        return self.engine.products(group, self.values, self.step)
+
+    def moves(self, changed: Engine) -> Array:
+        """(m,) how far the numbers move, to first order, where other factors of the same layout are in force."""
+        moved = np.zeros(len(self.names))
+        for sign, engine in ((1.0, changed), (-1.0, self.engine)):
+            for group in engine.groups:
+                L, right = engine.products(group, self.values, self.step)
+                moved += sign * np.einsum("nrm,nr->m", L, right)
+        return moved
+
+
+def error_budget(influence: Influence, added: Mapping[str, Array], covariance: Array) -> dict[str, dict[str, float]]:
+    """Number -> source -> share of the number's variance, the largest first; shares sum to one.
+
+    Sources are the families of the noise, each prior ("prior of NAME"), and what no measurement model has, together
+    with what is of second order ("not modelled").
+
+    Args:
+        influence: of the residuals.
+        added: family -> variance (m,) that correlation of its residuals adds, see `added_variance`.
+        covariance: (n, n) final posterior of all reported numbers.
+    """
+    names, variances = influence.names, dict[str, Array]()
+    for group in influence.engine.groups:
+        L, _ = influence.rows(group)
+        for source, variance in _sources(influence, group, np.square(L)):
+            variances[source] = variances.get(source, np.zeros(len(names))) + variance
+    for name, column in zip(names, np.square(influence.from_priors).T, strict=True):
+        variances[f"prior of {name}"] = variances.get(f"prior of {name}", np.zeros(len(names))) + column
+    for family, more in added.items():
+        variances[family] = variances[family] + more
+    known = np.sum(list(variances.values()), axis=0)
+    final = np.diag(covariance)[influence.reported.free]
+    variances["not modelled"] = np.maximum(final - known, ROUNDING * final) * (final - known > 1e-6 * final)
+    total = np.sum(list(variances.values()), axis=0)
+    return {
+        name: dict(
+            sorted(
+                ((source, float(v[j] / total[j])) for source, v in variances.items() if v[j] > 0.0),
+                key=lambda share: -share[1],
+            )
+        )
+        for j, name in enumerate(names)
+    }
+
+
+def _sources(influence: Influence, group: Group, squares: Array) -> list[tuple[str, Array]]:
+    """The sources of a group and the variance (m,) of each, from squares (n, rows, m) of its influence."""
+    if group.family != "prior" or group.target != "shared":
+        return [(group.family, squares.sum(axis=(0, 1)))]
+    layout, reported = influence.engine.layout, influence.reported
+    rows, _ = group.rows(influence.values, layout.sizes[4] + 1)
+    A = np.pad(rows[..., :-1].reshape(-1, layout.sizes[4]), ((0, 0), (layout.sizes[3], 0)))
+    about = np.abs(A @ np.linalg.pinv(reported.jacobian)[:, reported.free] * reported.scale)
+    largest = about > ROUNDING * about.max(axis=1, keepdims=True, initial=0.0)
+    labels = [f"prior of {influence.names[int(row.argmax())]}" if row.sum() == 1 else group.family for row in largest]
+    return list(zip(labels, squares.reshape(-1, squares.shape[2]), strict=True))
+
+
+def most_influential(influence: Influence, sigmas: Mapping[str, float], count: int) -> tuple[Pull, ...]:
+    """The measurements that move a number most, in its sigmas, each with that number.
+
+    A measurement with whitened residuals r moves the numbers by its columns of L times r; at the minimum all of these
+    and the priors' are in balance. Rejected measurements have no influence.
+
+    Args:
+        influence: of the residuals.
+        sigmas: of the numbers that are considered, by name.
+        count: number of measurements at most.
+    """
+    names = [name for name in influence.names if name in sigmas]
+    if not names:
+        return ()
+    columns = [influence.names.index(name) for name in names]
+    scale = np.array([sigmas[name] for name in names])
+    found: list[tuple[float, str, float, str]] = []
+    for group in influence.engine.groups:
+        if group.target == "shared" and group.family == "prior":
+            continue
+        L, right = influence.rows(group)
+        moves = np.einsum("nrm,nr->nm", L[..., columns], -right) / scale
+        which = np.abs(moves).argmax(axis=1)
+        moved = moves[np.arange(len(moves)), which]
+        first = np.argsort(-np.abs(moved), kind="stable")[:count].tolist()
+        found += [(float(moved[i]), group.family, float(group.model.time[i]), names[int(which[i])]) for i in first]
+    found.sort(key=lambda each: -abs(each[0]))
+    return tuple(Pull(family, time, name, move) for move, family, time, name in found[:count])
+
+
+def autocorrelation(whitened: Array) -> Array:
+    """Autocorrelation (K,) of residuals (n, r) at the lags 1 ... K, until it has died out; empty if they are white."""
+    n, r = whitened.shape
+    if n < MIN_MEASUREMENTS:
+        return np.empty(0)
+    sums = _lagged(whitened[..., None], int(MAX_LAG * n))[:, 0]
+    if not sums[0] > 0.0:
+        return np.empty(0)
+    correlation, sigma = sums[1:] / sums[0], float((n * r) ** -0.5)
+    if not len(correlation) or correlation[0] < CORRELATED * sigma:
+        return np.empty(0)
+    small = np.flatnonzero(correlation < DIED_OUT * sigma)
+    return np.asarray(correlation[: small[0] if len(small) else None])
+
+
+def autocorrelations(engine: Engine, values: Values) -> dict[str, Array]:
+    """Family of measurements -> autocorrelation of its residuals where they are not white; rejected ones are zero."""
+    found = {}
+    for family, groups in _measured(engine).items():
+        if len({group.model.rows for group in groups}) == 1:
+            whitened = [g.weighted(g.evaluate(values)[0]) * counted(g, values)[:, None] for g in groups]
+            if len(lags := autocorrelation(np.concatenate(whitened)[_in_time(groups)])):
+                found[family] = lags
+    return found
+
+
+def added_variance(influence: Influence, correlations: Mapping[str, Array]) -> dict[str, Array]:
+    """Family -> variance (m,) that the correlation of its residuals adds to each number, none negative.
+
+    Args:
+        influence: of the residuals.
+        correlations: see `autocorrelations`.
+    """
+    added, groups = {}, _measured(influence.engine)
+    for family, correlation in correlations.items():
+        L = np.concatenate([influence.rows(group)[0] for group in groups[family]])[_in_time(groups[family])]
+        more = 2.0 * correlation @ _lagged(L, len(correlation) + 1)[1:]
+        added[family] = np.maximum(more, 0.0)
+    return added
+
+
+def _measured(engine: Engine) -> dict[str, list[Group]]:
+    """Family -> its groups of measurements."""
+    found: dict[str, list[Group]] = {}
+    for group in engine.groups:
+        if group.is_measurement:
+            found.setdefault(group.family, []).append(group)
+    return found
+
+
+def _in_time(groups: Sequence[Group]) -> NDArray[np.intp]:
+    """Order of the measurements of several groups in time."""
+    return np.argsort(np.concatenate([group.model.time for group in groups]), kind="stable")
+
+
+def _lagged(L: Array, lags: int) -> Array:
+    """Sums (lags, m) over measurements and rows of L (n, r, m) times itself, 0 ... lags - 1 measurements later."""
+    size = 1 << (2 * len(L) - 1).bit_length()
+    out = np.empty((min(lags, len(L)), L.shape[2]))
+    for j in range(L.shape[2]):  # one number at a time: the transform of all would be several times L
+        power = (np.abs(np.fft.rfft(L[..., j], size, axis=0)) ** 2).sum(axis=1)
+        out[:, j] = np.fft.irfft(power, size)[: len(out)]
+    return out
+
+
+def inflation(names: Sequence[str], covariance: Array, free: Sequence[str], added: Mapping[str, Array]) -> Array:
+    """(n,) ratio of inflated to nominal sigma; 1 for fixed numbers.
+
+    Args:
+        names: (n,) of all reported numbers.
+        covariance: (n, n) of these for white noise.
+        free: (m,) names of those that the added variances are of.
+        added: see `added_variance`.
+    """
+    more = dict(zip(free, np.sum(list(added.values()), axis=0), strict=True)) if added else {}
+    variance = np.diag(covariance)
+    grown = variance + np.array([more.get(name, 0.0) for name in names])
+    return np.sqrt(np.divide(grown, variance, out=np.ones_like(variance), where=variance > 0.0))

@@ -1,0 +1,274 @@
+"""The same problem eliminated by gtsam: for graphs that are no chain, and as the answer that the chain is held against.
+
+Models are evaluated as for the chain; every measurement becomes a gtsam.JacobianFactor about its own variables. All but
+the last bias node and the shared unknowns are eliminated by QR in an order of gtsam's choice (COLAMD), and what is left
+is R of these. Its interface is that of the chain.
+
+Limits: a factor and a conditional at a time pass through Python, some 20 us each, and what was known at moments on the
+way is not asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from alidade.factors.loss import TruncatedLoss
+from alidade.factors.vectorized import jacobian_factor
+from alidade.pipelines.estimation.problem import Factor
+from alidade.pipelines.solvers.chain import UNDETERMINED, Array, IndeterminateStateError, Index
+from alidade.pipelines.solvers.layout import Layout, Tangent, Values
+from alidade.pipelines.solvers.linearization import Group, Linearization
+
+
+@dataclass(frozen=True, eq=False)
+class GtsamEngine:
+    """A problem's factors, eliminated by gtsam; see levenberg.Engine.
+
+    Attributes:
+        linearization: of the factors, as they are evaluated.
+    """
+
+    linearization: Linearization
+
+    @classmethod
+    def of(cls, factors: Sequence[Factor], layout: Layout) -> GtsamEngine:
+        """Of the factors of a graph."""
+        return cls(Linearization.of(factors, layout, chain=False))
+
+    @property
+    def layout(self) -> Layout:
+        """Of the variables."""
+        return self.linearization.layout
+
+    @property
+    def groups(self) -> Sequence[Group]:
+        """The measurements by kind."""
+        return self.linearization.groups
+
+    @property
+    def piece(self) -> Index:
+        """Node in force at each keyframe; nobody asks where there is no chain."""
+        return self.linearization.piece
+
+    @property
+    def time(self) -> Array:
+        """(N,) s of the keyframes."""
+        return self.linearization.time
+
+    def at(self, values: Values) -> tuple[GtsamSystem, float]:
+        """The system about the values, and the cost there."""
+        graph, squares, cost = gtsam.GaussianFactorGraph(), 0.0, 0.0
+        for group in self.groups:
+            right, jacobians, own = group.whitened(values)
+            squares, cost = squares + float(np.square(right).sum()), cost + own
+            for factor in _factors(self.layout, group, right, jacobians):
+                graph.push_back(factor)
+        return GtsamSystem(self.layout, graph, squares), cost
+
+    def cost(self, values: Values) -> float:
+        """Twice the sum of the losses."""
+        return self.linearization.cost(values)
+
+    def residuals(self, values: Values) -> list[Array]:
+        """Weighted whitened residuals of each group."""
+        return self.linearization.residuals(values)
+
+    def products(self, group: Group, values: Values, tangent: Tangent) -> tuple[Array, Array]:
+        """A x of a group's whitened rows with tangent vectors, and its right side."""
+        return self.linearization.products(group, values, tangent)
+
+    def under(self, loss: TruncatedLoss | None) -> GtsamEngine:
+        """With another loss for measurements that have one."""
+        return GtsamEngine(self.linearization.under(loss))
+
+    def with_groups(self, groups: Sequence[Group]) -> GtsamEngine:
+        """With other measurements in the same places."""
+        return GtsamEngine(self.linearization.with_groups(groups))
+
+
+def _factors(layout: Layout, group: Group, right: Array, jacobians: tuple[Array, ...]) -> list[gtsam.GaussianFactor]:
+    """The rows of a group: one factor if all are about the same variables, else one a measurement."""
+    n, m = right.shape
+    if all(len(at) == 1 for at in group.at):
+        columns = [np.broadcast_to(J, (n, *J.shape[1:])).reshape(n * m, -1) for J in jacobians]
+        return [_factor([int(layout.key[at[0]]) for at in group.at], columns, right.ravel())]
+    keys = [np.broadcast_to(layout.key[at], n) for at in group.at]
+    blocks = [np.broadcast_to(J, (n, *J.shape[1:])) for J in jacobians]
+    return [_factor([int(k[i]) for k in keys], [J[i] for J in blocks], right[i]) for i in range(n)]
+
+
+def _factor(keys: Sequence[int], blocks: Sequence[Array], right: Array) -> gtsam.JacobianFactor:
+    """Rows [A | b]; blocks of a variable that is there twice add up."""
+    summed: dict[int, Array] = {}
+    for key, block in zip(keys, blocks, strict=True):
+        summed[key] = summed[key] + block if key in summed else block
+    widths = [*(block.shape[1] for block in summed.values()), 1]
+    return jacobian_factor(list(summed), widths, np.column_stack([*summed.values(), right]))
+
+
+@dataclass(frozen=True, eq=False)
+class GtsamSystem:
+    """Whitened rows about some values; see levenberg.System."""
+
+    layout: Layout
+    graph: gtsam.GaussianFactorGraph
+    squares: float
+
+    def eliminate(self, damping: float = 0.0) -> GtsamFactorization:
+        """R of the rows, with so many times the information of each unknown added. Raises IndeterminateStateError."""
+        graph, layout = self._damped(damping) if damping > 0.0 else self.graph, self.layout
+        *_, J, c, s = layout.sizes
+        last = (layout.keyframe < 0) & ((layout.node <= 0) | (layout.node == J - 1))
+        rest = set(layout.key[~last].tolist())
+        colamd, ordering = gtsam.Ordering.ColamdGaussianFactorGraph(graph), gtsam.Ordering()
+        for key in (colamd.at(i) for i in range(colamd.size())):
+            if key in rest:
+                ordering.push_back(key)
+        try:
+            tree, left = graph.eliminatePartialMultifrontal(ordering, gtsam.EliminateQR)
+        except RuntimeError as error:
+            raise IndeterminateStateError(UNDETERMINED) from error
+        columns = {int(key): layout.root_columns(int(key)) for key in layout.key[last]}
+        rows = [np.zeros((0, c + s + 1))]
+        for i in range(left.size()):
+            linear: Any = left.at(i)
+            A, b = linear.jacobian()
+            parts = np.vstack([columns[key] for key in linear.keys()])
+            rows.append(np.column_stack([A @ parts, b]))
+        if c:
+            absent = np.flatnonzero(~layout.kept[1][-1])
+            rows.append(np.eye(c + s + 1)[absent])
+        whole = np.concatenate(rows)
+        if len(whole) < c + s + 1:
+            whole = np.pad(whole, ((0, c + s + 1 - len(whole)), (0, 0)))
+        root = np.triu(np.linalg.qr(whole, mode="r"))
+        conditionals = [_Conditional.of(each, layout) for each in _conditionals_of(tree, ordering)]
+        # gtsam drops what no variable can change.
+        explained = sum(float(each.d @ each.d) for each in conditionals) + float(root[:-1, -1] @ root[:-1, -1])
+        root[-1, -1] = np.sqrt(max(self.squares - explained, 0.0))
+        return GtsamFactorization(layout, root, conditionals)
+
+    def _damped(self, damping: float) -> gtsam.GaussianFactorGraph:
+        graph, layout = gtsam.GaussianFactorGraph(), self.layout
+        graph.push_back(self.graph)
+        squares = {key: np.zeros(layout.size(at)) for at, key in enumerate(layout.key.tolist())}
+        for i in range(self.graph.size()):
+            linear: Any = self.graph.at(i)
+            own, begin = np.square(linear.jacobian()[0]).sum(axis=0), 0
+            for key in linear.keys():
+                size = len(squares[key])
+                squares[key] += own[begin : begin + size]
+                begin += size
+        for key, own in squares.items():
+            graph.push_back(_factor([key], [np.diag(np.sqrt(damping * own))], np.zeros(len(own))))
+        return graph
+
+
+def _conditionals_of(tree: gtsam.GaussianBayesTree, ordering: gtsam.Ordering) -> list[gtsam.GaussianConditional]:
+    """Those of all variables of an ordering, each once, what is eliminated first before anything above it."""
+    # From the last one back: what is above a clique has been seen when the last of its own comes.
+    found, seen = [], set[int]()
+    for i in reversed(range(ordering.size())):
+        key = ordering.at(i)
+        if key not in seen:
+            conditional = tree[key].conditional()
+            seen.update(conditional.keys())
+            found.append(conditional)
+    return found[::-1]
+
+
+@dataclass(frozen=True, eq=False)
+class _Conditional:
+    """R x + S others = d of the variables of a clique, by their positions in the layout."""
+
+    own: list[int]
+    others: list[int]
+    R: Array
+    S: Array
+    d: Array
+
+    @classmethod
+    def of(cls, conditional: gtsam.GaussianConditional, layout: Layout) -> _Conditional:
+        at = layout.at(list(conditional.keys())).tolist()
+        R = np.array(conditional.R(), ndmin=2)  # copies: the memory is the conditional's
+        if not (np.abs(np.diag(R)) > 0.0).all():
+            raise IndeterminateStateError(UNDETERMINED)
+        S = np.array(conditional.S()).reshape(len(R), -1)
+        count = int(np.searchsorted(np.cumsum([layout.size(i) for i in at]), len(R))) + 1
+        return cls(at[:count], at[count:], R, S, np.array(conditional.d(), ndmin=1))
+
+
+@dataclass(frozen=True, eq=False)
+class GtsamFactorization:
+    """R of a system that gtsam eliminated; see levenberg.Factorization."""
+
+    layout: Layout
+    root: Array
+    _conditionals: list[_Conditional]
+
+    @property
+    def c(self) -> int:
+        """Numbers of the last node."""
+        return self.layout.sizes[3]
+
+    @property
+    def minimum(self) -> float:
+        """Sum of squares at the solution."""
+        return float(self.root[-1, -1] ** 2)
+
+    @property
+    def log_determinant(self) -> float:
+        """Of the information A'A."""
+        pivots = [np.diagonal(self.root[:-1]), *(np.diagonal(each.R) for each in self._conditionals)]
+        return 2.0 * float(np.log(np.abs(np.concatenate(pivots))).sum())
+
+    def solve(self) -> tuple[Array, Array, Array]:
+        """States, nodes, shared unknowns of the least squares."""
+        last = np.asarray(np.linalg.solve(self.root[:-1, :-1], self.root[:-1, -1]), dtype=float)
+        states, nodes = self.given(last[:, None])
+        return states[..., 0], nodes[..., 0], last[self.c :]
+
+    def given(self, last: Array) -> tuple[Array, Array]:
+        """States and nodes of the least squares for given last node and shared unknowns (c + s, n)."""
+        return self._back(last, 1.0, lambda shape: np.zeros(shape))
+
+    def propagate(self, last: Array) -> tuple[Array, Array]:
+        """Moves of states and nodes that go with moves of the last node and the shared unknowns (c + s, n)."""
+        return self._back(last, 0.0, lambda shape: np.zeros(shape))
+
+    def sample(self, count: int, generator: np.random.Generator) -> tuple[Array, Array, Array]:
+        """Draws from the posterior, as deviations from its mean."""
+        noise = generator.standard_normal((len(self.root) - 1, count))
+        last = np.asarray(np.linalg.solve(self.root[:-1, :-1], noise), dtype=float)
+        return *self._back(last, 0.0, generator.standard_normal), last[self.c :]
+
+    def prefix_roots(self) -> tuple[Index, list[Array]]:
+        """None: the elimination is not in time order."""
+        return np.zeros(0, dtype=np.intp), []
+
+    def _back(self, last: Array, right: float, noise: Callable[[tuple[int, int]], Array]) -> tuple[Array, Array]:
+        layout, n = self.layout, last.shape[1]
+        N, d, J, c, _ = layout.sizes
+        states, nodes, found = np.zeros((N, d, n)), np.zeros((J, c, n)), dict[int, Array]()
+        ends = (layout.keyframe < 0) & ((layout.node <= 0) | (layout.node == J - 1))
+        for at in np.flatnonzero(ends).tolist():
+            found[at] = layout.root_columns(int(layout.key[at])) @ last
+        for each in reversed(self._conditionals):
+            rest = right * each.d[:, None] + noise((len(each.d), n))
+            if each.others:
+                rest = rest - each.S @ np.vstack([found[at] for at in each.others])
+            ends = np.cumsum([layout.size(at) for at in each.own])[:-1]
+            found |= zip(each.own, np.split(np.linalg.solve(each.R, rest), ends), strict=True)
+        first = next((at for at in np.flatnonzero(layout.node == 0).tolist()), None)
+        for at, x in found.items():
+            size = layout.size(at)
+            if layout.keyframe[at] >= 0:
+                states[layout.keyframe[at], layout.offset[at] : layout.offset[at] + size] = x
+            elif layout.node[at] > 0 and first is not None:
+                nodes[layout.node[at], layout.part[at] : layout.part[at] + size] = x - found[first]
+        return states, nodes

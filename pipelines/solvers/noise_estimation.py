@@ -1,0 +1,290 @@
+"""Noise levels from the recording: a variance component for every measurement noise, all of them together.
+
+Restricted maximum likelihood with what was stated as prior (real sensors' noise is known to a part of itself at best).
+With u the logarithm of a noise's level over the one stated, chi2 the sum of its whitened squares, r their redundancy
+and tau how well the level is known,
+
+    chi2 - r - u / tau^2 = 0
+
+Without the last term that is Foerstner's iteration, "Ein Verfahren zur Schaetzung von Varianz- und
+Kovarianzkomponenten", Allgemeine Vermessungs-Nachrichten 1979. Between two solutions chi2 is taken to go with
+exp(-2 u) and r to stay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from alidade.factors.loss import TruncatedLoss
+from alidade.pipelines.estimation.noise import Level, Noise
+from alidade.pipelines.estimation.robust import robust_sigma
+from alidade.pipelines.solvers.chain import Array
+from alidade.pipelines.solvers.layout import Values
+from alidade.pipelines.solvers.levenberg import Engine, Factorization, Solution, minimize
+from alidade.pipelines.solvers.linearization import Group
+from alidade.pipelines.solvers.robust import RobustConfig, solve_robust, solve_truncated
+
+# (family, row of its measurements) -> expected sum of squares under noise of unit variance.
+ExpectedSquares = Mapping[tuple[str, int], float]
+
+
+@dataclass(frozen=True)
+class NoiseConfig:
+    """When levels change, and how residuals are read.
+
+    Attributes:
+        max_solutions: solutions with other levels.
+        negligible: change of a level's logarithm below which levels stay.
+        misplaced: ratio of the root mean square to the typical residual beyond which the gate is in the wrong place:
+            outliers are taken for measurements, or measurements for outliers. The typical one does not mind.
+        min_residuals: of fewer there is no typical one.
+        max_additional: bound of the logarithm of a noise beside others, over what was stated.
+        clipped: of a noise beside others a residual counts as no more than this, in sigmas; `clipped_square` is what
+            the square of a normal number is then expected to be.
+        too_small: sigmas by which a sum of squares is too small for its process.
+    """
+
+    max_solutions: int = 8
+    negligible: float = 0.01
+    misplaced: float = 1.3
+    min_residuals: int = 50
+    max_additional: float = 7.0
+    clipped: float = 2.0
+    clipped_square: float = 0.9205
+    too_small: float = 3.0
+
+
+CONFIG = NoiseConfig()
+
+
+def estimate_noise(
+    engine: Engine,
+    solution: Solution,
+    levels: tuple[Level, ...],
+    loss: TruncatedLoss | None,
+    robust: RobustConfig,
+    expected_squares: Callable[[Engine, Factorization, Values], ExpectedSquares],
+    config: NoiseConfig = CONFIG,
+) -> tuple[Solution, tuple[Level, ...]]:
+    """The solution with the noise levels that the recording has, and these.
+
+    Args:
+        engine: with the noise stated.
+        solution: of the same with the levels given.
+        levels: to begin with.
+        loss: of the problem; None: no outliers are expected.
+        robust: how outliers are looked for.
+        expected_squares: of the rows of families at a solution.
+        config: when levels change.
+
+    Raises:
+        IndeterminateStateError: a state is not determined.
+    """
+    first = levels
+    if not any(level.noise.estimated or level.least is not None for level in levels):
+        return solution, levels
+    for _ in range(config.max_solutions):
+        if not solution.converged:
+            break
+        before, values = levels, solution.values
+        expected = expected_squares(solution.engine, solution.system.eliminate(), values)
+        levels, steady = refine(levels, solution.engine, values, expected, levels is first, config)
+        if steady:
+            break
+        weighted = apply_levels(engine, levels)
+        if loss is None:
+            again = minimize(weighted, values, robust.minimizer)
+        elif _far(levels, before, config):
+            again = solve_robust(weighted, values, loss, robust)
+        else:
+            again = solve_truncated(weighted, values, loss, robust)
+        solution = replace(again, iterations=solution.iterations + again.iterations)
+    return solution, levels
+
+
+def apply_levels(engine: Engine, levels: Sequence[Level]) -> Engine:
+    """The measurements with their noise at these levels, over what they were whitened by."""
+    scaled = [level for level in levels if (level.used > 0.0 if level.noise.beside else level.scale != 1.0)]
+    if not scaled:
+        return engine
+    return engine.with_groups([_at_levels(group, scaled) for group in engine.groups])
+
+
+def _at_levels(group: Group, levels: Sequence[Level]) -> Group:
+    own = [level for level in levels if group.family in level.noise.families]
+    if not own:
+        return group
+    weights = group_weights(group)
+    for level in own:
+        if level.noise.beside:
+            weights = (weights**-2.0 + _additional(group, level.used)) ** -0.5
+        else:
+            weights[:, _rows(level.noise, weights.shape[1])] /= level.scale
+    return replace(group, weights=weights)
+
+
+def group_weights(group: Group) -> Array:
+    """(n, m) weights of a group's rows beside the loss."""
+    shape = len(group.model.time), group.model.rows
+    return np.ones(shape) if group.weights is None else group.weights.copy()
+
+
+def _additional(group: Group, level: float) -> Array:
+    """(n, 1) variance of a noise beside others, in units of what the group is whitened by."""
+    assert group.beside is not None
+    return ((level * group.beside) ** 2)[:, None]
+
+
+def _far(levels: Sequence[Level], others: Sequence[Level], config: NoiseConfig) -> bool:
+    """Whether levels are so far from others that outliers of the one are measurements of the other."""
+    pairs = zip(levels, others, strict=True)
+    low, high = 1.0 / config.misplaced, config.misplaced
+    return any(not low < a.scale / b.scale < high for a, b in pairs if not a.noise.beside)
+
+
+def refine(
+    levels: Sequence[Level],
+    engine: Engine,
+    values: Values,
+    expected: ExpectedSquares,
+    first: bool,
+    config: NoiseConfig = CONFIG,
+) -> tuple[tuple[Level, ...], bool]:
+    """The levels at a solution, and whether they are those that it was made with.
+
+    Args:
+        levels: that the engine has now.
+        engine: under the loss in force.
+        values: the solution.
+        expected: squares of the rows of families there.
+        first: whether it was made with the levels stated, which may have put the gate in the wrong place.
+        config: when levels change.
+    """
+    found, steady = list(levels), True
+    for i, level in enumerate(levels):
+        groups = [g for g in engine.groups if g.family in level.noise.families]
+        redundancy = _redundancy(level.noise, expected)
+        if level.least is not None and redundancy >= 1.0:
+            found[i] = _within(level, groups, values, redundancy, config)
+        elif level.noise.estimated and level.noise.beside and redundancy > 0.0:
+            found[i], kept = _found_beside(level, groups, values, redundancy, config)
+            steady &= kept
+            continue
+        elif level.noise.estimated and redundancy >= 1.0:
+            found[i] = _refined(level, groups, values, redundancy, first, config)
+        steady &= bool(abs(np.log(found[i].scale / level.scale)) < config.negligible)
+    if steady:
+        found = [replace(new, scale=old.scale) for new, old in zip(found, levels, strict=True)]
+    return tuple(found), steady
+
+
+def _redundancy(noise: Noise, expected: ExpectedSquares) -> float:
+    """Expected sum of a noise's whitened squares if it is at the level it has."""
+    return sum(
+        square
+        for (family, row), square in expected.items()
+        if family in noise.families and (noise.rows is None or row in noise.rows)
+    )
+
+
+def _refined(
+    level: Level, groups: Sequence[Group], values: Values, redundancy: float, first: bool, config: NoiseConfig
+) -> Level:
+    """What the level should be."""
+    square, typical = _size(level.noise, groups, values, config)
+    if first and typical > 0.0 and not config.misplaced**-2 < square / typical < config.misplaced**2:
+        square = typical
+    found = level.scale * float(np.sqrt(max(square / redundancy, 1e-12)))
+    told = replace(level, found=found, sigma=found * (2.0 * redundancy) ** -0.5)
+    scale = float(np.exp(_level(float(np.log(level.scale)), square, redundancy, told.known)))
+    return replace(told, scale=max(scale, level.noise.least))
+
+
+def _found_beside(
+    level: Level, groups: Sequence[Group], values: Values, redundancy: float, config: NoiseConfig
+) -> tuple[Level, bool]:
+    """A noise beside others as the residuals have it, and whether that changes little.
+
+    With v the variance of a row, f the part of it that is this noise's, and e the residual, all rows alike redundant,
+    the root of: sum f (e^2 / v - r / n) - ln(level) / tau^2. Where outliers are rejected, what is beyond two sigmas
+    counts as that: a pose near iron is not to pass for repeatability.
+    """
+    unit = np.concatenate([np.broadcast_to(_additional(g, level.noise.stated), _shape(g)).ravel() for g in groups])
+    variance = np.concatenate([group_weights(g).ravel() for g in groups]) ** -2.0
+    square = np.concatenate([g.evaluate(values)[0].ravel() for g in groups]) ** 2
+    rest, share = variance - unit * level.scale**2, redundancy / variance.size
+    rejecting = any(g.loss is not None for g in groups)
+    most, expected = (config.clipped**2, config.clipped_square) if rejecting else (np.inf, 1.0)
+    low, high = -config.max_additional, config.max_additional
+    while high - low > 1e-3:
+        middle = 0.5 * (low + high)
+        part = unit * np.exp(2.0 * middle)
+        whitened = np.minimum(square / (share * (rest + part)), most) / expected
+        score = share * (part / (rest + part) * (whitened - 1.0)).sum() - middle / level.known**2
+        low, high = (middle, high) if score > 0.0 else (low, middle)
+    scale = float(np.exp(low))
+    part = unit * scale**2
+    sigma = float((2.0 * share * ((part / (rest + part)) ** 2).sum() + level.known**-2) ** -0.5)
+    changed = float(np.abs((rest + part) / variance - 1.0).max())
+    return replace(level, scale=scale, found=scale, sigma=scale * sigma), changed < 2.0 * config.negligible
+
+
+def _shape(group: Group) -> tuple[int, int]:
+    return len(group.model.time), group.model.rows
+
+
+def _within(level: Level, groups: Sequence[Group], values: Values, redundancy: float, config: NoiseConfig) -> Level:
+    """A process at the level that its residuals have, between what its samples say and what was stated.
+
+    Where measurements take most of the redundancy its squares hardly tell the levels between: it stays as stated if
+    these fit, else it is taken down to its samples and up from there as far as its residuals ask for.
+    """
+    assert level.least is not None
+    ratio = sum(_used_square(g, values).sum() for g in groups) / redundancy
+    if level.scale == 1.0:
+        if ratio > 1.0 - config.too_small * (2.0 / redundancy) ** 0.5:
+            return replace(level, noise=replace(level.noise, families=()), least=None)
+        return replace(level, scale=level.least)
+    return replace(level, scale=float(np.clip(level.scale * max(ratio, 1.0) ** 0.5, level.least, 1.0)))
+
+
+def _level(now: float, square: float, redundancy: float, known: float) -> float:
+    """The root u of square exp(2 (now - u)) - redundancy - u / known^2, by Newton's method."""
+    u, step = now, np.inf
+    while abs(step) > 1e-6:
+        expected = square * np.exp(2.0 * (now - u))
+        step = (expected - redundancy - u / known**2) / (2.0 * expected + known**-2)
+        u += float(np.clip(step, -1.0, 1.0))
+    return u
+
+
+def _rows(noise: Noise, rows: int) -> list[int]:
+    return list(range(rows)) if noise.rows is None else [row for row in noise.rows if row < rows]
+
+
+def _used_square(group: Group, values: Values) -> Array:
+    """(n, m) squares of weighted residuals, zero of rejected measurements."""
+    residuals = group.evaluate(values)[0]
+    return np.where((group.used(residuals) > 0.5)[:, None], group.weighted(residuals) ** 2, 0.0)
+
+
+def _size(noise: Noise, groups: Sequence[Group], values: Values, config: NoiseConfig) -> tuple[float, float]:
+    """Sum of squares of a noise's whitened residuals that are used, and what it would be if all were of typical size.
+
+    Of few residuals, and of processes, the latter is 0.
+    """
+    if any(not g.is_measurement for g in groups):
+        return float(sum(_used_square(g, values).sum() for g in groups)), 0.0
+    square, rows, every = 0.0, 0, [np.empty(0)]
+    for g in groups:
+        residuals, own = g.evaluate(values)[0], _rows(noise, g.model.rows)
+        used = g.used(residuals) > 0.5
+        whitened = g.weighted(residuals)[:, own]
+        square += float((whitened[used] ** 2).sum())
+        rows += int(used.sum()) * len(own)
+        every.append(whitened.ravel())
+    whole = np.concatenate(every)
+    return square, rows * robust_sigma(whole) ** 2 if len(whole) >= config.min_residuals else 0.0

@@ -1,0 +1,385 @@
+"""What the factor R of a chain says of the reported numbers: covariance, chi-square, square-root information.
+
+The reported numbers q are functions of the last bias node and the shared unknowns x, with Jacobian J; `root` is R of x
+with its right side. With T = [N U], N the directions of x that no number sees and U the moves of x that change one free
+number each by its prior sigma,
+
+    QR of root [N U | b]  ->  last rows  R_q du = d_q
+
+is the square-root information of the numbers u in prior units, everything else marginalised out and fixed numbers
+conditioned on. All else follows from R_q; nothing is squared. Rows of R give the leverage h of each measurement row a,
+the variance of a x under the posterior (`sample`), and a family of n rows has n - sum of h degrees of freedom.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.pipelines.estimation.problem import ChiSquare, Problem, Told
+from alidade.pipelines.solvers.chain import Array, ChainFactorization, ChainSystem
+from alidade.pipelines.solvers.layout import Layout, Tangent, Values
+from alidade.pipelines.solvers.levenberg import Engine, Factorization
+from alidade.pipelines.solvers.linearization import NOT_MEASURED, Group
+
+# A direction without any information gets this many times its prior scale as sigma.
+MAX_SIGMA = 1e4
+# Combinations whose sigma would be more than this many times their prior's are left out of square-root information.
+MAX_TOLD = 1e6
+# Sigma of a prior where the config frees a number, in units of its default prior's sigma; see estimation.priors.
+FREE_PRIOR = 10.0
+# Draws whose mean squares give leverages: many where that costs little, few where rows are many.
+DRAWS, MAX_DRAWS, DRAWN_ROWS = 6, 60, 30_000
+# Singular values below this share of the largest, and to the power of 3/4 coefficients of a row, are rounding.
+UNSEEN = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Reported:
+    """The reported numbers about some values of all variables.
+
+    Attributes:
+        names: (n,) of all numbers.
+        numbers: (n,) at the values.
+        jacobian: (n, c + s) by the last node and the shared unknowns.
+        free: (m,) which numbers are not fixed.
+        mean, scale: (m,) of their priors, default scale where there is none.
+        prior: (m, m) precision of the priors in force, in units of the scales.
+        extra: (n,) sigmas of errors that no measurement model has.
+    """
+
+    names: tuple[str, ...]
+    numbers: Array
+    jacobian: Array
+    free: NDArray[np.intp]
+    mean: Array
+    scale: Array
+    prior: Array
+    extra: Array
+
+    @classmethod
+    def of(cls, problem: Problem, layout: Layout, values: Values, current_keys: Mapping[int, int]) -> Reported:
+        """Evaluate the coordinates of all parameters.
+
+        Args:
+            problem: of which the parameters are.
+            layout: of its variables.
+            values: of these.
+            current_keys: parameter key -> variable that holds its value.
+        """
+        keys = [current_keys.get(p.key, p.key) for p in problem.parameters]
+        known = layout.to_gtsam(values, keys)
+        pairs = [(key, *p.coordinates(known, key)) for p, key in zip(problem.parameters, keys, strict=True)]
+        quantities = problem.quantities
+        free = np.flatnonzero([q.prior_sigma != 0.0 for q in quantities])
+        precision = [1.0 if quantities[i].prior_sigma else FREE_PRIOR**-2 for i in free]
+        return cls(
+            names=tuple(q.name for q in quantities),
+            numbers=np.concatenate([numbers for _, numbers, _ in pairs]),
+            jacobian=np.vstack([J @ layout.root_columns(key) for key, _, J in pairs]),
+            free=free,
+            mean=np.array([quantities[i].prior_mean for i in free]),
+            scale=np.array([quantities[i].scale for i in free]),
+            prior=np.diag(precision),
+            extra=np.array([0.0 if q.prior_sigma == 0.0 else q.extra_sigma for q in quantities]),
+        )
+
+    @property
+    def u(self) -> Array:
+        """(m,) the free numbers in prior units, from their prior means."""
+        return np.asarray((self.numbers[self.free] - self.mean) / self.scale)
+
+    def root(self, root: Array) -> ReportedRoot:
+        """The square-root information of the free numbers from that of (last node, shared unknowns, right side)."""
+        inverse = np.linalg.pinv(self.jacobian)
+        _, sizes, axes = np.linalg.svd(self.jacobian, full_matrices=True)
+        seen = int(np.count_nonzero(sizes > UNSEEN * sizes.max(initial=0.0)))
+        basis = np.hstack([axes[seen:].T, inverse[:, self.free] * self.scale])
+        R = np.asarray(np.linalg.qr(np.column_stack([root[:, :-1] @ basis, root[:, -1]]), mode="r"), dtype=float)
+        return ReportedRoot(basis, R, basis.shape[1] - len(self.free))
+
+    def covariance(self, of_u: Array) -> Array:
+        """(n, n) of all numbers, from that of u (m, m); rows of fixed numbers are zero."""
+        out = np.diag(self.extra**2)
+        out[np.ix_(self.free, self.free)] += of_u * np.outer(self.scale, self.scale)
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class ReportedRoot:
+    """Square-root information of moves of the free reported numbers u.
+
+    Attributes:
+        basis: (c + s, p + m) moves of the last node and the shared unknowns: p that no number sees, then those of u.
+        triangle: (., p + m + 1) R in this basis, right side last.
+        unseen: p.
+    """
+
+    basis: Array
+    triangle: Array
+    unseen: int
+
+    @property
+    def R(self) -> Array:
+        """(m, m) of u, everything else marginalised out."""
+        rows = self.triangle[self.unseen : -1, self.unseen : -1]
+        m = rows.shape[1]
+        return np.vstack([rows[:m], np.zeros((max(0, m - len(rows)), m))])
+
+    @property
+    def d(self) -> Array:
+        """(m,) right side: |R du - d| is minimal at the solution."""
+        return np.asarray(self.triangle[self.unseen : self.triangle.shape[1] - 1, -1])
+
+    def last(self, du: Array, right: float = 1.0) -> Array:
+        """Moves (c + s, k) of the last node and the shared unknowns for moves (m, k) of u, the rest optimal.
+
+        `right`: factor of the right side; 0 for the response to the moves alone.
+        """
+        p, rows = self.unseen, self.triangle[: self.unseen]
+        y = np.linalg.solve(rows[:, :p], right * rows[:, -1:] - rows[:, p:-1] @ du) if p else np.zeros((0, du.shape[1]))
+        return np.asarray(self.basis @ np.vstack([y, du]))
+
+    def covariance(self) -> Array:
+        """(m, m) of u as the linear system has it; works where R is singular."""
+        _, sizes, axes = np.linalg.svd(self.R)
+        root = axes.T / np.maximum(sizes, 1.0 / MAX_SIGMA)
+        return np.asarray(root @ root.T)
+
+
+def responses(factorization: Factorization, jacobian: Array) -> Tangent:
+    """N^-1 J' of all unknowns, a column for each row of a Jacobian (n, c + s) by the last node and the shared unknowns.
+
+    Raises:
+        LinAlgError: the shared unknowns are not determined.
+    """
+    R = factorization.root[:-1, :-1]
+    last = np.linalg.solve(R, np.linalg.solve(R.T, jacobian.T))
+    states, nodes = factorization.propagate(last)
+    return Tangent(states, nodes, last[factorization.c :])
+
+
+def draws(factorization: Factorization, count: int, generator: np.random.Generator) -> Tangent:
+    """Deviations from the posterior mean, drawn; the first bias node does not deviate from itself."""
+    states, nodes, shared = factorization.sample(count, generator)
+    nodes[:1] = 0.0
+    return Tangent(states, nodes, shared)
+
+
+@dataclass(frozen=True, eq=False)
+class Leverage:
+    """Leverages of the rows of a group.
+
+    Attributes:
+        group: of n measurements of m rows.
+        used: (n,) which the loss does not reject.
+        h: (n, m) variance of what the rows predict under the posterior, in squared sigmas of their noise.
+        squares: (n, m) of the whitened residuals.
+    """
+
+    group: Group
+    used: NDArray[np.bool_]
+    h: Array
+    squares: Array
+
+
+def counted(group: Group, values: Values) -> NDArray[np.bool_]:
+    """(n,) measurements that the loss does not reject."""
+    residuals, _ = group.evaluate(values)
+    return np.asarray(group.used(residuals) > 0.0)
+
+
+def leverages(engine: Engine, factorization: Factorization, values: Values) -> list[Leverage]:
+    """Leverages of all measurements, processes and priors.
+
+    In a chain random signs e stand as more right sides in the columns of the system, so that one elimination solves for
+    all of them: h is the mean of e A x(e), which has the trace of the projection without the scatter of its diagonal
+    (Hutchinson, Comm. Statist. Simul. Comput. 1989). Rows about nodes alone, and all rows of another engine, have the
+    mean square of A x over draws of the posterior. That all leverages together are the number of unknowns is exact.
+
+    Args:
+        engine: of the factors.
+        factorization: of its system at the values.
+        values: the estimate.
+
+    Raises:
+        IndeterminateStateError: a state is not determined.
+    """
+    system, _ = engine.at(values)
+    rows = sum(g.model.rows * len(g.model.time) for g in engine.groups)
+    count = int(np.clip(DRAWN_ROWS // max(rows, 1), DRAWS, MAX_DRAWS))
+    chain = system if isinstance(system, ChainSystem) else None
+    signs, solved = (None, None) if chain is None else _solved_signs(chain, count)
+    drawn = draws(factorization, count, np.random.default_rng(1)) if chain is None or chain.c else None
+    found, begin = [], 0
+    for group in engine.groups:
+        own = None
+        if signs is not None:
+            own, begin = _signs_of(signs, group, begin, count)
+        tangent = drawn if own is None else solved
+        assert tangent is not None
+        moves, right = engine.products(group, values, tangent)
+        h = (np.square(moves) if own is None else own * moves).mean(axis=2)
+        found.append(Leverage(group, counted(group, values), h, np.square(right)))
+    return _summing_to(found, _unknowns(engine.layout))
+
+
+def _summing_to(found: Sequence[Leverage], unknowns: int) -> list[Leverage]:
+    """Leverages that sum to the number of unknowns, corrected where they are uncertain: neither 0 nor 1."""
+    weights = [max(float((each.h - each.h**2)[each.used].sum()), 0.0) for each in found]
+    share = (unknowns - sum(float(each.h.sum()) for each in found)) / max(sum(weights), 1e-300)
+    return [
+        replace(each, h=each.h + share * weight / max(each.used.sum() * each.h.shape[1], 1) * each.used[:, None])
+        for each, weight in zip(found, weights, strict=True)
+    ]
+
+
+def _solved_signs(system: ChainSystem, count: int) -> tuple[ChainSystem, Tangent]:
+    """Random signs in the rows' places (their last columns but one), and the least squares solutions for them."""
+    generator = np.random.default_rng(0)
+
+    def beside(rows: Array) -> Array:
+        signs = generator.choice([-1.0, 1.0], (*rows.shape[:-1], count)) * rows[..., :-1].any(axis=-1, keepdims=True)
+        return np.concatenate([rows[..., :-1], signs, 0.0 * rows[..., -1:]], axis=-1)
+
+    wider = replace(
+        system,
+        measured=beside(system.measured),
+        between=beside(system.between),
+        beside=beside(system.beside),
+        shared=beside(system.shared),
+    )
+    factorization = ChainFactorization.of(wider)
+    known = len(factorization.root) - 1 - count
+    R = factorization.root[:known]
+    last = np.vstack([np.linalg.solve(R[:, :known], R[:, known:-1]), -np.eye(count)])
+    states, nodes = factorization.propagate(last)
+    return wider, Tangent(states, nodes, last[system.c : known])
+
+
+def _signs_of(system: ChainSystem, group: Group, begin: int, count: int) -> tuple[Array | None, int]:
+    """(n, m, count) signs of a group's rows, None for rows about nodes alone; first row of the next shared group."""
+    n, m = len(group.model.time), group.model.rows
+    if group.target == "walk":
+        return None, begin
+    if group.target == "shared":
+        return system.shared[begin : begin + n * m, -1 - count : -1].reshape(n, m, count), begin + n * m
+    rows = system.measured if group.target == "state" else system.between
+    return rows[group.place[:, None], group.row[:, None] + np.arange(m), -1 - count : -1], begin
+
+
+def _unknowns(layout: Layout) -> int:
+    """Number of unknowns of a layout."""
+    return int(layout.kept[0].sum() + layout.kept[1].sum() + layout.sizes[4])
+
+
+def chi_square(found: Sequence[Leverage]) -> ChiSquare:
+    """Sum of squares of measurements and processes and their degrees of freedom, whole and by family; none negative."""
+    families: dict[str, tuple[float, float]] = {}
+    for each in found:
+        family, used = each.group.family, each.used
+        if family not in NOT_MEASURED:
+            value, dof = families.get(family, (0.0, 0.0))
+            families[family] = value + float(each.squares[used].sum()), dof + float((1.0 - each.h[used]).sum())
+    families = {family: (value, max(dof, 0.0)) for family, (value, dof) in families.items()}
+    sums = [sum(each[i] for each in families.values()) for i in range(2)]
+    return ChiSquare(sums[0], sums[1], families)
+
+
+def expected_squares(engine: Engine, factorization: Factorization, values: Values) -> dict[tuple[str, int], float]:
+    """(family, row of its measurements) -> expected sum of squares under noise of unit variance.
+
+    Rows of a process or a prior count as one. Arguments and errors are those of `leverages`.
+    """
+    squares: dict[tuple[str, int], float] = {}
+    for each in leverages(engine, factorization, values):
+        for row, more in enumerate((1.0 - each.h[each.used]).sum(axis=0).tolist()):
+            label = each.group.family, row if each.group.is_measurement else 0
+            squares[label] = squares.get(label, 0.0) + more
+    return {label: max(square, 0.0) for label, square in squares.items()}
+
+
+def sqrt_information(
+    problem: Problem,
+    engine: Engine,
+    values: Values,
+    current_keys: Mapping[int, int],
+    device: Collection[str],
+    at: Mapping[str, float] | None = None,
+) -> Told:
+    """Square-root information about the free reported numbers, priors of the device set apart.
+
+    Args:
+        problem: of which the numbers are.
+        engine: of its factors, rejected measurements without weight.
+        values: the estimate.
+        current_keys: parameter key -> variable that holds its value.
+        device: names of the numbers whose priors are set apart.
+        at: numbers about which it is linear, by name, instead of the estimate's; states are optimal there.
+
+    Raises:
+        IndeterminateStateError: a state is not determined.
+    """
+    if at:
+        values = moved_to(problem, engine, values, current_keys, at)
+    layout = engine.layout
+    reported = Reported.of(problem, layout, values, current_keys)
+    inverse = np.linalg.pinv(reported.jacobian)[layout.sizes[3] :, reported.free]
+    named = np.array([reported.names[i] in device for i in reported.free], dtype=bool)
+    groups, prior_R, prior_d = [], [np.empty((0, len(named)))], [np.empty(0)]
+    for group in engine.groups:
+        if group.target == "shared" and group.family == "prior":
+            rows, _ = group.rows(values, layout.sizes[4] + 1)
+            about = rows[..., :-1] @ inverse
+            of_device = _about_alone((about * reported.scale).reshape(-1, len(named)), named).reshape(rows.shape[:2])
+            prior_R.append(about[of_device])
+            prior_d.append(rows[of_device, -1])
+            weights = np.ones(of_device.shape) if group.weights is None else group.weights
+            groups.append(replace(group, weights=weights * ~of_device))
+        else:
+            groups.append(group)
+    found = reported.root(engine.with_groups(groups).at(values)[0].eliminate().root)
+    rows, d = _fewest(found.R, found.d)
+    return Told(
+        names=tuple(reported.names[i] for i in reported.free),
+        at=reported.numbers[reported.free],
+        R=rows / reported.scale,
+        d=d,
+        prior_R=np.concatenate(prior_R),
+        prior_d=np.concatenate(prior_d),
+        scales=np.array([problem.quantities[i].prior_scale for i in reported.free]),
+    )
+
+
+def moved_to(
+    problem: Problem,
+    engine: Engine,
+    values: Values,
+    current_keys: Mapping[int, int],
+    numbers: Mapping[str, float],
+) -> Values:
+    """Values with some of the reported numbers moved, the other numbers kept and all states optimal to first order."""
+    reported = Reported.of(problem, engine.layout, values, current_keys)
+    wanted = np.array([numbers.get(n, here) for n, here in zip(reported.names, reported.numbers, strict=True)])
+    du = (wanted - reported.numbers)[reported.free] / reported.scale
+    factorization = engine.at(values)[0].eliminate()
+    last = reported.root(factorization.root).last(du[:, None])
+    states, nodes = factorization.given(last)
+    move = Tangent(states[..., 0], nodes[..., 0], last[factorization.c :, 0])
+    return engine.layout.retract(values, move)
+
+
+def _about_alone(rows: Array, named: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(r,) rows about some of the named numbers and about no others; numbers are in prior units."""
+    about = np.abs(rows) > UNSEEN**0.75 * np.abs(rows).max(axis=1, keepdims=True, initial=0.0)
+    return np.asarray((about & named).any(axis=1) & ~(about & ~named).any(axis=1))
+
+
+def _fewest(R: Array, d: Array) -> tuple[Array, Array]:
+    """The rows R u = d without combinations that nothing is known of."""
+    u, sizes, axes = np.linalg.svd(R)
+    kept = sizes > 1.0 / MAX_TOLD
+    return sizes[kept, None] * axes[kept], u.T[kept] @ d

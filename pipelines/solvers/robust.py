@@ -1,0 +1,116 @@
+"""Least squares with outliers: graduated non-convexity on the problem's truncated loss.
+
+Yang, Antonante, Tzoumas, Carlone, "Graduated non-convexity for robust spatial perception", RA-L 2020: surrogates of the
+loss, the first one convex for the largest residual that there is, lead to the truncated loss one after the other. What
+the last one leaves is plain least squares on the measurements inside the gate, so its covariance means what it says.
+
+It begins with plain least squares, or at the first guess where that explains more measurements: gross outliers take
+plain least squares, and small effects that priors alone hold, out of all bounds.
+
+Outliers are a minority. A family of measurements of which more than half are rejected, beyond what chance could make
+of one in which every second is an outlier (binomial in the normal approximation, one sided, p = `max_chance`), has
+another noise than stated, or its model is wrong: all of it counts then, and chi-square says so.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from alidade.factors.loss import TruncatedLoss
+from alidade.pipelines.solvers.chain import Array, IndeterminateStateError
+from alidade.pipelines.solvers.layout import Tangent, Values
+from alidade.pipelines.solvers.levenberg import Engine, LevenbergConfig, Solution, minimize
+from alidade.pipelines.solvers.linearization import Group
+
+
+@dataclass(frozen=True)
+class RobustConfig:
+    """How outliers are looked for.
+
+    Attributes:
+        minimizer: termination of every minimisation.
+        rough_tolerance: decrease of chi-square per measurement at which plain least squares is near enough to begin
+            with: residuals move by .05 sigma yet.
+        rough_iterations: of these at most: where they do not do outliers lead, and the surrogates begin anyhow.
+        mu_step: factor from one surrogate to the next, with one reweighted step each (Yang et al.: 1.4).
+        last_mu: of the last surrogate; its weights are 0 or 1 but for .1 % about the gate.
+        max_chance: of a family that it loses more than half of its measurements to outliers.
+    """
+
+    minimizer: LevenbergConfig = field(default_factory=LevenbergConfig)
+    rough_tolerance: float = 2e-3
+    rough_iterations: int = 8
+    mu_step: float = 2.5
+    last_mu: float = 1e3
+    max_chance: float = 1e-3
+
+
+def solve_robust(engine: Engine, values: Values, loss: TruncatedLoss | None, config: RobustConfig) -> Solution:
+    """Minimise the truncated loss from a first guess."""
+    plain = engine.under(None)
+    if loss is None:
+        return minimize(plain, values, config.minimizer)
+    count = sum(len(group.model.time) for group in engine.groups if group.is_measurement)
+    most = min(config.rough_iterations, config.minimizer.max_iterations)
+    rough = replace(config.minimizer, max_iterations=most, cost_tolerance=config.rough_tolerance * max(count, 1))
+    found = minimize(plain, values, rough)
+    iterations = found.iterations
+    truncated = engine.under(loss)
+    start = min(values, found.values, key=truncated.cost) if np.isfinite(found.cost) else values
+    start, more = _graduated(engine, start, loss, config)
+    final = solve_truncated(engine, start, loss, config)
+    return replace(final, iterations=iterations + more + final.iterations)
+
+
+def solve_truncated(engine: Engine, values: Values, loss: TruncatedLoss, config: RobustConfig) -> Solution:
+    """Least squares on what lies inside the gate near some values, and on all of a family that loses too much."""
+    current, iterations = engine.under(loss), 0
+    while True:
+        final = minimize(current, values, config.minimizer)
+        iterations += final.iterations
+        wrong = _mostly_rejected(final.engine, final.values, config.max_chance)
+        if not wrong:
+            return replace(final, iterations=iterations)
+        groups = [replace(g, loss=None) if g.family in wrong else g for g in current.groups]
+        current = current.with_groups(groups)
+
+
+def _graduated(engine: Engine, values: Values, loss: TruncatedLoss, config: RobustConfig) -> tuple[Values, int]:
+    """Values to which one surrogate of the loss after the other leads, and the iterations that takes."""
+    largest = max((_norms(g, values).max(initial=0.0) for g in engine.groups if g.loss is not None), default=0.0)
+    if largest <= loss.gate:
+        return values, 0
+    mu, iterations = loss.gate**2 / max(2.0 * largest**2 - loss.gate**2, 1e-300), 0
+    while mu < config.last_mu:
+        relaxed = engine.under(replace(loss, mu=mu))
+        try:
+            step = Tangent(*relaxed.at(values)[0].eliminate().solve())
+        except (IndeterminateStateError, np.linalg.LinAlgError):
+            break
+        values, iterations = engine.layout.retract(values, step), iterations + 1
+        mu *= config.mu_step
+    return values, iterations
+
+
+def _norms(group: Group, values: Values) -> Array:
+    """(n,) whitened norms of measurements."""
+    return np.linalg.norm(group.weighted(group.evaluate(values)[0]), axis=1)
+
+
+def _mostly_rejected(engine: Engine, values: Values, chance: float) -> set[str]:
+    """Families of which more than half are rejected, by more than chance makes of an even one."""
+    counts: dict[str, list[int]] = {}
+    for group in engine.groups:
+        if group.loss is not None:
+            used = group.used(group.evaluate(values)[0]) > 0.0
+            each = counts.setdefault(group.family, [0, 0])
+            each[0] += int((~used).sum())
+            each[1] += len(used)
+    return {
+        family
+        for family, (rejected, n) in counts.items()
+        if 0.5 * math.erfc((2.0 * rejected - 1.0 - n) / math.sqrt(2.0 * n)) < chance
+    }

@@ -1,0 +1,244 @@
+"""One rule for what a recording hardly determines.
+
+The reported numbers are whitened by their priors, q = mean + L u. A direction of u whose posterior sigma is above
+MAX_SIGMA of the prior's is weak: it keeps its prior mean and its prior sigma and is uncorrelated with all others. The
+values of the strong directions are the minimum over these, the weak ones fixed at their prior means.
+
+What a linearised system says along weak directions cannot be relied on: noise of the states at which it is linearised
+looks like information (about the only axis of a motion a mount cannot be known, yet the axis wavers), and the strong
+directions turn while the weak ones move by as much as their priors allow. A prior is right, if wide: for an error with
+covariance C, E[NEES] = tr(P^-1 C) is the number of directions for every P made of diagonal blocks of C. It is the
+truncated solution of the self-calibration literature (Maye, Furgale, Siegwart, "Self-supervised calibration for robotic
+systems", IEEE Intelligent Vehicles Symposium 2013), with priors as the yardstick.
+
+Everything follows from the square-root information R u = d of the reported numbers by one singular value decomposition;
+nothing is squared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from alidade.pipelines.estimation.problem import Problem
+from alidade.pipelines.solvers.chain import Array
+from alidade.pipelines.solvers.layout import Tangent, Values
+from alidade.pipelines.solvers.levenberg import Engine, Factorization
+from alidade.pipelines.solvers.posterior import Reported, ReportedRoot
+
+# Posterior sigma of a direction, in sigmas of the priors in force, above which the direction is weak.
+MAX_SIGMA = 0.3
+# Ratio of sigmas up to which the better known of two directions follows the other one.
+FOLLOWS = 0.5
+# Steps to the constrained solution, and how near it has to be, in sigmas; how often strong directions may turn weak.
+MAX_STEPS, NEAR, ROUNDS = 15, 0.02, 3
+# Random moves whose slopes show along which ways anything is curved, and the share of its sigma, as root mean square,
+# by which all that is curved has to follow a way.
+DRAWS, STRAIGHT = 3, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class WeakDirections:
+    """Orthonormal directions of the whitened numbers u, split by what the recording determines.
+
+    Attributes:
+        strong: (m, k) columns, best determined first.
+        weak: (m, w) columns.
+        sigmas: (k,) posterior sigmas of the strong directions, in sigmas of the prior.
+        precision: (m, m) of the prior in force on u, identity where every number has one.
+    """
+
+    strong: Array
+    weak: Array
+    sigmas: Array
+    precision: Array
+
+    @classmethod
+    def of(cls, R: Array, precision: Array, at_least: int = 0) -> WeakDirections:
+        """Split the directions of a square-root information R (m, m), prior included.
+
+        Args:
+            R: rows of unit variance.
+            precision: (m, m) of the prior in force on u.
+            at_least: number of weak directions to be kept, so that an iteration cannot alternate.
+        """
+        _, sizes, directions = np.linalg.svd(R)
+        k = min(int(np.count_nonzero(sizes * MAX_SIGMA >= 1.0)), len(R) - at_least)
+        return cls(directions[:k].T, directions[k:].T, 1.0 / sizes[:k], precision)
+
+    @property
+    def prior_covariance(self) -> Array:
+        """(w, w) of the weak directions under the prior alone, the strong ones given."""
+        return np.asarray(np.linalg.inv(self.weak.T @ self.precision @ self.weak), dtype=float)
+
+    def prior_mean(self, u: Array) -> Array:
+        """(w,) of the weak directions under the prior alone, the strong ones of u (m,) given."""
+        given = self.strong @ (self.strong.T @ u)
+        return np.asarray(-self.prior_covariance @ (self.weak.T @ (self.precision @ given)))
+
+    def covariance(self) -> Array:
+        """(m, m) of u: posterior of the strong directions, prior of the weak ones, no correlation between the two."""
+        root = self.strong * self.sigmas
+        return root @ root.T + self.weak @ self.prior_covariance @ self.weak.T
+
+    def again(self, R: Array) -> WeakDirections:
+        """The same weak directions, the strong ones as another square-root information (m, m) has them."""
+        _, sizes, axes = np.linalg.svd(R @ self.strong)
+        return WeakDirections(self.strong @ axes.T, self.weak, 1.0 / sizes[: len(axes)], self.precision)
+
+    def with_curvature(self, covariance: Array) -> WeakDirections:
+        """Add a covariance (k, k) of second order to the strong directions; those that become too wide are weak."""
+        variances, axes = np.linalg.eigh(np.diag(self.sigmas**2) + covariance)
+        kept, axes = variances <= MAX_SIGMA**2, self.strong @ axes
+        weak = np.hstack([axes[:, ~kept], self.weak])
+        return WeakDirections(axes[:, kept], weak, np.sqrt(variances[kept]), self.precision)
+
+
+def constrained_step(directions: WeakDirections, R: Array, d: Array, u: Array) -> Array:
+    """Move (m,) of u to the minimum over the strong directions, the weak ones at their prior means.
+
+    Args:
+        directions: of the system at u.
+        R, d: square-root information of the move, |R du - d| minimal.
+        u: (m,) where the system is linearised.
+    """
+    strong, *_ = np.linalg.lstsq(R @ directions.strong, d, rcond=None)
+    there = u + directions.strong @ strong
+    strong_part = directions.strong @ (directions.strong.T @ there)
+    return np.asarray(strong_part + directions.weak @ directions.prior_mean(there) - u)
+
+
+def curvature(directions: WeakDirections, roots: Callable[[Array], Iterable[Array]]) -> Array:
+    """Covariance (k, k) of second order: how far strong directions follow the less known ones.
+
+    A strong direction that follows by w'Hw/2, w white in units of sigmas, has the variance tr(HH)/2 and the mean
+    tr(H)/2 beside what the linear system says. Hw is the slope of its conditional minimum at w. Slopes at DRAWS
+    random w span the few ways along which anything is curved; slopes along these give H.
+
+    Args:
+        directions: of the system at its solution.
+        roots: square-root information (m, m) of u at the points moved by (m, n), all else following.
+    """
+    k, m = len(directions.sigmas), len(directions.precision)
+    if not k:
+        return np.zeros((0, 0))
+    wide = np.sqrt(np.diag(directions.prior_covariance))
+    sigmas, axes = np.concatenate([directions.sigmas, wide]), np.hstack([directions.strong, directions.weak])
+    follows = sigmas[:k, None] < FOLLOWS * sigmas
+
+    def slopes(ways: Array) -> Array:
+        there = roots(axes @ (sigmas[:, None] * ways))
+        triangles = [np.asarray(np.linalg.qr(R @ axes, mode="r"), dtype=float)[:k] for R in there]
+        return np.array([np.where(follows, -R / np.diag(R)[:, None], 0.0) * sigmas for R in triangles])
+
+    drawn = slopes(np.random.default_rng(0).standard_normal((m, DRAWS)))
+    spread = np.sqrt(directions.sigmas**2 + np.square(drawn).sum(axis=2).mean(axis=0))
+    sizes, ways = np.linalg.svd((drawn / spread[:, None]).reshape(-1, m), full_matrices=False)[1:]
+    ways = ways[sizes > STRAIGHT * np.sqrt(DRAWS)]
+    if not len(ways):
+        return np.zeros((k, k))
+    H = slopes(np.sqrt(len(ways)) * ways.T) / np.sqrt(len(ways))
+    mean = 0.5 * np.einsum("ial,il->a", H, ways)
+    return np.asarray(0.5 * np.einsum("ial,ibl->ab", H, H) + np.outer(mean, mean))
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """The final posterior of the reported numbers: the one that all results are made of.
+
+    Attributes:
+        values: of all variables, weak directions at their prior means.
+        factorization: of the system there.
+        reported: the numbers there.
+        directions: strong and weak ones, second order included.
+        converged: whether the constrained solution is one; else the strong directions are as they were.
+    """
+
+    values: Values
+    factorization: Factorization
+    reported: Reported
+    directions: WeakDirections
+    converged: bool
+
+    @property
+    def covariance(self) -> Array:
+        """(n, n) of all reported numbers."""
+        return self.reported.covariance(self.directions.covariance())
+
+
+def constrained_solution(
+    problem: Problem, engine: Engine, values: Values, current_keys: Mapping[int, int]
+) -> Posterior:
+    """The posterior near a minimum, its weak directions at the prior.
+
+    Args:
+        problem: of which the reported numbers are.
+        engine: of its factors, without the measurements that are rejected: elsewhere the loss would reject others.
+        values: at a minimum.
+        current_keys: parameter key -> variable that holds its value.
+
+    Raises:
+        IndeterminateStateError: a state is not determined.
+    """
+    found = _constrained(problem, engine, values, current_keys, None)
+    for _ in range(ROUNDS):
+        second_order = curvature(found.directions, partial(_roots, problem, engine, found, current_keys))
+        directions = found.directions.with_curvature(second_order)
+        if directions.weak.shape[1] == found.directions.weak.shape[1]:
+            break
+        found = _constrained(problem, engine, found.values, current_keys, directions)
+    return replace(found, directions=directions)
+
+
+def _constrained(
+    problem: Problem,
+    engine: Engine,
+    values: Values,
+    current_keys: Mapping[int, int],
+    fixed: WeakDirections | None,
+) -> Posterior:
+    """The minimum with the weak directions at their prior means: those of the system there, or fixed ones."""
+    weak, cost = 0, np.inf
+    for _ in range(MAX_STEPS):
+        factorization = engine.at(values)[0].eliminate()
+        reported = Reported.of(problem, engine.layout, values, current_keys)
+        found = reported.root(factorization.root)
+        directions = WeakDirections.of(found.R, reported.prior, weak) if fixed is None else fixed.again(found.R)
+        weak = directions.weak.shape[1]
+        du = constrained_step(directions, found.R, found.d, reported.u)
+        size = np.linalg.norm(directions.strong.T @ du / directions.sigmas), np.linalg.norm(directions.weak.T @ du)
+        if max(size) < NEAR:
+            return Posterior(values, factorization, reported, directions, True)
+        share, there = 1.0, _moved(engine, factorization, values, found, du)
+        if size[1] < NEAR:  # the weak directions are where they are to be: from here on the cost falls
+            while engine.cost(there) > cost and share > 1e-3:
+                share *= 0.3
+                there = _moved(engine, factorization, values, found, share * du)
+            cost = engine.cost(there)
+        values = there
+    return Posterior(values, factorization, reported, directions, False)
+
+
+def _moved(engine: Engine, factorization: Factorization, values: Values, found: ReportedRoot, du: Array) -> Values:
+    """Values with the reported numbers moved by du (m,), all else where it is optimal then."""
+    last = found.last(du[:, None])
+    states, nodes = factorization.given(last)
+    move = Tangent(states[..., 0], nodes[..., 0], last[factorization.c :, 0])
+    return engine.layout.retract(values, move)
+
+
+def _roots(
+    problem: Problem, engine: Engine, at: Posterior, current_keys: Mapping[int, int], moves: Array
+) -> Iterator[Array]:
+    """Square-root information (m, m) of the numbers moved by (m, n) from a solution, all else following."""
+    found = at.reported.root(at.factorization.root)
+    last = found.last(moves, 0.0)
+    states, nodes = at.factorization.propagate(last)
+    for i in range(moves.shape[1]):
+        move = Tangent(states[..., i], nodes[..., i], last[at.factorization.c :, i])
+        there = engine.layout.retract(at.values, move)
+        reported = Reported.of(problem, engine.layout, there, current_keys)
+        yield reported.root(engine.at(there)[0].eliminate().root).R

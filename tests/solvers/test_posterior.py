@@ -1,0 +1,334 @@
+"""What is derived from the chain's factor, against dense least squares of gtsam's linearisation, for every method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cache
+
+import gtsam
+import numpy as np
+import pytest
+
+from alidade.pipelines.estimation.problem import Array, Factor, Problem
+from alidade.pipelines.solvers.chain import ChainFactorization
+from alidade.pipelines.solvers.error_budget import (
+    Influence,
+    added_variance,
+    autocorrelation,
+    error_budget,
+    inflation,
+    most_influential,
+)
+from alidade.pipelines.solvers.layout import Layout, Tangent, Values
+from alidade.pipelines.solvers.linearization import NOT_MEASURED, Linearization
+from alidade.pipelines.solvers.posterior import (
+    Reported,
+    chi_square,
+    expected_squares,
+    leverages,
+    sqrt_information,
+)
+from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed_bias
+from alidade.pipelines.solvers.weak_directions import WeakDirections
+from tests.support.problems import SCENARIOS, problem
+
+
+@dataclass(frozen=True, eq=False)
+class Dense:
+    """A problem near its minimum, its chain, and gtsam's linearisation of the same factors as one dense system."""
+
+    problem: Problem
+    factors: list[Factor]
+    current: dict[int, int]
+    linearization: Linearization
+    values: Values
+    factorization: ChainFactorization
+    rows: list[Array]  # of each factor, over all unknowns
+    rights: list[Array]
+    numbers: Array  # (n, unknowns) Jacobian of the reported numbers
+    columns: dict[int, slice]
+
+    @property
+    def reported(self) -> Reported:
+        return Reported.of(self.problem, self.linearization.layout, self.values, self.current)
+
+    @property
+    def covariance(self) -> Array:
+        """(unknowns, unknowns)."""
+        inverse = np.linalg.inv(np.linalg.qr(np.vstack(self.rows), mode="r"))
+        return np.asarray(inverse @ inverse.T)
+
+
+@cache
+def dense(name: str) -> Dense:
+    made, initial, factors, current, times = problem(name), gtsam.Values(), list[Factor](), dict[int, int](), []
+    for step in made.steps(10**9):
+        initial.insert(step.initial)
+        factors += step.factors
+        current.update(step.current_keys)
+        times.append(step.time)
+    assert made.layout is not None
+    layout, values = Layout.of(made.layout, initial)
+    linearization = Linearization.of(factors, layout).under(None)
+    for _ in range(3):
+        step_taken = Tangent(*ChainFactorization.of(linearization.at(values)[0]).solve())
+        values = layout.retract(values, step_taken)
+    at = layout.to_gtsam(values)
+    graph = gtsam.GaussianFactorGraph()
+    for f in factors:
+        graph.add((f.factor if f.vectorized is None else f.vectorized.under(None).factor).linearize(at))
+    dims, end, columns = at.dims(), 0, {}
+    for key in at.keys():
+        columns[key] = slice(end, end + dims[key])
+        end += dims[key]
+    rows, rights = [], []
+    for i in range(graph.size()):
+        linear = graph.at(i)
+        A, b = linear.jacobian()
+        whole, begin = np.zeros((len(A), end)), 0
+        for key in linear.keys():
+            whole[:, columns[key]] = A[:, begin : begin + dims[key]]
+            begin += dims[key]
+        rows.append(whole)
+        rights.append(b)
+    numbers = []
+    for p in made.parameters:
+        key = current.get(p.key, p.key)
+        _, J = p.coordinates(at, key)
+        block = np.zeros((len(J), end))
+        block[:, columns[key]] = J
+        numbers.append(block)
+    factorization = ChainFactorization.of(linearization.at(values)[0])
+    return Dense(
+        made, factors, current, linearization, values, factorization, rows, rights, np.vstack(numbers), columns
+    )
+
+
+def all_strong(reported: Reported, R: Array) -> WeakDirections:
+    """Every direction as the linear system has it."""
+    _, sizes, axes = np.linalg.svd(R)
+    return WeakDirections(axes.T, np.zeros((len(R), 0)), 1.0 / sizes, reported.prior)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_covariance_of_reported_numbers_is_the_dense_marginal(name: str) -> None:
+    case = dense(name)
+    reported = case.reported
+    expected = case.numbers @ case.covariance @ case.numbers.T
+    found = reported.covariance(reported.root(case.factorization.root).covariance()) - np.diag(reported.extra**2)
+    sigmas = np.sqrt(np.diag(expected))[reported.free]
+    block = np.ix_(reported.free, reported.free)
+    np.testing.assert_allclose(
+        found[block] / np.outer(sigmas, sigmas), expected[block] / np.outer(sigmas, sigmas), atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_degrees_of_freedom_are_rows_less_leverages(name: str) -> None:
+    case = dense(name)
+    covariance, families, total = case.covariance, dict[str, list[float]](), 0.0
+    for f, A, b in zip(case.factors, case.rows, case.rights, strict=True):
+        if f.family not in NOT_MEASURED:
+            h = np.einsum("ij,jk,ik->i", A, covariance, A)
+            value, dof, used = families.get(f.family, [0.0, 0.0, 0.0])
+            v = f.vectorized
+            count = len(A) if v is None else v.model.rows * len(v.model.time)  # of which a compressed factor has fewer
+            families[f.family] = [value + float(b @ b), dof + count - h.sum(), used + h.sum()]
+    found = leverages(case.linearization, case.factorization, case.values)
+    summary = chi_square(found)
+    assert set(summary.families) == set(families)
+    for family, (value, dof, used) in families.items():
+        if name != "indexer":  # its compressed factors leave out what no unknown changes
+            assert summary.families[family][0] == pytest.approx(value, rel=1e-5, abs=1e-6)
+        # The trace over 6 draws at least scatters by sqrt(2 sum over pairs of H^2 / draws), H^2 at most dof or used.
+        assert summary.families[family][1] == pytest.approx(
+            dof, abs=4.0 * np.sqrt((used if family == "bias walk" else min(used, dof)) / 3.0) + 0.05
+        )
+        assert summary.families[family][1] >= 0.0
+        total += dof
+    assert summary.dof == pytest.approx(total, rel=0.01, abs=0.5)
+    squares = expected_squares(case.linearization, case.factorization, case.values)
+    for family, (_, dof) in summary.families.items():
+        assert sum(v for (f, _), v in squares.items() if f == family) == pytest.approx(dof, rel=1e-6, abs=1e-6)
+
+
+def test_priors_alone_have_no_chi_square_and_do_not_crash() -> None:
+    assert chi_square([]).dof == 0.0
+    assert chi_square([]).families == {}
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_budget_and_influence_are_those_of_the_dense_system(name: str) -> None:
+    case = dense(name)
+    reported = case.reported
+    found = reported.root(case.factorization.root)
+    influence = Influence.of(
+        reported, all_strong(reported, found.R), case.linearization, case.factorization, case.values
+    )
+    gains = (case.numbers @ case.covariance)[reported.free]
+    variance = np.einsum("ij,ij->i", gains, case.numbers[reported.free])
+    families: dict[str, Array] = {}
+    for f, A in zip(case.factors, case.rows, strict=True):
+        families[f.family] = families.get(f.family, np.zeros(len(gains))) + np.square(gains @ A.T).sum(axis=1)
+    covariance = reported.covariance(found.covariance()) - np.diag(reported.extra**2)
+    budget = error_budget(influence, {}, covariance)
+    for j, name_of in enumerate(influence.names):
+        shares = budget[name_of]
+        assert sum(shares.values()) == pytest.approx(1.0)
+        for family, squares in families.items():
+            if family != "prior":
+                assert shares.get(family, 0.0) == pytest.approx(squares[j] / variance[j], abs=1e-5)
+        priors = sum(share for source, share in shares.items() if source.startswith("prior"))
+        assert priors == pytest.approx(families["prior"][j] / variance[j], abs=1e-5)
+        assert shares.get("not modelled", 0.0) < 1e-5
+
+
+def test_moves_of_a_changed_input_are_those_of_the_dense_system() -> None:
+    case = dense("head")
+    reported = case.reported
+    found = reported.root(case.factorization.root)
+    influence = Influence.of(
+        reported, all_strong(reported, found.R), case.linearization, case.factorization, case.values
+    )
+    groups = [
+        replace(g, weights=np.full((len(g.model.time), g.model.rows), 0.9)) if g.is_measurement else g
+        for g in case.linearization.groups
+    ]
+    moves = influence.moves(replace(case.linearization, groups=groups))
+    gradient = np.zeros(case.numbers.shape[1])
+    for f, A, b in zip(case.factors, case.rows, case.rights, strict=True):
+        if f.measurement is not None:
+            gradient += (0.81 - 1.0) * A.T @ b
+    expected = (case.numbers @ case.covariance @ gradient)[reported.free]
+    np.testing.assert_allclose(moves, expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max())
+
+
+def test_most_influential_measurements_are_in_balance_with_all_others() -> None:
+    case = dense("los")
+    reported = case.reported
+    found = reported.root(case.factorization.root)
+    influence = Influence.of(
+        reported, all_strong(reported, found.R), case.linearization, case.factorization, case.values
+    )
+    covariance = reported.covariance(found.covariance())
+    sigmas = dict(zip(reported.names, np.sqrt(np.diag(covariance)), strict=True))
+    first = most_influential(influence, {"delta_px": sigmas["delta_px"]}, 20)
+    gain = (case.numbers @ case.covariance)[reported.names.index("delta_px")]
+    moves = [
+        float(gain @ A[m * i : m * i + m].T @ b[m * i : m * i + m]) / sigmas["delta_px"]
+        for f, A, b in zip(case.factors, case.rows, case.rights, strict=True)
+        if f.vectorized is not None and f.family != "prior"
+        for m in [f.vectorized.model.rows]
+        for i in range(len(f.vectorized.model.time))
+    ]
+    expected = -np.sort(-np.abs(moves))[:20]
+    np.testing.assert_allclose([abs(pull.sigmas) for pull in first], expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_square_root_information_with_device_priors_is_all_there_is(name: str) -> None:
+    case = dense(name)
+    reported = case.reported
+    device = {reported.names[i] for i in reported.free[::2]}
+    told = sqrt_information(case.problem, case.linearization, case.values, case.current, device)
+    information = told.R.T @ told.R + told.prior_R.T @ told.prior_R
+    expected = case.numbers @ case.covariance @ case.numbers.T
+    block = expected[np.ix_(reported.free, reported.free)]
+    sigmas = np.sqrt(np.diag(block))
+    found = np.linalg.inv(information * np.outer(sigmas, sigmas))
+    np.testing.assert_allclose(found, block / np.outer(sigmas, sigmas), atol=1e-5)
+    assert (np.abs(told.prior_R) > 0.0).sum(axis=1).max(initial=1) >= 1
+    # The prior of a bias that walks is about its first node, which is not what is reported.
+    walking = {"gyro_bias_x", "gyro_bias_y", "gyro_bias_z"} if case.linearization.layout.sizes[3] else set()
+    assert len(told.prior_R) == len(device - walking)
+
+
+def test_square_root_information_elsewhere_is_linear_there() -> None:
+    case = dense("head")
+    wanted = {"helmet_mount_x": 0.1}
+    told = sqrt_information(case.problem, case.linearization, case.values, case.current, set(), wanted)
+    assert told.at[told.names.index("helmet_mount_x")] == pytest.approx(0.1, abs=1e-3)
+
+
+@pytest.mark.parametrize("name", ["los", "head with a bias that walks"])
+def test_history_ends_with_the_estimate(name: str) -> None:
+    case = dense(name)
+    layout = case.linearization.layout
+    time = np.arange(layout.sizes[0], dtype=float)
+    system, _ = case.linearization.at(case.values)
+    course = posterior_history(
+        case.problem, case.linearization, system, case.factorization, case.values, case.current, time
+    )
+    assert course is not None
+    reported = case.reported
+    R = reported.root(case.factorization.root).R
+    expected = reported.covariance(WeakDirections.of(R, reported.prior).covariance())
+    np.testing.assert_allclose(course.covariance[-1], expected, rtol=1e-6, atol=1e-12 * expected.max())
+    assert len(course.time) > 10
+    # What is determined only gets better known.
+    widest = np.linalg.eigvalsh(course.covariance[:, reported.free[:, None], reported.free])[:, -1]
+    assert widest[-1] <= widest[0] * (1.0 + 1e-9)
+    assert not course.steady[[n.startswith("gyro_bias") for n in reported.names]].any()
+    assert course.steady[[not n.startswith("gyro_bias") for n in reported.names]].all()
+
+
+def test_smoothed_bias_has_the_dense_sigmas() -> None:
+    case = dense("head with a bias that walks")
+    layout = case.linearization.layout
+    nodes = np.array([gtsam.symbol("b", j) for j in range(layout.sizes[2])])
+    history = smoothed_bias(layout, case.factorization, case.values, nodes.astype(float), nodes, slice(0, 3))
+    covariance = case.covariance
+    expected = [np.sqrt(np.diag(covariance[case.columns[int(key)], case.columns[int(key)]])) for key in nodes]
+    ratio = history.sigmas / np.array(expected)
+    assert np.abs(ratio - 1.0).max() < 0.25
+    assert ratio.mean() == pytest.approx(1.0, abs=0.05)
+
+
+def test_autocorrelation_is_that_of_the_noise() -> None:
+    rng = np.random.default_rng(0)
+    white, walk = rng.standard_normal((4000, 1)), np.zeros((4000, 1))
+    for i in range(1, len(walk)):
+        walk[i] = 0.9 * walk[i - 1] + rng.standard_normal()
+    assert len(autocorrelation(white)) == 0
+    assert 10.0 < 1.0 + 2.0 * float(autocorrelation(walk).sum()) < 30.0  # 19 for the process
+
+
+def test_correlated_residuals_of_one_family_leave_what_another_determines() -> None:
+    """Accelerometer and magnetometer are not tied: correlated field readings widen nothing but the magnetometer's."""
+    case = dense("tumble with gyro")
+    reported = case.reported
+    found = reported.root(case.factorization.root)
+    influence = Influence.of(
+        reported, all_strong(reported, found.R), case.linearization, case.factorization, case.values
+    )
+    families = {g.family for g in case.linearization.groups if g.is_measurement}
+    added = {family: added_variance(influence, {family: 0.8 ** np.arange(1, 8)})[family] for family in families}
+    names = list(influence.names)
+    budget = error_budget(influence, {}, reported.covariance(found.covariance()))
+    for family, more in added.items():
+        for name, variance in zip(names, more, strict=True):
+            # A family adds at most 2 sum of the correlation times what it has in the variance.
+            own = budget[name].get(family, 0.0) * found.covariance()[names.index(name), names.index(name)]
+            own *= reported.scale[names.index(name)] ** 2
+            assert variance <= 2.0 * (0.8 ** np.arange(1, 8)).sum() * own * (1.0 + 1e-6) + 1e-30
+
+
+def test_added_variance_is_that_of_drawn_noise() -> None:
+    """Autocorrelated noise through the influence of one family has the variance that is said."""
+    case = dense("head")
+    reported = case.reported
+    found = reported.root(case.factorization.root)
+    influence = Influence.of(
+        reported, all_strong(reported, found.R), case.linearization, case.factorization, case.values
+    )
+    lags = 0.8 ** np.arange(1, 40)
+    (family,) = {g.family for g in case.linearization.groups if g.is_measurement}
+    added = added_variance(influence, {family: lags})[family]
+    (group,) = [g for g in case.linearization.groups if g.is_measurement]
+    L, _ = influence.rows(group)
+    n = len(L)
+    g = np.concatenate([[1.0], lags, np.zeros(n)])[np.abs(np.subtract.outer(np.arange(n), np.arange(n)))]
+    exact = np.einsum("irm,ij,jrm->m", L, g, L) - np.square(L).sum(axis=(0, 1))
+    np.testing.assert_allclose(added, np.maximum(exact, 0.0), rtol=1e-6, atol=1e-12 * np.abs(exact).max())
+    ratios = inflation(reported.names, reported.covariance(found.covariance()), influence.names, {family: added})
+    assert (ratios >= 1.0).all()
