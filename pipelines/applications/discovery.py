@@ -92,7 +92,7 @@ def with_suggested(recording: Recording, config: Config, method: str | None = No
         raise InputError(f"{recording.path}: {what or 'no topics for any method were found'}; {recording.there()}")
     more = config.model_copy(update={"topics": {**config.topics, **whole[0].topics}, "method": whole[0].method})
     recording.use(more.topics.values(), {})
-    recording.remark(f"topics taken as suggested for {whole[0].method}: {'; '.join(whole[0].reasons)}")
+    recording.remark(f"topics chosen automatically ({whole[0].method}): {'; '.join(whole[0].reasons)}")
     return more
 
 
@@ -102,7 +102,7 @@ def nearest_suggestion(found: Sequence[Suggestion]) -> str:
         return ""
     best = min(found, key=lambda suggestion: len(suggestion.missing))
     by_name = f"--method {best.method} " if best.has_to_be_asked_for else ""
-    lacks = f"; still lacking: {'; '.join(best.missing)}" if best.missing else f", which `{by_name}--auto-topics` takes"
+    lacks = f"; still missing: {'; '.join(best.missing)}" if best.missing else f", which `{by_name}--auto-topics` uses"
     if not best.topics:
         return f"for {best.method}: {'; '.join(best.reasons)}{lacks}"
     topics = best.yaml.replace("\n  ", ", ").replace("topics:,", "topics: {", 1).replace("{ ", "{") + "}"
@@ -187,7 +187,7 @@ def _suggestion(
             )
         if named is not None:
             topics[topic.key] = TopicSource(topic=named)
-            reasons.append(f"{named} ({_short(recording, named)}) can serve as {topic.key}")
+            reasons.append(f"{named} ({_short(recording, named)}) proposed as {topic.key}")
     more = config.model_copy(update={"topics": {**config.topics, **topics}})
     before = tuple(config.topics.values())
     recording.use(more.topics.values(), {})
@@ -238,10 +238,9 @@ def _pair_up(
         topics[gyro.key] = g
     if config.topic(attitude) != a.name or found.inverted:
         topics[attitude.key] = a.model_copy(update={"invert": a.invert != found.inverted})
-    way = ", as the inverse of the attitude meant" if found.inverted else ""
-    delay = f", {1e3 * abs(found.offset_s):.0f} ms {'early' if found.offset_s > 0.0 else 'late'}"
-    late = delay if abs(found.offset_s) > _DELAY else ""
-    reasons.append(f"{a.name} turns with {g.name} (correlation {found.correlation:.2f}{late}){way}")
+    way = ", inverted" if found.inverted else ""
+    offset = f", time offset {1e3 * found.offset_s:+.0f} ms" if abs(found.offset_s) > _DELAY else ""
+    reasons.append(f"{a.name} matches {g.name}: rate correlation {found.correlation:.2f}{offset}{way}")
     return True
 
 

@@ -24,7 +24,7 @@ _MAX_NAMED = 3
 _DIRECTIONS = {Severity.UNOBSERVABLE: "Not observable", Severity.WEAK: "Less accurate than required"}
 _NEXT = {
     "calibrated": (
-        "Apply it: formulas, Python, C and ROS parameters are below, under How to apply it.",
+        "Apply it: formulas, Python, C and ROS parameters are below, under Apply.",
         "Later, `alidade validate RECORDING --calibration calibration.yaml` says whether it still holds.",
     ),
     "weak": ("Parameters that are observable can be applied as they are; for the others record again.",),

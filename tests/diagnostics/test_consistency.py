@@ -373,7 +373,7 @@ def test_a_flipped_axis_ends_inconsistent_with_that_first(tmp_path: Path) -> Non
     assert first["label"] == saved["causes"][0]["label"] == label
     assert first["chi_square_after"] < 0.1 * first["chi_square_before"]
     assert f"Consistent with: {label} (chi-square" in saved["headline"]
-    assert "Hypotheses" in (out / "report.html").read_text()
+    assert "Tested hypotheses" in (out / "report.html").read_text()
 
 
 def test_a_trial_that_raises_ends_alone_and_is_logged(

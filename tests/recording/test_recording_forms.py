@@ -845,7 +845,7 @@ BUNCHES = 8 * STEP * (np.arange(400) // 8) + 30_000 * (np.arange(400) % 8) + JIT
         (STEP * np.arange(400), LATE, "100 % of the stamps are exactly 10 ms apart while log times jitter by 0."),
         (FLOAT_S, LATE, "100 % of the stamps are exactly 9.99"),
         (STEP * (np.arange(400) + (np.arange(400) > 200)), LATE, "100 % of the stamps are exactly 10 ms"),
-        (BUNCHES, BUNCHES, "88 % of the stamps are bunched"),
+        (BUNCHES, BUNCHES, "88 % of stamps in bursts"),
         (STEP * np.arange(400), STEP * np.arange(400), ""),
         (STEP * np.arange(400) + JITTER // 10, LATE, ""),
         (STEP * np.arange(400) + JITTER // 10, BUNCHES, ""),
