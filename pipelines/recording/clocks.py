@@ -41,8 +41,8 @@ def check_clock(topic: str, t_ns: Stamps, log_ns: Stamps, epoch_ns: int) -> None
         way = "back" if step.size < 0.0 else "forward"
         raise InputError(
             f"topic {topic}: {step.what} jump {way} by {abs(step.size):.3f} s after "
-            f"{(step.after_ns - epoch_ns) * 1e-9:.3f} s (clock adjusted). Split the recording there, or record again with "
-            "the clock free-running"
+            f"{(step.after_ns - epoch_ns) * 1e-9:.3f} s (clock adjusted). Split the recording there, or record again "
+            "with the clock free-running"
         )
 
 
