@@ -13,7 +13,7 @@ from alidade.pipelines import methods
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.info import lacking
-from alidade.pipelines.recording.pairing import Pairing, pair
+from alidade.pipelines.recording.pairing import MAX_MOUNT, Pairing, pair
 from alidade.pipelines.recording.placeholders import is_there
 from alidade.pipelines.recording.reading import Recording
 from alidade.pipelines.recording.series import ImuSeries
@@ -154,16 +154,18 @@ def _suggestion(
     taken = {config.topic(topic) for topic in chosen.topics if config.topic(topic) in recording.topics}
     topics: dict[str, TopicSource] = {}
     reasons: list[str] = []
+    doubtful: set[str] = set()
     attitudes = [topic for topic in needed if _is_attitude(topic)]
     gyros = [topic for topic in needed if messages.IMU in topic.types and not _is_attitude(topic)]
     for attitude in attitudes:
         for gyro in gyros:
             free = [_candidates(recording, config, topic, taken) for topic in (attitude, gyro)]
-            _pair_up(recording, config, (attitude, gyro), free, pairings, topics, reasons)
+            if not _pair_up(recording, config, (attitude, gyro), free, pairings, topics, reasons):
+                doubtful.add(attitude.key)
     for topic in dict.fromkeys([*needed, *chosen.topics]):
         if topic.key in topics or config.topic(topic) in recording.topics or topic.key in config.topics:
             continue
-        if topic not in needed and not topics:
+        if topic.key in doubtful or (topic not in needed and not topics):
             continue
         used = taken | {part for source in topics.values() for part in (source.name, *source.parts)}
         split = _split_imu(recording, used) if messages.IMU in topic.types and not _is_attitude(topic) else None
@@ -197,8 +199,11 @@ def _pair_up(
     pairings: dict[tuple[str, str], Pairing | None],
     topics: dict[str, TopicSource],
     reasons: list[str],
-) -> None:
-    """The gyro and the attitude that turn together most alike, of those that may serve."""
+) -> bool:
+    """The gyro and the attitude that turn together most alike, of those that may serve.
+
+    Returns False where the best attitude fits only in a way that is not taken without being asked for.
+    """
     attitude, gyro = pair_of
     best: tuple[float, TopicSource, TopicSource, Pairing] | None = None
     for a in free[0]:
@@ -211,8 +216,15 @@ def _pair_up(
             if found is not None and found.correlation > _BELONGS and (best is None or found.correlation > best[0]):
                 best = found.correlation, g, a, found
     if best is None:
-        return
+        return True
     _, g, a, found = best
+    if found.order != (0, 1, 2, 3) or (found.inverted and found.angle > MAX_MOUNT):
+        fits = "inverted, far from its mount" if found.inverted else "in another order of its components"
+        reasons.append(
+            f"{a.name} turns with {g.name}, but {fits}: are they x, y, z, w where w, x, y, z is meant? Not taken by "
+            "itself: mend the order, or say invert in the config"
+        )
+        return False
     if config.topic(gyro) != g.name:
         topics[gyro.key] = g
     if config.topic(attitude) != a.name or found.inverted:
@@ -221,6 +233,7 @@ def _pair_up(
     delay = f", {1e3 * abs(found.offset_s):.0f} ms {'early' if found.offset_s > 0.0 else 'late'}"
     late = delay if abs(found.offset_s) > _DELAY else ""
     reasons.append(f"{a.name} turns with {g.name} (correlation {found.correlation:.2f}{late}){way}")
+    return True
 
 
 def _candidates(recording: Recording, config: Config, topic: Topic, taken: set[str]) -> list[TopicSource]:

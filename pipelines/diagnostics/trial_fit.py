@@ -74,6 +74,12 @@ class TrialFit:
         return self.chi_square.value + self.lost
 
     @property
+    def cost_with_priors(self) -> float:
+        """The same with how far the solution is from its priors: what weighs corrections that fit alike."""
+        found = zip(self.quantities, self.estimate.values.tolist(), strict=True)
+        return self.cost + sum(((x - q.prior_mean) / q.prior_sigma) ** 2 for q, x in found if q.prior_sigma)
+
+    @property
     def factor(self) -> float:
         """Factor on the noise used with which the recording would fit."""
         return float(np.sqrt(self.cost / max(self.dof, 1.0)))

@@ -146,7 +146,7 @@ def test_sign_of_the_platform_gyro(head: Case) -> None:
 def test_faults_of_the_head_are_mended(head: Case) -> None:
     """What each trial changes, changed back by the same."""
     find, data, config = head
-    inverted, swapped, moving = find.hypotheses().faults
+    inverted, reordered, reordered_back, swapped, moving = find.hypotheses().faults
     once = inverted.corrected(data, config)
     assert once is not None
     np.testing.assert_allclose(once[0].vision_wxyz, so3.inverse(data.vision_wxyz))
@@ -154,6 +154,12 @@ def test_faults_of_the_head_are_mended(head: Case) -> None:
     assert again is not None
     np.testing.assert_allclose(again[0].vision_wxyz, data.vision_wxyz)
     np.testing.assert_allclose(again[0].vision_cov, data.vision_cov, atol=1e-18)
+    once = reordered.corrected(replace(data, vision_wxyz=data.vision_wxyz[:, [1, 2, 3, 0]]), config)
+    assert once is not None
+    np.testing.assert_array_equal(once[0].vision_wxyz, data.vision_wxyz)
+    once = reordered_back.corrected(replace(data, vision_wxyz=data.vision_wxyz[:, [3, 0, 1, 2]]), config)
+    assert once is not None
+    np.testing.assert_array_equal(once[0].vision_wxyz, data.vision_wxyz)
     once = swapped.corrected(data, config)
     assert once is not None
     assert once[0].head_gyro is data.platform_gyro

@@ -22,8 +22,8 @@ from alidade.pipelines.methods import method, simulate
 from alidade.pipelines.methods.head.topics import VISION_ATTITUDE
 from alidade.pipelines.methods.indexer.simulation import Position
 from alidade.pipelines.recording import messages, series
-from alidade.pipelines.recording.checks import density
 from alidade.pipelines.recording.gyro import read_gyro
+from alidade.pipelines.recording.placeholders import density
 from alidade.pipelines.recording.reading import Recording, open_recording
 from alidade.pipelines.recording.sources import TopicSource, inverted
 from alidade.pipelines.recording.topics import IMU
@@ -935,7 +935,7 @@ def test_log_times_in_place_of_stamps_stand_in_the_sigma_of_the_delay(
 def test_covariances_that_no_sensor_has_are_not_believed(variance: float, least: float, believed: float | None) -> None:
     dropped: dict[str, int] = {}
     covariance = np.broadcast_to(np.diag([variance, *(2 * [abs(variance)])]), (50, 3, 3))
-    found = density("/imu", 0.01 * np.arange(50.0), covariance, least, dropped)
+    found = density("/imu", "gyro", 0.01 * np.arange(50.0), covariance, least, dropped)
     assert found == (None if believed is None else pytest.approx(believed))
     assert sum(dropped.values()) == (50 if variance in (1e-12, -1.0) else 0)
 
