@@ -25,6 +25,8 @@ from alidade.pipelines.settings import Config
 _BELONGS = 0.7
 # Names are alike above this ratio of difflib.
 _ALIKE = 0.6
+# ... and one is meant rather than another by a ratio so much larger.
+_CLEARLY = 0.1
 # Of the pairs of frames of a TFMessage so many are tried, those with so many transforms at least.
 _MOST_PAIRS, _FEWEST = 12, 20
 # Delays worth a word, s.
@@ -66,7 +68,7 @@ def suggestions(recording: Recording, config: Config, only: Sequence[str] | None
             if made.topics and made.missing and config.method is None:
                 by_name = _suggestion(name, recording, config.model_copy(update={"method": name}), pairings)
                 made = replace(by_name, has_to_be_asked_for=True) if not by_name.missing else made
-            if made.topics:
+            if made.topics or made.reasons:
                 found.append(made)
     return tuple(found)
 
@@ -99,7 +101,10 @@ def nearest_suggestion(found: Sequence[Suggestion]) -> str:
     if not found:
         return ""
     best = min(found, key=lambda suggestion: len(suggestion.missing))
-    lacks = f"; still lacking: {'; '.join(best.missing)}" if best.missing else ", which `--auto-topics` takes"
+    by_name = f"--method {best.method} " if best.has_to_be_asked_for else ""
+    lacks = f"; still lacking: {'; '.join(best.missing)}" if best.missing else f", which `{by_name}--auto-topics` takes"
+    if not best.topics:
+        return f"for {best.method}: {'; '.join(best.reasons)}{lacks}"
     topics = best.yaml.replace("\n  ", ", ").replace("topics:,", "topics: {", 1).replace("{ ", "{") + "}"
     return f"for {best.method}: {'; '.join(best.reasons)}: `{topics}`{lacks}"
 
@@ -176,6 +181,10 @@ def _suggestion(
             )
             continue
         named = _by_name(recording, topic, used, is_needed=topic in needed)
+        if named is None and topic in needed and len(several := _of_type(recording, topic, used)) > 1:
+            reasons.append(
+                f"{' and '.join(several)} could be the {topic.key}: choose, `topics: {{{topic.key}: {several[0]}}}`"
+            )
         if named is not None:
             topics[topic.key] = TopicSource(topic=named)
             reasons.append(f"{named} ({_short(recording, named)}) can serve as {topic.key}")
@@ -284,16 +293,12 @@ def _by_name(recording: Recording, topic: Topic, used: set[str], is_needed: bool
 
     An attitude of an Imu is left to its content, which pairs it.
     """
-    there = [
-        name
-        for name, found in recording.topics.items()
-        if found.type in topic.types and found.count and found.is_readable and name not in used
-        if not (_is_attitude(topic) and found.type == messages.IMU)
-        if not (topic.key.startswith("reference") and found.type == messages.IMU and not _has_attitude(recording, name))
-    ]
+    there = _of_type(recording, topic, used)
     words = topic.key.replace("_", " ")
     alike = {name: difflib.SequenceMatcher(None, words, name.strip("/").replace("/", " ")).ratio() for name in there}
     best = max(there, key=lambda name: alike[name], default=None)
+    if is_needed and best is not None and _is_ambiguous(alike):
+        return None
     return best if best is not None and (is_needed or alike[best] > _ALIKE or _is_other_gyro(topic, there)) else None
 
 
@@ -321,6 +326,23 @@ def _has_attitude(recording: Recording, topic: str) -> bool:
 
 def _has_accel(imu: ImuSeries) -> bool:
     return is_there("accel", imu.accel, imu.accel_cov)
+
+
+def _of_type(recording: Recording, topic: Topic, used: set[str]) -> list[str]:
+    """Recorded topics that a topic of a method could be, by type."""
+    return [
+        name
+        for name, found in recording.topics.items()
+        if found.type in topic.types and found.count and found.is_readable and name not in used
+        if not (_is_attitude(topic) and found.type == messages.IMU)
+        if not (topic.key.startswith("reference") and found.type == messages.IMU and not _has_attitude(recording, name))
+    ]
+
+
+def _is_ambiguous(alike: dict[str, float]) -> bool:
+    """Whether several topics could be meant, none of them by its name: which is not for chance to say."""
+    ranked = sorted(alike.values(), reverse=True)
+    return len(ranked) > 1 and ranked[0] < _ALIKE and ranked[0] - ranked[1] < _CLEARLY
 
 
 def _is_other_gyro(topic: Topic, there: list[str]) -> bool:

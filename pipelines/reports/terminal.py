@@ -209,6 +209,8 @@ def _show_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:
                 _say_wrapped(f"  {reason}")
             for line in suggestion.yaml.split("\n"):
                 say(f"  {line}")
+        elif not suggestion.topics:
+            _say_wrapped(f"{suggestion.method}: {'; '.join(suggestion.reasons)}")
     whole = {suggestion.method for suggestion in found if not suggestion.missing}
     for method, missing in facts.missing.items():
         if missing and method not in whole:

@@ -200,3 +200,49 @@ def test_a_recording_without_anything_is_one_line(tmp_path: Path) -> None:
     named = r"/v \(Vector3Stamped, 5 messages\) can serve as head_imu.*still lacking: /vision"
     with pytest.raises(InputError, match=named):
         with_suggested(open_recording(tmp_path / "s.mcap"), NONE)
+
+
+def _moving(n: int = 600) -> tuple[Any, Any]:
+    rng = np.random.default_rng(4)
+    t_ns = 1_790_000_000_000_000_000 + 10_000_000 * np.arange(n)
+    return t_ns, rng
+
+
+def test_a_gyro_and_an_accelerometer_on_two_topics_are_one_imu(tmp_path: Path) -> None:
+    t_ns, rng = _moving()
+    gyro = series.ImuSeries(t_ns, 0.3 * rng.normal(size=(600, 3)), np.zeros(3))
+    accel = series.ImuSeries(t_ns + 3_000_000, np.zeros(3), np.array([0.0, 0.0, 9.8]) + rng.normal(size=(600, 3)))
+    write_session(tmp_path / "s.mcap", {"/camera/gyro/sample": gyro, "/camera/accel/sample": accel})
+    (found,) = suggestions(open_recording(tmp_path / "s.mcap"), NONE, ["tumble"])
+    assert found.topics["imu"].parts == ("/camera/gyro/sample", "/camera/accel/sample")
+    assert found.has_to_be_asked_for
+    assert not found.missing
+
+
+def test_of_two_imus_none_is_taken_by_chance(tmp_path: Path) -> None:
+    t_ns, rng = _moving()
+    imus = [
+        series.ImuSeries(t_ns, 0.3 * rng.normal(size=(600, 3)), np.array([0.0, 0.0, 9.8]) + rng.normal(size=(600, 3)))
+        for _ in range(2)
+    ]
+    write_session(tmp_path / "s.mcap", {"/sensors/a": imus[0], "/sensors/b": imus[1]})
+    recording = open_recording(tmp_path / "s.mcap")
+    (found,) = suggestions(recording, NONE, ["tumble"])
+    assert not found.topics
+    assert "/sensors/a and /sensors/b could be the imu: choose" in found.reasons[0]
+    with pytest.raises(InputError, match="could be the imu: choose"):
+        with_suggested(recording, NONE, "tumble")
+
+
+def test_another_order_of_a_quaternions_components_is_no_inverse(simulated: Path, tmp_path: Path) -> None:
+    """(x, y, z, w) read as (w, x, y, z) is exactly an inverse between two constant rotations, with a mount far off."""
+    whole = open_recording(simulated)
+    poses = whole.poses("/vision/attitude")
+    wrong = series.PoseSeries(poses.t_ns, poses.wxyz[:, [1, 2, 3, 0]], poses.position)
+    topics = {"/xsens/data": whole.imu("/head/imu"), "/tracker/pose": wrong, "/vehicle/imu": whole.imu("/platform/imu")}
+    write_session(tmp_path / "s.mcap", topics)
+    recording = open_recording(tmp_path / "s.mcap")
+    (found,) = suggestions(recording, NONE, ["head"])
+    assert "vision_attitude" not in found.topics
+    assert "another order of its components" in found.reasons[0]
+    assert found.missing
