@@ -646,10 +646,10 @@ def test_a_gyro_and_an_accelerometer_make_an_imu(tmp_path: Path) -> None:
     [
         ("topics: {imu: {gyro: /g, topic: /x}}", "topics.imu: either a topic or a gyro is needed"),
         ("topics: {imu: {accel: /g, topic: /x}}", "topics.imu: accel goes with a gyro"),
-        ("topics: {imu: {gyro: /g, invert: true}}", "topics.imu: frames and invert go with a topic"),
+        ("topics: {imu: {gyro: /g, invert: true}}", "topics.imu: frame, frames and invert go with a topic"),
         (
-            "topics: {imu: {topic: /g, framse: [a, b]}}",
-            r"unknown key topics\.imu\.framse; the nearest known key is frames",
+            "topics: {imu: {topic: /g, farmes: [a, b]}}",
+            r"unknown key topics\.imu\.farmes; the nearest known key is frames",
         ),
     ],
 )
