@@ -70,7 +70,7 @@ class TrialFit:
         rows = sum(n * estimate.residuals[f].whitened.shape[1] for f, n in rejected.items())
         gate = problem.loss.gate if problem.loss else 0.0
         lost = gate**2 * sum(rejected.values())
-        return cls(problem.quantities, estimate, estimate.chi_square, lost, estimate.chi_square.dof + rows)
+        return cls(problem.quantities, estimate, estimate.chi_square, lost, float(estimate.chi_square.dof + rows))
 
     @property
     def cost(self) -> float:
