@@ -50,8 +50,8 @@ BUDGETS = {
     "validation": 2_050,
     "reference": 2_200,
 }
-# Of all pages with what the program writes; blocks of code do not count, nor what autodoc adds (900).
-BUDGET = 29_100
+# Of all pages with what the program writes; blocks of code do not count, nor what autodoc adds (some 600).
+BUDGET = 29_300
 
 
 def words(text: str) -> int:
