@@ -378,7 +378,8 @@ class Session:
         if self.faults.cut and not deadline.passed(_SEGMENTS):
             with progress.doing("solving both sides of a change"):
                 parts = solve_segments(self.method.graph, self.faults, self.data, self.config, stable.time_s)
-        return stable, change_finding(stable, parts, quantities)
+        ratios = [] if estimate.sandwich is None else estimate.sandwich[[q.judged for q in quantities]].tolist()
+        return stable, change_finding(stable, parts, quantities, max(ratios, default=1.0))
 
     def _difference(self, estimate: Estimate) -> SolverDifference | None:
         """An incremental estimate compared with batch's, which has nothing of what a report needs."""
