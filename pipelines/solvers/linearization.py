@@ -259,7 +259,8 @@ class Linearization:
                 if group.target == target and group.family not in NOT_MEASURED and (group.place >= 0).all():
                     np.maximum.at(known, group.place, group.model.time)
             out = np.where(known > -np.inf, known, out)
-        return np.maximum.accumulate(out)
+        known = out[out > -np.inf]
+        return np.maximum.accumulate(np.where(out > -np.inf, out, known[0] if len(known) else 0.0))
 
     def under(self, loss: TruncatedLoss | None) -> Linearization:
         """The same with another loss for measurements that have one."""
@@ -395,7 +396,7 @@ class _Draft:
             target, place = ("pair" if (self.count > 1).any() else "state"), self.last
         elif c and self._is_walk(layout):
             target, place = "walk", self.node
-        elif c and self.node.max(initial=-1) > 0:
+        elif c and self.node.max(initial=-1) >= (0 if self.is_measurement else 1):
             if self.pair:
                 raise NotAChainError(f"{self.family}: a factor joins two bias nodes and shared variables")
             target, place = "state", np.searchsorted(piece, np.maximum(self.node, 0), side="right") - 1
