@@ -22,7 +22,7 @@ from alidade.pipelines.methods.los import graph as los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.settings import Sensors
 from alidade.pipelines.solvers.batch import solve_batch
-from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, Run
+from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, IncrementalSolver
 from benchmarks.batch import IDEAL, IMAGES_PER_S, los_problem
 from benchmarks.measure import Ratio, peak_mib, resident_mib
 
@@ -42,7 +42,7 @@ class _Measured:
     `pictures` are in each, `young` tells which updates left the run young; `memory` are rows of time, s, and MiB held.
     """
 
-    run: Run
+    run: IncrementalSolver
     time: Array
     making: Array
     cost: Array
@@ -116,7 +116,7 @@ def _head() -> Problem:
 
 
 def _measured(problem: Problem) -> _Measured:
-    solver = Run(problem, DEFAULT_WINDOW)
+    solver = IncrementalSolver(problem, DEFAULT_WINDOW)
     rows, memory = [], []
     gc.freeze()  # as `alidade follow` does
     begun = time.process_time()
@@ -125,7 +125,7 @@ def _measured(problem: Problem) -> _Measured:
         solver.add_step(step)
         done = time.process_time()
         pictures = sum(len(f.measurement.model.time) for f in step.factors if f.measurement is not None)
-        rows.append((step.time, made - begun, done - made, pictures, solver.base is None))
+        rows.append((step.time, made - begun, done - made, pictures, solver.marginal is None))
         if len(rows) % 500 == 0:
             memory.append((step.time, resident_mib()))
         begun = time.process_time()

@@ -35,7 +35,7 @@ from alidade.pipelines.methods.tumble.scenario import TumbleScenario
 from alidade.pipelines.settings import Sensors
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from alidade.pipelines.solvers.batch import solve_batch
-from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, Run
+from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, IncrementalSolver
 
 HEAD = HeadScenario(
     duration_s=30.0,
@@ -297,7 +297,7 @@ class _Errors:
 
 def followed(problem: Problem, truth: Array, moments: Array) -> Followed:
     """Errors of the incremental solver at some moments, s."""
-    run, errors = Run(problem, DEFAULT_WINDOW), _Errors(problem, truth)
+    run, errors = IncrementalSolver(problem, DEFAULT_WINDOW), _Errors(problem, truth)
     for step in problem.steps(1):
         run.add_step(step)
         if len(errors.nees) < len(moments) and step.time >= moments[len(errors.nees)]:

@@ -6,8 +6,10 @@ but numbers that are believed; rows that tie these to others stay.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import takewhile
 
 import gtsam
 import numpy as np
@@ -17,6 +19,9 @@ from alidade.pipelines.belief import Belief, root_of_information
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.priors import pinned
 from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Problem, Quantity, Step
+
+# Gives the steps before some.
+Earlier = Callable[[], Iterable[Step]]
 
 # Elements of a prior's row below this share of its largest are rounding.
 _ROUNDING = 1e-9
@@ -70,7 +75,8 @@ def about_alone(
     return np.asarray((rows & among).any(axis=1) & ~(rows & others).any(axis=1))
 
 
-def _believing(problem: Problem, belief: Belief) -> Problem:
+def _believing(problem: Problem, belief: Belief, before: Earlier = tuple) -> Problem:
+    """The problem with one belief; `before` are the steps before its own, of a recording that grows."""
     own = {q.name: q for q in problem.quantities}
     for name, mean, sigma in zip(belief.names, belief.mean, belief.sigmas, strict=True):
         if name not in own and sigma == 0.0 and mean != 0.0:
@@ -98,9 +104,11 @@ def _believing(problem: Problem, belief: Belief) -> Problem:
     return replace(
         problem,
         parameters=parameters,
-        steps=lambda chunk: told.steps(steps(chunk)),
-        steps_after=None if after is None else lambda time: told.steps(after(time)),
-        onward=None if onward is None else lambda data, time: _grown(onward(data, time), belief),
+        steps=lambda chunk: told.steps(steps(chunk), before),
+        steps_after=None if after is None else lambda time: told.steps(after(time), lambda: _until(steps, time)),
+        onward=None
+        if onward is None
+        else lambda data, time: _grown(onward(data, time), belief, lambda: _until(steps, time)),
         premises=(*problem.premises, *filter(None, [premise])),
     )
 
@@ -123,13 +131,18 @@ def _require_sense(belief: Belief, own: Mapping[str, Quantity]) -> None:
         raise InputError(f"{where}: the covariance is singular: a combination of its numbers is known exactly")
 
 
-def _grown(problem: Problem | None, belief: Belief) -> Problem | None:
-    return None if problem is None else _believing(problem, belief)
+def _grown(problem: Problem | None, belief: Belief, before: Earlier) -> Problem | None:
+    return None if problem is None else _believing(problem, belief, before)
+
+
+def _until(steps: Callable[[int], Iterator[Step]], time: float) -> Iterator[Step]:
+    """The steps up to a time, s."""
+    return takewhile(lambda step: step.time <= time, steps(1) if np.isfinite(time) else ())
 
 
 @dataclass(frozen=True, eq=False)
 class _Told:
-    """A belief as a factor, and the step that takes it.
+    """A belief as factors, and the steps that take them: each variable's conditional on those that begin before it.
 
     Attributes:
         parameters: of the problem, with the priors now in force.
@@ -141,25 +154,54 @@ class _Told:
     belief: Belief
     replaced: Collection[str]
 
-    def steps(self, steps: Iterable[Step]) -> Iterator[Step]:
-        """The steps, the one with the parameters changed."""
-        concerned = [p for p in self.parameters if any(q.name in self.belief.names for q in p.quantities)]
-        for step in steps:
-            begins = all(step.initial.exists(p.key) for p in concerned)
-            yield self._begun(step, concerned) if begins else step
+    def steps(self, steps: Iterable[Step], before: Earlier = tuple) -> Iterator[Step]:
+        """The steps, with the belief in place of priors where its variables begin.
 
-    def _begun(self, step: Step, concerned: Sequence[Parameter]) -> Step:
-        keys = {p.key for p in self.parameters}
+        Args:
+            steps: in time order.
+            before: the steps before these, looked at only if a variable begins in these.
+        """
+        begun: gtsam.Values | None = None
+        for step in steps:
+            if not any(step.initial.exists(p.key) for p in self.parameters):
+                yield step
+                continue
+            if begun is None:
+                begun = gtsam.Values()
+                for earlier in before():
+                    self._begin(earlier, begun)
+            yield self._changed(step, begun)
+
+    @cached_property
+    def _concerned(self) -> list[Parameter]:
+        """The parameters that the belief is about."""
+        return [p for p in self.parameters if any(q.name in self.belief.names for q in p.quantities)]
+
+    def _begin(self, step: Step, begun: gtsam.Values) -> list[Parameter]:
+        """Add the parameters that begin in a step to those that have begun, at the belief's mean; returns these."""
+        new = [p for p in self.parameters if step.initial.exists(p.key)]
+        for p in new:
+            begun.insert(p.key, _value(step.initial, p.key))
+            if p in self._concerned:
+                self._move(p, begun)
+        return new
+
+    def _changed(self, step: Step, begun: gtsam.Values) -> Step:
+        """A step in which parameters begin, with the belief about them in place of priors."""
+        earlier = [p for p in self._concerned if begun.exists(p.key)]
+        new = self._begin(step, begun)
+        initial = gtsam.Values(step.initial)
+        for p in new:
+            initial.update(p.key, _value(begun, p.key))
         factors: list[Factor] = []
         for f in step.factors:
-            if f.family == "prior" and keys.issuperset(f.factor.keys()):
-                factors += self._rest(f, step.initial)
+            if f.family == "prior" and all(begun.exists(key) for key in f.keys):
+                factors += self._rest(f, begun)
             else:
                 factors.append(f)
-        initial = gtsam.Values(step.initial)
-        for p in concerned:
-            self._move(p, initial)
-        return replace(step, factors=[*factors, self._factor(concerned)], initial=initial)
+        concerned = [p for p in new if p in self._concerned]
+        factors += [self._factor(earlier, concerned)] if concerned else []
+        return replace(step, factors=factors, initial=initial)
 
     def _rest(self, prior: Factor, values: gtsam.Values) -> list[Factor]:
         """What of a prior is not replaced."""
@@ -188,12 +230,18 @@ class _Told:
         rows = [i for i, name in enumerate(names) if name in self.belief.names]
         return rows, [self.belief.names.index(names[i]) for i in rows]
 
-    def _factor(self, concerned: Sequence[Parameter]) -> Factor:
-        """The belief, whitened."""
+    def _factor(self, earlier: Sequence[Parameter], new: Sequence[Parameter]) -> Factor:
+        """The belief about parameters that begin, given those that have begun; whitened."""
+        concerned = [*earlier, *new]
         places = [self._places(p) for p in concerned]
         order = [place for _, own in places for place in own]
         quantities = {q.name: q for p in concerned for q in p.quantities}
-        root = _square_root(self.belief, [quantities[name] for name in self.belief.names])[:, order]
+        names = [self.belief.names[i] for i in order]
+        sigmas = np.array(
+            [sigma or pinned(quantities[name]) for name, sigma in zip(names, self.belief.sigmas[order], strict=True)]
+        )
+        count = sum(len(self._places(p)[1]) for p in new)
+        root = conditional_root(self.belief.covariance[np.ix_(order, order)], sigmas)[-count:]
         mean = self.belief.mean[order]
 
         def evaluate(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[Array] | None) -> Array:
@@ -211,14 +259,28 @@ class _Told:
         return Factor("prior", gtsam.CustomFactor(unit, [p.key for p in concerned], evaluate))
 
 
-def _square_root(belief: Belief, quantities: Sequence[Quantity]) -> Array:
-    """(n, n) R with R'R the information of the numbers; one that is exactly known is held as fixed ones are."""
-    sigmas = np.where(belief.sigmas > 0.0, belief.sigmas, [pinned(q) for q in quantities])
-    correlation = belief.covariance / np.outer(sigmas, sigmas)
+def _value(values: gtsam.Values, key: int) -> gtsam.Rot3 | Array:
+    """A variable that is a rotation or a vector."""
+    try:
+        return values.atRot3(key)
+    except RuntimeError:
+        return values.atVector(key)
+
+
+def conditional_root(covariance: Array, sigmas: Array) -> Array:
+    """(n, n) lower triangular R, R'R the information of numbers: row i is number i given those before it.
+
+    Args:
+        covariance: (n, n) of the numbers; fixed ones have rows of zeros.
+        sigmas: (n,) of the numbers, above zero also where they are fixed.
+    """
+    correlation = covariance / np.outer(sigmas, sigmas)
     np.fill_diagonal(correlation, 1.0)
     if not (correlation - np.eye(len(sigmas))).any():
-        return np.diag(1.0 / sigmas)  # row by row about one number, as budgets tell priors
-    return root_of_information(correlation, sigmas)
+        return np.diag(1.0 / sigmas)
+    # A QR decomposition from the last column to the first.
+    R = np.linalg.qr(root_of_information(correlation, np.ones(len(sigmas)))[:, ::-1])[1]
+    return np.asarray(R[::-1, ::-1] / sigmas)
 
 
 def _rows_of(factor: gtsam.NonlinearFactor, rows: NDArray[np.intp], at: gtsam.Values) -> gtsam.CustomFactor:

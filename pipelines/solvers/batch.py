@@ -226,7 +226,8 @@ def _estimate(solved: Solved, config: BatchConfig, budget: bool, changed: Iterab
     system = engine.at(values)[0]
     course = None
     if isinstance(engine, Linearization) and isinstance(system, ChainSystem) and isinstance(found, ChainFactorization):
-        course = posterior_history(problem, engine, system, found, values, compiled.current_keys, engine.time)
+        final = posterior.reported.numbers, posterior.covariance
+        course = posterior_history(problem, engine, system, found, values, compiled.current_keys, engine.time, final)
     residuals = residuals_by_family(engine, values)
     out = Estimate(
         solver="batch",

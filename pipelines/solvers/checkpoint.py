@@ -1,8 +1,8 @@
-"""A run of the incremental solver in a file, to be taken up again in another process.
+"""What an incremental run continues from: a marginal Gaussian, in memory and in a file.
 
-A run is saved where the past was just marginalised out: the Gaussian it goes on from, in gtsam's own text, which keeps
-every digit, and the rows it has gathered. The steps after it come from the recording again. The run that wrote the file
-went on from the very same numbers, so both end at the same estimates.
+A run is saved where everything but the active variables was just marginalised out of its smoother: the Gaussian, in
+gtsam's own text, which keeps every digit, with the rows and noise levels that the run has gathered. Later steps come
+from the recording again. The run that wrote the file continues from the same numbers, so both give the same estimates.
 """
 
 from __future__ import annotations
@@ -10,7 +10,8 @@ from __future__ import annotations
 import json
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,59 +19,173 @@ import gtsam
 import numpy as np
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import Problem
-from alidade.pipelines.solvers.course import Way
-from alidade.pipelines.solvers.incremental import Run
-from alidade.pipelines.solvers.innovations import Innovations
-from alidade.pipelines.solvers.rows import Rows
-from alidade.pipelines.solvers.state import State
+from alidade.pipelines.estimation.noise import Level, Noise
+from alidade.pipelines.estimation.problem import Array, Factor
+from alidade.pipelines.solvers.marginals import IndeterminateError, explain, ordering_of
 from alidade.pipelines.solvers.window import Keyframes
 
-_SCHEMA = "alidade.checkpoint/4"
-_INNOVATIONS = "innovations/"
+_SCHEMA = "alidade.checkpoint/5"
+_ROWS, _INNOVATIONS, _INFORMATION = "rows/", "innovations/", "information/"
 
 
-def save_checkpoint(path: Path, run: Run, identity: Mapping[str, str]) -> None:
-    """Write a run whose past was just marginalised out; the file is replaced whole or not at all.
+@dataclass(frozen=True)
+class MarginalState:
+    """A Gaussian over some variables, all others marginalised out.
+
+    Attributes:
+        time: s, of the last step in it.
+        values: of the variables, about which it is linear.
+        linear: square-root information, rows R dx = d.
+        stamps: variable -> time of last use, of variables that age.
+    """
+
+    time: float
+    values: gtsam.Values
+    linear: gtsam.JacobianFactor
+    stamps: Mapping[int, float]
+
+    @classmethod
+    def of(
+        cls,
+        time: float,
+        linear: gtsam.GaussianFactorGraph,
+        values: gtsam.Values,
+        keys: Sequence[int],
+        stamps: Mapping[int, float],
+    ) -> MarginalState:
+        """The marginal of a linear system about the values.
+
+        Raises:
+            IndeterminateError: a variable that is marginalised out is not determined.
+        """
+        kept = set(keys)
+        rest = [key for key in linear.keyVector() if key not in kept]
+        try:
+            # By QR: tight processes beside loose priors cost Cholesky its digits.
+            remaining = linear.eliminatePartialMultifrontal(rest, gtsam.EliminateQR)[1] if rest else linear
+            conditional, _ = gtsam.EliminateQR(remaining, ordering_of(keys))
+        except RuntimeError as error:
+            raise IndeterminateError(explain(str(error))) from None
+        own = gtsam.Values()
+        for key in keys:
+            _copy(values, key, own)
+        return cls(time, own, gtsam.JacobianFactor(conditional), {k: t for k, t in stamps.items() if k in kept})
+
+    @property
+    def estimate(self) -> gtsam.Values:
+        """The mean."""
+        graph = gtsam.GaussianFactorGraph()
+        graph.add(self.linear)
+        return self.values.retract(graph.optimize(ordering_of(self.linear.keys()), gtsam.EliminateQR))
+
+    @property
+    def factor(self) -> Factor:
+        """The Gaussian as a factor of a graph."""
+        return Factor("prior", gtsam.LinearContainerFactor(self.linear, self.values))
+
+
+def _copy(values: gtsam.Values, key: int, out: gtsam.Values) -> None:
+    try:
+        out.insert(key, values.atRot3(key))
+    except RuntimeError:
+        out.insert(key, values.atVector(key))
+
+
+def require_known_variables(factors: Iterable[Factor], values: gtsam.Values, time: float) -> None:
+    """Raise InputError if a factor needs a variable that is not among the values."""
+    for f in factors:
+        for key in f.keys:
+            if not values.exists(key):
+                raise InputError(
+                    f"{f.family} at {time:.3f} s needs the state {gtsam.Symbol(key).string()}, which the smoother has "
+                    "forgotten: give it a longer --window"
+                )
+
+
+def require_finite(factors: Sequence[Factor], values: gtsam.Values, time: float) -> None:
+    """Check factors before they enter a smoother, which an exception or a NaN would spoil.
+
+    Raises:
+        InputError: a factor needs a variable that is not there, or its residual or Jacobian is not finite.
+    """
+    require_known_variables(factors, values, time)
+    for f in factors:
+        linear = f.linearized(values)
+        if linear is not None and not np.isfinite(linear.augmentedJacobian()).all():
+            moment = time if f.measurement is None else float(f.measurement.model.time[0])
+            raise InputError(
+                f"{f.family} at {moment:.3f} s: residual or Jacobian is not a finite number; look for NaN, infinite or "
+                "absurd values in the recording around that time"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class SavedRun:
+    """An incremental run at a moment at which all but its active variables are marginalised out.
+
+    Attributes:
+        window: of the smoother, s or Keyframes.
+        marginal: the Gaussian of the active variables.
+        current_keys: parameter key -> variable that holds its value.
+        keyframes: number added so far.
+        walked: parameter keys whose values other variables held before.
+        levels: noise levels.
+        trouble: why the last batch solution did not converge; empty: it did.
+        rejected_in_a_row: steps until now.
+        unusable: family -> number of measurements that gave no finite numbers.
+        rows: rows gathered, by name.
+        innovations: rows of the gate by family.
+        information: information of the gate by family.
+    """
+
+    window: Keyframes | float
+    marginal: MarginalState
+    current_keys: Mapping[int, int]
+    keyframes: int
+    walked: frozenset[int]
+    levels: tuple[Level, ...]
+    trouble: str
+    rejected_in_a_row: int
+    unusable: Mapping[str, int]
+    rows: Mapping[str, Array]
+    innovations: Mapping[str, Array]
+    information: Mapping[str, Array]
+
+
+def save_checkpoint(path: Path, run: SavedRun, identity: Mapping[str, str]) -> None:
+    """Write a run; the file is replaced whole or not at all.
 
     Args:
         path: the file.
-        run: with run.just_marginalized.
+        run: to be saved.
         identity: what the run belongs to, in words: recording, config, versions. Only a run of the same is resumed.
 
     Raises:
         InputError: the file cannot be written.
     """
-    state = run.base
-    if state is None or run.past:
-        raise ValueError("a run can be saved only where its past was just marginalised out")
+    state = run.marginal
     head = {
         "schema": _SCHEMA,
         "identity": dict(identity),
         "window": run.window,
         "time": state.time,
         "stamps": list(state.stamps.items()),
+        "values": state.values.serialize(),
+        "linear": state.linear.serialize(),
         "current_keys": list(run.current_keys.items()),
         "keyframes": run.keyframes,
         "walked": sorted(run.walked),
-        "levels": {level.noise.name: level.scale for level in run.levels},
-        "unusable": run.innovations.unusable,
-        "rejected_in_a_row": run.innovations.rejected_in_a_row,
-        "values": state.values.serialize(),
-        "linear": state.linear.serialize(),
+        "levels": [asdict(level) for level in run.levels],
+        "trouble": run.trouble,
+        "rejected_in_a_row": run.rejected_in_a_row,
+        "unusable": dict(run.unusable),
     }
-    rows: dict[str, Any] = {_INNOVATIONS + family: rows.array for family, rows in run.innovations.families.items()}
+    groups = {_ROWS: run.rows, _INNOVATIONS: run.innovations, _INFORMATION: run.information}
+    arrays: dict[str, Any] = {prefix + name: array for prefix, of in groups.items() for name, array in of.items()}
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with part.open("wb") as stream:
-            np.savez(
-                stream,
-                head=np.array(json.dumps(head)),
-                history=run.history.array,
-                way=run.way.rows.array,
-                attitudes=run.attitudes.array,
-                **rows,
-            )
+            np.savez(stream, head=np.array(json.dumps(head)), **arrays)
             stream.flush()
             os.fsync(stream.fileno())
         part.replace(path)
@@ -80,8 +195,8 @@ def save_checkpoint(path: Path, run: Run, identity: Mapping[str, str]) -> None:
         part.unlink(missing_ok=True)
 
 
-def load_checkpoint(path: Path, problem: Problem, identity: Mapping[str, str]) -> Run:
-    """The run as it was saved; it goes on with the steps later than `run.time`.
+def load_checkpoint(path: Path, identity: Mapping[str, str]) -> SavedRun:
+    """The run as it was saved; it continues with the steps later than its marginal's time.
 
     Raises:
         InputError: the file is no checkpoint, is damaged, or belongs to something else.
@@ -98,21 +213,41 @@ def load_checkpoint(path: Path, problem: Problem, identity: Mapping[str, str]) -
                 raise InputError(
                     f"{path}: the checkpoint is of another {what}, {theirs}, not {mine}; delete it or name another file"
                 )
-        values, linear = gtsam.Values(), gtsam.JacobianFactor()
-        values.deserialize(head["values"])
-        linear.deserialize(head["linear"])
-        stamps = {int(key): float(stamp) for key, stamp in head["stamps"]}
-        # What is saved as a whole number is keyframes.
-        window = Keyframes(head["window"]) if isinstance(head["window"], int) else float(head["window"])
-        run = Run.resumed(problem, window, State(head["time"], values, linear, stamps), head["levels"])
-        run.current_keys = {int(key): int(held) for key, held in head["current_keys"]}
-        run.keyframes, run.walked = head["keyframes"], set(head["walked"])
-        run.history, run.attitudes = Rows(arrays.pop("history")), Rows(arrays.pop("attitudes"))
-        run.way = Way(Rows(arrays.pop("way")))
-        families = {name.removeprefix(_INNOVATIONS): Rows(array) for name, array in arrays.items()}
-        run.innovations = Innovations(families, head["unusable"], head["rejected_in_a_row"])
+        return _saved_run(head, arrays)
     except OSError as error:
         raise InputError(f"{path}: the checkpoint cannot be read ({error.strerror or error}); delete it") from error
     except (zipfile.BadZipFile, KeyError, ValueError, TypeError, EOFError, RuntimeError) as error:
         raise InputError(f"{path}: no checkpoint, or a damaged one ({error}); delete it") from error
-    return run
+
+
+def _saved_run(head: Mapping[str, Any], arrays: Mapping[str, Array]) -> SavedRun:
+    """A run from the parts of its file."""
+    values, linear = gtsam.Values(), gtsam.JacobianFactor()
+    values.deserialize(head["values"])
+    linear.deserialize(head["linear"])
+    rows, innovations, information = (
+        {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+        for prefix in (_ROWS, _INNOVATIONS, _INFORMATION)
+    )
+    stamps = {int(key): float(stamp) for key, stamp in head["stamps"]}
+    return SavedRun(
+        # A whole number is a number of keyframes.
+        window=Keyframes(head["window"]) if isinstance(head["window"], int) else float(head["window"]),
+        marginal=MarginalState(head["time"], values, linear, stamps),
+        current_keys={int(key): int(held) for key, held in head["current_keys"]},
+        keyframes=head["keyframes"],
+        walked=frozenset(head["walked"]),
+        levels=tuple(_level_of(**level) for level in head["levels"]),
+        trouble=head["trouble"],
+        rejected_in_a_row=head["rejected_in_a_row"],
+        unusable=head["unusable"],
+        rows=rows,
+        innovations=innovations,
+        information=information,
+    )
+
+
+def _level_of(noise: Mapping[str, Any], **level: Any) -> Level:
+    """A noise level from its fields; JSON keeps tuples as lists."""
+    stated: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in noise.items()}
+    return Level(Noise(**stated), **level)

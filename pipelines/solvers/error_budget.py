@@ -3,11 +3,11 @@
 That is the error budget, the most influential measurements, the effect of fixed inputs, and the inflation by residuals
 that are correlated in time. At the minimum a small change r of the whitened residuals moves the numbers by L r,
 
-    L = P J N^-1 A',    N = A'A
+    L = J B (B'N B)^-1 B'A',    N = A'A
 
-A the linearised, whitened system, J the Jacobian of the numbers, P the projection on the directions that are not weak
-(`weak_directions`): weak ones stay at their priors. The squares of a row of L are the parts of the residuals in a
-number's variance. One column N^-1 J'P' a number is kept for all unknowns; L follows group by group as A x.
+A the linearised, whitened system, J the Jacobian of the numbers, B a basis of all moves but those along weak directions
+(`weak_directions`), which stay at their priors. The squares of a row of L are the parts of the residuals in a
+number's variance. One column B (B'N B)^-1 B'J' a number is kept for all unknowns; L follows group by group as A x.
 
 Noise of a family whose autocorrelation at lag k is g(k) adds 2 sum_k g(k) sum_i L_i+k L_i to a variance (Newey, West,
 "A simple, positive semi-definite, heteroskedasticity and autocorrelation consistent covariance matrix", Econometrica
@@ -48,16 +48,15 @@ class Influence:
         engine: of all factors.
         values: at which it is linearised.
         reported: the numbers there.
-        step: (m) columns N^-1 J'P' of all unknowns.
-        weak: (m, m) covariance of the numbers from the weak directions, which have their priors.
-        from_priors: (m, m) square root of it, a column for each number's prior.
+        step: (m) columns B (B'N B)^-1 B'J' of all unknowns.
+        from_priors: (m, 2 m) square root of what the priors of the weak directions add to the covariance of these and
+            of the others, columns for each number's prior.
     """
 
     engine: Engine
     values: Values
     reported: Reported
     step: Tangent
-    weak: Array
     from_priors: Array
 
     @classmethod
@@ -74,13 +73,16 @@ class Influence:
         Raises:
             LinAlgError: the shared unknowns are not determined.
         """
-        scale, strong, weak = reported.scale, directions.strong, directions.weak
-        J = reported.jacobian[reported.free] / scale[:, None]
-        projected = scale[:, None] * (strong @ (strong.T @ J))
-        of_weak = scale[:, None] * (weak @ directions.prior_covariance @ weak.T)
-        root = of_weak * np.sqrt(np.diag(reported.prior))
-        step = responses(factorization, projected)
-        return cls(engine, values, reported, step, of_weak * scale, root)
+        found, scale, weak = reported.root(factorization.root), reported.scale, directions.weak
+        p, strong = found.unseen, directions.strong
+        basis = np.hstack([found.basis[:, :p], found.basis[:, p:] @ strong])
+        step = responses(factorization, reported.jacobian[reported.free], basis)
+        slope = np.linalg.lstsq(found.R @ strong, -found.R @ weak, rcond=None)[0]
+        roots = [
+            scale[:, None] * (axes @ directions.prior_covariance @ weak.T) * np.sqrt(np.diag(reported.prior))
+            for axes in (weak, strong @ slope)
+        ]
+        return cls(engine, values, reported, step, np.hstack(roots))
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -117,7 +119,7 @@ def error_budget(influence: Influence, added: Mapping[str, Array], covariance: A
         L, _ = influence.rows(group)
         for source, variance in _sources(influence, group, np.square(L)):
             variances[source] = variances.get(source, np.zeros(len(names))) + variance
-    for name, column in zip(names, np.square(influence.from_priors).T, strict=True):
+    for name, column in zip(2 * names, np.square(influence.from_priors).T, strict=True):
         variances[f"prior of {name}"] = variances.get(f"prior of {name}", np.zeros(len(names))) + column
     for family, more in added.items():
         variances[family] = variances[family] + more

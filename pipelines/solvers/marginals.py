@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.problem import Array, ChiSquare, Factor, History, Parameter, Problem
-from alidade.pipelines.solvers.chain import IndeterminateError
+from alidade.pipelines.solvers.chain import IndeterminateError as IndeterminateError
 
 if TYPE_CHECKING:
     from alidade.pipelines.solvers.system import Linear
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 # A direction the data and priors say nothing about gets this many times its prior scale as sigma, so that it can be
 # named with the others instead of making the system unsolvable.
 _UNKNOWN = 1e4
-# What balances the pull of noise, see alidade.pipelines.solvers.pull: neither measured nor believed.
+# Forces that hold combinations of numbers at their priors: neither measured nor believed.
 HELD = "held"
 # Families whose residuals say nothing about the noise of the recording.
 _NO_MEASUREMENTS = ("prior", "definition", HELD)
@@ -43,7 +43,7 @@ def joint_covariance(
 ) -> Array:
     """Covariance (n, n) of the reported numbers, everything else marginalised out; works for singular systems.
 
-    `noise` is information that counts for nothing, see alidade.pipelines.solvers.spurious.
+    `noise` is information that counts for nothing.
 
     Raises:
         IndeterminateError: another variable is undetermined.

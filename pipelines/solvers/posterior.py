@@ -49,6 +49,7 @@ class Reported:
         mean, scale: (m,) means of the priors in force, and sigmas of the default ones.
         prior: (m, m) precision of the priors in force, in units of the scales.
         extra: (n,) sigmas of errors that no measurement model has.
+        calibrated: (m,) which free numbers are what is calibrated, and no assumed sensor errors.
     """
 
     names: tuple[str, ...]
@@ -59,6 +60,7 @@ class Reported:
     scale: Array
     prior: Array
     extra: Array
+    calibrated: NDArray[np.bool_]
 
     @classmethod
     def of(cls, problem: Problem, layout: Layout, values: Values, current_keys: Mapping[int, int]) -> Reported:
@@ -87,6 +89,7 @@ class Reported:
             scale=scale,
             prior=np.diag((scale / sigma) ** 2),
             extra=np.array([0.0 if q.prior_sigma == 0.0 else q.extra_sigma for q in quantities]),
+            calibrated=np.array([not quantities[i].assumed for i in free], dtype=bool),
         )
 
     @property
@@ -152,14 +155,19 @@ class ReportedRoot:
         return np.asarray(root @ root.T)
 
 
-def responses(factorization: Factorization, jacobian: Array) -> Tangent:
+def responses(factorization: Factorization, jacobian: Array, basis: Array) -> Tangent:
     """N^-1 J' of all unknowns, a column for each row of a Jacobian (n, c + s) by the last node and the shared unknowns.
 
+    Args:
+        factorization: of the system.
+        jacobian: (n, c + s).
+        basis: (c + s, k) of the moves that are free.
+
     Raises:
-        LinAlgError: the shared unknowns are not determined.
+        LinAlgError: these are not determined.
     """
-    R = factorization.root[:-1, :-1]
-    last = np.linalg.solve(R, np.linalg.solve(R.T, jacobian.T))
+    R = np.asarray(np.linalg.qr(factorization.root[:, :-1] @ basis, mode="r"), dtype=float)
+    last = basis @ np.linalg.solve(R, np.linalg.solve(R.T, basis.T @ jacobian.T))
     states, nodes = factorization.propagate(last)
     return Tangent(states, nodes, last[factorization.c :])
 
@@ -255,7 +263,7 @@ def _solved_signs(system: ChainSystem, count: int) -> tuple[ChainSystem, Tangent
         shared=beside(system.shared),
     )
     factorization = ChainFactorization.of(wider)
-    known = len(factorization.root) - 1 - count
+    known = factorization.root.shape[1] - 1 - count
     R = factorization.root[:known]
     last = np.vstack([np.linalg.solve(R[:, :known], R[:, known:-1]), -np.eye(count)])
     states, nodes = factorization.propagate(last)

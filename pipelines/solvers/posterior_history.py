@@ -33,6 +33,7 @@ def posterior_history(
     values: Values,
     current_keys: Mapping[int, int],
     time: Array,
+    final: tuple[Array, Array] | None = None,
 ) -> Course | None:
     """Values and joint covariance of the reported numbers at moments, weak directions at their priors.
 
@@ -44,6 +45,7 @@ def posterior_history(
         values: the estimate.
         current_keys: parameter key -> variable that holds its value at the end.
         time: (N,) s of the keyframes.
+        final: numbers (n,) and covariance (n, n) of the estimate, which the last moment has.
 
     Returns None where there is but one moment.
     """
@@ -56,6 +58,8 @@ def posterior_history(
         _known(problem, layout, values, _keys_at(layout, own, int(node)), current_keys, root)
         for node, root in zip(nodes, roots, strict=True)
     ]
+    if final is not None:
+        found[-1] = final
     numbers, covariances = (np.array(each) for each in zip(*found, strict=True))
     moving = [layout.sizes[3] > 0 and layout.node[layout.at([key])[0]] >= 0 for key in own.values()]
     steady = ~np.repeat(moving, [len(p.quantities) for p in problem.parameters])
@@ -115,7 +119,7 @@ def _known(
     padded = np.zeros((max(len(root), width), width))
     padded[: len(root)] = root
     found = end.root(padded)
-    directions = WeakDirections.of(found.R, end.prior)
+    directions = WeakDirections.of(found.R, end.prior, end.calibrated)
     u = (here[end.free] - end.mean) / end.scale
     numbers = here.copy()
     numbers[end.free] += end.scale * constrained_step(directions, found.R, found.d, u)

@@ -16,7 +16,7 @@ from alidade.pipelines.estimation.finding import Severity
 from alidade.pipelines.estimation.problem import Course, Estimate, History, Quantity, Told
 from alidade.pipelines.settings import Config
 from alidade.pipelines.solvers.batch import solve_batch
-from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, Run
+from alidade.pipelines.solvers.incremental import DEFAULT_WINDOW, IncrementalSolver
 
 IDEAL = Config.model_validate({"sensors": "ideal"})
 HEAD = {"duration_s": 60.0, "gyro_rate_hz": 100.0, "vision_rate_hz": 20.0}
@@ -31,10 +31,10 @@ def session(seed: int, slip_deg: float, config: Config | None = None, **scenario
     return alidade.open(replace(simulated, data=replace(simulated.data, vision_wxyz=wxyz)), config=config)
 
 
-def watched(session: alidade.Session) -> tuple[Run, list[tuple[float, float]]]:
+def watched(session: alidade.Session) -> tuple[IncrementalSolver, list[tuple[float, float]]]:
     """A run that is watched, and each time at which it was seen to have changed, with when it changed, s."""
     problem = session.problem()
-    run, watch, alarms = Run(problem, DEFAULT_WINDOW), Watch(), []
+    run, watch, alarms = IncrementalSolver(problem, DEFAULT_WINDOW), Watch(), []
     for step in problem.steps(1):
         run.add_step(step)
         watch.look(run)
@@ -190,7 +190,7 @@ def test_a_mount_that_stays_is_calibrated() -> None:
 def test_a_slip_is_seen_while_it_is_recorded() -> None:
     """With the estimate still young, and the same when the run has gone on from a Gaussian."""
     run, alarms = watched(session(0, 0.8, IDEAL, vision_rate_hz=4.0))
-    assert run.way.rows.array[-1, 0] > 55.0
+    assert run.recorder.rows.array[-1, 0] > 55.0
     assert alarms
     told, when = alarms[0]
     assert told < 46.0

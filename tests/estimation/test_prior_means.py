@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import alidade
 from alidade import Config
+from alidade.factors.model import Model, Residuals
 from alidade.pipelines.applications.cli import app
 from alidade.pipelines.applications.sharing import walks
 from alidade.pipelines.belief import Belief, independent
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.believing import believing
-from alidade.pipelines.estimation.problem import Problem
+from alidade.pipelines.estimation.priors import vector_prior
+from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Problem, Quantity, Step
 from alidade.pipelines.methods import method
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.solvers.batch import solve_batch
@@ -113,6 +117,76 @@ def test_what_is_fixed_today_stays_fixed_and_tells_of_the_others() -> None:
     estimate = solve_batch(believing(session.problem(), [tight]))
     value = dict(zip(estimate.names, estimate.values.tolist(), strict=True))
     assert value["camera_mount_x"] == pytest.approx(0.0, abs=1e-9)
+
+
+@dataclass(frozen=True)
+class Sum(Model):
+    """Measurements of the sum of two numbers."""
+
+    time: Array
+    z: Array
+    rows: int = 1
+    blocks = (1, 1)
+
+    def __call__(self, a: Array, b: Array) -> Residuals:
+        return (a + b - self.z[:, None]) / 0.1, lambda: (np.full((len(a), 1, 1), 10.0),) * 2
+
+
+FIRST, SECOND = (int(gtsam.symbol("p", i)) for i in range(2))
+
+
+def _begins_twice() -> Problem:
+    """A parameter that begins at 0 s and one that begins at 3 s; sums of both are measured from then on."""
+    parameters = [
+        Parameter(key, (Quantity(name, "", 1.0, 1.0, 0.1),)) for key, name in ((FIRST, "first"), (SECOND, "second"))
+    ]
+
+    def steps(_: int) -> Iterator[Step]:
+        for k in range(6):
+            values = gtsam.Values()
+            factors = []
+            for p in parameters:
+                if k == 3 * (p.key == SECOND):
+                    values.insert(p.key, np.zeros(1))
+                    factors.append(vector_prior(p, np.zeros(1)))
+            if k >= 3:
+                seen = Sum(np.array([float(k)]), np.array([0.7]))
+                factors.append(Factor.of("seen", seen.on(FIRST, SECOND)))
+            yield Step(float(k), values, factors)
+
+    return Problem(
+        "two", tuple(parameters), steps, steps_after=lambda time: (step for step in steps(1) if step.time > time)
+    )
+
+
+def test_a_joint_prior_of_parameters_that_begin_in_different_steps() -> None:
+    mean, covariance = np.array([0.3, -0.2]), np.array([[0.04, 0.03], [0.03, 0.09]])
+    problem = believing(_begins_twice(), [Belief(("first", "second"), mean, covariance)])
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for step in problem.steps(1):
+        values.insert(step.initial)
+        for f in step.factors:
+            graph.add(f.factor)
+    solved = values.retract(graph.linearize(values).optimize())
+    information = np.linalg.inv(covariance) + 300.0 * np.ones((2, 2))
+    expected = np.linalg.solve(information, np.linalg.solve(covariance, mean) + 300.0 * 0.7 * np.ones(2))
+    np.testing.assert_allclose([solved.atVector(key)[0] for key in (FIRST, SECOND)], expected, atol=1e-9)
+    joint = gtsam.Marginals(graph, solved).jointMarginalInformation([FIRST, SECOND]).fullMatrix()
+    np.testing.assert_allclose(joint, information, atol=1e-6)
+
+
+def test_a_joint_prior_in_the_later_steps_of_a_recording_that_grows() -> None:
+    """Its second half is the conditional of what begins, given what began before."""
+    belief = Belief(("first", "second"), np.zeros(2), np.array([[0.04, 0.03], [0.03, 0.09]]))
+    problem = believing(_begins_twice(), [belief])
+    assert problem.steps_after is not None
+    whole, late = list(problem.steps(1))[3], next(problem.steps_after(2.0))
+    values = gtsam.Values(late.initial)
+    values.insert(FIRST, np.array([0.1]))
+    for step in (whole, late):
+        (prior,) = (f.factor for f in step.factors if f.family == "prior")
+        variance = 0.09 - 0.03**2 / 0.04
+        assert 2.0 * prior.error(values) == pytest.approx((0.75 * 0.1) ** 2 / variance)
 
 
 CASES: dict[str, tuple[dict[str, Any] | None, str, float]] = {

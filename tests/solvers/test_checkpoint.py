@@ -14,6 +14,7 @@ import pytest
 
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import Attitudes, Estimate, Problem
 from alidade.pipelines.methods.los.graph import problem
 from alidade.pipelines.methods.los.recording import read_los, write_los
@@ -22,8 +23,8 @@ from alidade.pipelines.recording.reading import open_recording
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
-from alidade.pipelines.solvers.incremental import Run, solve_incremental
-from alidade.pipelines.solvers.smoother import FixedLag
+from alidade.pipelines.solvers.incremental import IncrementalSolver, solve_incremental
+from alidade.pipelines.solvers.smoother import FixedLagSmoother
 from tests.support.builders import IDEAL
 
 BRISK = EulerMotion(
@@ -44,10 +45,12 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.methods.los.recording import read_los
 from alidade.pipelines.recording.reading import open_recording
 from alidade.pipelines.solvers.checkpoint import load_checkpoint
+from alidade.pipelines.solvers.incremental import IncrementalSolver
 recording = open_recording(Path(sys.argv[1]))
 config = load_config(recording.attachment("alidade.yaml"))
 made = problem(read_los(recording, config), config)
-run = load_checkpoint(Path(sys.argv[2]), made, {"recording": "first", "config": "{}"})
+saved = load_checkpoint(Path(sys.argv[2]), {"recording": "first", "config": "{}"})
+run = IncrementalSolver.resumed(made, saved)
 for step in made.steps(1):
     if step.time > run.time:
         run.add_step(step)
@@ -62,6 +65,7 @@ class Saved:
     session: Path
     checkpoint: Path
     made: Problem
+    levels: tuple[Level, ...]
     end: Estimate
 
 
@@ -75,16 +79,17 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Saved:
     recording = open_recording(session)
     config = load_config(recording.attachment("alidade.yaml"))
     made = problem(read_los(recording, config), config)
-    run = Run(made, 1.0)
+    run = IncrementalSolver(made, 1.0)
     times = 0
     for step in made.steps(1):
         run.add_step(step)
-        if run.just_marginalized:
+        if run.can_checkpoint:
             times += 1
             if times == 1:
-                save_checkpoint(checkpoint, run, IDENTITY)
-    assert times == 2, "the past has to be marginalised out again after the one that is saved"
-    return Saved(session, checkpoint, made, run.finish(0.0))
+                save_checkpoint(checkpoint, run.saved(), IDENTITY)
+                levels = run.levels
+    assert times > 1, "the past has to be marginalised out again after the one that is saved"
+    return Saved(session, checkpoint, made, levels, run.finish(0.0))
 
 
 def test_a_new_process_ends_at_the_same_estimates(saved: Saved) -> None:
@@ -100,6 +105,22 @@ def test_a_new_process_ends_at_the_same_estimates(saved: Saved) -> None:
     assert (moments, rejected) == (len(end.history.time), end.rejected)
 
 
+def test_a_resumed_run_keeps_noise_levels_and_the_reason_for_not_converging(saved: Saved, tmp_path: Path) -> None:
+    """Noise section, verdict and exit code follow from these."""
+    run = IncrementalSolver.resumed(saved.made, load_checkpoint(saved.checkpoint, IDENTITY))
+    assert run.levels == saved.levels
+    assert {level.noise.name for level in run.levels if level.found is not None} == {"los_error", "gyro_density"}
+    run.trouble = "the first 40.0 s: no step lowers the error"
+    save_checkpoint(tmp_path / "c", run.saved(), IDENTITY)
+    resumed = IncrementalSolver.resumed(saved.made, load_checkpoint(tmp_path / "c", IDENTITY))
+    for step in saved.made.steps(1):
+        if step.time > resumed.time:
+            resumed.add_step(step)
+    end = resumed.finish(0.0)
+    assert (end.converged, end.message) == (False, run.trouble)
+    assert end.levels == saved.end.levels
+
+
 def test_marginalizing_the_past_loses_nothing(saved: Saved) -> None:
     batch = solve_batch(saved.made)
     assert saved.end.rejected == batch.rejected == {"los": 0}
@@ -110,7 +131,7 @@ def test_marginalizing_the_past_loses_nothing(saved: Saved) -> None:
 @pytest.mark.parametrize("what", ["recording", "config"])
 def test_a_checkpoint_of_something_else_is_refused_and_both_are_named(saved: Saved, what: str) -> None:
     with pytest.raises(InputError, match=f"another {what}, {IDENTITY[what]}, not second"):
-        load_checkpoint(saved.checkpoint, saved.made, {**IDENTITY, what: "second"})
+        load_checkpoint(saved.checkpoint, {**IDENTITY, what: "second"})
 
 
 def _damaged(content: bytes) -> Iterator[bytes]:
@@ -125,14 +146,14 @@ def _damaged(content: bytes) -> Iterator[bytes]:
 
 def test_a_damaged_checkpoint_is_refused_or_whole(saved: Saved, tmp_path: Path) -> None:
     """A flipped byte that nothing checks, such as a time of day in the archive, may pass; nothing else does."""
-    reference = load_checkpoint(saved.checkpoint, saved.made, IDENTITY)
+    reference = IncrementalSolver.resumed(saved.made, load_checkpoint(saved.checkpoint, IDENTITY))
     path = tmp_path / "damaged"
     refused = 0
     cases = list(_damaged(saved.checkpoint.read_bytes()))
     for content in cases:
         path.write_bytes(content)
         try:
-            run = load_checkpoint(path, saved.made, IDENTITY)
+            run = IncrementalSolver.resumed(saved.made, load_checkpoint(path, IDENTITY))
         except InputError:
             refused += 1
         else:
@@ -145,7 +166,7 @@ def test_a_checkpoint_takes_the_place_of_the_old_one_whole_or_not_at_all(
 ) -> None:
     path = tmp_path / "c"
     path.write_bytes(saved.checkpoint.read_bytes())
-    run = load_checkpoint(path, saved.made, IDENTITY)
+    run = load_checkpoint(path, IDENTITY)
 
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
@@ -158,7 +179,7 @@ def test_a_checkpoint_takes_the_place_of_the_old_one_whole_or_not_at_all(
 
 
 def test_a_smoother_that_throws_is_built_anew_from_what_is_known(saved: Saved, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = FixedLag.update
+    whole = FixedLagSmoother.update
     calls = 0
 
     def update(*arguments: object) -> None:
@@ -168,7 +189,7 @@ def test_a_smoother_that_throws_is_built_anew_from_what_is_known(saved: Saved, m
             raise RuntimeError("indeterminate")
         whole(*arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(FixedLag, "update", update)
+    monkeypatch.setattr(FixedLagSmoother, "update", update)
     end = solve_incremental(replace(saved.made))
     assert calls > 340
     assert np.abs((end.values - saved.end.values) / saved.end.sigmas).max() < 0.05
@@ -177,7 +198,7 @@ def test_a_smoother_that_throws_is_built_anew_from_what_is_known(saved: Saved, m
 
 def test_a_smoother_that_throws_late_loses_no_attitudes(saved: Saved, monkeypatch: pytest.MonkeyPatch) -> None:
     """Those from before the past was marginalised out were recorded then, and only then."""
-    whole, calls = FixedLag.update, 0
+    whole, calls = FixedLagSmoother.update, 0
 
     def update(*arguments: object) -> None:
         nonlocal calls
@@ -189,7 +210,7 @@ def test_a_smoother_that_throws_late_loses_no_attitudes(saved: Saved, monkeypatc
     def attitudes(keyframes: Sequence[int], _: object) -> Attitudes:
         return Attitudes(np.array(keyframes, dtype=float), np.tile([1.0, 0.0, 0.0, 0.0], (len(keyframes), 1)))
 
-    monkeypatch.setattr(FixedLag, "update", update)
+    monkeypatch.setattr(FixedLagSmoother, "update", update)
     end = solve_incremental(replace(saved.made, attitudes=attitudes))
     assert calls > 340
     assert end.attitudes is not None

@@ -129,7 +129,7 @@ def test_degrees_of_freedom_are_rows_less_leverages(name: str) -> None:
     covariance, families, total = case.covariance, dict[str, list[float]](), 0.0
     for f, A, b in zip(case.factors, case.rows, case.rights, strict=True):
         if f.family not in NOT_MEASURED:
-            h = np.einsum("ij,jk,ik->i", A, covariance, A)
+            h = ((A @ covariance) * A).sum(axis=1)
             value, dof, used = families.get(f.family, [0.0, 0.0, 0.0])
             v = f.vectorized
             count = len(A) if v is None else v.model.rows * len(v.model.time)  # of which a compressed factor has fewer
@@ -262,7 +262,7 @@ def test_history_ends_with_the_estimate(name: str) -> None:
     assert course is not None
     reported = case.reported
     R = reported.root(case.factorization.root).R
-    expected = reported.covariance(WeakDirections.of(R, reported.prior).covariance())
+    expected = reported.covariance(WeakDirections.of(R, reported.prior, reported.calibrated).covariance())
     np.testing.assert_allclose(course.covariance[-1], expected, rtol=1e-6, atol=1e-12 * expected.max())
     assert len(course.time) > 10
     # What is determined only gets better known.
@@ -302,7 +302,8 @@ def test_correlated_residuals_of_one_family_leave_what_another_determines() -> N
         reported, all_strong(reported, found.R), case.linearization, case.factorization, case.values
     )
     families = {g.family for g in case.linearization.groups if g.is_measurement}
-    added = {family: added_variance(influence, {family: 0.8 ** np.arange(1, 8)})[family] for family in families}
+    lags: Array = 0.8 ** np.arange(1, 8, dtype=float)
+    added = {family: added_variance(influence, {family: lags})[family] for family in families}
     names = list(influence.names)
     budget = error_budget(influence, {}, reported.covariance(found.covariance()))
     for family, more in added.items():
@@ -310,7 +311,7 @@ def test_correlated_residuals_of_one_family_leave_what_another_determines() -> N
             # A family adds at most 2 sum of the correlation times what it has in the variance.
             own = budget[name].get(family, 0.0) * found.covariance()[names.index(name), names.index(name)]
             own *= reported.scale[names.index(name)] ** 2
-            assert variance <= 2.0 * (0.8 ** np.arange(1, 8)).sum() * own * (1.0 + 1e-6) + 1e-30
+            assert variance <= 2.0 * lags.sum() * own * (1.0 + 1e-6) + 1e-30
 
 
 def test_added_variance_is_that_of_drawn_noise() -> None:
@@ -321,7 +322,7 @@ def test_added_variance_is_that_of_drawn_noise() -> None:
     influence = Influence.of(
         reported, all_strong(reported, found.R), case.linearization, case.factorization, case.values
     )
-    lags = 0.8 ** np.arange(1, 40)
+    lags: Array = 0.8 ** np.arange(1, 40, dtype=float)
     (family,) = {g.family for g in case.linearization.groups if g.is_measurement}
     added = added_variance(influence, {family: lags})[family]
     (group,) = [g for g in case.linearization.groups if g.is_measurement]

@@ -22,6 +22,7 @@ from alidade.pipelines.solvers.weak_directions import (
     curvature,
 )
 from benchmarks.young import CASES, DRAWN, interval, made, nees
+from tests.support.problems import problem
 
 
 def root(*rows: Array) -> Array:
@@ -29,25 +30,25 @@ def root(*rows: Array) -> Array:
     return np.asarray(np.linalg.qr(np.vstack(rows), mode="r"), dtype=float)
 
 
-def posterior(problem: Problem, until: float) -> Posterior:
+def posterior(recorded: Problem, until: float) -> Posterior:
     """The posterior of a problem's steps until a time, s."""
     initial, factors, current = gtsam.Values(), [], dict[int, int]()
-    for step in problem.steps(1):
+    for step in recorded.steps(1):
         initial.insert(step.initial)
         factors += step.factors
         current.update(step.current_keys)
         if step.time >= until:
             break
-    assert problem.layout is not None
-    layout, values = Layout.of(problem.layout, initial)
-    solution = solve_robust(Linearization.of(factors, layout), values, problem.loss, RobustConfig())
+    assert recorded.layout is not None
+    layout, values = Layout.of(recorded.layout, initial)
+    solution = solve_robust(Linearization.of(factors, layout), values, recorded.loss, RobustConfig())
     assert solution.converged, solution.message
     groups = [
         replace(g, weights=counted(g, solution.values)[:, None] * np.asarray(1.0 if g.weights is None else g.weights))
         for g in solution.engine.groups
     ]
     engine = solution.engine.with_groups(groups).under(None)
-    return constrained_solution(problem, engine, solution.values, current)
+    return constrained_solution(recorded, engine, solution.values, current)
 
 
 def errors(method: str, case: str, share: float, seeds: range) -> tuple[list[float], int, int]:
@@ -57,11 +58,11 @@ def errors(method: str, case: str, share: float, seeds: range) -> tuple[list[flo
         number = 1000 * list(CASES[method]).index(case) + seed
         settings, _ = CASES[method][case](number)
         settings = settings.model_copy(update={"priors": {**DRAWN[method](settings), **settings.priors}})
-        problem, truth = made(method, settings, number)
-        end = [step.time for step in problem.steps(1)][-1]
-        known = posterior(problem, share * end)
+        recorded, truth = made(method, settings, number)
+        end = [step.time for step in recorded.steps(1)][-1]
+        known = posterior(recorded, share * end)
         size, numbers = nees(known.reported.numbers, known.covariance, truth)
-        bounded = sum(bool(q.prior_sigma) for q in problem.quantities)
+        bounded = sum(bool(q.prior_sigma) for q in recorded.quantities)
         found.append(size)
     return found, numbers, bounded
 
@@ -135,3 +136,26 @@ def test_linear_system_has_no_curvature() -> None:
     R = root(np.eye(3), np.array([[50.0, 20.0, 1.0]]))
     directions = WeakDirections.of(R, np.eye(3))
     np.testing.assert_allclose(curvature(directions, lambda moves: [R] * moves.shape[1]), 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["head", "indexer", "tumble"])
+def test_ordinary_recording_has_the_linear_covariance(name: str) -> None:
+    """Assumed sensor errors that a recording hardly determines are jointly Gaussian with the rest: nothing is lost."""
+    known = posterior(problem(name), np.inf)
+    linear = known.reported.root(known.factorization.root).covariance()
+    assert known.directions.weak.shape[1] == 0
+    sigmas = np.sqrt(np.diag(linear))
+    np.testing.assert_allclose(
+        known.directions.covariance() / np.outer(sigmas, sigmas), linear / np.outer(sigmas, sigmas), atol=0.02
+    )
+
+
+def test_assumed_errors_are_never_held_at_their_priors() -> None:
+    """A mount and an assumed error, whose sum alone is measured: the mount is weak, the error follows."""
+    R = root(np.eye(2), np.array([[1e3, 1e3]]))
+    directions = WeakDirections.of(R, np.eye(2), np.array([True, False]))
+    assert directions.weak.shape[1] <= 1
+    covariance = directions.covariance()
+    exact = np.linalg.inv(R.T @ R)
+    # Every marginal is as wide as the exact one at least.
+    assert (np.diag(covariance) >= np.diag(exact) * (1.0 - 1e-9)).all()

@@ -33,7 +33,7 @@ from alidade.pipelines.reports.known import load_known
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
 from alidade.pipelines.solvers.checkpoint import load_checkpoint, save_checkpoint
-from alidade.pipelines.solvers.incremental import Run
+from alidade.pipelines.solvers.incremental import IncrementalSolver
 from alidade.pipelines.solvers.window import check_window
 
 # At least so long from one look to the next, s, and so many times what it took to read: steps wait for nothing.
@@ -98,7 +98,7 @@ class Follower:
     ) -> None:
         self.source = source
         self.settings, self._show, self._say, self._stopped = settings, show, say, stopped
-        self._run: Run | None = None
+        self._run: IncrementalSolver | None = None
         self._watch = Watch()
         self._epoch_ns = 0
         self._identity: dict[str, str] = {}
@@ -202,15 +202,15 @@ class Follower:
     def _end_alone(self) -> tuple[Problem, Iterator[Step]] | None:
         """The graph from where the past was marginalised out, and its new steps; None where that is too little."""
         run, session = self._run, self._session
-        if run is None or run.base is None or run.problem.onward is None or session is None:
+        if run is None or run.marginal is None or run.problem.onward is None or session is None:
             return None
         for margin in _MARGINS:
-            since = self._epoch_ns + self._delay_ns + round((run.base.time - margin) * 1e9)
+            since = self._epoch_ns + self._delay_ns + round((run.marginal.time - margin) * 1e9)
             recording = Recording(self._growing.look(self.source.parts, since), self._epoch_ns)
             if len(self._growing.attachments) != self._attachments:
                 return None
             late = session.again(recording)
-            problem = run.problem.onward(late.data, run.base.time)
+            problem = run.problem.onward(late.data, run.marginal.time)
             if problem is not None and problem.steps_after is not None:
                 self._delay_ns = recording.delay_ns
                 self._collect(late)
@@ -239,13 +239,13 @@ class Follower:
         if self._run is None and problem.steps_after is not None:
             self._run = self._resumed(problem)
         if self._run is None:
-            self._run = Run(problem, self.settings.window)
+            self._run = IncrementalSolver(problem, self.settings.window)
             return problem.steps(1)
         assert problem.steps_after is not None
         steps = deque(_first(problem.steps_after(self._run.time)))
         if steps and steps[0].keyframes.start != self._run.keyframes:
             self._say("what was recorded before now reads otherwise: beginning anew")
-            self._run = Run(problem, self.settings.window)
+            self._run = IncrementalSolver(problem, self.settings.window)
             return problem.steps(1)
         self._run.update_problem(problem)
         return problem.steps_after(self._run.time)
@@ -263,7 +263,7 @@ class Follower:
         goes_on = problem.steps_after is not None
         for step in steps:
             run.add_step(step)
-            if run.just_marginalized and goes_on:
+            if run.can_checkpoint and goes_on:
                 self._save(run)
             if goes_on and time.monotonic() - self._shown > _VIEW:
                 self._view()
@@ -280,19 +280,19 @@ class Follower:
 
     # -- the checkpoint
 
-    def _save(self, run: Run) -> None:
+    def _save(self, run: IncrementalSolver) -> None:
         if self.settings.checkpoint is None:
             return
         try:
-            save_checkpoint(self.settings.checkpoint, run, self._identity)
+            save_checkpoint(self.settings.checkpoint, run.saved(), self._identity)
         except InputError as error:  # a full disk is no reason to stop
             self._say(str(error))
 
-    def _resumed(self, problem: Problem) -> Run | None:
+    def _resumed(self, problem: Problem) -> IncrementalSolver | None:
         if not self._resumable or self.settings.checkpoint is None:
             return None
         self._resumable = False
-        run = load_checkpoint(self.settings.checkpoint, problem, self._identity)
+        run = IncrementalSolver.resumed(problem, load_checkpoint(self.settings.checkpoint, self._identity))
         self._say(f"resumed at {run.time:.1f} s from {self.settings.checkpoint}")
         return run
 
@@ -331,7 +331,7 @@ class Follower:
         kept, taken = growing.keyframes, problem.keyframes
         if kept is not None and taken is not None and kept.are_far(taken.clock, session.facts.duration_s):
             self._say(f"{_MISPLACED}: solved anew, with keyframes where they were")
-            self._run, steps = Run(problem, self.settings.window), problem.steps(1)
+            self._run, steps = IncrementalSolver(problem, self.settings.window), problem.steps(1)
             # It is no run that another process could go on with.
             growing = replace(problem, steps_after=None)
         self._take(growing, steps)
@@ -348,7 +348,7 @@ def _first(steps: Iterable[Step]) -> Iterator[Step]:
         return
 
 
-def _is_misplaced(run: Run) -> bool:
+def _is_misplaced(run: IncrementalSolver) -> bool:
     """Whether pictures of a run are certainly far from its keyframes by now."""
     keyframes, names = run.problem.keyframes, _names(run.problem)
     if not run.started or keyframes is None or not set(_CLOCK) <= set(names):

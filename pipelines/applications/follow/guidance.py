@@ -23,7 +23,7 @@ from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.finding import Finding, by_severity, status
 from alidade.pipelines.estimation.problem import Array, Quantity
 from alidade.pipelines.reports import sentences
-from alidade.pipelines.solvers.incremental import Run
+from alidade.pipelines.solvers.incremental import IncrementalSolver
 
 # Parameters a sentence names.
 _MOST_NAMED = 6
@@ -170,10 +170,10 @@ class Watch:
     """
 
     def __init__(self) -> None:
-        self._seen: tuple[Run, int] | None = None  # the run, and its moments at the last look
+        self._seen: tuple[IncrementalSolver, int] | None = None  # the run, and its moments at the last look
         self.change: Stability | None = None
 
-    def look(self, run: Run) -> None:
+    def look(self, run: IncrementalSolver) -> None:
         """Look again if the run has come to another moment since."""
         now = run, run.moments
         if not run.started or now == self._seen:
@@ -187,7 +187,9 @@ def _is_estimated(q: Quantity) -> bool:
     return q.judged and q.prior_sigma != 0.0
 
 
-def view_of(epoch_ns: int, run: Run, checklist: tuple[ChecklistItem, ...], change: Stability | None = None) -> View:
+def view_of(
+    epoch_ns: int, run: IncrementalSolver, checklist: tuple[ChecklistItem, ...], change: Stability | None = None
+) -> View:
     """The view of a run so far."""
     quantities, advise = run.problem.quantities, run.problem.advice
     time = run.time if np.isfinite(run.time) else 0.0

@@ -23,7 +23,7 @@ from alidade.pipelines.methods.formula import apply
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.simulated import Simulated
 from alidade.pipelines.solvers.batch import solve_batch
-from alidade.pipelines.solvers.incremental import Run, solve_incremental
+from alidade.pipelines.solvers.incremental import IncrementalSolver, solve_incremental
 from gyro_pair import GyroPair
 from gyro_pair.factor import GyroPairFactor
 from gyro_pair.graph import problem, windows
@@ -114,7 +114,7 @@ def test_the_smoother_forgets_though_all_variables_stay() -> None:
     """What it knows becomes one Gaussian: an update costs the same however long the recording is."""
     slow = {"rate_hz": 50}
     graph = problem(simulated(duration_s=64, gyro_a=slow, gyro_b=slow).data, Config())
-    run = Run(graph, window=1.0)
+    run = IncrementalSolver(graph, window=1.0)
     for step in graph.steps(1):
         run.add_step(step)
     assert run.base is not None

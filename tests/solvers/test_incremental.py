@@ -1,4 +1,4 @@
-"""The incremental solver while little is known: what the recording does not tell stays where the prior has it."""
+"""The initialisation phase of the incremental solver: weak directions keep their priors, errors fit the covariance."""
 
 from __future__ import annotations
 
@@ -16,14 +16,18 @@ from alidade.pipelines.methods.los import graph as los
 from alidade.pipelines.methods.los.simulation import los_config, simulate_los
 from alidade.pipelines.settings import Sensors
 from alidade.pipelines.simulation.motion import EulerMotion
-from alidade.pipelines.solvers import incremental
 from alidade.pipelines.solvers.assembly import CHUNK, Assembly
 from alidade.pipelines.solvers.batch import solve_batch
-from alidade.pipelines.solvers.incremental import Run, solve_incremental
+from alidade.pipelines.solvers.incremental import (
+    DEFAULT_WINDOW,
+    IncrementalConfig,
+    IncrementalSolver,
+    solve_incremental,
+)
 from alidade.pipelines.solvers.noise_levels import weigh
 from alidade.pipelines.solvers.weighing import optimize
 from benchmarks.batch import IDEAL
-from benchmarks.young import CASES, LOS, beginning, followed, made, nees, report, run
+from benchmarks.young import CASES, LOS, beginning, drawn_los, followed, made, nees, report, run
 
 MOUNT = slice(3, 6)
 PRIOR = 0.35
@@ -40,6 +44,13 @@ def _made(seed: int, **changes: object) -> tuple[Problem, Array]:
 
 def _rest_first(rest_s: float) -> EulerMotion:
     return beginning(SCENARIO.head, dict.fromkeys(("yaw", "pitch", "roll"), rest_s))
+
+
+def assert_consistent(nees: Array, numbers: int, recordings: int, level: float = 0.999) -> None:
+    """The mean joint errors (k,) over recordings lie inside the two-sided interval of chi-square."""
+    low, high = chi2.ppf([0.5 - 0.5 * level, 0.5 + 0.5 * level], numbers * recordings) / recordings
+    assert (nees > low).all(), nees
+    assert (nees < high).all(), nees
 
 
 def _apart(one: Estimate, other: Estimate) -> float:
@@ -81,13 +92,47 @@ def test_errors_fit_their_covariance_at_all_times() -> None:
     moments = np.array([2.0, 5.0, 8.0, 12.0, 16.0, 19.0])
     found = [followed(*_made(seed, duration_s=20.0, head=_rest_first(10.0)), moments) for seed in range(3)]
     assert not any(each.message for each in found)
-    nees = np.sum([each.nees for each in found], axis=0)
-    assert (nees < chi2.ppf(0.9995, 3 * found[0].numbers)).all(), nees
+    assert_consistent(np.mean([each.nees for each in found], axis=0), found[0].numbers, len(found))
 
 
 @pytest.mark.slow
-def test_a_minute_at_rest_is_not_folded_while_noise_moves_the_mount() -> None:
-    """Folded after 55 s it was 1500 sigmas off when motion began."""
+@pytest.mark.parametrize(
+    ("method", "case", "from_moment"),
+    [
+        ("head", "rest", 0),
+        ("head", "one axis", 0),
+        ("head", "dropouts", 0),
+        ("head", "outliers", 0),
+        ("head", "mount", 0),
+        ("los", "rest", 0),
+        ("los", "one axis", 0),
+        ("los", "slow", 0),
+        ("los", "outliers", 0),
+        ("indexer", "mount", 0),
+        # Truths are drawn from a tenth of the priors: errors are smaller while a prior is all there is.
+        ("tumble", "slow", 3),
+    ],
+)
+def test_errors_fit_their_covariance_from_both_sides(method: str, case: str, from_moment: int) -> None:
+    """Linear about the last solution, heads that turn about one axis were at 155 of 24, slow gimbals at 1,000 of 35."""
+    found = [run(method, case, seed) for seed in range(4)]
+    assert not any(each.message for each in found)
+    mean = np.mean([each.nees for each in found], axis=0)
+    assert_consistent(mean[from_moment:], found[0].numbers, len(found), 0.9999)
+
+
+def test_motion_about_one_axis_keeps_consistent() -> None:
+    """The other two angles of the mount follow the unknown one along a curve: without second order 8 times as much."""
+    settings, _ = CASES["head"]["one axis"](1001)
+    problem, truth = made("head", settings.model_copy(update={"duration_s": 12.0}), 1001)
+    found = followed(problem, truth, np.array([4.0, 8.0, 11.5]))
+    assert not found.message
+    assert_consistent(np.array(found.nees), found.numbers, 1, 0.9999)
+
+
+@pytest.mark.slow
+def test_a_minute_at_rest_is_not_marginalised_while_noise_moves_the_mount() -> None:
+    """Marginalised after 55 s it was 1500 sigmas off when motion began."""
     settings, _ = CASES["head"]["rest"](3)
     problem, truth = made("head", settings.model_copy(update={"duration_s": 64.0}), 3)
     found = followed(problem, truth, np.array([30.0, 57.0, 63.5]))
@@ -96,7 +141,7 @@ def test_a_minute_at_rest_is_not_folded_while_noise_moves_the_mount() -> None:
 
 
 @pytest.mark.slow
-def test_a_second_axis_after_the_run_was_folded() -> None:
+def test_a_second_axis_after_45_s_of_one() -> None:
     since = {"yaw": 0.0, "pitch": 45.0, "roll": 45.0}
     problem, truth = _made(4, duration_s=60.0, head=beginning(SCENARIO.head, since))
     batch, incremental = solve_batch(problem), solve_incremental(problem)
@@ -143,14 +188,13 @@ def test_no_sigma_is_far_beyond_its_prior(seed: int) -> None:
     settings, _ = CASES["tumble"]["slow"](seed)
     problem, _ = made("tumble", settings, seed)
     widest = 0.0
-    following = Run(problem, 1.0)
+    following = IncrementalSolver(problem, 1.0)
     for step in islice(problem.steps(1), 11):
         following.add_step(step)
         if following.started:
-            # As it is though withheld.
-            sigmas = np.sqrt(np.diag(following._covariance()))
+            sigmas = np.sqrt(np.diag(following.covariance()))
             widest = max(widest, float(np.max(sigmas / [q.scale for q in problem.quantities])))
-    assert 0.9 < widest < 1.5
+    assert 0.9 < widest < 1.05
 
 
 def test_the_study_follows_a_recording_to_its_end() -> None:
@@ -162,26 +206,87 @@ def test_the_study_follows_a_recording_to_its_end() -> None:
     assert len(list(report([found]))) == 3
 
 
-def test_the_first_attitudes_of_a_tumbled_magnetometer() -> None:
-    # One by one, the samples of a rest would tell how the ellipsoid lies there, and it is found far away.
-    found = [run("tumble", "rest", seed) for seed in range(2, 6)]
-    assert not any(f.message for f in found)
-    assert np.mean([f.nees for f in found], axis=0).max() < 30.0
+def test_the_first_attitudes_of_a_tumbled_magnetometer_are_at_their_priors() -> None:
+    """Their covariance of second order does not go far enough: of some recordings it is off by hundreds."""
+    settings, _ = CASES["tumble"]["rest"](2)
+    problem, truth = made("tumble", settings, 2)
+    following = IncrementalSolver(problem, 1.0)
+    for step in problem.steps(1):
+        if step.time > 22.0:
+            break
+        following.add_step(step)
+        if 5.0 < step.time < 9.0:
+            values, sigmas = following.values()[:9], np.sqrt(np.diag(following.covariance()))[:9]
+            np.testing.assert_allclose(values, [q.prior_mean for q in problem.quantities[:9]], atol=1e-12)
+            np.testing.assert_allclose(sigmas, [q.prior_sigma for q in problem.quantities[:9]], rtol=1e-9)
+    size, numbers = nees(following.values(), following.covariance(), truth)
+    assert size < chi2.ppf(0.999, numbers)
+    sigmas = np.sqrt(np.diag(following.covariance()))
+    assert (sigmas[:9] < 0.5 * np.array([q.scale for q in problem.quantities[:9]])).any()
 
 
-def test_a_run_that_rejects_all_is_solved_anew_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Not when it has grown by a twentieth, which may take seconds; but not twice for the same reason."""
-    for name, never in {"_GROWTH": np.inf, "_MORE": np.inf, "_LOST": np.inf, "_HALF": 0.0}.items():
-        monkeypatch.setattr(incremental, name, never)
+def test_outliers_among_few_pictures_leave_everything_at_its_prior() -> None:
+    """Three of eleven pictures are rejected: which ones are wrong cannot be told."""
+    settings, _ = CASES["los"]["outliers"](4010)
+    problem, _ = made("los", settings, 4010)
+    following = IncrementalSolver(problem, 1.0)
+    for step in problem.steps(1):
+        if step.time > 1.05:
+            break
+        following.add_step(step)
+    sigmas = np.sqrt(np.diag(following.covariance()))
+    prior = np.array([q.prior_sigma for q in problem.quantities], dtype=float)
+    np.testing.assert_allclose(sigmas, prior, rtol=1e-9)
+
+
+def test_a_number_without_prior_keeps_its_posterior() -> None:
+    settings, _ = CASES["indexer"]["mount"](3001)
+    problem, _ = made("indexer", settings, 3001)
+    following = IncrementalSolver(problem, 1.0)
+    for step in problem.steps(1):
+        following.add_step(step)
+        if following.started:
+            break
+    free = [q.prior_sigma is None for q in problem.quantities]
+    assert any(free)
+    posterior = following._posterior()
+    values, covariance = posterior.at_prior(np.eye(len(posterior.mean)))
+    some = np.array([bool(q.prior_sigma) for q in problem.quantities])
+    own = np.diag(posterior.covariance)[np.isin(posterior.free, np.flatnonzero(free))]
+    scale = np.array([q.prior_scale for q in problem.quantities])[free]
+    np.testing.assert_allclose(np.diag(covariance)[free], own * scale**2)
+    np.testing.assert_allclose(values[some], [q.prior_mean for q in problem.quantities if q.prior_sigma], atol=1e-12)
+    assert not covariance[np.ix_(some, free)].any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 3, 4])
+def test_the_initialisation_phase_ends_though_nothing_tells_the_roll(seed: int) -> None:
+    """After two minutes the answer is as good as batch; else it would be solved anew until the tenth minute."""
+    problem, truth = made("los", drawn_los(seed, duration_s=120.0), seed)
+    following = IncrementalSolver(problem, DEFAULT_WINDOW)
+    for step in problem.steps(1):
+        following.add_step(step)
+    assert not following.initialising
+    batch, estimate = solve_batch(problem), following.finish(0.0)
+    assert _apart(estimate, batch) < 0.5
+    np.testing.assert_allclose(estimate.sigmas, batch.sigmas, rtol=0.05)
+    size, numbers = nees(estimate.values, estimate.covariance, truth)
+    assert size < chi2.ppf(0.9995, numbers)
+
+
+def test_a_run_that_rejects_all_is_solved_again_at_once() -> None:
+    """Not only when it has grown by a quarter; but not twice for the same reason."""
     scenario = LOS.model_copy(update={"duration_s": 4.0, "sensors": IDEAL})
     data, _ = simulate_los(scenario, 3)
     wrong = (data.image_t > 2.0) & (data.image_t < 3.2)
     moved = data.error + 0.01 * wrong[:, None]
     problem = los.problem(replace(data, error=moved), load_config(los_config(scenario).encode()))
-    following, solved = Run(problem, 1.0), []
+    following, solved = IncrementalSolver(problem, 1.0, IncrementalConfig(solve_growth=np.inf)), []
     for step in problem.steps(1):
         before = following.moments
         following.add_step(step)
-        solved += [step.time] if following.moments > before else []
-    assert len(solved) == 2
-    assert 2.0 < solved[1] < 2.6
+        solved += [step.time] if following.initialising and following.moments > before else []
+    rejecting = [time for time in solved if time > 2.0]
+    assert 2.0 < rejecting[0] < 2.6
+    assert len(rejecting) <= 3

@@ -1,0 +1,328 @@
+"""The innovation gate: measurements against their prediction, and which of them the smoother takes.
+
+With the joint covariance P of the variables of a measurement, its whitened error e and Jacobian A, the innovation has
+the covariance S = A P A' + I. Its normalised square (NIS) e' S^-1 e is chi-square distributed if the measurement is
+good; beyond the gate, which one good measurement in 10,000 exceeds, it is rejected (Bar-Shalom, Li, Kirubarajan,
+"Estimation with applications to tracking and navigation", 2001, section 5.4).
+
+Each family of measurements has its own binomial tests: whether it is rejected more often than its outliers are, so that
+the linearisation is in doubt, and whether it is certain that most of it is good.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.factors.chi_square import gate
+from alidade.pipelines.estimation.problem import Array, ChiSquare, Factor, Problem, Residuals
+from alidade.pipelines.solvers.coloured import correlations
+from alidade.pipelines.solvers.linear_system import linear_graph_of
+from alidade.pipelines.solvers.marginals import ordering_of
+from alidade.pipelines.solvers.smoother import Smoother, slices
+from alidade.pipelines.solvers.system import residuals_of
+
+# Steps in a row that are rejected whole before one is taken nevertheless: by then it is the prediction that is wrong.
+MAX_REJECTED_IN_A_ROW = 10
+# Probability with which chance alone makes a binomial test fire.
+FALSE_ALARM = 1e-3
+# Outliers are a minority of every family of measurements.
+MAX_OUTLIER_SHARE = 0.5
+# Information in units of that of the priors below which it is rounding.
+_ROUNDING = 1e-9
+
+
+class RowBuffer:
+    """Rows of numbers of one width, in an array that doubles when it is full.
+
+    A list of small arrays would take ten times the memory over hours.
+    """
+
+    def __init__(self, array: Array | None = None) -> None:
+        self._array = np.empty((0, 0)) if array is None else array.copy()
+        self._count = len(self._array)
+
+    def __len__(self) -> int:
+        return self._count
+
+    @property
+    def array(self) -> Array:
+        """(n, width), a view that the next row may make stale."""
+        return self._array[: self._count]
+
+    def add(self, rows: Array) -> None:
+        """Append rows (n, width)."""
+        if not len(rows):
+            return
+        needed = self._count + len(rows)
+        if needed > len(self._array):
+            grown = np.empty((max(needed, 2 * len(self._array)), rows.shape[1]))
+            if self._count:
+                grown[: self._count] = self.array
+            self._array = grown
+        self._array[self._count : needed] = rows
+        self._count = needed
+
+    def clear(self) -> None:
+        """Remove all rows."""
+        self._count = 0
+
+
+def binomial_tail(rejected: int, count: int, share: float) -> float:
+    """Probability that at least `rejected` of `count` measurements are rejected, each with probability `share`."""
+    from scipy.special import bdtrc
+
+    return 1.0 if rejected <= 0 else float(bdtrc(rejected - 1, count, share))
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The new variables of a step as its processes predict them from the old ones.
+
+    Attributes:
+        smoother: holds the old variables.
+        processes: factors of the step that are no measurements.
+        about: values of all variables, about which the prediction is linear.
+        new: values of the new variables.
+    """
+
+    smoother: Smoother
+    processes: Sequence[Factor]
+    about: gtsam.Values
+    new: gtsam.Values
+
+    def of(self, keys: Sequence[int]) -> tuple[Array, Array]:
+        """Mean (d,) of the moves of variables, old and new, from `about`, and their joint covariance (d, d)."""
+        dims = self.about.dims()
+        fresh = list(self.new.keys())
+        involved = set(self._process.keyVector())
+        held = [k for k in dict.fromkeys([*keys, *involved]) if k not in fresh]
+        P, moves = self.smoother.covariance(held), self.smoother.moves(held)
+        where = slices(held + fresh, dims)
+        if fresh:
+            order = [k for k in held if k in involved] + fresh
+            A, b = self._process.jacobian(ordering_of(order))
+            columns = slices(order, dims)
+            inverse = np.linalg.pinv(A[:, columns[fresh[0]].start :])
+            response = np.zeros((inverse.shape[0], P.shape[0]))
+            for key in order[: -len(fresh)]:
+                response[:, where[key]] = -inverse @ A[:, columns[key]]
+            across = response @ P
+            P = np.block([[P, across.T], [across, across @ response.T + inverse @ inverse.T]])
+            moves = np.append(moves, response @ moves + inverse @ b)
+        pick = np.concatenate([np.arange(P.shape[0])[where[key]] for key in keys])
+        return moves[pick], P[np.ix_(pick, pick)]
+
+    @cached_property
+    def _process(self) -> gtsam.GaussianFactorGraph:
+        return linear_graph_of(self.processes, self.about)
+
+
+@dataclass
+class InnovationGate:
+    """The innovations of a run, and which measurements were used.
+
+    Attributes:
+        families: family -> rows of time, 1 if used, and the innovation whitened by its own covariance, whose norm
+            squared is the NIS.
+        unusable: family -> number of measurements left out because they gave no finite numbers.
+        information: family -> information (d, d) that its measurements added about the parameters' tangents, all else
+            marginalised out.
+        rejected_in_a_row: number of steps until now.
+        counted: family -> number of measurements, and of those rejected, when `begin_count` was called last.
+    """
+
+    families: dict[str, RowBuffer] = field(default_factory=dict)
+    unusable: dict[str, int] = field(default_factory=dict)
+    information: dict[str, Array] = field(default_factory=dict)
+    rejected_in_a_row: int = 0
+    counted: dict[str, tuple[int, int]] = field(default_factory=dict)
+
+    def begin_count(self) -> None:
+        """Count rejections from now on."""
+        self.rejected_in_a_row = 0
+        self.counted = self._counts()
+
+    def too_many_rejected(self) -> bool:
+        """Whether a family is rejected more often since `begin_count` than it was until then, by more than chance."""
+        return any(
+            binomial_tail(rejected - before[1], count - before[0], (before[1] + 1.0) / (before[0] + 2.0)) < FALSE_ALARM
+            for count, rejected, before in (
+                (*counts, self.counted.get(family, (0, 0))) for family, counts in self._counts().items()
+            )
+        )
+
+    def too_few_to_decide(self) -> bool:
+        """Whether a family has rejections among so few measurements that outliers may be its majority.
+
+        Which of them are wrong cannot be told then: those that are may agree by chance.
+        """
+        return any(
+            rejected > 0 and 1.0 - binomial_tail(rejected + 1, count, MAX_OUTLIER_SHARE) > FALSE_ALARM
+            for count, rejected in self._counts().values()
+        )
+
+    def select(
+        self, factor: Factor, prediction: Prediction, gated: bool, parameters: Sequence[int] = ()
+    ) -> Factor | None:
+        """Select the measurements of a factor whose innovation lies within the gate, and record all innovations.
+
+        Args:
+            factor: with a measurement.
+            prediction: of its variables.
+            gated: whether innovations outside the gate are rejected.
+            parameters: variables about which the information that the measurements add is recorded; none: not recorded.
+
+        Returns:
+            The factor on the measurements used; None: none is.
+        """
+        measurement = factor.measurement
+        assert measurement is not None
+        error, A = measurement.rows(prediction.about)
+        n = len(measurement.model.time)
+        if not (np.isfinite(error).all() and np.isfinite(A).all()):
+            self.unusable[factor.family] = self.unusable.get(factor.family, 0) + n
+            return None
+        other = [key for key in parameters if key not in measurement.keys]
+        moves, P = prediction.of([*measurement.keys, *other])
+        own = A.shape[1]
+        error, S = error + A @ moves[:own], A @ P[:own, :own] @ A.T + np.eye(len(error))
+        parts = n if measurement.divisible else 1
+        rows = np.arange(len(error)).reshape(parts, -1)
+        used = self._within_gate(error[rows], S[rows[:, :, None], rows[:, None, :]], gated)
+        whitened = np.zeros(len(error))
+        for block in (rows[used].ravel(), *rows[~used]):
+            whitened[block] = np.linalg.solve(np.linalg.cholesky(S[np.ix_(block, block)]), error[block])
+        self.record(factor, whitened.reshape(n, -1), np.repeat(used, n // parts))
+        if len(parameters) and used.any():
+            kept = rows[used].ravel()
+            where = slices([*measurement.keys, *other], prediction.about.dims())
+            of = np.concatenate([np.arange(P.shape[0])[where[key]] for key in parameters])
+            added = _added_information(P[np.ix_(of, of)], P[of, :own] @ A[kept].T, S[np.ix_(kept, kept)])
+            self.information[factor.family] = self.information.get(factor.family, 0.0) + added
+        if used.all() or not used.any():
+            return factor if used.all() else None
+        return Factor.of(factor.family, measurement.only(used))
+
+    def _within_gate(self, error: Array, S: Array, gated: bool) -> NDArray[np.bool_]:
+        """(p,) which innovations (p, m) of covariances (p, m, m) are used."""
+        squares = (error * np.linalg.solve(S, error[:, :, None])[:, :, 0]).sum(axis=1)
+        used = squares < gate(error.shape[1]) ** 2 if gated else np.ones(len(error), dtype=bool)
+        self.rejected_in_a_row = 0 if used.any() else self.rejected_in_a_row + 1
+        if self.rejected_in_a_row > MAX_REJECTED_IN_A_ROW:
+            used[:], self.rejected_in_a_row = True, 0
+        return np.asarray(used)
+
+    def record(self, factor: Factor, whitened: Array, used: NDArray[np.bool_]) -> None:
+        """Add the innovations (n, m) of a measurement."""
+        assert factor.measurement is not None
+        time = factor.measurement.model.time
+        rows = self.families.setdefault(factor.family, RowBuffer())
+        rows.add(np.column_stack([time, used, whitened.reshape(len(time), -1)]))
+
+    def adopt_inliers(self, factors: Sequence[Factor], values: gtsam.Values) -> None:
+        """Adopt the inlier set of a solution, and its residuals where the gate had decided otherwise."""
+        for family, found in residuals_of(factors, values).items():
+            rows = np.column_stack([found.time, found.used, found.whitened])
+            live = self.families.setdefault(family, RowBuffer()).array
+            if len(live):
+                known = len(live)
+                kept = (live[:, 1] > 0.0) & found.used[:known]
+                rows[:known][kept] = live[kept]
+            self.families[family] = RowBuffer(rows)
+
+    def chi_square(self) -> ChiSquare:
+        """The sum of the squared innovations of the measurements used."""
+        families = {}
+        for family, rows in self.families.items():
+            used = rows.array[rows.array[:, 1] > 0.0, 2:]
+            families[family] = float((used**2).sum()), float(used.size)
+        return ChiSquare(sum(v for v, _ in families.values()), sum(d for _, d in families.values()), families)
+
+    def residuals(self) -> dict[str, Residuals]:
+        """Family -> the innovations."""
+        return {
+            family: Residuals(rows.array[:, 0].copy(), rows.array[:, 2:].copy(), rows.array[:, 1] > 0.0)
+            for family, rows in self.families.items()
+        }
+
+    def rejected(self) -> dict[str, int]:
+        """Family -> number of measurements left out."""
+        return {family: rejected + self.unusable.get(family, 0) for family, (_, rejected) in self._counts().items()}
+
+    def _counts(self) -> dict[str, tuple[int, int]]:
+        """Family -> number of measurements, and of those rejected."""
+        return {family: (len(rows), int((rows.array[:, 1] == 0.0).sum())) for family, rows in self.families.items()}
+
+
+def _added_information(C: Array, across: Array, S: Array) -> Array:
+    """Information (d, d) that a measurement adds about numbers.
+
+    It is J+ - J with J = C^-1 and J+ = (C - across S^-1 across')^-1, by the matrix inversion lemma.
+
+    Args:
+        C: (d, d) covariance of the numbers before.
+        across: (d, m) their covariance with the innovation.
+        S: (m, m) covariance of the innovation.
+    """
+    sigmas = np.sqrt(np.diag(C))
+    gain = np.linalg.solve(C / np.outer(sigmas, sigmas), across / sigmas[:, None]) / sigmas[:, None]
+    return np.asarray(gain @ np.linalg.solve(S - across.T @ gain, gain.T))
+
+
+def correlation_inflation(
+    problem: Problem, covariance: Array, gate: InnovationGate, to_tangents: Array
+) -> tuple[Array, dict[str, float]]:
+    """Covariance (n, n) of a filter whose innovations are correlated in time, and the correlation lengths by family.
+
+    Where innovations of a family are correlated over L measurements, L of them count as one: the information that the
+    family added is divided by L. Information of priors, and of families with white innovations, stays.
+
+    Args:
+        problem: gives the priors.
+        covariance: (n, n) of the reported numbers for white noise.
+        gate: with the innovations.
+        to_tangents: (d, n) Jacobian of the parameters' tangents by the reported numbers.
+    """
+    lengths = {}
+    for family, found in gate.residuals().items():
+        lags = correlations(np.where(found.used[:, None], found.whitened, 0.0))
+        if len(lags):
+            lengths[family] = 1.0 + 2.0 * float(lags.sum())
+    if not lengths:
+        return covariance, lengths
+    free = np.flatnonzero(np.diag(covariance) > 0.0)
+    scale, extra = np.array([(problem.quantities[i].scale, problem.quantities[i].extra_sigma) for i in free]).T
+    block = np.ix_(free, free)
+    variance, vectors = np.linalg.eigh((covariance[block] - np.diag(extra**2)) / np.outer(scale, scale))
+    prior = np.diag([0.0 if problem.quantities[i].prior_sigma is None else 1.0 for i in free])
+    measured = (vectors / np.maximum(variance, _ROUNDING**2)) @ vectors.T - prior
+    unit = to_tangents[:, free] * scale
+    added = {family: unit.T @ each @ unit for family, each in gate.information.items()}
+    information, vectors = np.linalg.eigh(prior + _divided(measured, added, lengths))
+    grown = covariance.copy()
+    grown[block] = (vectors / information) @ vectors.T * np.outer(scale, scale) + np.diag(extra**2)
+    return grown, lengths
+
+
+def _divided(measured: Array, added: Mapping[str, Array], lengths: Mapping[str, float]) -> Array:
+    """Information (n, n) with the share of each family divided by its correlation length.
+
+    Directions to which no family has added count with the longest.
+    """
+    longest = max(lengths.values())
+    floor = _ROUNDING * max((float(np.trace(each)) for each in added.values()), default=1.0) * np.eye(len(measured))
+    whole, parts = floor.copy(), floor / longest
+    for family, each in added.items():
+        whole += each
+        parts += each / lengths.get(family, 1.0)
+    values, vectors = np.linalg.eigh(whole)
+    inverse_root = (vectors / np.sqrt(values)) @ vectors.T
+    values, vectors = np.linalg.eigh(measured)
+    root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return np.asarray(root @ inverse_root @ parts @ inverse_root @ root)
