@@ -66,18 +66,16 @@ def _engine(
     problem: Problem, name: EngineName, factors: list[Factor], initial: gtsam.Values, current: dict[int, int]
 ) -> tuple[Linearization | GtsamEngine, Values]:
     shared = [current.get(p.key, p.key) for p in problem.parameters]
-    if name != "gtsam" and (problem.layout is not None or name == "chain"):
-        try:
-            if problem.layout is None:
-                raise NotAChainError(f"{problem.method}: the problem does not say how its variables are a chain")
-            layout, values = Layout.of(problem.layout, initial)
-            found = Linearization.of(factors, layout)
-            for key in shared:
-                layout.root_columns(key)
-        except NotAChainError:
-            if name == "chain":
-                raise
-        else:
-            return found, values
-    layout, values = Layout.of(problem.layout, initial, shared)
+    try:
+        if problem.layout is None:
+            raise NotAChainError(f"{problem.method}: the problem does not say how its variables are a chain")
+        layout, values = Layout.of(problem.layout, initial)
+        for key in shared:
+            layout.root_columns(key)
+        if name != "gtsam":
+            return Linearization.of(factors, layout), values
+    except NotAChainError:
+        if name == "chain":
+            raise
+        layout, values = Layout.of(None, initial, shared)
     return GtsamEngine.of(factors, layout), values

@@ -148,10 +148,21 @@ class GtsamSystem:
             whole = np.pad(whole, ((0, c + s + 1 - len(whole)), (0, 0)))
         root = np.triu(np.linalg.qr(whole, mode="r"))
         conditionals = [_Conditional.of(each, layout) for each in _conditionals_of(tree, ordering)]
-        # gtsam drops what no variable can change.
-        explained = sum(float(each.d @ each.d) for each in conditionals) + float(root[:-1, -1] @ root[:-1, -1])
-        root[-1, -1] = np.sqrt(max(self.squares - explained, 0.0))
-        return GtsamFactorization(layout, root, conditionals)
+        found = GtsamFactorization(layout, root, conditionals)
+        root[-1, -1] = np.sqrt(self._minimum(graph, found))  # gtsam drops what no variable can change
+        return found
+
+    def _minimum(self, graph: gtsam.GaussianFactorGraph, found: GtsamFactorization) -> float:
+        """Sum of squares at the solution; where there is none, what the rows of R leave of it."""
+        try:
+            last = np.asarray(np.linalg.solve(found.root[:-1, :-1], found.root[:-1, -1:]), dtype=float)
+            moves = found.moves(last, 1.0, np.zeros)
+        except np.linalg.LinAlgError:
+            return max(self.squares - found.explained, 0.0)
+        solution = gtsam.VectorValues()
+        for at, move in moves.items():
+            solution.insert(int(self.layout.key[at]), move[:, 0])
+        return 2.0 * float(graph.error(solution))
 
     def _damped(self, damping: float) -> gtsam.GaussianFactorGraph:
         graph, layout = gtsam.GaussianFactorGraph(), self.layout
@@ -235,11 +246,11 @@ class GtsamFactorization:
 
     def given(self, last: Array) -> tuple[Array, Array]:
         """States and nodes of the least squares for given last node and shared unknowns (c + s, n)."""
-        return self._back(last, 1.0, lambda shape: np.zeros(shape))
+        return self._back(last, 1.0, np.zeros)
 
     def propagate(self, last: Array) -> tuple[Array, Array]:
         """Moves of states and nodes that go with moves of the last node and the shared unknowns (c + s, n)."""
-        return self._back(last, 0.0, lambda shape: np.zeros(shape))
+        return self._back(last, 0.0, np.zeros)
 
     def sample(self, count: int, generator: np.random.Generator) -> tuple[Array, Array, Array]:
         """Draws from the posterior, as deviations from its mean."""
@@ -251,24 +262,33 @@ class GtsamFactorization:
         """None: the elimination is not in time order."""
         return np.zeros(0, dtype=np.intp), []
 
-    def _back(self, last: Array, right: float, noise: Callable[[tuple[int, int]], Array]) -> tuple[Array, Array]:
-        layout, n = self.layout, last.shape[1]
-        N, d, J, c, _ = layout.sizes
-        states, nodes, found = np.zeros((N, d, n)), np.zeros((J, c, n)), dict[int, Array]()
-        ends = (layout.keyframe < 0) & ((layout.node <= 0) | (layout.node == J - 1))
-        for at in np.flatnonzero(ends).tolist():
+    @property
+    def explained(self) -> float:
+        """Decrease of the sum of squares by the solution."""
+        return sum(float(np.square(d).sum()) for d in (self.root[:-1, -1], *(each.d for each in self._conditionals)))
+
+    def moves(self, last: Array, right: float, noise: Callable[[tuple[int, int]], Array]) -> dict[int, Array]:
+        """Moves (dim, n) of all variables, by position, for those of the last node and the shared unknowns."""
+        layout, found, J = self.layout, dict[int, Array](), self.layout.sizes[2]
+        for at in np.flatnonzero((layout.keyframe < 0) & ((layout.node <= 0) | (layout.node == J - 1))).tolist():
             found[at] = layout.root_columns(int(layout.key[at])) @ last
         for each in reversed(self._conditionals):
-            rest = right * each.d[:, None] + noise((len(each.d), n))
+            rest = right * each.d[:, None] + noise((len(each.d), last.shape[1]))
             if each.others:
                 rest = rest - each.S @ np.vstack([found[at] for at in each.others])
             ends = np.cumsum([layout.size(at) for at in each.own])[:-1]
             found |= zip(each.own, np.split(np.linalg.solve(each.R, rest), ends), strict=True)
-        first = next((at for at in np.flatnonzero(layout.node == 0).tolist()), None)
+        return found
+
+    def _back(self, last: Array, right: float, noise: Callable[[tuple[int, int]], Array]) -> tuple[Array, Array]:
+        layout, n = self.layout, last.shape[1]
+        N, d, J, c, _ = layout.sizes
+        states, nodes, found = np.zeros((N, d, n)), np.zeros((J, c, n)), self.moves(last, right, noise)
+        first = int(np.flatnonzero(layout.node == 0)[0]) if c else -1
         for at, x in found.items():
             size = layout.size(at)
             if layout.keyframe[at] >= 0:
                 states[layout.keyframe[at], layout.offset[at] : layout.offset[at] + size] = x
-            elif layout.node[at] > 0 and first is not None:
+            elif layout.node[at] > 0:
                 nodes[layout.node[at], layout.part[at] : layout.part[at] + size] = x - found[first]
         return states, nodes

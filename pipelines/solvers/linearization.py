@@ -197,7 +197,8 @@ class Linearization:
         drafts = [_Draft.of(kind, layout, chain) for kind in kinds.values()]
         piece = _pieces(drafts, layout) if chain else np.zeros(layout.sizes[0], dtype=np.intp)
         used = np.zeros((2, layout.sizes[0]), dtype=np.intp)
-        groups = [draft.placed(layout, piece, used, chain) for draft in drafts]
+        # What joins keyframes first: rows about single ones may stand where there is no such row.
+        groups = [draft.placed(layout, piece, used, chain) for draft in sorted(drafts, key=lambda d: d.count.max() < 2)]
         absent = int((~layout.kept[0]).sum(axis=1).max(initial=0))
         return cls(layout, groups, piece, (int(used[0].max()) + absent, int(used[1].max())))
 
@@ -258,7 +259,8 @@ class Linearization:
                 if group.target == target and group.family not in NOT_MEASURED and (group.place >= 0).all():
                     np.maximum.at(known, group.place, group.model.time)
             out = np.where(known > -np.inf, known, out)
-        return np.maximum.accumulate(out)
+        known = out[out > -np.inf]
+        return np.maximum.accumulate(np.where(out > -np.inf, out, known[0] if len(known) else 0.0))
 
     def under(self, loss: TruncatedLoss | None) -> Linearization:
         """The same with another loss for measurements that have one."""
@@ -394,10 +396,12 @@ class _Draft:
             target, place = ("pair" if (self.count > 1).any() else "state"), self.last
         elif c and self._is_walk(layout):
             target, place = "walk", self.node
-        elif c and self.node.max(initial=-1) >= 0:
+        elif c and self.node.max(initial=-1) >= (0 if self.is_measurement else 1):
             if self.pair:
                 raise NotAChainError(f"{self.family}: a factor joins two bias nodes and shared variables")
             target, place = "state", np.searchsorted(piece, np.maximum(self.node, 0), side="right") - 1
+        if target == "state" and (used[1][place] + self.model.rows <= used[1].max()).all() and len(set(place)) == n:
+            target = "pair"
         if target in ("state", "pair"):
             row = _below(place, self.model.rows, used[int(target == "pair")])
         return Group(

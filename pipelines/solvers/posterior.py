@@ -46,7 +46,7 @@ class Reported:
         numbers: (n,) at the values.
         jacobian: (n, c + s) by the last node and the shared unknowns.
         free: (m,) which numbers are not fixed.
-        mean, scale: (m,) of their priors, default scale where there is none.
+        mean, scale: (m,) means of the priors in force, and sigmas of the default ones.
         prior: (m, m) precision of the priors in force, in units of the scales.
         extra: (n,) sigmas of errors that no measurement model has.
         calibrated: (m,) which free numbers are what is calibrated, and no assumed sensor errors.
@@ -77,15 +77,17 @@ class Reported:
         pairs = [(key, *p.coordinates(known, key)) for p, key in zip(problem.parameters, keys, strict=True)]
         quantities = problem.quantities
         free = np.flatnonzero([q.prior_sigma != 0.0 for q in quantities])
-        precision = [1.0 if quantities[i].prior_sigma else FREE_PRIOR**-2 for i in free]
+        # The default priors are the yardstick: an earlier calibration as prior makes nothing weak that it determined.
+        scale = np.array([quantities[i].prior_scale for i in free])
+        sigma = np.array([quantities[i].prior_sigma or FREE_PRIOR * quantities[i].prior_scale for i in free])
         return cls(
             names=tuple(q.name for q in quantities),
             numbers=np.concatenate([numbers for _, numbers, _ in pairs]),
             jacobian=np.vstack([J @ layout.root_columns(key) for key, _, J in pairs]),
             free=free,
             mean=np.array([quantities[i].prior_mean for i in free]),
-            scale=np.array([quantities[i].scale for i in free]),
-            prior=np.diag(precision),
+            scale=scale,
+            prior=np.diag((scale / sigma) ** 2),
             extra=np.array([0.0 if q.prior_sigma == 0.0 else q.extra_sigma for q in quantities]),
             calibrated=np.array([not quantities[i].assumed for i in free], dtype=bool),
         )
@@ -335,14 +337,19 @@ def sqrt_information(
         values = moved_to(problem, engine, values, current_keys, at)
     layout = engine.layout
     reported = Reported.of(problem, layout, values, current_keys)
-    inverse = np.linalg.pinv(reported.jacobian)[layout.sizes[3] :, reported.free]
+    c, J = layout.sizes[3], reported.jacobian
+    inverse = np.linalg.pinv(J)[c:]
     named = np.array([reported.names[i] in device for i in reported.free], dtype=bool)
     groups, prior_R, prior_d = [], [np.empty((0, len(named)))], [np.empty(0)]
     for group in engine.groups:
         if group.target == "shared" and group.family == "prior":
             rows, _ = group.rows(values, layout.sizes[4] + 1)
-            about = rows[..., :-1] @ inverse
+            whole = rows[..., :-1] @ inverse
+            # The first node of a bias that walks has a prior, and is not what is reported.
+            off = np.abs(whole @ J - np.pad(rows[..., :-1], ((0, 0), (0, 0), (c, 0)))).max(axis=2)
+            about = whole[..., reported.free]
             of_device = _about_alone((about * reported.scale).reshape(-1, len(named)), named).reshape(rows.shape[:2])
+            of_device &= off <= UNSEEN**0.5 * np.abs(rows[..., :-1]).max(axis=2)
             prior_R.append(about[of_device])
             prior_d.append(rows[of_device, -1])
             weights = np.ones(of_device.shape) if group.weights is None else group.weights

@@ -36,7 +36,9 @@ class RobustConfig:
             with: residuals move by .05 sigma yet.
         rough_iterations: of these at most: where they do not do outliers lead, and the surrogates begin anyhow.
         mu_step: factor from one surrogate to the next, with one reweighted step each (Yang et al.: 1.4).
-        last_mu: of the last surrogate; its weights are 0 or 1 but for .1 % about the gate.
+        undecided: share of measurements whose weights are neither 0 nor 1 below which the truncated loss follows: what
+            they say of anything is less than that share.
+        last_mu: of the last surrogate at most; its weights are 0 or 1 but for .1 % about the gate.
         max_chance: of a family that it loses more than half of its measurements to outliers.
     """
 
@@ -44,6 +46,7 @@ class RobustConfig:
     rough_tolerance: float = 2e-3
     rough_iterations: int = 8
     mu_step: float = 2.5
+    undecided: float = 0.01
     last_mu: float = 1e3
     max_chance: float = 1e-3
 
@@ -86,6 +89,8 @@ def _graduated(engine: Engine, values: Values, loss: TruncatedLoss, config: Robu
     mu, iterations = loss.gate**2 / max(2.0 * largest**2 - loss.gate**2, 1e-300), 0
     while mu < config.last_mu:
         relaxed = engine.under(replace(loss, mu=mu))
+        if _undecided(relaxed, values) < config.undecided:
+            break
         try:
             step = Tangent(*relaxed.at(values)[0].eliminate().solve())
         except (IndeterminateStateError, np.linalg.LinAlgError):
@@ -93,6 +98,13 @@ def _graduated(engine: Engine, values: Values, loss: TruncatedLoss, config: Robu
         values, iterations = engine.layout.retract(values, step), iterations + 1
         mu *= config.mu_step
     return values, iterations
+
+
+def _undecided(engine: Engine, values: Values) -> float:
+    """Share of measurements whose weight under a surrogate is neither 0 nor 1."""
+    weights = [group.used(group.evaluate(values)[0]) for group in engine.groups if group.loss is not None]
+    whole = np.concatenate(weights)
+    return float(((whole > 0.0) & (whole < 1.0)).mean())
 
 
 def _norms(group: Group, values: Values) -> Array:
