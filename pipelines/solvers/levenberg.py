@@ -114,12 +114,15 @@ class LevenbergConfig:
         max_iterations: linear systems solved.
         cost_tolerance: stop when the predicted decrease is below it (squared sigmas): no number is off its minimum by
             more than the root of it, in its own sigmas, and by far less once the step is taken.
+        curved_tolerance: predicted decrease of an undamped step below which it may raise the cost at a minimum: what the
+            data hardly determine is curved by more than the linear system knows. .01 is .1 sigma.
         initial_damping: of the first damped step, relative to the diagonal of A'A.
         max_damping: above it no step is left.
     """
 
     max_iterations: int = 60
     cost_tolerance: float = 2e-5
+    curved_tolerance: float = 1e-2
     initial_damping: float = 1e-6
     max_damping: float = 1e8
 
@@ -148,7 +151,7 @@ class Solution:
 def minimize(engine: Engine, values: Values, config: LevenbergConfig) -> Solution:
     """Minimise an engine's cost from some values."""
     system, cost = engine.at(values)
-    damping, growth = 0.0, 2.0
+    damping, growth, undamped = 0.0, 2.0, np.inf
 
     def solution(converged: bool, message: str, iterations: int) -> Solution:
         return Solution(engine, values, system, cost, converged, message, iterations)
@@ -161,7 +164,9 @@ def minimize(engine: Engine, values: Values, config: LevenbergConfig) -> Solutio
             candidate = engine.layout.retract(values, step)
             new_system, new_cost = engine.at(candidate)
             decrease = cost - new_cost
-            near = damping == 0.0 and min(predicted, abs(decrease)) < _enough(config, cost)
+            undamped = predicted if damping == 0.0 else undamped
+            near = min(predicted, abs(decrease)) < _enough(config, cost)
+            near &= damping == 0.0 or undamped < config.curved_tolerance
             if decrease > 0.0 or (near and decrease > -_enough(config, cost)):
                 values, system, cost = candidate, new_system, new_cost
                 if near:

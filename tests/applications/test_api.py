@@ -300,7 +300,10 @@ def test_arrays_have_the_place_of_the_config() -> None:
     arrays = {
         field.name: getattr(data, field.name) for field in fields(data) if field.name not in ("latitude", "longitude")
     }
-    place = {"latitude_deg": float(np.rad2deg(data.latitude)), "longitude_deg": float(np.rad2deg(data.longitude))}
+    place: dict[str, Any] = {
+        "latitude_deg": float(np.rad2deg(data.latitude)),
+        "longitude_deg": float(np.rad2deg(data.longitude)),
+    }
     opened = alidade.open(arrays, method="tumble", config=alidade.Config(**place)).data
     assert opened.latitude == pytest.approx(data.latitude)
     assert opened.longitude == pytest.approx(data.longitude)

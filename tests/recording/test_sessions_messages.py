@@ -203,14 +203,15 @@ def test_a_wrong_schema_of_the_right_name_is_one_line(kind: str, text: str, tmp_
     data = store.serialize_cdr(made or random_message(kind, rng, T0, "abc", store), kind)
     path = write_raw(tmp_path / "x.mcap", "/x", kind, full, [bytes(data)] * 2, [T0, T0 + 1])
     recording = open_recording(path)
+    read: dict[str, Any] = {
+        messages.IMU: recording.imu,
+        messages.JOINT_STATE: lambda topic: recording.joints(topic, ["ab", "c"]),
+        messages.CAMERA_INFO: recording.camera_info,
+        messages.COMPRESSED_IMAGE: lambda topic: list(recording.images(topic)),
+        messages.TAG_DETECTIONS: recording.detections,
+    }
     with pytest.raises(InputError, match=r"topic /x: the messages have no usable field|/x has no message with"):
-        {
-            messages.IMU: recording.imu,
-            messages.JOINT_STATE: lambda topic: recording.joints(topic, ["ab", "c"]),
-            messages.CAMERA_INFO: recording.camera_info,
-            messages.COMPRESSED_IMAGE: lambda topic: list(recording.images(topic)),
-            messages.TAG_DETECTIONS: recording.detections,
-        }[kind]("/x")
+        read[kind]("/x")
 
 
 @pytest.mark.parametrize(

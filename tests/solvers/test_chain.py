@@ -117,7 +117,8 @@ def test_prefix_roots_are_the_information_of_what_came_until_then(chain: ChainSy
         kept = [*range(first, first + c), *range(n * d + nodes * c, part.shape[1] - 1)]
         used = np.abs(part[:, :-1]).sum(axis=0) > 0.0
         others = [i for i in np.flatnonzero(used) if i not in kept]
-        rest = np.linalg.qr(part[:, [*others, *kept, -1]], mode="r")[len(others) :, len(others) :]
+        R = np.asarray(np.linalg.qr(part[:, [*others, *kept, -1]], mode="r"))
+        rest = R[len(others) :, len(others) :]
         theirs, own = rest[:, :-1].T @ rest, root[:, :-1].T @ root
         assert np.abs(theirs - own).max() < 1e-9 * np.abs(theirs).max()
 

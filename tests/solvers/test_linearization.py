@@ -43,7 +43,7 @@ def test_step_covariance_and_minimum_are_those_of_gtsams_linearisation(name: str
     for key in [*others, *reported]:
         ordering.push_back(key)
     A, b = graph.jacobian(ordering)
-    R = np.linalg.qr(np.column_stack([A, b]), mode="r")
+    R = np.asarray(np.linalg.qr(np.column_stack([A, b]), mode="r"))
     inverse = np.linalg.inv(R[:-1, :-1])
     sigma, step = np.linalg.norm(inverse, axis=1), inverse @ R[:-1, -1]
 

@@ -95,7 +95,7 @@ def write_raw(
 
 def read_any(path: Path, kind: str) -> dict[str, Any]:
     recording = open_recording(path)
-    method = {
+    method: Any = {
         messages.IMU: recording.imu,
         messages.MAGNETIC_FIELD: recording.magnetic,
         messages.VECTOR: recording.vector,
@@ -104,4 +104,4 @@ def read_any(path: Path, kind: str) -> dict[str, Any]:
         messages.NAV_SAT_FIX: recording.fixes,
         messages.TEMPERATURE: recording.temperature,
     }.get(kind, lambda topic: recording.joints(topic, ["defgh", "ab"]))
-    return vars(method("/x"))
+    return dict(vars(method("/x")))
