@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test slow lint types bench docs dist clean
+.PHONY: demo test slow lint types bench docs words dist clean
 
 demo: $(VENV)/run
 	$(BIN)/alidade demo
@@ -28,7 +28,7 @@ bench: $(VENV)/dev
 	$(BIN)/python -m benchmarks
 
 # Wheel and sdist, each installed into an environment of its own, away from the checkout; then a new user's path through
-# README and tutorials, typed there.
+# README, quick start and the page of each method, typed there.
 dist: $(VENV)/dev
 	rm -rf build/smoke dist
 	$(BIN)/python -m build --outdir dist > build.log 2>&1 || { cat build.log; exit 1; }
@@ -39,12 +39,16 @@ dist: $(VENV)/dev
 	  build/smoke/bin/python -m pip install --quiet --disable-pip-version-check $$made -c constraints.txt && \
 	  cp tests/install/smoke.py tests/install/walk.py build/smoke/ && (cd build/smoke && bin/python smoke.py) || exit 1; \
 	done
-	cd build/smoke && bin/python walk.py $(CURDIR)/README.md $(CURDIR)/docs/tutorials/*.md
+	cd build/smoke && bin/python walk.py $(CURDIR)/README.md $(CURDIR)/docs/quickstart.md $(CURDIR)/docs/methods/*.md
 
 # The site; tests/applications/test_docs.py runs what its pages show.
 docs: $(VENV)/dev
 	$(BIN)/python -m sphinx -q -W --keep-going -d build/doctrees docs build/docs
 	@echo "The site: build/docs/index.html"
+
+# Words of the documentation by group of pages, and dialect that is left in pages, screens and code.
+words: $(VENV)/dev
+	$(BIN)/python -m docs._site.words
 
 # Two stamps: people who try the command need none of what tests need.
 $(VENV)/run: pyproject.toml constraints.txt

@@ -121,6 +121,10 @@ class VectorizedFactor:
         """Whitened residuals (n, m) at the values, outliers included."""
         return self._at(values).residuals
 
+    def evaluated(self, values: gtsam.Values) -> Evaluation:
+        """Residuals and, on demand, Jacobians by the model's blocks, weighed but whatever the loss."""
+        return self._at(values)
+
     def rows(self, values: gtsam.Values) -> tuple[Array, Array]:
         """Residuals (n * m,) and their Jacobian (n * m, d) on the factor's keys, neither weighed nor compressed."""
         evaluation = self._at(values)

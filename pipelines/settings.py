@@ -95,6 +95,7 @@ class Noise(Section):
     """Noise of the sensors, one sigma each; null where not given."""
 
     gyro_density: NoiseSigma | None = None  # rad/s/sqrt(Hz), white noise
+    gyro_rate_noise: NoiseOrZero | None = None  # 1/sqrt(Hz), white noise that grows with the rate
     gyro_bias_walk: NoiseOrZero | None = None  # rad/s/sqrt(s)
     gyro_scale: NoiseOrZero | None = None  # fraction of the angle turned that errors not estimated add
     platform_gyro_density: NoiseOrZero | None = None  # rad/s/sqrt(Hz)
@@ -114,6 +115,7 @@ class Noise(Section):
 # Where neither the config nor a message says anything.
 DEFAULT_NOISE = Noise(
     gyro_density=5.0e-5,
+    gyro_rate_noise=3.0e-4,
     gyro_bias_walk=1.0e-6,
     gyro_scale=0.0,
     platform_gyro_density=1.0e-5,

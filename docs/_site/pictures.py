@@ -1,9 +1,10 @@
-"""A picture of every page the program makes, as it looks on a desktop, on a phone and on paper.
+"""Pictures of the pages that the program makes: on a desktop, on a phone and on paper; cards of reports with faults.
 
     python -m docs._site.pictures [NAME...]      # all of them or some, into docs/pictures; minutes, needs a Chromium
 
 Recordings are simulated with fixed seeds. NAME.png has the top of the page at 1280 px and at 390 px, and its first
-sheet as printed; los-dark.png has the report of los as somebody sees it who likes it dark.
+sheet as printed; report.png has the beginning of a report, fault-NAME.png one figure of the report of a faulty
+recording, 845 px wide.
 """
 
 from __future__ import annotations
@@ -12,20 +13,29 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
+import alidade
+from alidade.factors import so3
 from alidade.pipelines.applications import cli
+from alidade.pipelines.settings import Noise
 
 if TYPE_CHECKING:
     from tests.support.devtools import Tab
+
+Array = NDArray[np.float64]
 
 FOLDER = Path(__file__).parents[1] / "pictures"
 _METHODS = ("los", "indexer", "head", "cube", "tumble")
 # Of each look: width of the window, px, and the size it is brought to.
 _DESKTOP, _PHONE = (1280, (600, 560)), (390, (205, 560))
+_REPORT = (1020, (760, 860))
 _SHEET = (396, 560)
 _GAP, _COLOURS = 10, 48
 _DRAWN = "document.readyState == 'complete' && !document.querySelector('.plot:not([data-drawn])')"
@@ -43,9 +53,11 @@ def main(wanted: list[str]) -> None:
         for name, make in _pages(Path(scratch)).items():
             if not wanted or name in wanted:
                 _write(name, _looks(tab, make().as_uri(), Path(scratch)))
-        if not wanted or "los-dark" in wanted:
-            page = _pages(Path(scratch))["los"]().as_uri()
-            _write("los-dark", [_screen(tab, page, look, Path(scratch), dark=True) for look in (_DESKTOP, _PHONE)])
+        if not wanted or "report" in wanted:
+            _write_report(tab, Path(scratch))
+        for name, (fault, figure) in _FAULTS.items():
+            if not wanted or name in wanted:
+                _write_figure(tab, name, fault(Path(scratch)), figure)
 
 
 def _pages(folder: Path) -> dict[str, Callable[[], Path]]:
@@ -91,6 +103,59 @@ def _pages(folder: Path) -> dict[str, Callable[[], Path]]:
     }
 
 
+def _write_report(tab: Tab, scratch: Path) -> None:
+    recording = _recording(scratch, "head", 1, "--scenario", "head_mounts")
+    _run("calibrate", recording, "--out", scratch / "mounts", "--quiet")
+    top = _screen(tab, (scratch / "mounts" / "report.html").as_uri(), _REPORT, scratch)
+    path = FOLDER.parent / "report.png"
+    top.quantize(_COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(path, optimize=True)
+    print(f"{path.name}: {path.stat().st_size / 1000:.0f} kB")
+
+
+def _faulty(folder: Path, where: Callable[[Array], NDArray[np.bool_]], by: Array) -> Path:
+    """The report of a minute of head motion, attitudes rotated by these vectors at the times that `where` selects."""
+    data, _ = alidade.simulate("head", "head_mounts", seed=3)
+    wrong = where(data.vision_t)
+    attitudes = data.vision_wxyz.copy()
+    attitudes[wrong] = so3.multiply(attitudes[wrong], so3.exp(by[: wrong.sum()]))
+    config = alidade.Config(noise=Noise(gyro_density=1.0e-4, vision_attitude=8.7e-3))
+    changed = replace(data, vision_wxyz=attitudes)
+    alidade.open(changed, method="head", config=config).calibrate().write(folder)
+    return folder / "report.html"
+
+
+def _step(folder: Path) -> Path:
+    slip = np.tile(np.deg2rad([0.5, 0.0, 0.0]), (10_000, 1))
+    return _faulty(folder / "step", lambda t: t > 30.0, slip)
+
+
+def _outliers(folder: Path) -> Path:
+    rng = np.random.default_rng(0)
+    return _faulty(folder / "outliers", lambda t: rng.random(len(t)) < 0.15, 0.2 * rng.normal(size=(10_000, 3)))
+
+
+# Name of a picture -> the report, and the beginning of the figure's title.
+_FAULTS: dict[str, tuple[Callable[[Path], Path], str]] = {
+    "fault-step": (_step, "helmet_mount over time"),
+    "fault-outliers": (_outliers, "Residuals of vision"),
+}
+
+
+def _write_figure(tab: Tab, name: str, report: Path, title: str) -> None:
+    """One figure of a report, alone on the page."""
+    tab.screen()
+    tab.size(845, 380)
+    tab.open(report.as_uri())
+    tab.wait(_DRAWN, 60.0)
+    cards = "[...document.querySelectorAll('.card.figure')]"
+    card = f"{cards}.find(card => card.querySelector('h3').textContent.startsWith('{title}'))"
+    tab.value(f"document.body.replaceChildren({card})")
+    path = FOLDER / f"{name}.png"
+    tab.picture(path)
+    Image.open(path).convert("RGB").quantize(_COLOURS).save(path, optimize=True)
+    print(f"{path.name}: {path.stat().st_size / 1000:.0f} kB")
+
+
 def _run(*words: str | Path) -> None:
     """The command, in this process; it may say that a recording is short of something."""
     sys.argv = ["alidade", *map(str, words)]
@@ -132,12 +197,10 @@ def _looks(tab: Tab, url: str, scratch: Path) -> list[Image.Image]:
     return [*screens, Image.open(sheet.with_suffix(".png")).convert("RGB").resize(_SHEET, Image.Resampling.LANCZOS)]
 
 
-def _screen(tab: Tab, url: str, look: tuple[int, tuple[int, int]], scratch: Path, *, dark: bool = False) -> Image.Image:
+def _screen(tab: Tab, url: str, look: tuple[int, tuple[int, int]], scratch: Path) -> Image.Image:
     """The top of a page in a window of that width."""
     width, size = look
     tab.screen()
-    if dark:
-        tab.dark()
     tab.size(width, round(width * size[1] / size[0]))
     tab.open(url)
     tab.wait(_DRAWN, 60.0)

@@ -62,7 +62,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # boxes around the help would take three times as long to import as all else
-    help="Calibrates how sensors are mounted and how wrong they are, from recordings, and says how sure it is.",
+    help="Calibrate sensor mounting (extrinsics), scale, bias and time offsets from a recording, with uncertainties.",
 )
 
 
@@ -87,38 +87,40 @@ class Solver(StrEnum):
 
 
 class Engine(StrEnum):
-    """What eliminates batch's linear systems."""
+    """Linear solvers of batch."""
 
     auto = "auto"
     chain = "chain"
     gtsam = "gtsam"
 
 
-_METHODS = "los, indexer, head, cube, tumble or one installed"
+_METHODS = "los, indexer, head, cube, tumble or an installed plug-in"
 _MethodName = Annotated[
     str | None,
-    typer.Option("--method", help=f"{_METHODS}; by default what fits.", autocompletion=_complete_method),
+    typer.Option("--method", help=f"{_METHODS} [default: from the topics].", autocompletion=_complete_method),
 ]
 _OfMethod = Annotated[str, typer.Argument(help=f"{_METHODS}.", autocompletion=_complete_method)]
 _Scenario = Annotated[
     str | None,
     typer.Option(
-        help="YAML file, or a name that `scenarios` lists; default: the nominal one.", autocompletion=_complete_scenario
+        help="YAML file, or a name that `scenarios` lists [default: nominal].", autocompletion=_complete_scenario
     ),
 ]
-_Scheduler = Annotated[str | None, typer.Option(help="Of a dask cluster, tcp://host:8786; default: this machine.")]
-_Jobs = Annotated[int | None, typer.Option(help="Local worker processes; default: one a core.")]
-_OwnJobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Processes to be used; default: one a core.")]
-_Strict = Annotated[bool, typer.Option("--strict", help="Refuse a recording of which anything is lost.")]
-_AutoTopics = Annotated[bool, typer.Option("--auto-topics", help="Take the topics that `info` suggests.")]
-_AutoColumns = Annotated[
-    bool, typer.Option("--auto-columns", help="Take what `info` concludes of the columns of tables.")
+_Scheduler = Annotated[
+    str | None, typer.Option(help="Scheduler of a dask cluster, tcp://host:8786 [default: this machine].")
 ]
-_NoCheck = Annotated[bool, typer.Option("--no-check", help="Do not hold an incremental result against batch.")]
+_Jobs = Annotated[int | None, typer.Option(help="Local worker processes [default: one per core].")]
+_OwnJobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Processes [default: one per core].")]
+_Strict = Annotated[bool, typer.Option("--strict", help="Fail if any part of the recording is damaged or missing.")]
+_AutoTopics = Annotated[bool, typer.Option("--auto-topics", help="Use the topics that `info` proposes.")]
+_AutoColumns = Annotated[bool, typer.Option("--auto-columns", help="Use the columns of tables that `info` proposes.")]
+_NoCheck = Annotated[bool, typer.Option("--no-check", help="Skip the final comparison with the batch solution.")]
 _Prior = Annotated[
-    Path | None, typer.Option(help="An earlier calibration of the device to begin from: result.json, calibration.yaml.")
+    Path | None, typer.Option(help="Earlier calibration (result.json or calibration.yaml) used as prior.")
 ]
-_Window = Annotated[str, typer.Option(help="Of the incremental solver: seconds kept, keyframes (50kf), or 'all'.")]
+_Window = Annotated[
+    str, typer.Option(help="Smoothing window of the incremental solver: seconds, keyframes (50kf) or 'all'.")
+]
 
 
 def _version(wanted: bool) -> None:
@@ -134,13 +136,15 @@ _TimeLimit = Annotated[
     typer.Option(
         "--time-limit",
         min=0.1,
-        help="Seconds to solve in; default: 60, or a tenth of the recording, online all of it, where that is more.",
+        help="Time limit of the solution, s [default: 60, or a tenth of the recording; online all of it].",
     ),
 ]
-_Version = Annotated[bool, typer.Option("--version", "-V", callback=_version, is_eager=True, help="Print it.")]
+_Version = Annotated[
+    bool, typer.Option("--version", "-V", callback=_version, is_eager=True, help="Print the version and exit.")
+]
 
 
-_Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Say what is tried and fails, with tracebacks.")]
+_Verbose = Annotated[bool, typer.Option("--verbose", "-v", help="Log what is tried and fails, with tracebacks.")]
 
 
 @app.callback()
@@ -157,21 +161,23 @@ def calibrate(
     sessions: RecordingPaths,
     method: _MethodName = None,
     config: ConfigFile = None,
-    solver: Annotated[Solver, typer.Option(help="How to solve.")] = Solver.batch,
+    solver: Annotated[Solver, typer.Option(help="Solver.")] = Solver.batch,
     window: _Window = "1",
-    out: Annotated[Path | None, typer.Option(help="Folder for the results; default: SESSION-SOLVER.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the results [default: RECORDING-SOLVER].")] = None,
     strict: _Strict = False,
     auto_topics: _AutoTopics = False,
     auto_columns: _AutoColumns = False,
     jobs: _OwnJobs = None,
     prior: _Prior = None,
     no_check: _NoCheck = False,
-    engine: Annotated[Engine, typer.Option(help="What eliminates batch's linear systems.")] = Engine.auto,
+    engine: Annotated[
+        Engine, typer.Option(help="Linear solver of batch: by chain elimination, or gtsam.")
+    ] = Engine.auto,
     time_limit: _TimeLimit = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Calibrate a recording, or several of one device together.
+    """Calibrate one recording, or several of one device.
 
     Exit code 0 calibrated, 2 unusable input, 3 weak or unobservable, 4 inconsistent.
     """
@@ -191,7 +197,7 @@ def calibrate(
         if solver != Solver.batch:
             raise InputError(f"--solver {solver.value}: several recordings are calibrated together by batch alone")
         if engine != Engine.auto:
-            raise InputError(f"--engine {engine.value}: of several recordings each has the one that fits it")
+            raise InputError(f"--engine {engine.value}: with several recordings each uses the engine that fits it")
         folder = out or _beside(sessions[0], "device")
         if not as_json:
             terminal.say(f"{len(recordings)} recordings of one device: {told(recordings)}")
@@ -233,14 +239,17 @@ def compare(
     config: ConfigFile = None,
     window: _Window = "1",
     prior: _Prior = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for compare.html, which also splits the recording.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for compare.html, with the split-half test.")] = None,
     strict: _Strict = False,
     auto_topics: _AutoTopics = False,
     jobs: _OwnJobs = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """The published, batch and incremental solvers side by side, with errors where the truth is known."""
+    """Compare the published, batch and incremental solver.
+
+    With errors where the truth is known, and a split-half test with --out.
+    """
     import time
 
     from alidade.pipelines import parallel, progress
@@ -272,37 +281,40 @@ def compare(
 def follow(
     source: Annotated[
         str,
-        typer.Argument(metavar="SOURCE", help="A file or folder being written, ws://host:port, - for standard input."),
+        typer.Argument(metavar="SOURCE", help="File or folder being written, ws://host:port, or - (standard input)."),
     ],
     method: _MethodName = None,
     config: ConfigFile = None,
     window: _Window = "1",
     patience: Annotated[
-        float, typer.Option(help="Seconds without anything new that end an unfinished file.", min=0.0)
+        float, typer.Option(help="Seconds without new data after which an unfinished file ends.", min=0.0)
     ] = 30.0,
     prior: _Prior = None,
-    checkpoint: Annotated[Path | None, typer.Option(help="File to save the run in, and to go on from.")] = None,
-    serve: Annotated[bool, typer.Option("--serve", help="Estimates live over Foxglove's WebSocket.")] = False,
-    port: Annotated[int, typer.Option(help="Of --serve, on this machine alone.")] = 8765,
+    checkpoint: Annotated[Path | None, typer.Option(help="File that saves the run, and from which it resumes.")] = None,
+    serve: Annotated[bool, typer.Option("--serve", help="Serve live estimates over Foxglove's WebSocket.")] = False,
+    port: Annotated[int, typer.Option(help="Port of --serve, on this machine only.")] = 8765,
     allow_origin: Annotated[
         list[str] | None,
-        typer.Option(help="Of --serve: a page that may read it beside Foxglove's, https://host; may be repeated."),
+        typer.Option(help="Site that may read --serve beside Foxglove's, https://host; may be repeated."),
     ] = None,
     page: Annotated[
-        bool, typer.Option("--page", help="A page that says what to do, for a browser or a phone.")
+        bool, typer.Option("--page", help="Serve a live page with the motion that is needed, for a phone.")
     ] = False,
     host: Annotated[
-        str, typer.Option(help="Of --page: 0.0.0.0 opens it to the network, by a token in its address.")
+        str, typer.Option(help="Address of the live page; 0.0.0.0 opens it to the network (token in the URL).")
     ] = "127.0.0.1",
-    page_port: Annotated[int, typer.Option(help="Of --page.")] = 8766,
+    page_port: Annotated[int, typer.Option(help="Port of --page.")] = 8766,
     record: Annotated[
-        Path | None, typer.Option(help="Folder to keep what comes by ws:// or -; a later run goes on in it.")
+        Path | None, typer.Option(help="Folder that keeps what arrives by ws:// or -; a later run appends.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the results; default: SOURCE-incremental.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the results [default: SOURCE-incremental].")] = None,
     no_check: _NoCheck = False,
     as_json: Json = False,
 ) -> None:
-    """Calibrate a recording while it is being written, and say what is still missing. Ctrl-C ends it."""
+    """Calibrate while recording.
+
+    Shows the motion that is still needed. Ctrl-C finishes.
+    """
     from alidade.pipelines.applications.follow.follow import follow as run
     from alidade.pipelines.applications.follow.follower import Settings
     from alidade.pipelines.reports.whole import require_room
@@ -321,18 +333,18 @@ def follow(
 @app.command()
 def validate(
     session: RecordingPath,
-    calibration: Annotated[Path, typer.Option(help="The calibration.yaml or result.json to try on the recording.")],
+    calibration: Annotated[Path, typer.Option(help="calibration.yaml or result.json to test.")],
     method: _MethodName = None,
     config: ConfigFile = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the page; default: SESSION-validation.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the page [default: RECORDING-validation].")] = None,
     strict: _Strict = False,
     jobs: _OwnJobs = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Whether a calibration made on another recording still holds, and errors before and after compensation with it.
+    """Test a calibration on another recording.
 
-    Exit code 0 it holds, 2 unusable input, 3 the recording cannot say, 4 it does not hold.
+    Has the device changed, and what error remains? Exit code 0 valid, 2 unusable input, 3 not observable, 4 changed.
     """
     from alidade.pipelines import parallel, progress
     from alidade.pipelines.applications.validate import table, write_validation
@@ -359,11 +371,14 @@ def simulate(
     method: _OfMethod,
     out: Annotated[Path, typer.Option(help="The recording to write.")],
     scenario: _Scenario = None,
-    seed: Annotated[int, typer.Option(help="Of the noise.", min=0)] = 0,
-    images: Annotated[bool, typer.Option("--images", help="Pictures instead of what is measured in them.")] = False,
+    seed: Annotated[int, typer.Option(help="Seed of the simulated noise.", min=0)] = 0,
+    images: Annotated[
+        bool,
+        typer.Option("--images", help="Write camera pictures in place of attitudes, LOS errors or tag detections."),
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """Simulate a recording with its truth."""
+    """Simulate a recording, with its truth."""
     from alidade.pipelines import progress
     from alidade.pipelines.methods import simulate as run
     from alidade.pipelines.reports import terminal
@@ -377,11 +392,14 @@ def simulate(
 def scenarios(
     name: Annotated[
         str | None,
-        typer.Argument(help="Of a scenario, to print its file; or of a method.", autocompletion=_complete_scenario),
+        typer.Argument(help="A scenario, to print its YAML; or a method.", autocompletion=_complete_scenario),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """The scenarios that `simulate`, `plan` and `montecarlo` find by name, or the YAML of one, to be changed."""
+    """List scenarios, or print one as YAML to edit.
+
+    `simulate`, `plan` and `montecarlo` find them by name.
+    """
     from alidade.pipelines import methods
     from alidade.pipelines.errors import InputError, nearest_three
     from alidade.pipelines.reports import terminal
@@ -412,13 +430,16 @@ def plan(
     method: _OfMethod,
     scenario: _Scenario = None,
     config: ConfigFile = None,
-    require: Annotated[list[str] | None, typer.Option(help="NAME=SIGMA wanted, SI; may be repeated.")] = None,
+    require: Annotated[list[str] | None, typer.Option(help="NAME=SIGMA required, SI; may be repeated.")] = None,
     out: Annotated[Path | None, typer.Option(help="File for the better motion, as a scenario.")] = None,
-    page: Annotated[Path | None, typer.Option(help="File for the plan as a page, HTML.")] = None,
+    page: Annotated[Path | None, typer.Option(help="HTML file for the plan.")] = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """How well a planned motion would determine each parameter, and a better one. Exit code 3 if less than required."""
+    """Predict the accuracy of a motion; propose a better one.
+
+    Exit code 3 if the motion falls short of the requirements.
+    """
     from alidade.pipelines import progress
     from alidade.pipelines.applications.planning import make_plan, requirements, write_scenario
     from alidade.pipelines.reports import terminal
@@ -451,7 +472,10 @@ def info(
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """What can be calibrated from a recording, with which topics, what is missing, and what is in it."""
+    """Show what a recording can calibrate.
+
+    With which topics, what is missing, and the contents of the recording.
+    """
     from alidade.pipelines import progress
     from alidade.pipelines.applications.discovery import suggestions, unused
     from alidade.pipelines.applications.session import checked_facts
@@ -479,12 +503,15 @@ def noise(
     session: RecordingPath,
     config: Annotated[Path | None, typer.Option(help="YAML with `topics` and `columns` of the recording.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for noise.html and noise.json.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print noise.json and nothing else.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print noise.json only.")] = False,
     strict: _Strict = False,
     auto_columns: _AutoColumns = False,
     quiet: Quiet = False,
 ) -> None:
-    """The noise of gyros, accelerometers and magnetometers from their time at rest, and the config's section for it."""
+    """Measure sensor noise at rest (Allan deviation).
+
+    Gyros, accelerometers, magnetometers; prints the section `noise` of the config.
+    """
     from alidade.pipelines import progress
     from alidade.pipelines.applications.noise import noise_of
     from alidade.pipelines.reports import terminal
@@ -506,7 +533,10 @@ def demo(
     out: Annotated[Path, typer.Option(help="Folder for the recording and its results.")] = Path("alidade-demo"),
     quiet: Quiet = False,
 ) -> None:
-    """Simulate a helmet on a manoeuvring platform, calibrate it with all three solvers, say where the report is."""
+    """Simulate and calibrate a helmet tracker.
+
+    With all three solvers; prints the path of the report.
+    """
     from alidade.pipelines import progress
     from alidade.pipelines.applications.session import calibrate as run
     from alidade.pipelines.methods import simulate as simulated
@@ -530,18 +560,21 @@ def demo(
 @app.command()
 def montecarlo(
     method: _OfMethod,
-    runs: Annotated[int, typer.Option(help="How many recordings to simulate, one a seed.")] = 200,
+    runs: Annotated[int, typer.Option(help="Number of simulated recordings, one per seed.")] = 200,
     scenario: _Scenario = None,
-    seed: Annotated[int, typer.Option(help="Of the first run; the others follow.", min=0)] = 0,
-    solvers: Annotated[str, typer.Option(help="'all', or some of published,batch,incremental.")] = "all",
+    seed: Annotated[int, typer.Option(help="Seed of the first run; the others follow.", min=0)] = 0,
+    solvers: Annotated[str, typer.Option(help="'all', or a list of published,batch,incremental.")] = "all",
     window: _Window = "1",
     scheduler: _Scheduler = None,
     jobs: _Jobs = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the results; default: METHOD-montecarlo.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the results [default: METHOD-montecarlo].")] = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Simulate and solve many recordings: are the sigmas true? The same command goes on after an interruption."""
+    """Monte Carlo study: are the sigmas consistent?
+
+    NEES and coverage of many simulated recordings. The same command resumes after an interruption.
+    """
     from alidade.pipelines import progress
     from alidade.pipelines.applications.fleet.montecarlo import SOLVERS, run_study
     from alidade.pipelines.applications.fleet.write import write_study
@@ -569,11 +602,11 @@ def fleet(
     recordings: Annotated[list[str], typer.Argument(metavar="FILES", help="Paths or patterns, 'recordings/*.mcap'.")],
     method: _MethodName = None,
     config: ConfigFile = None,
-    solver: Annotated[Solver, typer.Option(help="How to solve.")] = Solver.batch,
+    solver: Annotated[Solver, typer.Option(help="Solver.")] = Solver.batch,
     window: _Window = "1",
-    names: Annotated[str | None, typer.Option(help="What file names tell: '{unit}_{date}*'.")] = None,
+    names: Annotated[str | None, typer.Option(help="Pattern of file names, '{unit}_{date}*'.")] = None,
     prior: Annotated[
-        str | None, typer.Option(help="Earlier calibrations to begin from: 'last/{unit}/result.json'.")
+        str | None, typer.Option(help="Earlier calibrations used as priors: 'last/{unit}/result.json'.")
     ] = None,
     scheduler: _Scheduler = None,
     jobs: _Jobs = None,
@@ -581,7 +614,10 @@ def fleet(
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Calibrate many recordings and compare units and dates. The same command goes on after an interruption."""
+    """Calibrate many recordings; compare units and dates.
+
+    The same command resumes after an interruption.
+    """
     from alidade.pipelines import progress
     from alidade.pipelines.applications.fleet.analysis import counting, populations
     from alidade.pipelines.applications.fleet.attention import sentence, units_of_interest
@@ -615,10 +651,13 @@ def export(
     form: Annotated[
         str, typer.Option("--format", help="px4, ardupilot, ros2, kalibr, openvins (sensors); tf, urdf (mounts).")
     ],
-    out: Annotated[Path | None, typer.Option(help="The file to write; default: printed.")] = None,
+    out: Annotated[Path | None, typer.Option(help="File to write [default: printed].")] = None,
     as_json: Json = False,
 ) -> None:
-    """A calibration as the parameters of another program, in its own conventions."""
+    """Export to PX4, ArduPilot, ROS 2, URDF, Kalibr, OpenVINS.
+
+    Each in the conventions of that program.
+    """
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.calibration import load_calibration
     from alidade.pipelines.reports.export import exported
@@ -640,12 +679,17 @@ def export(
 @app.command()
 def certificate(
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="Folder of a calibration, or its result.json.")],
-    fields: Annotated[Path | None, typer.Option(help="YAML of what only people know: number, item, serial ...")] = None,
-    before: Annotated[Path | None, typer.Option(help="An earlier result.json or calibration.yaml of the item.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for the certificate; default: that of the results.")] = None,
-    pdf: Annotated[bool, typer.Option("--pdf", help="Print it too, certificate.pdf.")] = False,
+    fields: Annotated[
+        Path | None, typer.Option(help="YAML with certificate fields: number, item, serial number, customer ...")
+    ] = None,
+    before: Annotated[Path | None, typer.Option(help="Earlier result.json or calibration.yaml of the item.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the certificate [default: that of the results].")] = None,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Write certificate.pdf too.")] = False,
 ) -> None:
-    """A calibration certificate, certificate.html to be printed and certificate.json."""
+    """Write a calibration certificate (ISO/IEC 17025 items).
+
+    certificate.html for printing, certificate.json for programs.
+    """
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.certificate import write_certificate
 

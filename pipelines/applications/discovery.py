@@ -13,7 +13,7 @@ from alidade.pipelines import methods
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.info import lacking
-from alidade.pipelines.recording.pairing import Pairing, pair
+from alidade.pipelines.recording.pairing import MAX_MOUNT, Pairing, pair
 from alidade.pipelines.recording.placeholders import is_there
 from alidade.pipelines.recording.reading import Recording
 from alidade.pipelines.recording.series import ImuSeries
@@ -25,6 +25,8 @@ from alidade.pipelines.settings import Config
 _BELONGS = 0.7
 # Names are alike above this ratio of difflib.
 _ALIKE = 0.6
+# ... and one is meant rather than another by a ratio so much larger.
+_CLEARLY = 0.1
 # Of the pairs of frames of a TFMessage so many are tried, those with so many transforms at least.
 _MOST_PAIRS, _FEWEST = 12, 20
 # Delays worth a word, s.
@@ -66,7 +68,7 @@ def suggestions(recording: Recording, config: Config, only: Sequence[str] | None
             if made.topics and made.missing and config.method is None:
                 by_name = _suggestion(name, recording, config.model_copy(update={"method": name}), pairings)
                 made = replace(by_name, has_to_be_asked_for=True) if not by_name.missing else made
-            if made.topics:
+            if made.topics or made.reasons:
                 found.append(made)
     return tuple(found)
 
@@ -90,7 +92,7 @@ def with_suggested(recording: Recording, config: Config, method: str | None = No
         raise InputError(f"{recording.path}: {what or 'no topics for any method were found'}; {recording.there()}")
     more = config.model_copy(update={"topics": {**config.topics, **whole[0].topics}, "method": whole[0].method})
     recording.use(more.topics.values(), {})
-    recording.remark(f"topics taken as suggested for {whole[0].method}: {'; '.join(whole[0].reasons)}")
+    recording.remark(f"topics chosen automatically ({whole[0].method}): {'; '.join(whole[0].reasons)}")
     return more
 
 
@@ -99,7 +101,10 @@ def nearest_suggestion(found: Sequence[Suggestion]) -> str:
     if not found:
         return ""
     best = min(found, key=lambda suggestion: len(suggestion.missing))
-    lacks = f"; still lacking: {'; '.join(best.missing)}" if best.missing else ", which `--auto-topics` takes"
+    by_name = f"--method {best.method} " if best.has_to_be_asked_for else ""
+    lacks = f"; still missing: {'; '.join(best.missing)}" if best.missing else f", which `{by_name}--auto-topics` uses"
+    if not best.topics:
+        return f"for {best.method}: {'; '.join(best.reasons)}{lacks}"
     topics = best.yaml.replace("\n  ", ", ").replace("topics:,", "topics: {", 1).replace("{ ", "{") + "}"
     return f"for {best.method}: {'; '.join(best.reasons)}: `{topics}`{lacks}"
 
@@ -154,16 +159,18 @@ def _suggestion(
     taken = {config.topic(topic) for topic in chosen.topics if config.topic(topic) in recording.topics}
     topics: dict[str, TopicSource] = {}
     reasons: list[str] = []
+    doubtful: set[str] = set()
     attitudes = [topic for topic in needed if _is_attitude(topic)]
     gyros = [topic for topic in needed if messages.IMU in topic.types and not _is_attitude(topic)]
     for attitude in attitudes:
         for gyro in gyros:
             free = [_candidates(recording, config, topic, taken) for topic in (attitude, gyro)]
-            _pair_up(recording, config, (attitude, gyro), free, pairings, topics, reasons)
+            if not _pair_up(recording, config, (attitude, gyro), free, pairings, topics, reasons):
+                doubtful.add(attitude.key)
     for topic in dict.fromkeys([*needed, *chosen.topics]):
         if topic.key in topics or config.topic(topic) in recording.topics or topic.key in config.topics:
             continue
-        if topic not in needed and not topics:
+        if topic.key in doubtful or (topic not in needed and not topics):
             continue
         used = taken | {part for source in topics.values() for part in (source.name, *source.parts)}
         split = _split_imu(recording, used) if messages.IMU in topic.types and not _is_attitude(topic) else None
@@ -174,9 +181,13 @@ def _suggestion(
             )
             continue
         named = _by_name(recording, topic, used, is_needed=topic in needed)
+        if named is None and topic in needed and len(several := _of_type(recording, topic, used)) > 1:
+            reasons.append(
+                f"{' and '.join(several)} could be the {topic.key}: choose, `topics: {{{topic.key}: {several[0]}}}`"
+            )
         if named is not None:
             topics[topic.key] = TopicSource(topic=named)
-            reasons.append(f"{named} ({_short(recording, named)}) can serve as {topic.key}")
+            reasons.append(f"{named} ({_short(recording, named)}) proposed as {topic.key}")
     more = config.model_copy(update={"topics": {**config.topics, **topics}})
     before = tuple(config.topics.values())
     recording.use(more.topics.values(), {})
@@ -197,8 +208,11 @@ def _pair_up(
     pairings: dict[tuple[str, str], Pairing | None],
     topics: dict[str, TopicSource],
     reasons: list[str],
-) -> None:
-    """The gyro and the attitude that turn together most alike, of those that may serve."""
+) -> bool:
+    """The gyro and the attitude that turn together most alike, of those that may serve.
+
+    Returns False where the best attitude fits only in a way that is not taken without being asked for.
+    """
     attitude, gyro = pair_of
     best: tuple[float, TopicSource, TopicSource, Pairing] | None = None
     for a in free[0]:
@@ -211,16 +225,23 @@ def _pair_up(
             if found is not None and found.correlation > _BELONGS and (best is None or found.correlation > best[0]):
                 best = found.correlation, g, a, found
     if best is None:
-        return
+        return True
     _, g, a, found = best
+    if found.order != (0, 1, 2, 3) or (found.inverted and found.angle > MAX_MOUNT):
+        fits = "inverted, far from its mount" if found.inverted else "in another order of its components"
+        reasons.append(
+            f"{a.name} turns with {g.name}, but {fits}: are they x, y, z, w where w, x, y, z is meant? Not taken by "
+            "itself: mend the order, or say invert in the config"
+        )
+        return False
     if config.topic(gyro) != g.name:
         topics[gyro.key] = g
     if config.topic(attitude) != a.name or found.inverted:
         topics[attitude.key] = a.model_copy(update={"invert": a.invert != found.inverted})
-    way = ", as the inverse of the attitude meant" if found.inverted else ""
-    delay = f", {1e3 * abs(found.offset_s):.0f} ms {'early' if found.offset_s > 0.0 else 'late'}"
-    late = delay if abs(found.offset_s) > _DELAY else ""
-    reasons.append(f"{a.name} turns with {g.name} (correlation {found.correlation:.2f}{late}){way}")
+    way = ", inverted" if found.inverted else ""
+    offset = f", time offset {1e3 * found.offset_s:+.0f} ms" if abs(found.offset_s) > _DELAY else ""
+    reasons.append(f"{a.name} matches {g.name}: rate correlation {found.correlation:.2f}{offset}{way}")
+    return True
 
 
 def _candidates(recording: Recording, config: Config, topic: Topic, taken: set[str]) -> list[TopicSource]:
@@ -271,16 +292,12 @@ def _by_name(recording: Recording, topic: Topic, used: set[str], is_needed: bool
 
     An attitude of an Imu is left to its content, which pairs it.
     """
-    there = [
-        name
-        for name, found in recording.topics.items()
-        if found.type in topic.types and found.count and found.is_readable and name not in used
-        if not (_is_attitude(topic) and found.type == messages.IMU)
-        if not (topic.key.startswith("reference") and found.type == messages.IMU and not _has_attitude(recording, name))
-    ]
+    there = _of_type(recording, topic, used)
     words = topic.key.replace("_", " ")
     alike = {name: difflib.SequenceMatcher(None, words, name.strip("/").replace("/", " ")).ratio() for name in there}
     best = max(there, key=lambda name: alike[name], default=None)
+    if is_needed and best is not None and _is_ambiguous(alike):
+        return None
     return best if best is not None and (is_needed or alike[best] > _ALIKE or _is_other_gyro(topic, there)) else None
 
 
@@ -308,6 +325,23 @@ def _has_attitude(recording: Recording, topic: str) -> bool:
 
 def _has_accel(imu: ImuSeries) -> bool:
     return is_there("accel", imu.accel, imu.accel_cov)
+
+
+def _of_type(recording: Recording, topic: Topic, used: set[str]) -> list[str]:
+    """Recorded topics that a topic of a method could be, by type."""
+    return [
+        name
+        for name, found in recording.topics.items()
+        if found.type in topic.types and found.count and found.is_readable and name not in used
+        if not (_is_attitude(topic) and found.type == messages.IMU)
+        if not (topic.key.startswith("reference") and found.type == messages.IMU and not _has_attitude(recording, name))
+    ]
+
+
+def _is_ambiguous(alike: dict[str, float]) -> bool:
+    """Whether several topics could be meant, none of them by its name: which is not for chance to say."""
+    ranked = sorted(alike.values(), reverse=True)
+    return len(ranked) > 1 and ranked[0] < _ALIKE and ranked[0] - ranked[1] < _CLEARLY
 
 
 def _is_other_gyro(topic: Topic, there: list[str]) -> bool:

@@ -107,7 +107,7 @@ def noise_of(path: Path, strict: bool = False, config: Path | None = None, auto_
         kinds = f"{messages.IMU} or {messages.MAGNETIC_FIELD}"
         raise InputError(
             f"{path}: no messages of an inertial sensor or magnetometer ({kinds}); {recording.there()}; tables need "
-            "--config with their `columns`, rates alone their topic under `topics` in it, as head_imu"
+            "--auto-columns or --config with their `columns`, rates alone their topic under `topics` in it, as head_imu"
         )
     found: list[SensorNoise] = []
     troubles: list[str] = []

@@ -7,13 +7,13 @@ from typing import Annotated
 
 import typer
 
-RecordingPath = Annotated[
-    Path, typer.Argument(metavar="RECORDING", help="A file, a bag folder, or a pattern in quotes.")
-]
+RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="File, bag folder or quoted pattern.")]
 RecordingPaths = Annotated[
     list[Path],
-    typer.Argument(metavar="RECORDING...", help="A file, a bag folder, or a pattern in quotes; several: one device's."),
+    typer.Argument(
+        metavar="RECORDING...", help="File, bag folder or quoted pattern. Several: one device, solved jointly."
+    ),
 ]
-ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML that overrides the recording's own config.")]
+ConfigFile = Annotated[Path | None, typer.Option("--config", help="YAML config; overrides the recording's own.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress bars.")]
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON and nothing else.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON only.")]

@@ -21,7 +21,7 @@ import numpy as np
 from alidade.pipelines import deadline, methods, progress
 from alidade.pipelines.applications.discovery import empty, idle, nearest_suggestion, suggestions, with_suggested
 from alidade.pipelines.applications.sharing import device_belief, walks
-from alidade.pipelines.applications.table_discovery import with_columns
+from alidade.pipelines.applications.table_discovery import propose_columns, with_columns
 from alidade.pipelines.config import load_config, recorded_config
 from alidade.pipelines.diagnostics.change_test import Stability, change_finding, stability, with_change
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf, solve_segments, split_halves
@@ -35,9 +35,11 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
 from alidade.pipelines.estimation.problem import EngineName, Estimate, Problem, Quantity, Step, Told
 from alidade.pipelines.methods import Method
+from alidade.pipelines.recording.checks import COPIED, OVERTAKEN
 from alidade.pipelines.recording.info import SessionFacts, facts_of, lacking
 from alidade.pipelines.recording.message_reader import ENCODING
 from alidade.pipelines.recording.opening import Where
+from alidade.pipelines.recording.placeholders import HELD
 from alidade.pipelines.recording.reading import Recording, open_recording
 from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, wanted
 from alidade.pipelines.reports.known import load_known
@@ -193,7 +195,9 @@ class Session:
                 raise
             nearest = nearest_suggestion(suggestions(recording, config, [chosen.name]))
             raise InputError(f"{error}{f'; nearest is {nearest}' if nearest else ''}") from error
-        for sentence in (*idle(recording, config, chosen.name), *empty(recording, config, chosen.name)):
+        noted = (COPIED, OVERTAKEN, HELD, "not believed (kept)")
+        many = [f"{reason}: {n}" for reason, n in getattr(data, "dropped", {}).items() if reason.endswith(noted)]
+        for sentence in (*many, *idle(recording, config, chosen.name), *empty(recording, config, chosen.name)):
             recording.remark(sentence)
         session = cls(chosen, data, config, Recorded(recording))
         return session if prior is None else session.beginning_from(prior)
@@ -374,7 +378,8 @@ class Session:
         if self.faults.cut and not deadline.passed(_SEGMENTS):
             with progress.doing("solving both sides of a change"):
                 parts = solve_segments(self.method.graph, self.faults, self.data, self.config, stable.time_s)
-        return stable, change_finding(stable, parts, quantities)
+        ratios = [] if estimate.sandwich is None else estimate.sandwich[[q.judged for q in quantities]].tolist()
+        return stable, change_finding(stable, parts, quantities, max(ratios, default=1.0))
 
     def _difference(self, estimate: Estimate) -> SolverDifference | None:
         """An incremental estimate compared with batch's, which has nothing of what a report needs."""
@@ -531,6 +536,18 @@ def resolve_method(option: str | None, recording: Recording, config: Config) -> 
     if able:
         raise InputError(f"{recording.path}: the topics serve {' and '.join(able)}; choose with --method")
     nearest = nearest_suggestion(suggestions(recording, config))
+    by_name = [
+        name for name in methods.names() if not missing_for(name, recording, config.model_copy(update={"method": name}))
+    ]
+    if by_name:
+        options = " or ".join(f"--method {name}" for name in by_name)
+        raise InputError(f"{recording.path}: what is there serves only a method that is asked for: {options}")
+    columns = propose_columns(recording)
+    if columns is not None and columns.columns:
+        concluded = f"`--auto-columns` takes {', '.join(columns.reasons)}"
+        raise InputError(
+            f"{recording.path}: no `columns:` in the config; {concluded}; `alidade info` shows them to paste"
+        )
     raise InputError(
         f"{recording.path}: no usable topics for any method; {recording.there()}; needed are ROS 2 messages "
         f"({ENCODING}): `alidade info` tells which for each method, `topics:` in the config can rename"

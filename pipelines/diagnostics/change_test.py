@@ -28,7 +28,7 @@ _PATHS, _BATCH = 4000, 500
 # Directions in which the rest of the recording added less than this share of the variance say nothing of a change.
 _LEAST = 1e-3
 # A step between the segments is significant beyond so many sigmas, and material from this share of the requirement on.
-_STEP, _MATERIAL = 3.0, 0.5
+_STEP, _MATERIAL, _CERTAIN = 3.0, 0.5, 2.0
 # Differences that are named where no segment has a solution.
 _MAX_NAMED = 3
 # Source of variance, as in the budget.
@@ -67,23 +67,28 @@ class Stability:
         return self.level < LEVEL
 
 
-def change_finding(found: Stability, parts: Mapping[str, SplitHalf], quantities: Sequence[Quantity]) -> Finding:
-    """The finding of kind `change`: a NOTE where all steps are known and immaterial.
+def change_finding(
+    found: Stability, parts: Mapping[str, SplitHalf], quantities: Sequence[Quantity], ratio: float = 1.0
+) -> Finding:
+    """The finding of kind `change`: a NOTE where no step is material.
 
     Its steps are those between the segments that are significant, the most significant first; where the segments have
-    none, the estimate of the whole recording less that until the change.
+    none, the estimate of the whole recording less that until the change. A step is material that is certainly, by two
+    sigmas, more than half of what is required.
 
     Args:
         found: a change that is more than chance.
         parts: parameter -> values before and after it; none where the segments have no solution.
         quantities: of the estimate.
+        ratio: of sandwich to nominal sigmas, the largest of a required parameter: the segments' own sigmas have it.
     """
     significant = sorted((n for n in parts if abs(parts[n].z) > _STEP), key=lambda name: -abs(parts[name].z))
     steps = {name: (parts[name].step, parts[name].step_sigma) for name in significant}
+    steps = steps or {name: (size, ratio * sigma) for name, (size, sigma) in found.differences.items()}
     required = {q.name: q.require for q in quantities}
-    immaterial = bool(steps) and all(abs(step) < _MATERIAL * required[name] for name, (step, _) in steps.items())
-    severity = Severity.NOTE if immaterial else Severity.INCONSISTENT
-    return Finding("change", severity, {"time_s": found.time_s, "steps": steps or dict(found.differences)})
+    material = any(abs(step) - _CERTAIN * sigma > _MATERIAL * required[name] for name, (step, sigma) in steps.items())
+    severity = Severity.INCONSISTENT if material else Severity.NOTE
+    return Finding("change", severity, {"time_s": found.time_s, "steps": steps})
 
 
 def with_change(estimate: Estimate, change: Finding) -> Estimate:

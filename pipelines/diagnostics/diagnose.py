@@ -14,7 +14,7 @@ from alidade.pipelines.diagnostics.observability import Advise, weak_directions
 from alidade.pipelines.estimation.assumptions import pull as prior_z_score
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.problem import ChiSquare, Estimate, Quantity
+from alidade.pipelines.estimation.problem import SLOW_ERROR, ChiSquare, Estimate, Quantity
 from alidade.pipelines.estimation.robust import robust_sigma
 
 NOTE, WEAK, INCONSISTENT = Severity.NOTE, Severity.WEAK, Severity.INCONSISTENT
@@ -72,6 +72,7 @@ def diagnose(
     if not published:
         found += [*_prior_conflicts(estimate, quantities, limits), *([change] if change else [])]
         found += [*_rejections(estimate, limits), *_noise(estimate, limits), *_correlations(estimate, limits)]
+        found += _slow_errors(estimate, quantities)
     found += misfits(estimate.chi_square, estimate.levels, limits)
     if any(finding.severity == WEAK for finding in directions):
         found += dominant_priors(quantities, estimate.covariance)
@@ -163,6 +164,18 @@ def _correlations(estimate: Estimate, limits: Thresholds) -> Iterator[Finding]:
         share = length / len(estimate.residuals[family].time)
         if share > limits.correlated:
             yield Finding("correlation", INCONSISTENT, {"family": family, "share": share})
+
+
+def _slow_errors(estimate: Estimate, quantities: Sequence[Quantity]) -> Iterator[Finding]:
+    """What errs slowly and is no noise of the model, where that widens a required parameter."""
+    ratios = estimate.sandwich
+    if ratios is None:
+        return
+    judged = [i for i, q in enumerate(quantities) if q.judged]
+    worst = max(judged, key=lambda i: float(ratios[i]), default=None)
+    if worst is not None and ratios[worst] > SLOW_ERROR:
+        ratio = float(ratios[worst])
+        yield Finding("slow_error", NOTE, {"parameter": quantities[worst].name, "ratio": ratio})
 
 
 def misfits(chi_square: ChiSquare | None, levels: Sequence[Level], limits: Thresholds = DEFAULT) -> list[Finding]:

@@ -86,7 +86,7 @@ def _findings(before: TrialFit, found: Sequence[_Tested]) -> tuple[Finding, ...]
     """One finding for hypotheses whose chi-square is alike, the best of them named and the others its equivalents."""
     groups: list[list[_Tested]] = []
     for each in found:
-        if groups and each[0].cost - groups[-1][0][0].cost < _SIGNIFICANT**2:
+        if groups and each[0].cost_with_priors - groups[-1][0][0].cost_with_priors < _SIGNIFICANT**2:
             groups[-1].append(each)
         else:
             groups.append([each])
@@ -113,7 +113,8 @@ def _explaining(build: Build, cases: Iterable[TrialCase], before: TrialFit, conc
     for case, after in zip(cases, parallel.done(works, _WHAT, concurrent), strict=True):
         if after is not None and _explains(before, after):
             found.append((after, _with_delays(case.label, after)))
-    return sorted(found, key=lambda each: each[0].factor)
+    # Corrections that fit alike are weighed by their priors: a mount that is likely before one that is not.
+    return sorted(found, key=lambda each: each[0].cost_with_priors / max(each[0].dof, 1.0))
 
 
 def _promising(build: Build, model: FaultModel, data: Any, config: Config, before: TrialFit) -> list[TrialCase]:

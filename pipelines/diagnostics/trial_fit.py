@@ -70,12 +70,18 @@ class TrialFit:
         rows = sum(n * estimate.residuals[f].whitened.shape[1] for f, n in rejected.items())
         gate = problem.loss.gate if problem.loss else 0.0
         lost = gate**2 * sum(rejected.values())
-        return cls(problem.quantities, estimate, estimate.chi_square, lost, estimate.chi_square.dof + rows)
+        return cls(problem.quantities, estimate, estimate.chi_square, lost, float(estimate.chi_square.dof + rows))
 
     @property
     def cost(self) -> float:
         """Chi-square, the rejected measurements included."""
         return self.chi_square.value + self.lost
+
+    @property
+    def cost_with_priors(self) -> float:
+        """The same with how far the solution is from its priors: what weighs corrections that fit alike."""
+        found = zip(self.quantities, self.estimate.values.tolist(), strict=True)
+        return self.cost + sum(((x - q.prior_mean) / q.prior_sigma) ** 2 for q, x in found if q.prior_sigma)
 
     @property
     def factor(self) -> float:

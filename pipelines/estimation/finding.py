@@ -31,6 +31,7 @@ KINDS: Mapping[str, tuple[str, ...]] = {
         "estimated_factor",
     ),  # used, and estimated alone, over stated
     "correlation": ("family", "share"),
+    "slow_error": ("parameter", "ratio"),  # sandwich over nominal sigma, the largest of a required parameter
     # Family None: all measurements, of which `largest` departs most; noise_factor times its noise would fit it.
     "misfit": ("family", "chi_square", "dof", "largest", "noise_factor"),
     "dominant_prior": ("figure", "stated", "share"),  # data-sheet figure: its share of a weak parameter's variance

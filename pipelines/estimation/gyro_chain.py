@@ -223,7 +223,9 @@ class GyroChain:
         model = GyroIncrementFactor(
             self.time[as_slice(after)], turns, self.gyro, np.sqrt(variance), carrying, self.platform, self.share
         )
-        return [Factor.process_of("gyro", model.on(*states, bias, *self.error_keys))]
+        turned = np.linalg.norm(so3.log(turns.wxyz), axis=1)
+        beside = turned / np.sqrt(turns.duration * variance)
+        return [Factor.process_of("gyro", model.on(*states, bias, *self.error_keys), beside)]
 
     def predict(
         self, keyframes: range, seen: Callable[[int, gtsam.Values], Array], current: gtsam.Values

@@ -11,6 +11,7 @@ Source = Literal["config", "message", "default"]
 
 UNITS = {
     "gyro_density": "rad/s/√Hz",
+    "gyro_rate_noise": "1/√Hz",
     "gyro_bias_walk": "rad/s/√s",
     "platform_gyro_density": "rad/s/√Hz",
     "accel_density": "m/s²/√Hz",

@@ -76,6 +76,16 @@ def repeatability(sensor: str, config: Config, family: str) -> Level:
     return Level(replace(noise, known=_HARDLY)) if noise.known else Level(noise, scale=0.0)
 
 
+def estimated(
+    name: str, config: Config, families: Sequence[str], message: float | None = None, beside: bool = False
+) -> Level:
+    """A noise whose level the marginal likelihood finds, its prior by what is stated; else within a factor seven."""
+    noise = replace(stated(name, config, message, families), beside=beside)
+    if noise.source == _DEFAULT and noise.known:
+        return Level(replace(noise, known=_HARDLY))
+    return Level(noise)
+
+
 def sampled(noise: Noise, time: Array, samples: Array) -> Level:
     """The level of a sensor's white noise, from what was stated and from its own samples while it moves.
 

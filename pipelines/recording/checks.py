@@ -31,6 +31,8 @@ _ADVICE = {"out of order": ": sort the recording by header stamps", "duplicate":
 # With so many stamps twice, of different readings, two devices are likelier than a recorder's mistake.
 _TWO_DEVICES = 0.2
 _MIXED = "; are two devices on one topic? choose one by `frame:` under `topics`, of a table by `where:` under `columns`"
+# What was done to many messages, and is noted beside being counted.
+COPIED, OVERTAKEN = ": the same message once more, left out", ": messages overtook each other, sorted by stamp"
 # A few stamps out of place are a recorder's hiccup, more are a broken time base.
 MAX_BAD_STAMPS = 0.01
 
@@ -71,7 +73,7 @@ def clean(
     backward = int(np.count_nonzero(in_file < np.maximum.accumulate(in_file)))
     keep = keep[np.argsort(in_file, kind="stable")]
     copies = _copies(t_ns[keep], taken(values, keep))
-    count(dropped, f"{topic}: the same message once more", int(np.count_nonzero(copies)))
+    count(dropped, f"{topic}{COPIED}", int(np.count_nonzero(copies)))
     keep = keep[~copies]
     stamps = t_ns[keep]
     first = np.diff(stamps, prepend=np.iinfo(np.int64).min // 2) > 0
@@ -86,6 +88,8 @@ def clean(
                 f"start); the stamps have to be those of the measurements{_ADVICE[what]}{mixed}"
             )
     count(dropped, f"{topic}: stamp out of order (sorted, kept)", backward)
+    if overtaken and backward > MAX_BAD_STAMPS * len(in_file):
+        count(dropped, f"{topic}{OVERTAKEN}", backward)
     count(dropped, f"{topic}: duplicate stamp", duplicate)
     keep = keep[first]
     if len(keep) < least:

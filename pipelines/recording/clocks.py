@@ -40,9 +40,9 @@ def check_clock(topic: str, t_ns: Stamps, log_ns: Stamps, epoch_ns: int) -> None
     if step is not None:
         way = "back" if step.size < 0.0 else "forward"
         raise InputError(
-            f"topic {topic}: {step.what} step {way} by {abs(step.size):.3f} s after "
-            f"{(step.after_ns - epoch_ns) * 1e-9:.3f} s; the clock was set there: cut the recording at that time, or "
-            "record again with the clock left alone"
+            f"topic {topic}: {step.what} jump {way} by {abs(step.size):.3f} s after "
+            f"{(step.after_ns - epoch_ns) * 1e-9:.3f} s (clock adjusted). Split the recording there, or record again "
+            "with the clock free-running"
         )
 
 

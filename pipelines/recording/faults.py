@@ -28,8 +28,8 @@ _ALTERNATE, _ALTERNATE_SAMPLES = 3.0, 100
 # More repeats than this are the nature of the stream.
 _MOST_REPEATED = 0.5
 # What is dropped, as it is counted.
-CLIPPED = "at the end of the sensor's range"
-_STUCK = "frozen, the same value for long"
+CLIPPED = "saturated"
+_STUCK = "stuck at one value"
 # A recording that loses more than this is not worth solving.
 _MOST_LOST = 0.2
 

@@ -138,7 +138,8 @@ def _by_content(path: Path, data: Path, strict: bool) -> Container:
         return ArrayContainer(path, {}, ["a video; `columns:` in the config says which table has its pictures' stamps"])
     from alidade.pipelines.recording.tables import looks_like_text, read_table
 
-    return read_table(path, data) if looks_like_text(start) else McapFile(path, strict, data)
+    is_table = looks_like_text(start) and not start.startswith(MAGIC)
+    return read_table(path, data) if is_table else McapFile(path, strict, data)
 
 
 def _unpacked(path: Path, strict: bool) -> Container:

@@ -27,6 +27,11 @@ _INTERVAL = 0.1
 _WITHIN, _REACHES, _FEWEST = 0.1, (0.05, 0.02, 0.02), 30
 # Rates that vary less, rad/s, or are known for less time, s, tell nothing.
 _LEAST_MOTION, _SHORTEST = 0.02, 3.0
+# A mount beyond three sigmas of its default prior, 0.35 rad, is not what makes an inverse likely.
+MAX_MOUNT = 3.0 * 0.35
+# Other orders of a quaternion's components: x, y, z, w given as w, x, y, z, and the other way round; each fits as well
+# as an inverse up to so much.
+_ORDERS, _AS_WELL = ((3, 0, 1, 2), (1, 2, 3, 0)), 0.98
 # An interval of an attitude so many times the usual one is a gap.
 _GAP = 3.0
 
@@ -40,12 +45,17 @@ class Pairing:
         offset_s: what to add to the attitude's stamps to get the gyro's times.
         inverted: whether the inverse of the attitude is that of the gyro's body.
         fit: share of the rates that one constant rotation explains; of the better of the two directions.
+        angle: of that rotation, rad.
+        order: of the quaternions' components, w, x, y, z, as recorded; another one where an inverse that fits is beyond
+            MAX_MOUNT and another order, which fits as well, is not.
     """
 
     correlation: float
     offset_s: float
     inverted: bool
     fit: float
+    angle: float = 0.0
+    order: tuple[int, int, int, int] = (0, 1, 2, 3)
 
 
 class _Gyro:
@@ -101,17 +111,25 @@ def pair(
     if correlation is None:
         return None
 
-    def fits(later: float) -> list[float]:
-        """Of both ways, at a delay."""
+    def fits(later: float, of: Sequence[Array] = ways) -> list[tuple[float, float]]:
+        """Share explained and angle of both ways, at a delay."""
         inside = ours.covers(a + later, b + later)
         against = ours.mean(a[inside] + later, b[inside] + later)
-        return [_fit(one[inside], against) for one in ways]
+        return [_fit(one[inside], against) for one in of]
 
-    way = int(np.argmax(fits(offset)))
+    way = int(np.argmax([share for share, _ in fits(offset)]))
     middle = directions[way][stride // 2 :][: len(steps)][whole]
     seen = _Seen(a, b, ways[way], matrices(middle).swapaxes(1, 2))
     offset = _refined(offset, seen, ours, [_Gyro(t_ns, rates, start) for t_ns, rates in others])
-    return Pairing(correlation, offset, way == 1, fits(offset)[way])
+    fit, angle = fits(offset)[way]
+    if way == 1 and angle > MAX_MOUNT:
+        # (x, y, z, w) read as (w, x, y, z) is exactly an inverse between two constant rotations.
+        reordered = [quaternions[:, components] for components in _ORDERS]
+        turns = [_rates(one[:-stride], one[stride:], steps)[whole] for one in reordered]
+        for components, (share, turned) in zip(_ORDERS, fits(offset, turns), strict=True):
+            if share > _AS_WELL * fit and turned < MAX_MOUNT:
+                return Pairing(correlation, offset, False, share, turned, components)
+    return Pairing(correlation, offset, way == 1, fit, angle)
 
 
 class _Seen(NamedTuple):
@@ -200,9 +218,12 @@ def _rates(first: Array, second: Array, steps: Array) -> Array:
     return np.asarray(v * (scale / steps)[:, None])
 
 
-def _fit(ours: Array, theirs: Array) -> float:
-    """Share of the squared rates explained by the rotation that fits best (Wahba's problem, by SVD)."""
+def _fit(ours: Array, theirs: Array) -> tuple[float, float]:
+    """Share of the squared rates explained by the rotation that fits best (Wahba's problem, by SVD), and its angle."""
     u, s, vt = np.linalg.svd(ours.T @ theirs)
-    s[-1] *= np.sign(np.linalg.det(u @ vt))
+    sign = np.sign(np.linalg.det(u @ vt))
+    s[-1] *= sign
     total = float(np.sqrt((ours**2).sum() * (theirs**2).sum()))
-    return float(s.sum()) / total if total > 0.0 else 0.0
+    trace = float(np.trace(u @ np.diag([1.0, 1.0, sign]) @ vt))
+    angle = float(np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)))
+    return (float(s.sum()) / total if total > 0.0 else 0.0), angle

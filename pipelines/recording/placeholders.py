@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 # Sigmas of a sample, in SI, beyond which a reading says nothing at all: of a gyro, of an accelerometer (gravity), of a
 # magnetometer (twice the earth's field) and of an attitude (a radian).
 MOST_SIGMA = {"gyro": 0.5, "accel": 9.8, "mag": 1e-4, "attitude": 1.0}
+HELD = ": repeats the reading before, used once"
 _LARGEST = 1e100
 # Readings that repeat the one before in more than so much of the rows were held; so many have to tell.
 _HELD, _FEWEST = 0.4, 100
@@ -96,5 +97,5 @@ def measured_once(topic: str, values: Array, dropped: dict[str, int]) -> NDArray
     runs = np.diff(np.flatnonzero(np.append(~repeats, True)))
     if repeats.mean() < _HELD or np.mean(np.abs(runs - np.median(runs)) <= 1) < 0.9:
         return everything
-    count(dropped, f"{topic}: repeats the reading before, used once", int(repeats.sum()))
+    count(dropped, f"{topic}{HELD}", int(repeats.sum()))
     return np.flatnonzero(~repeats)

@@ -52,7 +52,7 @@ AnySeries = TypeVar("AnySeries", bound=series.Series)
 
 
 def open_recording(where: Where, strict: bool = False) -> Recording:
-    """The recording in a file, a folder of parts, files named by a pattern or a list; see docs/recordings.md.
+    """The recording in a file, a folder of parts, files named by a pattern or a list; see docs/reference/messages.md.
 
     One that is still being written, or is damaged, is read as far as it is sound. Raises InputError when something is
     missing, empty or no recording, when nothing in it can be read, and with `strict` when anything is lost: truncated,

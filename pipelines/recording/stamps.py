@@ -32,8 +32,8 @@ def stamp_notes(topic: str, t_ns: Stamps, log_ns: Stamps) -> tuple[str, ...]:
     found = []
     if (share := _bunched(steps)) > _MOST_BUNCHED:
         found.append(
-            f"topic {topic}: {100.0 * share:.0f} % of the stamps are bunched, closer to the one before than a tenth of "
-            "the usual interval: samples that came together were stamped as they arrived, not as they were measured"
+            f"topic {topic}: {100.0 * share:.0f} % of stamps in bursts (interval below 10 % of the median): stamped on "
+            "arrival, not on measurement"
         )
     if (share := _even(steps)) > _MOST_EVEN and _even(logged) < _FEW_EVEN:
         found.append(

@@ -76,7 +76,8 @@ def write_estimates(path: Path, calibration: Calibration, history: History) -> N
             series = JointSeries(stamps, numbers, names)
             messages += [(t, channel, row) for t, row in zip(stamps.tolist(), _cdr(series), strict=True)]
         for k, (t_ns, channel, message) in enumerate(sorted(messages, key=lambda m: m[0])):
-            writer.add_message(channel, t_ns, message, t_ns, k)
+            # Log times are unsigned: what was stamped before 1970 is logged at its beginning.
+            writer.add_message(channel, max(t_ns, 0), message, max(t_ns, 0), k)
         writer.finish()  # type: ignore[no-untyped-call]
 
 

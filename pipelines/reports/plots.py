@@ -233,7 +233,7 @@ def _ellipses(calibration: Calibration) -> Plot | None:
         x, y = np.array([[1.0, 0.0], [correlation, np.sqrt(1.0 - correlation**2)]]) @ circle
         out.line(x, y, f"{quantities[j].name}, {quantities[i].name}: {correlation:+.2f}", color)
     return Plot(
-        "Parameters that trade against each other",
+        "Most correlated parameters",
         "One-sigma ellipses of the most correlated pairs: the thinner, the more the error of one is that of the other.",
         out,
     )

@@ -158,14 +158,14 @@ class Calibration:
 
     @property
     def budget(self) -> dict[str, Mapping[str, float]] | None:
-        """Parameter -> source -> its share of the variance, without assumptions; None if the solver does not tell."""
+        """Parameter -> source -> share of the variance, without nuisance parameters; None if the solver has none."""
         if self.estimate.budget is None:
             return None
         return {name: self.estimate.budget[name] for name in self._calibrated if name in self.estimate.budget}
 
     @property
     def sensitivity(self) -> dict[str, SensitivityResult] | None:
-        """Input taken for exact -> what it does to the parameters if off; None if the solver does not tell."""
+        """Fixed input -> effect of its error on the parameters; None if the solver has none."""
         moved = self.estimate.moved
         if moved is None:
             return None
@@ -179,7 +179,7 @@ class Calibration:
 
     @property
     def measurements(self) -> list[MeasurementResult] | None:
-        """The measurements that move parameters most; None if the solver does not tell."""
+        """The most influential measurements; None if the solver has none."""
         if self.estimate.strongest is None:
             return None
         return [
@@ -392,7 +392,7 @@ class ParameterResult(_Record):
     require: float | None  # sigma wanted; null: none
     observability: Verdict | None  # verdict; null of an assumption that nothing is required of
     group: Literal["assumption"] | None = None  # assumption, or left out
-    pull: float | None = None  # of an assumption: how far from its prior, in sigmas of what the recording could
+    pull: float | None = None  # z-score of a nuisance parameter: distance from its prior over the expected spread
     inflation: float = 1.0  # of sigma, by noise that is correlated in time
 
     @model_serializer(mode="wrap")
@@ -415,7 +415,7 @@ class NoiseResult(_Record):
     stated: float  # where the search began
     estimated: float | None  # what the recording alone says; null: it was not asked
     sigma: float | None  # of estimated
-    used: float  # what all sigmas reckon with
+    used: float  # used in the solution and all sigmas
     inflation: float  # by what a mean of such measurements is less certain than of independent ones
 
 
@@ -476,10 +476,10 @@ class LearningResult(_Record):
 
 
 class StabilityResult(_Record):
-    """The largest difference between an estimate on the way and the final one, and how often chance makes it."""
+    """Largest difference between an estimate during the recording and the final one, with its p-value."""
 
     statistic: float  # its size as a standard normal number
-    level: float  # how often chance makes as much
+    level: float  # p-value
     time_s: float  # when, from the start
     change: dict[str, float]  # parameter: the step, SI
 
@@ -503,7 +503,7 @@ class TruthResult(_Record):
 
 
 class SensitivityResult(_Record):
-    """What an input that is taken for exact does: parameter -> change, SI, per unit of the input.
+    """Effect of a fixed input: parameter -> change, SI, per unit of the input.
 
     `step` is what the input is usually off by, one sigma; unit "1" is a share of the input itself.
     """
@@ -514,12 +514,12 @@ class SensitivityResult(_Record):
 
 
 class MeasurementResult(_Record):
-    """A measurement and the parameter that it moves most: by `pull` of its sigmas."""
+    """A measurement and the parameter that it shifts most, by `pull` sigmas."""
 
     family: str  # of measurements
     time_s: float  # s from the start
-    parameter: str  # that it moves most
-    pull: float  # by how many of its sigmas
+    parameter: str  # that it shifts most
+    pull: float  # shift in sigmas
 
 
 class SelfCheckResult(_Record):
@@ -550,7 +550,7 @@ class PartResult(_Record):
     """One recording of a joint calibration.
 
     `parameters` are its own numbers, and the device's that walk, from all recordings; `alone` is what it says of the
-    device by itself, `status` and `headline` are its own. `dof` are the degrees of freedom by which it tells its noise;
+    device by itself, `status` and `headline` are its own. `dof` are the degrees of freedom of its noise estimate;
     null where that was stated.
     """
 
@@ -560,7 +560,7 @@ class PartResult(_Record):
     duration_s: float
     status: Status
     headline: str
-    dof: float | None  # by which it tells its noise
+    dof: float | None  # of the noise estimate
     parameters: list[PartParameter]  # its own, and the device's that walk
     alone: list[PartParameter]  # what it says of the device by itself
 
@@ -584,15 +584,15 @@ class RateResult(_Record):
 
 
 class ChangesResult(_Record):
-    """Changes of the device between recordings; chance makes any found one in a history with this level."""
+    """Changes of the device between recordings, tested at this level for the whole history."""
 
-    level: float  # how often chance makes any found one
+    level: float  # significance level of the whole history
     steps: list[ChangeResult]  # from recording to recording
     rates: dict[str, RateResult]  # kind of parameter: how far it walks
 
 
 class Result(_Record):
-    """result.json; null where the solver does not tell."""
+    """result.json; null where the solver has no such figure."""
 
     schema_name: Annotated[Literal["alidade.result/1"], Field(alias="schema")] = "alidade.result/1"
     method: str  # of calibration
@@ -614,7 +614,7 @@ class Result(_Record):
     stability: StabilityResult | None
     self_check: SelfCheckResult | None
     budget: dict[str, dict[str, float]] | None  # parameter: source: its share of the variance
-    sensitivity: dict[str, SensitivityResult] | None  # input taken for exact: what it does
+    sensitivity: dict[str, SensitivityResult] | None  # effect of a fixed input
     measurements: list[MeasurementResult] | None  # the twenty that matter most
     findings: list[dict[str, object]]  # kind, severity and evidence, the most severe first
     tables: dict[str, list[dict[str, object]]]  # the method's own

@@ -21,10 +21,12 @@ Quantities = Mapping[str, Quantity]
 
 # Findings of a kind, and parameters or recordings of a finding, that are named.
 _MAX_NAMED = 3
+# Ratio of sandwich to nominal sigma from which on it is a warning.
+SLOW_ERROR_WARNING = 2.0
 _DIRECTIONS = {Severity.UNOBSERVABLE: "Not observable", Severity.WEAK: "Less accurate than required"}
 _NEXT = {
     "calibrated": (
-        "Apply it: formulas, Python, C and ROS parameters are below, under How to apply it.",
+        "Apply it: formulas, Python, C and ROS parameters are below, under Apply.",
         "Later, `alidade validate RECORDING --calibration calibration.yaml` says whether it still holds.",
     ),
     "weak": ("Parameters that are observable can be applied as they are; for the others record again.",),
@@ -190,6 +192,14 @@ def _correlation(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
     return f"Residuals of {e['family']} are correlated over {100.0 * e['share']:.0f} % of the recording."
 
 
+def _slow_error(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
+    warning = "Warning: a sensor errs slowly" if e["ratio"] > SLOW_ERROR_WARNING else "A sensor errs slowly"
+    return (
+        f"{warning}, as with the pose, which no noise explains: by blocks of 5 s the sigma of {e['parameter']} is "
+        f"{e['ratio']:.2g} times the nominal one. Sigmas include it."
+    )
+
+
 def _misfit(e: Mapping[str, Any], severity: Severity, _: Quantities) -> str:
     fit = Fit.of(e["chi_square"], e["dof"])
     if fit.value != fit.value:
@@ -250,6 +260,7 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any], Severity, Quantities], str]] =
     "rejection": _rejection,
     "noise": _noise,
     "correlation": _correlation,
+    "slow_error": _slow_error,
     "misfit": _misfit,
     "dominant_prior": _dominant_prior,
     "ambiguous_solution": _ambiguous_solution,

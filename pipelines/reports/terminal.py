@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -32,6 +33,8 @@ if console.width < _NARROWEST:
 _LONGEST = 10_000
 # Sentences are broken at so many characters.
 _WIDTH = 100
+# The types of messages in what a method lacks: reference/messages.md has them.
+_TYPE = re.compile(r" \(\w+/msg/\w+\)")
 
 COLOURS = {
     "calibrated": "green",
@@ -92,7 +95,7 @@ def show(calibrations: Sequence[Calibration]) -> None:
         table.add_row(*row)
     console.print(table)
     if any(errors):
-        say("In brackets: error in sigmas.")
+        say("In brackets: error / sigma.")
     for c in calibrations:
         _verdict(c, name=not alone)
 
@@ -149,14 +152,15 @@ def show_facts(
     say(f"{name}, {facts.duration_s:.1f} s")
     _show_columns(columns)
     _show_methods(facts, found)
-    if unused:
-        _say_wrapped(f"used by no method: {', '.join(unused)}")
+    proposed = {str(name) for each in found for source in each.topics.values() for _, name in source}
+    if left := [name for name in unused if name not in proposed]:
+        _say_wrapped(f"not used: {', '.join(left)}")
     for note in facts.notes:
         _say_wrapped(f"note: {note}")
     table = Table(box=SIMPLE_HEAD, header_style="bold", pad_edge=False)
     table.add_column("topic", no_wrap=True)
-    table.add_column("type", overflow="fold")
-    for column in ("messages", "Hz", "gap, s", "twice", "back"):
+    table.add_column("type", overflow="ellipsis")
+    for column in ("messages", "Hz", "gap, s", "dupli-\ncates", "out of\norder"):
         table.add_column(column, justify="right", no_wrap=True)
     for t in facts.topics:
         gap = ""
@@ -169,8 +173,6 @@ def show_facts(
         name = escape(printable(t.name))
         table.add_row(name, escape(kind), str(t.count), rate, gap, str(t.duplicates), str(t.out_of_order))
     console.print(table)
-    if any(t.duplicates or t.out_of_order for t in facts.topics):
-        say("twice: stamps that occur again; back: stamps before the one ahead of them")
     if facts.attachments:
         say(f"attachments: {', '.join(facts.attachments)}")
 
@@ -183,11 +185,11 @@ def _say_wrapped(text: str) -> None:
 
 
 def _show_columns(columns: Columns | None) -> None:
-    """What tables hold, as it is concluded, to be pasted."""
+    """The proposed section `columns`, with reasons and doubts."""
     if columns is None:
         return
     if columns.columns:
-        console.print("[yellow]tables, concluded (calibrate --auto-columns takes this):[/]")
+        console.print("[yellow]tables, proposed (use `calibrate --auto-columns` or paste into the config):[/]")
         for line in columns.yaml.split("\n"):
             say(f"  {line}")
     for sentence in (*columns.reasons, *(f"in doubt: {doubt}" for doubt in columns.doubts)):
@@ -202,17 +204,18 @@ def _show_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:
     for suggestion in found:
         if not suggestion.missing:
             name = f"--method {suggestion.method} " if suggestion.has_to_be_asked_for else ""
-            console.print(
-                f"[yellow]{suggestion.method}: with these topics (calibrate {name}--auto-topics takes them)[/]"
-            )
+            how = f"use `calibrate {name}--auto-topics` or paste them into the config"
+            console.print(f"[yellow]{suggestion.method}: yes, with these topics ({how}):[/]")
             for reason in suggestion.reasons:
                 _say_wrapped(f"  {reason}")
             for line in suggestion.yaml.split("\n"):
                 say(f"  {line}")
+        elif not suggestion.topics:
+            _say_wrapped(f"{suggestion.method}: {'; '.join(suggestion.reasons)}")
     whole = {suggestion.method for suggestion in found if not suggestion.missing}
     for method, missing in facts.missing.items():
         if missing and method not in whole:
-            _say_wrapped(f"{method}: no, it lacks {'; '.join(missing)}")
+            _say_wrapped(f"{method}: missing {_TYPE.sub('', '; '.join(missing))}")
 
 
 def show_plan(plan: Plan) -> None:

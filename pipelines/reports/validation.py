@@ -97,7 +97,7 @@ _WORDS: dict[str, tuple[str, Tone, tuple[str, ...]]] = {
 
 def _answer(verdict: str, sentence: str) -> Answer:
     word, tone, steps = _WORDS[verdict]
-    return Answer("Does the calibration still hold?", word, tone, sentence, (), steps)
+    return Answer("Is the calibration still valid?", word, tone, sentence, (), steps)
 
 
 def _plot(validation: Validation) -> Plot:

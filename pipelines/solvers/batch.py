@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import (
+    SLOW_ERROR,
     Array,
     Attitudes,
     EngineName,
@@ -44,6 +45,7 @@ from alidade.pipelines.solvers.error_budget import (
 from alidade.pipelines.solvers.layout import Layout, Values
 from alidade.pipelines.solvers.levenberg import Engine, LevenbergConfig, Solution, minimize
 from alidade.pipelines.solvers.linearization import Group, Linearization
+from alidade.pipelines.solvers.marginal_likelihood import sandwich_of, solve_likelihood
 from alidade.pipelines.solvers.noise_estimation import apply_levels, estimate_noise, group_weights
 from alidade.pipelines.solvers.posterior import Reported, chi_square, expected_squares, leverages, sqrt_information
 from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed_bias
@@ -126,7 +128,11 @@ def solve(compiled: Compiled, config: BatchConfig | None = None, levels: tuple[L
     start = problem.noises if levels is None else levels
     engine: Engine = compiled.engine
     solution = solve_robust(apply_levels(engine, start), compiled.initial, problem.loss, config.robust)
-    if levels is None:
+    if levels is None and problem.marginal_likelihood and isinstance(engine, Linearization):
+        if solution.converged and any(level.noise.estimated for level in start):
+            compiled, solution, start = solve_likelihood(compiled, solution, start, config.robust.minimizer)
+            problem = compiled.problem
+    elif levels is None:
         solution, start = estimate_noise(engine, solution, start, problem.loss, config.robust, expected_squares)
     solution, second = _best(compiled, solution, config)
     posterior = constrained_solution(
@@ -216,13 +222,17 @@ def _estimate(solved: Solved, config: BatchConfig, budget: bool, changed: Iterab
     compiled, engine, values, posterior = solved.compiled, solved.engine, solved.values, solved.posterior
     problem, found = compiled.problem, solved.posterior.factorization
     names = tuple(q.name for q in problem.quantities)
-    correlations = autocorrelations(engine, values) if solved.levels else {}
+    correlations = autocorrelations(engine, values) if solved.levels and not problem.marginal_likelihood else {}
     influence, added = None, dict[str, Array]()
     if budget or correlations:
         influence = Influence.of(posterior.reported, posterior.directions, engine, found, values)
         added = added_variance(influence, correlations)
     by = inflation(names, posterior.covariance, influence.names if influence else (), added)
-    covariance = posterior.covariance * np.outer(by, by)
+    sandwich, wide = None, by
+    if problem.marginal_likelihood and isinstance(engine, Linearization) and solved.solution.converged:
+        sandwich = sandwich_of(compiled, solved.levels, solved.solution)
+        wide = by * np.where(sandwich > SLOW_ERROR, sandwich, 1.0)
+    covariance = posterior.covariance * np.outer(wide, wide)
     system = engine.at(values)[0]
     course = None
     if isinstance(engine, Linearization) and isinstance(system, ChainSystem) and isinstance(found, ChainFactorization):
@@ -235,12 +245,13 @@ def _estimate(solved: Solved, config: BatchConfig, budget: bool, changed: Iterab
         values=posterior.reported.numbers,
         covariance=covariance,
         inflation=by,
+        sandwich=sandwich,
         colours={family: 1.0 + 2.0 * float(lags.sum()) for family, lags in correlations.items()},
         converged=solved.solution.converged,
         message=solved.solution.message,
         residuals=residuals,
         chi_square=chi_square(leverages(engine, found, values)),
-        history=None if course is None else course.history.inflated(by),
+        history=None if course is None else course.history.inflated(wide),
         course=course,
         smoothed=_smoothed(solved, covariance),
         attitudes=_attitudes(solved) if problem.attitudes else None,

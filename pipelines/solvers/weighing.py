@@ -13,6 +13,9 @@ from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import Array, Factor, Problem
 from alidade.pipelines.solvers.assembly import StepBoundary
 from alidade.pipelines.solvers.gauss_newton import MOST_DAMPING, MOST_ITERATIONS, Solution, minimize
+from alidade.pipelines.solvers.layout import Layout
+from alidade.pipelines.solvers.linearization import Linearization
+from alidade.pipelines.solvers.marginal_likelihood import maximise_likelihood, rejected
 from alidade.pipelines.solvers.marginals import rows_used
 from alidade.pipelines.solvers.noise_levels import far, refined, weigh
 from alidade.pipelines.solvers.redundancy import expected_squares
@@ -129,6 +132,15 @@ def with_levels(
     Raises:
         IndeterminateError: a variable is not determined.
     """
+    if problem.marginal_likelihood and problem.layout is not None and solution.converged:
+        layout, at = Layout.of(problem.layout, solution.values)
+        engine = Linearization.of(factors, layout)
+        outliers = rejected(engine.under(problem.loss), at)
+        levels = maximise_likelihood(engine, at, levels, outliers).levels
+        weighed = solution.system.made_of(weigh(factors, levels)).under(None)
+        again = _again(problem, weighed, solution.values, True, most)
+        solution = replace(again, iterations=solution.iterations + again.iterations)
+        return solution, levels, *linearized(solution)
     first, (linear, expected) = levels, linearized(solution)
     for _ in range(_MOST_LEVELS if any(level.noise.estimated for level in levels) else 0):
         if not solution.converged:

@@ -214,15 +214,15 @@ def test_an_array_that_is_not_what_it_has_to_be_is_named(
 def test_lists_integers_and_masked_arrays_become_floats(simulated: alidade.Simulated) -> None:
     data = simulated.data
     given = {
-        "head_t": range(len(data.head_t)),
-        "head_gyro": data.head_gyro.tolist(),
+        "head_t": data.head_t.tolist(),
+        "head_gyro": np.rint(data.head_gyro).astype(int),
         "vision_t": np.ma.masked_array(data.vision_t),
         "vision_wxyz": data.vision_wxyz.astype(np.float32),
     }
     opened = alidade.open(given, method="head").data
     assert {type(getattr(opened, name)) for name in given} == {np.ndarray}
     assert {getattr(opened, name).dtype for name in given} == {np.dtype(float)}
-    np.testing.assert_array_equal(opened.head_gyro, data.head_gyro)
+    np.testing.assert_array_equal(opened.head_gyro, np.rint(data.head_gyro))
 
 
 def test_a_roll_may_be_missing_and_nothing_else_of_an_los_error() -> None:
@@ -293,3 +293,35 @@ def test_a_misspelt_solver_is_refused_and_a_text_is_no_list(tmp_path: Path) -> N
         calibrate(tmp_path / "s.mcap", "batch")
     with pytest.raises(alidade.InputError, match="no solver 'bacth'"):
         alidade.calibrate(tmp_path / "s.mcap", "bacth")
+
+
+def test_arrays_have_the_place_of_the_config() -> None:
+    data = alidade.simulate("tumble", {}).data
+    arrays = {
+        field.name: getattr(data, field.name) for field in fields(data) if field.name not in ("latitude", "longitude")
+    }
+    place = {"latitude_deg": float(np.rad2deg(data.latitude)), "longitude_deg": float(np.rad2deg(data.longitude))}
+    opened = alidade.open(arrays, method="tumble", config=alidade.Config(**place)).data
+    assert opened.latitude == pytest.approx(data.latitude)
+    assert opened.longitude == pytest.approx(data.longitude)
+    with pytest.raises(alidade.InputError, match=r"arrays: latitude is .*by the config"):
+        alidade.open({**arrays, "latitude": 0.1}, method="tumble", config=alidade.Config(**place))
+
+
+def test_dates_are_times_and_rows_are_sorted_by_them(simulated: alidade.Simulated) -> None:
+    data = simulated.data
+    start = np.datetime64("2026-03-01T10:00:00", "ns")
+    names = ("head_t", "head_gyro", "vision_t", "vision_wxyz")
+    given = {name: getattr(data, name) for name in names}
+    dates = {name: start + np.round(1e9 * given[name]).astype("timedelta64[ns]") for name in ("head_t", "vision_t")}
+    opened = alidade.open({**given, **dates}, method="head").data
+    assert opened.epoch_ns == start.astype(np.int64)
+    np.testing.assert_allclose(opened.head_t, data.head_t, atol=1e-9)
+    swapped = np.arange(len(data.head_t))
+    swapped[[100, 101]] = 101, 100
+    mixed = {"head_t": np.append(data.head_t[swapped], data.head_t[-1])}
+    mixed["head_gyro"] = np.concatenate([data.head_gyro[swapped], data.head_gyro[-1:]])
+    again = alidade.open({**given, **mixed}, method="head").data
+    np.testing.assert_array_equal(again.head_t, data.head_t)
+    np.testing.assert_array_equal(again.head_gyro, data.head_gyro)
+    assert sum(again.dropped.values()) == 2

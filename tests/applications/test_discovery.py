@@ -87,12 +87,12 @@ def test_what_is_suggested_reads_as_the_recording_did_under_its_own_names(simula
         "  vision_attitude: {topic: /tracker/pose, invert: true}",
         "  platform_imu: /vehicle/imu",
     ]
-    assert "as the inverse of the attitude meant" in head.reasons[0]
+    assert head.reasons[0].endswith(", inverted")
     assert unused(recording, NONE) == ("/tracker/pose", "/vehicle/imu", "/xsens/data")
     assert load_config(head.yaml.encode()).topics == head.topics
     config = with_suggested(recording, NONE)
     assert config.method == "head"
-    assert recording.notes[0].startswith("topics taken as suggested for head: /tracker/pose turns with /xsens/data")
+    assert recording.notes[0].startswith("topics chosen automatically (head): /tracker/pose matches /xsens/data")
     data, expected = read_head(recording, config), read_head(open_recording(simulated), NONE)
     np.testing.assert_array_equal(data.head_gyro, expected.head_gyro)
     np.testing.assert_allclose(data.vision_wxyz, expected.vision_wxyz, atol=1e-15)
@@ -132,7 +132,7 @@ def test_the_pair_of_frames_that_turns_with_a_gyro_is_found(simulated: Path, tmp
         "  head_imu: /xsens",
         "  vision_attitude: {topic: /tf, frames: [helmet, camera], invert: true}",
     ]
-    assert "/tf (helmet to camera) turns with /xsens" in head.reasons[0]
+    assert "/tf (helmet to camera) matches /xsens" in head.reasons[0]
     config = load_config(head.yaml.encode())
     recording = open_recording(path)
     recording.use(config.topics.values(), config.columns)
@@ -181,8 +181,10 @@ def test_the_commands_suggest_and_say_what_is_nearest(simulated: Path, tmp_path:
     path = tmp_path / "s.mcap"
     renamed(simulated, path)
     shown = alidade("info", path, "--quiet").out
-    assert shown.index("head: with these topics") < shown.index("head_imu: /xsens/data") < shown.index("los: no")
-    assert "used by no method: /tracker/pose, /vehicle/imu, /xsens/data" in shown
+    lines = ("head: yes, with these topics", "head_imu: /xsens/data", "los: missing")
+    assert sorted(lines, key=shown.index) == list(lines)
+    # What is proposed three lines above is not listed as unused.
+    assert "not used:" not in shown
     told = json.loads(alidade("info", path, "--json").out)
     assert told["schema"] == "alidade.info/1"
     assert told["methods"]["head"]["suggested"]["platform_imu"] == "/vehicle/imu"
@@ -191,12 +193,58 @@ def test_the_commands_suggest_and_say_what_is_nearest(simulated: Path, tmp_path:
     for method in ([], ["--method", "head"]):
         refused = alidade("calibrate", path, *method)
         assert refused.code == 2
-        assert "nearest is for head: /tracker/pose turns with /xsens/data" in refused.err
+        assert "nearest is for head: /tracker/pose matches /xsens/data" in refused.err
         assert "`topics: {head_imu: /xsens/data, vision_attitude: /tracker/pose" in refused.err
 
 
 def test_a_recording_without_anything_is_one_line(tmp_path: Path) -> None:
     write_session(tmp_path / "s.mcap", {"/v": series.VectorSeries(np.arange(5), np.zeros((5, 3)))})
-    named = r"/v \(Vector3Stamped, 5 messages\) can serve as head_imu.*still lacking: /vision"
+    named = r"/v \(Vector3Stamped, 5 messages\) proposed as head_imu.*still missing: /vision"
     with pytest.raises(InputError, match=named):
         with_suggested(open_recording(tmp_path / "s.mcap"), NONE)
+
+
+def _moving(n: int = 600) -> tuple[Any, Any]:
+    rng = np.random.default_rng(4)
+    t_ns = 1_790_000_000_000_000_000 + 10_000_000 * np.arange(n)
+    return t_ns, rng
+
+
+def test_a_gyro_and_an_accelerometer_on_two_topics_are_one_imu(tmp_path: Path) -> None:
+    t_ns, rng = _moving()
+    gyro = series.ImuSeries(t_ns, 0.3 * rng.normal(size=(600, 3)), np.zeros(3))
+    accel = series.ImuSeries(t_ns + 3_000_000, np.zeros(3), np.array([0.0, 0.0, 9.8]) + rng.normal(size=(600, 3)))
+    write_session(tmp_path / "s.mcap", {"/camera/gyro/sample": gyro, "/camera/accel/sample": accel})
+    (found,) = suggestions(open_recording(tmp_path / "s.mcap"), NONE, ["tumble"])
+    assert found.topics["imu"].parts == ("/camera/gyro/sample", "/camera/accel/sample")
+    assert found.has_to_be_asked_for
+    assert not found.missing
+
+
+def test_of_two_imus_none_is_taken_by_chance(tmp_path: Path) -> None:
+    t_ns, rng = _moving()
+    imus = [
+        series.ImuSeries(t_ns, 0.3 * rng.normal(size=(600, 3)), np.array([0.0, 0.0, 9.8]) + rng.normal(size=(600, 3)))
+        for _ in range(2)
+    ]
+    write_session(tmp_path / "s.mcap", {"/sensors/a": imus[0], "/sensors/b": imus[1]})
+    recording = open_recording(tmp_path / "s.mcap")
+    (found,) = suggestions(recording, NONE, ["tumble"])
+    assert not found.topics
+    assert "/sensors/a and /sensors/b could be the imu: choose" in found.reasons[0]
+    with pytest.raises(InputError, match="could be the imu: choose"):
+        with_suggested(recording, NONE, "tumble")
+
+
+def test_another_order_of_a_quaternions_components_is_no_inverse(simulated: Path, tmp_path: Path) -> None:
+    """(x, y, z, w) read as (w, x, y, z) is exactly an inverse between two constant rotations, with a mount far off."""
+    whole = open_recording(simulated)
+    poses = whole.poses("/vision/attitude")
+    wrong = series.PoseSeries(poses.t_ns, poses.wxyz[:, [1, 2, 3, 0]], poses.position)
+    topics = {"/xsens/data": whole.imu("/head/imu"), "/tracker/pose": wrong, "/vehicle/imu": whole.imu("/platform/imu")}
+    write_session(tmp_path / "s.mcap", topics)
+    recording = open_recording(tmp_path / "s.mcap")
+    (found,) = suggestions(recording, NONE, ["head"])
+    assert "vision_attitude" not in found.topics
+    assert "another order of its components" in found.reasons[0]
+    assert found.missing

@@ -1,4 +1,4 @@
-"""README and docs are walked as they stand; their links lead somewhere; figures in them are the code's."""
+"""README and docs: commands and outputs are real, links lead somewhere, pages are short and in the field's words."""
 
 from __future__ import annotations
 
@@ -8,14 +8,19 @@ import subprocess
 import sys
 import textwrap
 import tomllib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import alidade as door
+from alidade.pipelines import methods
 from alidade.pipelines.config import load_config
-from alidade.pipelines.settings import DEFAULT_NOISE
+from alidade.pipelines.estimation.finding import KINDS
+from alidade.pipelines.methods.meanings import COMMON as MEANINGS
+from docs._site.tables import arrays, commands, config_keys, data_sheets, noise, result_keys, scenarios
+from docs._site.words import BUDGET, BUDGETS, counted, dialect, generated, prose, words
 from tests.install.walk import Step, difference, steps
 from tests.support.browser import DESKTOP, PHONE, look, needs_browser, running
 from tests.support.command import Command, Run
@@ -25,15 +30,27 @@ DOCS = ROOT / "docs"
 EXAMPLE = DOCS / "examples" / "gyro_pair"
 PAGES = [ROOT / "README.md", *sorted(p for p in DOCS.rglob("*.md") if EXAMPLE not in p.parents)]
 _CODE = re.compile(r"^```python file=(\S+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
-_LINK = re.compile(r"\]\((?!https?://)([^)#]+)")
+_LINK = re.compile(r"\]\((?!https?://)([^)#]*)(?:#([^)]*))?\)")
+_HEADING = re.compile(r"^#+ (.*)$", re.MULTILINE)
 
-# Its Python needs the scheduler of a cluster.
-_CLUSTER = "docs/fleet.md"
 # Their commands need a process of their own.
-_APART = ("docs/fleet.md", "docs/write-your-own-method.md")
-# Their commands are those of other tests, on longer recordings; `make dist` walks all tutorials.
-_TUTORIALS = ("docs/tutorials/cube.md", "docs/tutorials/indexer.md", "docs/tutorials/los.md")
-_LONG = (*_APART, *_TUTORIALS, "docs/cube.md", "docs/over-time.md", "docs/trust.md")
+_APART = ("docs/howto/fleet.md", "docs/howto/write-a-method.md")
+# Their commands are those of other tests, on longer recordings; `make dist` walks README, quick start and all methods.
+_METHODS = ("docs/methods/cube.md", "docs/methods/indexer.md", "docs/methods/los.md")
+_LONG = (
+    *_APART,
+    *_METHODS,
+    "docs/howto/check-a-result.md",
+    "docs/howto/print-a-cube.md",
+    "docs/howto/several-recordings.md",
+    "docs/howto/validate.md",
+    "docs/troubleshooting.md",
+)
+# What people search for, each in a title, in the first paragraph of a page or in the glossary.
+_SEARCHED = (
+    "extrinsic", "boresight", "misalignment", "lever arm", "hand-eye", "hard iron", "soft iron", "Allan", "gimbal",
+    "AHRS", "observability", "covariance", "ellipsoid fit", "AprilTag", "turntable", "intrinsics",
+)  # fmt: skip
 
 
 def _name(page: Path) -> str:
@@ -56,14 +73,14 @@ def test_page_works(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "100")
     path = [str(ROOT)]
-    if page.name == "write-your-own-method.md":
+    if page.name == "write-a-method.md":
         path.append(str(request.getfixturevalue("example_site")))
     program: dict[str, Any] = {"__name__": "__main__"}
     for step in steps(page):
         if step.kind == "yaml":
             Path(step.file).write_text(step.text, encoding="utf-8")
             load_config(None, Path(step.file))
-        elif step.kind == "python" and _name(page) != _CLUSTER:
+        elif step.kind == "python":
             capsys.readouterr()
             exec(compile(step.text, page.name, "exec"), program)
             assert not difference(step.output or "", capsys.readouterr().out)
@@ -98,19 +115,84 @@ def test_outputs_are_compared(documented: str, printed: str, agree: bool) -> Non
 
 
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "datasets" / "README.md"], ids=_name)
-def test_links_lead_somewhere(page: Path) -> None:
-    for target in _LINK.findall(page.read_text(encoding="utf-8")):
-        assert (page.parent / target).exists(), target
+def test_links_lead_to_files_and_headings(page: Path) -> None:
+    for target, anchor in _LINK.findall(page.read_text(encoding="utf-8")):
+        file = page.parent / target if target else page
+        assert file.exists(), target
+        assert not anchor or anchor in _anchors(file), f"{target}#{anchor}"
+
+
+def _anchors(page: Path) -> set[str]:
+    """Of a page's headings, as GitHub and MyST make them."""
+    headings = _HEADING.findall(page.read_text(encoding="utf-8"))
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_page_opens_with_its_purpose_in_a_sentence(page: Path) -> None:
+    title, first = page.read_text(encoding="utf-8").split("\n\n")[:2]
+    assert title.startswith("# ")
+    assert not re.match(r"[#|<!]|```", first), first
+    assert words(re.split(r"(?<=[.:])\s", first)[0]) <= 40, first
+
+
+@pytest.mark.parametrize("page", PAGES, ids=_name)
+def test_page_is_in_the_words_of_the_field(page: Path) -> None:
+    assert list(dialect(prose(page.read_text(encoding="utf-8")))) == []
+
+
+def test_help_is_in_the_words_of_the_field_and_summaries_fit_a_line(
+    alidade: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert list(dialect("\n".join(commands()))) == []
+    monkeypatch.setenv("COLUMNS", "80")
+    assert not [line for line in alidade("-h").out.splitlines()[1:] if line.endswith("...")]
+
+
+@pytest.mark.parametrize("generate", [config_keys, result_keys, noise, data_sheets])
+def test_generated_reference_is_in_the_words_of_the_field(generate: Callable[[], Iterator[str]]) -> None:
+    assert list(dialect(prose("\n".join(generate())))) == []
+
+
+@pytest.mark.parametrize("method", ["los", "indexer", "head", "cube", "tumble"])
+def test_parameters_scenarios_and_arrays_are_in_the_words_of_the_field(method: str) -> None:
+    text = "\n".join([*scenarios(method), *arrays(method), *_meanings(method)])
+    assert list(dialect(prose(text))) == []
+
+
+def _meanings(method: str) -> list[str]:
+    return [*MEANINGS.values(), *methods.method(method).meanings.values()]
+
+
+def test_pages_keep_their_budgets() -> None:
+    counts = counted()
+    assert counts.keys() == BUDGETS.keys()
+    assert {name for name, count in counts.items() if count > 1.05 * BUDGETS[name]} == set()
+    assert sum(counts.values()) + generated() <= BUDGET
+
+
+def test_what_people_search_for_is_found() -> None:
+    texts = [page.read_text(encoding="utf-8") for page in PAGES]
+    openings = " ".join(" ".join(" ".join(text.split("\n\n")[:2]).split()) for text in texts)
+    glossary = (DOCS / "reference" / "glossary.md").read_text(encoding="utf-8")
+    for word in _SEARCHED:
+        assert word.lower() in (openings + glossary).lower(), word
 
 
 def test_the_reference_has_every_name_of_the_public_door() -> None:
-    page = (DOCS / "reference" / "api.md").read_text(encoding="utf-8")
+    page = (DOCS / "reference" / "python.md").read_text(encoding="utf-8")
     for name in set(door.__all__) - {"__version__"}:
         assert re.search(rf"^\.\. auto\w+:: alidade\.{name}\b", page, re.MULTILINE), name
 
 
+def test_every_kind_of_finding_is_on_the_page() -> None:
+    page = (DOCS / "reference" / "result-json.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| (`\w+`(?:, `\w+`)*) \|", page, re.MULTILINE)
+    assert {kind: tuple(re.findall(r"\w+", numbers)) for kind, numbers in rows} == KINDS
+
+
 def test_code_of_the_example_is_that_of_its_files() -> None:
-    page = (DOCS / "write-your-own-method.md").read_text(encoding="utf-8")
+    page = (DOCS / "howto" / "write-a-method.md").read_text(encoding="utf-8")
     blocks = _CODE.findall(page)
     assert blocks
     for file, text in blocks:
@@ -119,21 +201,10 @@ def test_code_of_the_example_is_that_of_its_files() -> None:
         assert any(textwrap.indent(text, " " * depth) in source for depth in (0, 4, 8)), f"{file}:\n{text}"
 
 
-def test_defaults_of_the_noise_are_those_of_the_program() -> None:
-    table = (DOCS / "config.md").read_text(encoding="utf-8").split("## Noise")[1].split("## Priors")[0]
-    rows = re.findall(r"^\| (`\w+`(?:, `\w+`)*) \| .* \| ([-\d., e]+) \|", table, re.MULTILINE)
-    told = {
-        key.strip("`"): float(value)
-        for keys, values in rows
-        for key, value in zip(keys.split(", "), values.split(", "), strict=True)
-    }
-    assert told == DEFAULT_NOISE.model_dump()
-
-
 def test_every_dependency_is_named() -> None:
-    """The Dependencies section and pyproject.toml say the same, but for what only development needs."""
+    """The page Install and pyproject.toml agree, except for what only development needs."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    section = (DOCS / "limits.md").read_text(encoding="utf-8").split("## Dependencies")[1]
+    section = (DOCS / "install.md").read_text(encoding="utf-8").split("## Extras")[1]
     extras = {name: needed for name, needed in project["optional-dependencies"].items() if name != "dev"}
     assert set(re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE)) == extras.keys()
     for requirement in [*project["dependencies"], *(each for needed in extras.values() for each in needed)]:

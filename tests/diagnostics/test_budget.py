@@ -55,7 +55,7 @@ def test_sources_are_told_in_words_the_small_ones_together() -> None:
 
 def test_the_report_has_the_shares() -> None:
     page = Page(report_html(calibration()))
-    assert "What limits the accuracy" in page.text
+    assert "Error budget" in page.text
     assert "vision noise" in page.text
 
 

@@ -186,8 +186,8 @@ def test_without_a_measurement_the_parameter_is_back_by_its_pull() -> None:
 
 def test_the_report_tells_both() -> None:
     page = Page(report_html(calibration("cube")))
-    assert "Taken for exact" in page.text
+    assert "Sensitivity to fixed inputs" in page.text
     assert re.search(r"latitude_deg 0.1 deg mag_k\d\d \+\d.\d σ \(0.0", page.text)
     assert re.search(r"tag_size 0.2 % [a-z]+_k\d\d [^<]* more by less focal_length 0.5 %", page.text)
-    assert "Measurements that matter most 20 rows" in page.text
-    assert "Taken for exact" not in Page(report_html(calibration("head"))).text
+    assert "Most influential measurements 20 rows" in page.text
+    assert "Sensitivity to fixed inputs" not in Page(report_html(calibration("head"))).text

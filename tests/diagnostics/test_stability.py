@@ -169,7 +169,8 @@ def test_an_immaterial_step_is_a_note_and_in_the_covariance_of_everybody() -> No
     assert wide.history is not None
     assert wide.told is not None
     assert wide.budget is not None
-    np.testing.assert_allclose(wide.history.sigmas, [[0.1, 0.1], np.sqrt(np.diag(expected))])
+    np.testing.assert_allclose(wide.history.sigmas[0], [0.1, 0.1])
+    np.testing.assert_allclose(wide.history.sigmas[1], np.sqrt(np.diag(expected)))
     np.testing.assert_allclose(np.linalg.inv(wide.told.R.T @ wide.told.R), expected)
     np.testing.assert_allclose(np.linalg.solve(wide.told.R, wide.told.d), np.linalg.solve(R, told.d))
     assert wide.budget["a"] == pytest.approx({CHANGE: 0.16 / 0.17, "vision": 0.01 / 0.17})

@@ -1,4 +1,4 @@
-"""docs/data-sheets.md against the program: all figures, the defaults in force, sections that their methods take."""
+"""docs/reference/data-sheets: every figure with the program's defaults; sections that their methods accept."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+from ruamel.yaml import YAML
 
 from alidade.pipelines import methods
 from alidade.pipelines.config import load_config
@@ -19,9 +20,10 @@ from alidade.pipelines.methods.place import FIELD
 from alidade.pipelines.methods.tumble import turning
 from alidade.pipelines.methods.tumble.recording import SLOPES
 from alidade.pipelines.settings import Sensors
+from docs._site.tables import SHEETS, default_sigmas
 from tests.install.walk import steps
 
-PAGE = Path(__file__).parents[2] / "docs" / "data-sheets.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "data-sheets.md"
 ASSUMED: dict[str, Sequence[Assumption]] = {
     "los": LOS,
     "head": HEAD,
@@ -35,23 +37,27 @@ DEFAULTS = {
 SECTIONS = [pytest.param(step.file.split("-")[0], step.text, id=step.file) for step in steps(PAGE)]
 
 
-def test_every_figure_is_on_the_page() -> None:
-    text = PAGE.read_text(encoding="utf-8")
-    for sensor, sheet in Sensors():
-        for figure in type(sheet).model_fields:
-            assert f"`{sensor}.{figure}`" in text, f"{sensor}.{figure}"
-
-
-def test_defaults_are_those_of_the_program() -> None:
-    table = PAGE.read_text(encoding="utf-8").split("## Defaults")[1].split("\n## ")[0]
-    rows = re.findall(r"^\| `([\w.]+)` \| ([^|]*)\|", table, re.MULTILINE)
-    told = {
-        (method, figure): float(value)
-        for figure, defaults in rows
-        for method, value in re.findall(r"(\w+) ([\d.e-]+)", defaults)
+def test_every_figure_has_an_entry_with_its_sources() -> None:
+    sheets = YAML(typ="safe").load(SHEETS.read_text(encoding="utf-8"))
+    stated = {f"{sensor}.{figure}" for sensor, sheet in Sensors() for figure in type(sheet).model_fields}
+    assert sheets["figures"].keys() == stated
+    cited = {
+        key for entry in sheets["figures"].values() for device in entry.get("devices", ()) for key in _cited(device)
     }
-    assert told == {key: DEFAULTS.get(key) for key in told}
-    assert {figure for _, figure in DEFAULTS} <= {figure for figure, _ in rows}
+    assert cited <= sheets["sources"].keys()
+
+
+def _cited(device: Sequence[str]) -> list[str]:
+    return re.findall(r"\[(\w+)\]", device[-1])
+
+
+def test_defaults_shown_are_those_of_the_program() -> None:
+    shown = {
+        (method, figure): sigma
+        for figure in {figure for _, figure in DEFAULTS}
+        for method, sigma in default_sigmas(figure).items()
+    }
+    assert shown == DEFAULTS
 
 
 @pytest.mark.parametrize(("method", "section"), SECTIONS)

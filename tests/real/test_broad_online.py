@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from alidade.pipelines.applications.session import Session
-from alidade.pipelines.diagnostics.cross_validation import cut
 from alidade.pipelines.recording.reading import open_recording
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.incremental import solve_incremental
@@ -26,7 +25,7 @@ def test_every_second_is_within_the_sigmas_given_then(name: str, shared_data: Pa
     converted(shared_data / "broad" / f"{name}.mat", tmp_path / "s.mcap")
     session = Session.read(open_recording(tmp_path / "s.mcap"), None, None)
     method, config = session.method, session.config
-    whole = method.graph(cut(method.hypotheses(), session.data, 0.0, SECONDS), config)
+    whole = method.graph(method.hypotheses().segment(session.data, 0.0, SECONDS), config)
     final, online = solve_batch(whole), solve_incremental(whole)
     history = online.history
     assert history is not None
@@ -36,7 +35,7 @@ def test_every_second_is_within_the_sigmas_given_then(name: str, shared_data: Pa
     off = np.abs(history.values - final.values)[rows][:, steady] / history.sigmas[rows][:, steady]
     assert off.max() < 4.0
     for moment in ASKED:
-        then = solve_batch(method.graph(cut(method.hypotheses(), session.data, 0.0, moment), config))
+        then = solve_batch(method.graph(method.hypotheses().segment(session.data, 0.0, moment), config))
         row = int(np.searchsorted(history.time, moment, side="right")) - 1
         assert (history.sigmas[row, ~fixed] > 0.7 * then.sigmas[~fixed]).all(), moment
     assert (np.abs(online.values - final.values)[~fixed] < 0.5 * final.sigmas[~fixed]).all()

@@ -29,7 +29,7 @@ def test_a_cube_turned_by_hand_without_a_word_about_noise(shared_data: Path, tmp
         assert abs(p.value - published) < 3.0 * p.sigma, name
         assert p.sigma < 3e-3
     # All 38 poses, and a pause of a second on the way.
-    assert len(found.findings["static_poses"]) == 39
+    assert len(found.tables["static_poses"]) == 39
     used = {noise.name: noise.used for noise in found.noises}
     # Poses repeat to millimetres a second squared, which white noise over their duration does not say.
     assert 1e-3 < used["accel_repeatability"] < 8e-3

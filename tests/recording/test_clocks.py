@@ -138,5 +138,5 @@ def test_the_line_says_topic_time_size_and_what_to_do(ms: float, way: str, tmp_p
     ]
     data = [bytes(STORE.serialize_cdr(one, kind)) for one in made]
     path = write_raw(tmp_path / "x.mcap", "/imu", kind, messages.definition_text(kind), data, LOGGED[:300].tolist())
-    with pytest.raises(InputError, match=rf"topic /imu: the stamps step {way} by 0\.40\d s after 0\.495 s.*cut the"):
+    with pytest.raises(InputError, match=rf"topic /imu: the stamps jump {way} by 0\.40\d s after 0\.495 s.*Split the"):
         open_recording(path).imu("/imu")

@@ -90,9 +90,9 @@ def _not_numbers(t: Array, rate: Array) -> tuple[Array, Array]:
 
 Fault = Callable[[Array, Array], tuple[Array, Array]]
 FAULTS: dict[Fault, str] = {
-    _frozen: "frozen",
-    _one_axis_frozen: "frozen",
-    _clipped: "end of the sensor's range",
+    _frozen: "stuck",
+    _one_axis_frozen: "stuck",
+    _clipped: "saturated",
     _spiky: "spike",
     _gappy: "",
     _half_the_rate: "",
@@ -175,7 +175,7 @@ def test_saturated_samples_are_left_out_and_reported_by_every_method(
     chosen.write(tmp_path / "s.mcap", replace(simulated, data=clipped))
     recording = open_recording(tmp_path / "s.mcap")
     found = chosen.read(recording, load_config(recording.attachment("alidade.yaml")))
-    ((what, count),) = ((what, n) for what, n in found.dropped.items() if what.endswith("end of the sensor's range"))
+    ((what, count),) = ((what, n) for what, n in found.dropped.items() if what.endswith("saturated"))
     # Fewer than three in a row may be what there was.
     assert count > 0.1 * np.count_nonzero((np.abs(getattr(clipped, rates)) == most).any(axis=1))
     told = make_calibration()
@@ -207,7 +207,7 @@ def test_a_quantised_sensor_at_rest_is_sound() -> None:
     [
         (lambda g: g * [1.0, 1.0, 0.0], "topic /imu: axis z reads 0 throughout while the others move"),
         (lambda g: g * 0.0 + [0.0, 0.0, 9.8], r"topic /imu: all axes read the same throughout, \(0, 0, 9.8\) rad/s; "),
-        (lambda g: np.clip(g, -0.05, 0.05), r"topic /imu: \d+ % of the samples cannot be used: at the end of the"),
+        (lambda g: np.clip(g, -0.05, 0.05), r"topic /imu: \d+ % of the samples cannot be used: saturated"),
     ],
 )
 def test_a_useless_sensor_is_refused(spoil: Callable[[Array], Array], message: str, cases: dict[str, Case]) -> None:

@@ -13,7 +13,8 @@ from alidade.factors import preintegration
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.los import recording as los
-from alidade.pipelines.recording.checks import density, taken
+from alidade.pipelines.recording.checks import taken
+from alidade.pipelines.recording.placeholders import density
 from alidade.pipelines.recording.reading import open_recording
 
 # Of los at 1 kHz and 50 pictures a second, bytes a sample of the gyro: with ten hours, 36 million, in 8 GiB.
@@ -60,9 +61,9 @@ def test_rows_that_are_all_of_them_are_no_copy() -> None:
 def test_covariances_that_never_change_count_as_often_as_they_are_told(variance: float, known: bool) -> None:
     t, dropped = np.linspace(0.0, 0.49, 50), dict[str, int]()
     alike = np.broadcast_to(variance * np.eye(3), (50, 3, 3))
-    found = density("/t", t, alike, 2e-7, dropped)
+    found = density("/t", "gyro", t, alike, 2e-7, dropped)
     again: dict[str, int] = {}
-    assert found == pytest.approx(density("/t", t, alike.copy(), 2e-7, again))
+    assert found == pytest.approx(density("/t", "gyro", t, alike.copy(), 2e-7, again))
     assert (found is not None) == known
     assert dropped == again
     assert list(dropped.values()) == ([] if known else [50])

@@ -22,8 +22,8 @@ from alidade.pipelines.methods import method, simulate
 from alidade.pipelines.methods.head.topics import VISION_ATTITUDE
 from alidade.pipelines.methods.indexer.simulation import Position
 from alidade.pipelines.recording import messages, series
-from alidade.pipelines.recording.checks import density
 from alidade.pipelines.recording.gyro import read_gyro
+from alidade.pipelines.recording.placeholders import density
 from alidade.pipelines.recording.reading import Recording, open_recording
 from alidade.pipelines.recording.sources import TopicSource, inverted
 from alidade.pipelines.recording.topics import IMU
@@ -646,10 +646,10 @@ def test_a_gyro_and_an_accelerometer_make_an_imu(tmp_path: Path) -> None:
     [
         ("topics: {imu: {gyro: /g, topic: /x}}", "topics.imu: either a topic or a gyro is needed"),
         ("topics: {imu: {accel: /g, topic: /x}}", "topics.imu: accel goes with a gyro"),
-        ("topics: {imu: {gyro: /g, invert: true}}", "topics.imu: frames and invert go with a topic"),
+        ("topics: {imu: {gyro: /g, invert: true}}", "topics.imu: frame, frames and invert go with a topic"),
         (
-            "topics: {imu: {topic: /g, framse: [a, b]}}",
-            r"unknown key topics\.imu\.framse; the nearest known key is frames",
+            "topics: {imu: {topic: /g, farmes: [a, b]}}",
+            r"unknown key topics\.imu\.farmes; the nearest known key is frames",
         ),
     ],
 )
@@ -845,7 +845,7 @@ BUNCHES = 8 * STEP * (np.arange(400) // 8) + 30_000 * (np.arange(400) % 8) + JIT
         (STEP * np.arange(400), LATE, "100 % of the stamps are exactly 10 ms apart while log times jitter by 0."),
         (FLOAT_S, LATE, "100 % of the stamps are exactly 9.99"),
         (STEP * (np.arange(400) + (np.arange(400) > 200)), LATE, "100 % of the stamps are exactly 10 ms"),
-        (BUNCHES, BUNCHES, "88 % of the stamps are bunched"),
+        (BUNCHES, BUNCHES, "88 % of stamps in bursts"),
         (STEP * np.arange(400), STEP * np.arange(400), ""),
         (STEP * np.arange(400) + JITTER // 10, LATE, ""),
         (STEP * np.arange(400) + JITTER // 10, BUNCHES, ""),
@@ -935,7 +935,7 @@ def test_log_times_in_place_of_stamps_stand_in_the_sigma_of_the_delay(
 def test_covariances_that_no_sensor_has_are_not_believed(variance: float, least: float, believed: float | None) -> None:
     dropped: dict[str, int] = {}
     covariance = np.broadcast_to(np.diag([variance, *(2 * [abs(variance)])]), (50, 3, 3))
-    found = density("/imu", 0.01 * np.arange(50.0), covariance, least, dropped)
+    found = density("/imu", "gyro", 0.01 * np.arange(50.0), covariance, least, dropped)
     assert found == (None if believed is None else pytest.approx(believed))
     assert sum(dropped.values()) == (50 if variance in (1e-12, -1.0) else 0)
 

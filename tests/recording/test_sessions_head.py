@@ -147,7 +147,7 @@ def test_few_bad_samples_are_dropped_or_sorted_and_counted(tmp_path: Path) -> No
         ({"head": lambda one: series.ImuSeries(one.t_ns[:1], one.gyro[:1])}, "1 usable messages, at least 2"),
         ({"head": lambda one: series.ImuSeries(one.t_ns, one.gyro * 57.3)}, r"/head/imu: rate of .* in deg/s\?"),
         ({"platform": replaced("gyro", slice(7, 9), 36.0)}, r"topic /platform/imu: rate of 62\.35 at 0\.035000 s"),
-        ({"vision": replaced("wxyz", 5, 0.0)}, r"/vision/attitude: the quaternion at 0\.210\d+ s is zero"),
+        ({"vision": replaced("wxyz", slice(None), 0.0)}, r"/vision/attitude: the quaternion at 0\.\d+ s is zero"),
         ({"vision": replaced("wxyz", slice(5, 8), 1.0)}, r"the quaternion at 0\.210\d+ s has norm 2 \(and 2 more\)"),
         ({"vision": replaced("wxyz", slice(None), np.nan)}, "topic /vision/attitude: every one of the 50 messages"),
         (

@@ -64,7 +64,7 @@ def test_fast_and_slow_decoding_give_the_same_arrays(
     log = [T0 + 1000 * i for i in range(300)]
     data = []
     for i, t in enumerate(log):
-        frame_id = "imu" if i % 7 else ["imv", "imu_link", f"imu_{i}"][i % 3]
+        frame_id = "imu" if i % 7 else ["imv", "imu_link", "imu"][i % 3] + f"_{i}"
         message = random_message(kind, rng, t - 17, frame_id)
         data.append(bytes(STORE.serialize_cdr(message, kind, little_endian=i % 11 != 3)))
     path = write_raw(tmp_path / "x.mcap", "/x", kind, messages.definition_text(kind), data, log, chunk_size=20_000)

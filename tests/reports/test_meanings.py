@@ -28,8 +28,8 @@ def test_every_parameter_has_a_meaning(case: str) -> None:
 
 
 def test_the_words_are_of_the_parameter() -> None:
-    assert meaning(method("head"), "gyro_bias_y") == "What the gyro reads about its y axis when it does not turn."
-    assert meaning(method("cube"), "mag_k12") == "Share of the magnetometer's y that is added to x."
+    assert meaning(method("head"), "gyro_bias_y") == "Gyro bias about y."
+    assert meaning(method("cube"), "mag_k12") == "Magnetometer cross-axis term (y into x)."
     assert meaning(method("head"), "unheard_of") == ""
 
 

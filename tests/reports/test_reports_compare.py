@@ -57,8 +57,8 @@ def test_ellipses_are_drawn_of_correlated_pairs_only() -> None:
         covariance[0, 1] = covariance[1, 0] = correlation * 1e-6
         return [plot.title for plot in common_plots(make_calibration(covariance=covariance))]
 
-    assert "Parameters that trade against each other" in titles(0.9)
-    assert "Parameters that trade against each other" not in titles(0.1)
+    assert "Most correlated parameters" in titles(0.9)
+    assert "Most correlated parameters" not in titles(0.1)
 
 
 def test_what_cannot_be_written_is_bad_input(tmp_path: Path) -> None:

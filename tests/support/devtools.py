@@ -64,10 +64,6 @@ class Tab:
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600
         )
 
-    def dark(self) -> None:
-        """As somebody sees it who likes it dark."""
-        self._call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": "dark"}])
-
     def screen(self) -> None:
         """As on a screen, in light colours."""
         self._call(

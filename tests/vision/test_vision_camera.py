@@ -89,3 +89,33 @@ def test_jacobians_are_those_of_differences(name: str) -> None:
         for e in np.eye(len(given))
     ]
     np.testing.assert_allclose(camera.by_intrinsics(points), np.stack(by_intrinsics, axis=-1), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "coefficients", "model", "count"),
+    [
+        ("fisheye", [0.01, 0.0, 0.0, 0.0], "equidistant", 4),
+        ("radtan", [-0.1, 0.05, 1e-3, 0.0], "plumb_bob", 5),
+        ("PLUMB_BOB", [-0.1, 0.05, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], "plumb_bob", 5),
+        ("rational_polynomial", [-0.1, 0.05] + [0.0] * 12, "rational_polynomial", 8),
+        ("none", [], "plumb_bob", 5),
+    ],
+)
+def test_other_names_of_a_lens_and_zeros_that_are_no_coefficients(
+    name: str, coefficients: list[float], model: str, count: int
+) -> None:
+    camera = Camera(640, 480, np.diag([500.0, 500.0, 1.0]), name, np.array(coefficients))
+    assert (camera.distortion_model, len(camera.coefficients)) == (model, count)
+
+
+@pytest.mark.parametrize(
+    ("name", "coefficients", "message"),
+    [
+        ("rational_polynomial", [0.1] * 14, "rectify the pictures"),
+        ("plumb_bob", [0.1] * 8, "eight are those of rational_polynomial"),
+        ("thin_prism_fisheye", [0.0] * 8, "is none of plumb_bob.*rectify"),
+    ],
+)
+def test_another_lens_is_refused_with_what_to_do(name: str, coefficients: list[float], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Camera(640, 480, np.diag([500.0, 500.0, 1.0]), name, np.array(coefficients))

@@ -175,7 +175,7 @@ def _add_counts(
 
 def _truth(study: Study, solvers: Sequence[str]) -> Answer:
     """Whether the sigmas are true; of the published solver, whose are not its own, nothing is promised."""
-    question = "Are the sigmas true?"
+    question = "Are the sigmas consistent?"
     judged = {solver: study.nees(solver) for solver in solvers if solver != "published"} or {
         solver: study.nees(solver) for solver in solvers
     }

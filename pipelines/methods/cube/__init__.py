@@ -41,14 +41,14 @@ class Cube(Method):
     of_recording = ("gyro_b?", "accel_b?", "field_?", "reference_*")
     sketch = Path(__file__).with_name("frames.svg")
     meanings: ClassVar[Mapping[str, str]] = {
-        r"camera_mount_([xyz])": "Camera rotated about its {0}, relative to the config.",
-        r"reference_heading": "Heading that the reference's attitude is off, about up.",
-        r"reference_tilt_([en])": "Tilt that the reference's attitude is off, about {0}.",
-        r"tag_(\d+)_([xyz])": "Tag {0} rotated about its {1}, relative to the config.",
-        r"accel_square_([123])": "How the accelerometer's reading of {0} bends: per m/s^2, squared.",
-        r"accel_cube_([123])": "How the accelerometer's reading of {0} bends: per m/s^2, cubed.",
-        r"camera_focal": "Part by which the camera's focal length is larger than stated.",
-        r"camera_centre_([xy])": "How far the picture's centre is off along {0}.",
+        r"camera_mount_([xyz])": "Camera mount about {0}, correction of the config.",
+        r"reference_heading": "Heading error of the reference.",
+        r"reference_tilt_([en])": "Tilt error of the reference about {0}.",
+        r"tag_(\d+)_([xyz])": "Tag {0} rotation about {1}, correction of the config.",
+        r"accel_square_([123])": "Accelerometer quadratic nonlinearity, {0}.",
+        r"accel_cube_([123])": "Accelerometer cubic nonlinearity, {0}.",
+        r"camera_focal": "Relative correction of the focal length.",
+        r"camera_centre_([xy])": "Correction of the image centre along {0}.",
     }
     rotations: ClassVar[Mapping[str, str]] = {"camera_mount": "correction of BRC"}
 

@@ -13,16 +13,21 @@ if TYPE_CHECKING:
 
 
 def cube_layout(
-    sessions: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Of one camera or of several.")],
-    out: Annotated[Path, typer.Option(help="The config to write, with where the tags are; its page beside it, .html.")],
+    sessions: Annotated[
+        list[Path], typer.Argument(metavar="RECORDING...", help="Recordings of one or several cameras.")
+    ],
+    out: Annotated[Path, typer.Option(help="Config to write, with the located tags; its page is beside it, .html.")],
     config: ConfigFile = None,
     refine_camera: Annotated[
-        bool, typer.Option("--refine-camera", help="Adjust focal length, centre and distortion too.")
+        bool, typer.Option("--refine-camera", help="Estimate focal length, centre and distortion too.")
     ] = False,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Where the tags are on a cube, from pictures of it on all sides; the config gives their ids and sizes."""
+    """Locate the AprilTags of a cube.
+
+    From pictures of all sides; ids and sizes come from the config.
+    """
     from alidade.pipelines import progress
     from alidade.pipelines.config import recorded_config
     from alidade.pipelines.methods.cube.layout import cube_layout as estimate
@@ -71,11 +76,11 @@ def _show(layout: "Layout") -> None:
 
 
 def cube_print(
-    edge: Annotated[float, typer.Option(help="Of the cube, m.")],
-    out: Annotated[Path, typer.Option(help="The PDF to write; the tags as drawn beside it, .yaml.")],
-    first_id: Annotated[int, typer.Option(help="Tag on the top face; the others follow.")] = 16,
+    edge: Annotated[float, typer.Option(help="Edge of the cube, m.")],
+    out: Annotated[Path, typer.Option(help="PDF to write; the config of the tags is beside it, .yaml.")],
+    first_id: Annotated[int, typer.Option(help="Id of the tag on the top face; the others follow.")] = 16,
 ) -> None:
-    """Sheets with the six faces of a tag cube, true to scale."""
+    """Print the six faces of an AprilTag cube, true to scale."""
     from alidade.pipelines.methods.cube.printing import print_cube
     from alidade.pipelines.reports import terminal
 

@@ -55,7 +55,7 @@ class CubeData:
     East-North-Up, unit; None without one. reference_cov (R, 3, 3) rad^2, about the axes of n; None if unknown.
     latitude, longitude, rad, height, m above the ellipsoid: of the reference; None if unknown. camera, sightings: None
     without a camera. gyro_density, accel_density, mag_density: from the covariances of the messages, in the unit
-    recorded per sqrt(Hz), None if they say nothing. dropped: reason -> messages. temperature: of gyro and
+    recorded per sqrt(Hz), None if they have none. dropped: reason -> messages. temperature: of gyro and
     accelerometer, None where nobody measures it.
     """
 

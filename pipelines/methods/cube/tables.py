@@ -43,7 +43,7 @@ def _taken_apart(calibration: Calibration) -> Table:
             what = {"nonorthogonality": "non-orthogonality", "scale": "scale error"}.get(part, part)
             rows.append((f"{what} {axis}, {unit}", *cells))
     return Table(
-        "Sensors taken apart",
+        "Scale, non-orthogonality, misalignment",
         "What is in K: by how much each axis says too much, by how much two of them are closer than a right angle, "
         "and the rotation vector that turns the body's axes into the sensor's, with sigmas.",
         ("", *(NAMES[triad["sensor"]] for triad in triads)),

@@ -38,10 +38,10 @@ class Head(Method):
     of_recording = ("gyro_bias_*", "time_offset", "clock_skew", "platform_bias_*")
     sketch = Path(__file__).with_name("frames.svg")
     meanings: ClassVar[Mapping[str, str]] = {
-        r"helmet_mount_([xyz])": "Markers turned against the helmet's IMU: {0} of the rotation vector of vRh.",
-        r"camera_mount_([xyz])": "Platform turned against the camera: {0} of the rotation vector of cRb.",
-        r"vision_scale": "Part by which the angles that the camera tells are too large.",
-        r"vision_filter": "Half the second moment of vision's impulse response less the gyro's: t^2 of a low-pass t.",
+        r"helmet_mount_([xyz])": "Rotation markers to helmet IMU (vRh), {0} of the rotation vector.",
+        r"camera_mount_([xyz])": "Rotation platform to camera (cRb), {0} of the rotation vector.",
+        r"vision_scale": "Scale error of the angles measured by vision.",
+        r"vision_filter": "Low-pass of vision: half the second moment of its impulse response, less the gyro's.",
     }
     rotations: ClassVar[Mapping[str, str]] = {"helmet_mount": "vRh", "camera_mount": "cRb"}
 

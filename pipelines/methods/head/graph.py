@@ -7,7 +7,7 @@ keyframe serves all pictures around it: the gyros carry its attitude to their ti
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import gtsam
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.attitude import VisionAttitudeFactor
+from alidade.factors.attitude import FADE, VisionAttitudeFactor
 from alidade.factors.chi_square import gate
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.preintegration import GyroPath
@@ -32,7 +32,7 @@ from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.head.guess import guess, guess_picture_clock
 from alidade.pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, SENSITIVITY, TEMPERATURE, HeadParameters
 from alidade.pipelines.methods.head.recording import HeadData
-from alidade.pipelines.methods.noise import sampled, stated, typical, walking
+from alidade.pipelines.methods.noise import estimated, sampled, stated, typical
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 # Pictures share a keyframe within this time, s, and keyframes are never farther apart than this, s: increments are
@@ -43,6 +43,8 @@ _NEGLIGIBLE = 0.1
 # So far from its stamp, s, the gyros carry an attitude to where its picture was taken.
 _NEAR = 0.1
 _FEWEST_FRAMES = 10
+# Attitudes of which a larger share is turned by half a turn are no outliers.
+_FEW_OUTLIERS = 0.02
 _FAMILY = "vision"
 
 # Said where it is taken for granted.
@@ -97,15 +99,37 @@ def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
         constants=temperature.constants(model.reference),
         keyframes=Keyframes(model.clock, _NEAR),
         layout=LAYOUT,
+        marginal_likelihood=True,
+        finer=partial(_finer, config, data, model),
+    )
+
+
+def _finer(config: Config, data: HeadData, model: _Model, levels: Sequence[Level]) -> Problem | None:
+    """The graph for noise levels with which pictures may share fewer keyframes; see Problem.finer."""
+    noises = model.noises | {level.noise.name: level for level in levels}
+    if _shared(data, noises) > 0.5 * model.origins[2]:
+        return None
+    return replace(_problem(config, data, _prepare(data, config, clock=model.clock, noises=noises)), finer=None)
+
+
+def _shared(data: HeadData, noises: Mapping[str, Level]) -> float:
+    """Pictures share a keyframe within this time, s, over which gyro noise adds little to vision's."""
+    rate = float(np.sqrt((data.head_gyro**2).sum(axis=1).mean()))
+    density = [noises["gyro_density"].used, noises["gyro_rate_noise"].used * rate]
+    if "platform_gyro_density" in noises:
+        density.append(noises["platform_gyro_density"].used)
+    return min(
+        _SHARED, (_NEGLIGIBLE * noises["vision_attitude"].used) ** 2 / max(float(np.square(density).sum()), 1e-300)
     )
 
 
 def _noises(data: HeadData, config: Config) -> dict[str, Level]:
     """What is in force, by name."""
     found = [
-        Level(stated("vision_attitude", config, typical(data.vision_cov, 0, 1, 2), (_FAMILY,))),
-        sampled(stated("gyro_density", config, data.gyro_density, ("gyro",)), data.head_t, data.head_gyro),
-        walking(config),
+        estimated("vision_attitude", config, (_FAMILY,), typical(data.vision_cov, 0, 1, 2)),
+        estimated("gyro_density", config, ("gyro",), data.gyro_density),
+        estimated("gyro_rate_noise", config, ("gyro",), beside=True),
+        Level(stated("gyro_bias_walk", config)),
     ]
     if data.platform_t is not None and data.platform_gyro is not None:
         platform = stated("platform_gyro_density", config, data.platform_gyro_density)
@@ -131,17 +155,19 @@ def _prepare(
     trunk: Trunk | None = None,
     start: float = -np.inf,
     clock: Clock | None = None,
+    noises: Mapping[str, Level] | None = None,
 ) -> _Model:
     """The model of a recording, or of one that grows from a keyframe of its model until now on.
 
-    `clock` tells when pictures were taken. Those of a recording that grows count as taken at their stamps.
+    `noises` are those in force; None: as stated. `clock` tells when pictures were taken. Those of a recording that
+    grows count as taken at their stamps.
     """
     begun = float(data.vision_t[0])
     taken = data.vision_t + (Clock(begun) if clock is None else clock).late(data.vision_t - begun)
     inside = _inside(data, taken)
     stamps, taken, measured = data.vision_t[inside], taken[inside], data.vision_wxyz[inside]
-    noises = _noises(data, config) if before is None else before.noises
-    density, platform, platform_density = noises["gyro_density"].used, None, 0.0
+    noises = dict(noises or _noises(data, config)) if before is None else before.noises
+    density, platform, platform_density = noises["gyro_density"].noise.stated, None, 0.0
     if data.platform_t is not None and data.platform_gyro is not None:
         platform = GyroPath(data.platform_t, data.platform_gyro)
         platform_density = noises["platform_gyro_density"].used
@@ -149,7 +175,11 @@ def _prepare(
     warmth = temperature.above(data.temperature, reference, data.head_t)
     drivers = {SENSITIVITY: data.head_force, TEMPERATURE: warmth}
     caused = [each for each, driver in drivers.items() if driver is not None]
-    parameters = HeadParameters.of(config, platform is not None, caused, data.stamp_sigma)
+    if before is None:
+        around = _all_around(data.vision_wxyz)
+        parameters = HeadParameters.of(config, platform is not None, caused, data.stamp_sigma, around)
+    else:
+        parameters = before.parameters
     sqrt_information = _sqrt_information(data.vision_cov, inside, config)
     sigma = float(1.0 / np.median(np.linalg.norm(sqrt_information, axis=(1, 2)) / np.sqrt(3.0)))
     if before is None:
@@ -158,11 +188,10 @@ def _prepare(
             by = parameters.helmet, parameters.bias, parameters.picture
             guessed = guess_picture_clock(gyro, platform, stamps - begun, begun, measured, by, sigma)
             if np.abs(guessed.late(stamps - begun)).max() > _NEAR:
-                return _prepare(data, config, clock=guessed)
+                return _prepare(data, config, clock=guessed, noises=noises)
         iRb = so3.identity(len(taken)) if platform is None else platform.attitude(taken)
         bias_hat, vRh = guess(gyro, taken, so3.multiply(iRb, measured), sigma)
-        negligible = (_NEGLIGIBLE * sigma) ** 2 / max(density**2 + platform_density**2, 1e-300)
-        first, origins = data.vision_wxyz[0], (begun, taken[0], min(_SHARED, negligible))
+        first, origins = data.vision_wxyz[0], (begun, taken[0], _shared(data, noises))
     else:
         bias_hat, vRh, first, origins = before.chain.gyro.bias_hat, before.helmet_guess, before.first, before.origins
         if trunk is ROOT:
@@ -202,6 +231,12 @@ def _prepare(
         reference=reference,
         noises=noises,
     )
+
+
+def _all_around(attitudes: Array) -> bool:
+    """Whether more than chance outliers among attitudes (n, 4) are farther than FADE from the first."""
+    angles = np.linalg.norm(so3.log(so3.multiply(so3.inverse(attitudes[:1]), attitudes)), axis=1)
+    return bool((angles > FADE).mean() > _FEW_OUTLIERS)
 
 
 def _inside(data: HeadData, taken: Array) -> NDArray[np.bool_]:

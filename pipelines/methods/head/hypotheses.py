@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -22,6 +23,11 @@ def _inverted(data: HeadData, config: Config) -> tuple[HeadData, Config]:
         R = so3.matrix(data.vision_wxyz)
         covariance = R @ covariance @ np.swapaxes(R, 1, 2)
     return replace(data, vision_wxyz=so3.inverse(data.vision_wxyz), vision_cov=covariance), config
+
+
+def _reordered(data: HeadData, config: Config, order: tuple[int, ...]) -> tuple[HeadData, Config]:
+    """The components of vision's quaternions in another order; what was said of their errors is none of these."""
+    return replace(data, vision_wxyz=data.vision_wxyz[:, order], vision_cov=None), config
 
 
 def _swapped(data: HeadData, config: Config) -> tuple[HeadData, Config] | None:
@@ -62,6 +68,14 @@ HYPOTHESES = FaultModel(
     faults=(
         DataFault(
             "the attitudes of vision are inverted: they map the camera's frame to the markers', not back", _inverted
+        ),
+        DataFault(
+            "the quaternions of vision are given as x, y, z, w where w, x, y, z is meant",
+            partial(_reordered, order=(3, 0, 1, 2)),
+        ),
+        DataFault(
+            "the quaternions of vision are given as w, x, y, z where x, y, z, w is meant",
+            partial(_reordered, order=(1, 2, 3, 0)),
         ),
         DataFault("the topics of helmet and platform IMU are swapped", _swapped),
         DataFault("the platform moves, and no topic tells how: record /platform/imu", _moving, fallback=True),

@@ -63,7 +63,12 @@ class HeadParameters:
 
     @classmethod
     def of(
-        cls, config: Config, platform: bool, drivers: Sequence[Assumption], stamp_sigma: float = 0.0
+        cls,
+        config: Config,
+        platform: bool,
+        drivers: Sequence[Assumption],
+        stamp_sigma: float = 0.0,
+        all_around: bool = False,
     ) -> HeadParameters:
         """With the priors in force; a camera without a moving platform is fixed by default.
 
@@ -72,6 +77,8 @@ class HeadParameters:
             platform: whether there is a platform gyro.
             drivers: SENSITIVITY and TEMPERATURE, in this order, where the helmet's IMU measures their causes.
             stamp_sigma: s, how well the stamps are known.
+            all_around: whether vision shows the helmet turned by half a turn: no scale of its angles but 1 is
+                continuous there, so that it is fixed unless the config says something of it.
         """
         if config.noise.gyro_scale:
             figure = config.noise.gyro_scale
@@ -92,6 +99,8 @@ class HeadParameters:
         bias = triple(BIAS, "rad/s", 0.05, 2e-3, extra=0.0 if platform else EARTH_RATE)
         mounts = triple(HELMET, "rad", 0.35, 1e-2), triple(CAMERA, "rad", 0.35, 1e-2, fixed=not platform)
         offset = quantity(OFFSET, "s", 0.05, 5e-3, False, stamp_sigma)
+        if all_around and "scale" not in config.sensors.camera.model_fields_set:
+            config = config.model_copy(update={"priors": {"vision_scale": 0.0, **config.priors}})
         assumed = chain.from_iterable(quantities(each, config) for each in ASSUMPTIONS)
         known = [q.name for q in (*bias, *mounts[0], *mounts[1], offset, *assumed)]
         check_names(config.priors, known, "priors")

@@ -48,7 +48,7 @@ class HeadData:
     gyro w_ib in b; both None when there is no platform topic. vision_t (K,), vision_wxyz (K, 4): measured cRh, unit.
     vision_cov (K, 3, 3) rad^2: covariance of delta in R*Exp(delta), delta in h; None if unknown. truth_t (T,),
     truth_wxyz (T, 4): bRv, for scoring only, or None. gyro_density, platform_gyro_density, rad/s/sqrt(Hz): from the
-    covariances of the messages, None if they say nothing. head_force (N, 3) m/s^2: specific force by the helmet's
+    covariances of the messages, None if they have none. head_force (N, 3) m/s^2: specific force by the helmet's
     accelerometer in v, at head_t; None if it has none. dropped: reason -> messages. stamp_sigma, s: how well the stamps
     are known, 0 where they are those of the sensors. temperature: of the helmet's IMU, None where nobody measures it.
     """

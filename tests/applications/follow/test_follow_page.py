@@ -80,7 +80,7 @@ def test_it_says_what_to_do_until_enough_is_there_and_comes_back_by_itself(tmp_p
                 assert tab.overflow() == []
             assert tab.value("document.getElementById('reached').textContent").startswith("1 of 2 parameters")
             said = tab.value("document.getElementById('parameters').textContent")
-            assert "delta_px weak± 0.57 deg, wanted 0.057" in said
+            assert "delta_px weak± 0.57 deg, required 0.057" in said
             line = tab.value("document.querySelector('#parameters polyline').getAttribute('points')")
             assert len(line.split()) == 2, "the sigma as it was, and as it is"
         tab.wait(LOST)

@@ -157,7 +157,7 @@ def test_three_poses_are_unobservable_and_say_what_is_missing(alidade: Command, 
         assert words in out
     result = json.loads((tmp_path / "out" / "result.json").read_text())
     assert result["status"] == "unobservable"
-    assert len(result["findings"]["static_poses"]) == 3
+    assert len(result["tables"]["static_poses"]) == 3
 
 
 def test_from_recording_to_other_programs(alidade: Command, tmp_path: Path, data: CubeData) -> None:

@@ -106,7 +106,7 @@ def test_static_poses_are_told_with_what_was_used(solved: Solved) -> None:
 def test_figures_and_tables(solved: Solved) -> None:
     plots = _plots(solved)
     assert list(plots) == [
-        "Sensors taken apart",
+        "Scale, non-orthogonality, misalignment",
         "White noise at rest",
         "Static poses",
         "Accelerometer before and after",
@@ -121,7 +121,7 @@ def test_figures_and_tables(solved: Solved) -> None:
         assert np.sqrt((before**2).mean()) > least * np.sqrt((after**2).mean())
     raw, good, _ = plots["Sphere of the accelerometer"].beside[1].marks
     assert np.abs(good.y).max() < 0.1 < 1.0 < np.abs(raw.y).max()
-    table = plots["Sensors taken apart"]
+    table = plots["Scale, non-orthogonality, misalignment"]
     assert isinstance(table, Table)
     assert table.columns == ("", "accelerometer", "gyro", "magnetometer")
     assert [row[0] for row in table.rows][::3] == ["scale error x, %", "non-orthogonality xy, deg", "mounting x, deg"]

@@ -120,7 +120,7 @@ def _held(data: LosData, share: float) -> LosData:
         ),
         (_nearly_one_error, r"/los/error: x and z read the same value in 97 % of the 600 messages: the tracker"),
         (_one_axis, r"/los/error: z reads the same value in all 600 messages: the tracker did not measure; check"),
-        (lambda data: _held(data, 0.8), r"/los/error: \d\d % of the samples cannot be used: frozen, .* on axis x, the"),
+        (lambda data: _held(data, 0.8), r"/los/error: \d\d % of the samples cannot be used: stuck .* on axis x, the"),
     ],
 )
 def test_bad_input_is_named(tmp_path: Path, spoil: Callable[[LosData], LosData], said: str) -> None:
@@ -132,7 +132,7 @@ def test_bad_input_is_named(tmp_path: Path, spoil: Callable[[LosData], LosData],
 def test_what_a_tracker_holds_is_left_out_and_counted(tmp_path: Path) -> None:
     back = _back(tmp_path / "s.mcap", _held(DATA, 0.15))
     ((what, number),) = back.dropped.items()
-    assert what == "/los/error: frozen, the same value for long"
+    assert what == "/los/error: stuck at one value"
     # Of six stretches of fourteen one may end where the error happens to be what it was.
     assert number in (5 * 14, 6 * 14)
     assert len(back.image_t) == len(back.error) == len(DATA.image_t) - number

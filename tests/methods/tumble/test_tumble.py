@@ -344,7 +344,7 @@ def test_few_directions_are_told_and_not_guessed() -> None:
     assert calibration.status in ("weak", "unobservable")
     error = calibration.estimate.values - np.array([simulated.truth[n] for n in calibration.estimate.names])
     assert np.abs(error / calibration.estimate.sigmas).max() < 4.0
-    (row,) = calibration.findings["coverage"]
+    (row,) = calibration.tables["coverage"]
     assert "turn it there too" in str(row["says"])
 
 

@@ -36,9 +36,9 @@ class GyroPair(Method):
     rotations: ClassVar[Mapping[str, str]] = {"rotation": "aRb"}
     of_recording = ("bias_difference_*",)
     meanings: ClassVar[Mapping[str, str]] = {
-        r"rotation_([xyz])": "How gyro b is mounted against gyro a, part {0} of the rotation vector.",
-        r"bias_difference_([xyz])": "What gyro b reads about {0} at rest less what gyro a reads there, in b.",
-        r"time_offset": "How much later than gyro b's stamps its readings are, on gyro a's clock.",
+        r"rotation_([xyz])": "Rotation gyro b to gyro a (aRb), {0} of the rotation vector.",
+        r"bias_difference_([xyz])": "Bias of gyro b minus bias of gyro a about {0}, in b.",
+        r"time_offset": "Time offset of gyro b (true time minus stamp, on gyro a's clock).",
     }
     scenarios = Path(__file__).parent / "scenarios"
 

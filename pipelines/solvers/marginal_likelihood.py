@@ -1,0 +1,785 @@
+"""Noise levels by maximum marginal likelihood (Laplace), all families together with the parameters.
+
+About a solution the problem is linear: rows r + J x of variance v(h), h the noise levels, x the states of a chain and
+the shared parameters. Integrating x out leaves, up to a constant,
+
+    -2 log L = chi2(minimum) + log det H + sum log v + sum ((log h - log h0) / sigma_h)^2
+
+with H the information of states and parameters, priors included (Harville, J. Amer. Stat. Assoc. 1977; Barfoot, Forbes,
+Yoon, IEEE RA-L 2020). Its gradient is zero where restricted maximum likelihood's equations hold. It is maximised over
+log h at a fixed linearisation; the caller then solves with the levels found, and linearises again.
+
+Measurements whose innovation lies beyond the gate are widened until it does not, never left out for that: leaving them
+out lowers the level, and the lower level leaves out more. The nodes of a bias that walks stay where the solution has
+them, relative to the first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from alidade.factors.chi_square import gate
+from alidade.pipelines.estimation.noise import ROUGHLY, Level
+from alidade.pipelines.estimation.problem import Problem
+from alidade.pipelines.solvers.chain import Array, Index
+from alidade.pipelines.solvers.engines import Compiled
+from alidade.pipelines.solvers.layout import Tangent, Values
+from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize
+from alidade.pipelines.solvers.linearization import Linearization
+from alidade.pipelines.solvers.noise_estimation import apply_levels, group_weights
+
+Outliers = Mapping[int, NDArray[np.bool_]]
+
+# A measurement is widened to the 99.9 % gate of its innovation, and an outlier beyond so many times that.
+OUTLIER_GATES = 3.0
+# Keyframes that are enough to tell levels: of a longer recording half of them are the liveliest.
+ENOUGH_KEYFRAMES = 6000
+# Newton steps, none longer than this in the logarithm of a level; they stop where none is longer than that.
+_MOST_STEPS, _LONGEST_STEP, _SETTLED = 25, 1.5, 3e-3
+# A step may be shortened so often, and raise -2 log L by so much: rounding.
+_HALVINGS, _FINE = 6, 1e-3
+# s, within which errors may be correlated however they are.
+SANDWICH_BLOCK_S = 5.0
+# Linearisations, of which the first ones widen; levels have settled whose logarithms move by less.
+_MOST_ROUNDS, _WIDENING_ROUNDS, _STEADY = 8, 2, 0.02
+# Of the gate, where measurements that are widened lie at most.
+_INSIDE = 0.9
+# Random right sides that tell traces: a quarter of a level's own sigma.
+_SIGNS = 24
+# Innovations are predicted from so many keyframes before at least, in pieces of so many.
+_WARM_UP, _PIECE = 50, 100
+# Information of a state before anything is known, over that of its neighbour's rows.
+_DIFFUSE = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Rows of the measurements of one kind, whitened as stated.
+
+    Attributes:
+        family: of all of them.
+        group: number of theirs among the linearisation's.
+        time: (n,) s.
+        residuals: (n, m).
+        states: the states (n,) that they are about, none, one or two, and Jacobians (n, m, d).
+        shared: (n, m, p).
+        beside: (n,) what a unit of the noise beside their own adds, or None.
+        is_measurement: whether they may be outliers.
+    """
+
+    family: str
+    group: int
+    time: Array
+    residuals: Array
+    states: tuple[tuple[Index, Array], ...]
+    shared: Array
+    beside: Array | None
+    is_measurement: bool
+
+    def of(self, kept: NDArray[np.bool_], renumbered: Index) -> Rows:
+        """Some of them, with other numbers of states."""
+        states = tuple((renumbered[i[kept]], J[kept]) for i, J in self.states)
+        beside = None if self.beside is None else self.beside[kept]
+        parts = (self.time[kept], self.residuals[kept], states, self.shared[kept], beside)
+        return Rows(self.family, self.group, *parts, self.is_measurement)
+
+
+@dataclass(frozen=True, eq=False)
+class Innovations:
+    """Innovations of n measurements of one kind.
+
+    Attributes:
+        squares: (n,) of their norms over their own covariance.
+        whitened: (n, m, 1 + p) by the covariance they are used with, and their derivatives by the shared parameters,
+            none where these were not asked for.
+    """
+
+    squares: Array
+    whitened: Array
+
+
+@dataclass(frozen=True, eq=False)
+class LinearChain:
+    """A problem about a solution: states of a chain, each joined to the next at most, and shared parameters.
+
+    Attributes:
+        size: N states of d numbers.
+        rows: by kind.
+        prior: (r, p + 1) rows of the shared parameters alone, residuals last.
+    """
+
+    size: tuple[int, int]
+    rows: tuple[Rows, ...]
+    prior: Array
+
+    @classmethod
+    def of(cls, linearization: Linearization, values: Values) -> LinearChain:
+        """From a problem's factors, weighed as stated, about some values."""
+        (n, d, _, c, p), drafts = linearization.layout.sizes, list[Rows]()
+        prior = [np.zeros((0, p + 1))]
+        for number, group in enumerate(linearization.under(None).groups):
+            if group.target == "walk":
+                continue
+            begin = {"state": d + c, "pair": 2 * d + c, "shared": 0}[group.target]
+            whole, _ = group.rows(values, begin + p + 1)
+            whole[..., -1] *= -1.0
+            if group.target == "shared" and not group.is_measurement:
+                prior.append(whole.reshape(-1, p + 1))
+                continue
+            states: tuple[tuple[Index, Array], ...] = ()
+            if group.target != "shared":
+                states = ((group.place, whole[..., :d]),)
+            if group.target == "pair":
+                states = ((group.place - 1, whole[..., d : 2 * d]), *states)
+            drafts.append(
+                Rows(
+                    group.family,
+                    number,
+                    np.asarray(group.model.time),
+                    whole[..., -1],
+                    states,
+                    whole[..., begin:-1],
+                    group.beside,
+                    group.is_measurement,
+                )
+            )
+        return cls((n, d), tuple(drafts), np.concatenate(prior))
+
+    def liveliest(self, factors: list[Array], most: int = ENOUGH_KEYFRAMES) -> tuple[LinearChain, list[Array]]:
+        """That over some pieces, half of them those with most motion, and what else is about its rows.
+
+        What grows with motion shows there; what is white everywhere.
+        """
+        n = self.size[0]
+        if n <= most:
+            return self, factors
+        drive = np.zeros(n)
+        for rows in self.rows:
+            if rows.beside is not None and rows.states:
+                np.maximum.at(drive, rows.states[-1][0], rows.beside)
+        pieces, wanted = np.arange(n) // (2 * _PIECE), most // (2 * _PIECE)
+        size = np.bincount(pieces, drive) / np.bincount(pieces)
+        chosen = np.zeros(len(size), dtype=bool)
+        chosen[np.argsort(-size)[: wanted // 2]] = True
+        rest = np.flatnonzero(~chosen)
+        chosen[rest[np.linspace(0, len(rest) - 1, wanted - wanted // 2).astype(int)]] = True
+        kept = chosen[pieces]
+        renumbered = np.cumsum(kept) - 1
+        inside = [np.all([np.ones(len(r.time), bool), *(kept[i] for i, _ in r.states)], axis=0) for r in self.rows]
+        some = tuple(rows.of(own, renumbered) for rows, own in zip(self.rows, inside, strict=True))
+        part = replace(self, size=(int(kept.sum()), self.size[1]), rows=some)
+        return part, [each[own] for each, own in zip(factors, inside, strict=True)]
+
+    def variances(self, levels: Sequence[Level]) -> list[Array]:
+        """(n,) of each kind of rows, over what was stated."""
+        return [_variance(rows, levels) for rows in self.rows]
+
+    def solved(self, variances: Sequence[Array]) -> _Solution | None:
+        """The most likely states and parameters given variances (n,) of the rows of each kind; None: undetermined.
+
+        Rows of infinite variance have no say.
+        """
+        from scipy.linalg import cho_solve_banded, cholesky_banded
+
+        (n, d), p = self.size, self.prior.shape[1] - 1
+        Hd, Ho, Hs, g = np.zeros((n, d, d)), np.zeros((n, d, d)), np.zeros((n, d, p)), np.zeros((n, d))
+        Hss, gs = self.prior[:, :p].T @ self.prior[:, :p], self.prior[:, :p].T @ self.prior[:, p]
+        total, weights = float((self.prior[:, p] ** 2).sum()), []
+        for rows, variance, (square, own, crossed, projected, mixed) in zip(
+            self.rows, variances, self._products, strict=True
+        ):
+            counted = np.isfinite(variance)
+            w = np.where(counted, 1.0 / variance, 0.0)
+            weights.append(np.sqrt(w))
+            total += float((w * square).sum()) + rows.residuals.shape[1] * float(np.log(variance[counted]).sum())
+            for (i, _), JJ, Jr, JS in zip(rows.states, own, projected, mixed, strict=True):
+                _add(Hd, i, w[:, None, None] * JJ)
+                _add(g, i, w[:, None] * Jr)
+                _add(Hs, i, w[:, None, None] * JS)
+            if crossed is not None:
+                _add(Ho, rows.states[0][0], w[:, None, None] * crossed)
+            flat = (weights[-1][:, None, None] * rows.shared).reshape(-1, p)
+            Hss += flat.T @ flat
+            gs += flat.T @ (weights[-1][:, None] * rows.residuals).ravel()
+        try:
+            root = cholesky_banded(_banded(Hd, Ho), check_finite=False)
+            border = Hs.reshape(n * d, p)
+            X = cho_solve_banded((root, False), border, check_finite=False)
+            small = np.linalg.cholesky(Hss - border.T @ X)
+        except np.linalg.LinAlgError:
+            return None
+        found = _Solution(self, weights, root, X, small, np.zeros(n * d), np.zeros(p), 0.0)
+        states, shared = found.solve(-g.reshape(-1, 1), -gs[:, None])
+        chi_square = total + float(g.ravel() @ states[:, 0] + gs @ shared[:, 0])
+        value = chi_square + 2.0 * float(np.log(root[-1]).sum() + np.log(np.diag(small)).sum())
+        return replace(found, states=states[:, 0], shared=shared[:, 0], value=value)
+
+    @cached_property
+    def _products(self) -> list[tuple[Array, list[Array], Array | None, list[Array], list[Array]]]:
+        """Of each kind what does not change with the levels: squares, J'J, J_i'J_j, J'r and J'J_shared."""
+        return [_products(rows) for rows in self.rows]
+
+    def innovations(
+        self, variances: Sequence[Array], limits: Sequence[float], by_shared: bool = False
+    ) -> dict[int, Innovations]:
+        """Innovations of measurements, by number of their kind.
+
+        Predicted from the keyframes before, parameters as they are, by a filter that uses what lies beyond a limit with
+        a variance that takes it there. In pieces that begin with nothing known `_WARM_UP` keyframes before, all at the
+        same time.
+
+        Args:
+            variances: of each kind of rows (n,).
+            limits: of their squares, of each kind.
+            by_shared: also how they go with the shared parameters.
+        """
+        n, d = self.size
+        q = 1 + (self.prior.shape[1] - 1 if by_shared else 0)
+        F, c, Q = self._transitions(variances, by_shared)
+        seen = [k for k, rows in enumerate(self.rows) if rows.is_measurement and len(rows.states) == 1]
+        queues = {k: _queue(self.rows[k].states[0][0], n) for k in seen}
+        found = {k: (np.zeros(len(self.rows[k].time)), np.zeros((*self.rows[k].residuals.shape, q))) for k in seen}
+        starts = np.arange(0, n, _PIECE)
+        begin = np.maximum(starts - _WARM_UP, 0)
+        x, P = np.zeros((len(begin), d, q)), np.tile(np.eye(d) / _DIFFUSE, (len(begin), 1, 1))
+        for step_ in range(_PIECE + _WARM_UP):
+            live = np.flatnonzero(begin + step_ < np.minimum(starts + _PIECE, n))
+            k = begin[live] + step_
+            if step_ and len(live):
+                x[live] = F[k] @ x[live] + c[k]
+                P[live] = F[k] @ P[live] @ np.swapaxes(F[k], 1, 2) + Q[k]
+            for kind in seen:
+                rows, (order, begins, counts) = self.rows[kind], queues[kind]
+                for again in range(int(counts[k].max(initial=0))):
+                    some = np.flatnonzero(counts[k] > again)
+                    own, row = live[some], order[begins[k[some]] + again]
+                    J, v = rows.states[0][1][row], variances[kind][row][:, None, None] * np.eye(rows.residuals.shape[1])
+                    y = rows.residuals[row][..., None]
+                    if by_shared:
+                        y = np.concatenate([y, rows.shared[row]], axis=2)
+                    y = y + J @ x[own]
+                    Jt = np.swapaxes(J, 1, 2)
+                    S = J @ P[own] @ Jt + v
+                    square = _square(S, y[..., 0])
+                    widened = np.maximum(square / limits[kind], 1.0)[:, None, None]
+                    S = J @ P[own] @ Jt + widened * v
+                    squares, whitened = found[kind]
+                    squares[row] = square
+                    whitened[row] = np.linalg.solve(np.linalg.cholesky(S), y)
+                    K = P[own] @ Jt @ np.linalg.inv(S)
+                    x[own] -= K @ y
+                    P[own] -= K @ J @ P[own]
+        return {kind: Innovations(*each) for kind, each in found.items()}
+
+    def _transitions(self, variances: Sequence[Array], by_shared: bool) -> tuple[Array, Array, Array]:
+        """x_k = F_k x_k-1 + c_k and the covariance Q_k; a state that nothing joins to the one before is diffuse.
+
+        `c` has the derivatives by the shared parameters beside it where they are asked for.
+        """
+        n, d = self.size
+        q = self.prior.shape[1] if by_shared else 1
+        F, c, Q = np.zeros((n, d, d)), np.zeros((n, d, q)), np.tile(np.eye(d) / _DIFFUSE, (n, 1, 1))
+        for rows, variance in zip(self.rows, variances, strict=True):
+            if len(rows.states) != 2 or rows.residuals.shape[1] != d:
+                continue
+            (_, before), (now, after) = rows.states
+            inverse = np.linalg.inv(after)
+            right = rows.residuals[..., None]
+            if by_shared:
+                right = np.concatenate([right, rows.shared], axis=2)
+            F[now], c[now] = -inverse @ before, -inverse @ right
+            Q[now] = variance[:, None, None] * inverse @ np.swapaxes(inverse, 1, 2)
+        return F, c, Q
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    """A chain's most likely states and parameters.
+
+    Attributes:
+        chain: the problem.
+        weights: of each kind of rows, (n,) their inverse sigmas, 0 for those without a say.
+        root: Cholesky factor of the states' information, banded.
+        border: (N d, p) that information's inverse times the part it has in common with the shared parameters.
+        small: Cholesky factor of the shared parameters' information, states integrated out.
+        states, shared: (N d,), (p,).
+        value: -2 log L but for the levels' prior.
+    """
+
+    chain: LinearChain
+    weights: list[Array]
+    root: Array
+    border: Array
+    small: Array
+    states: Array
+    shared: Array
+    value: float
+
+    def solve(self, states: Array, shared: Array) -> tuple[Array, Array]:
+        """Information's inverse times right sides (N d, k) and (p, k)."""
+        from scipy.linalg import cho_solve_banded
+
+        right = shared - self.border.T @ states
+        x = np.linalg.solve(self.small.T, np.linalg.solve(self.small, right))
+        return cho_solve_banded((self.root, False), states, check_finite=False) - self.border @ x, x
+
+    def gathered(self, of_rows: Sequence[Array]) -> tuple[Array, Array]:
+        """A'y of whitened rows y (n, m, k) of each kind."""
+        (n, d), p, k = self.chain.size, self.chain.prior.shape[1] - 1, of_rows[0].shape[2]
+        states, shared = np.zeros((n, d, k)), np.zeros((p, k))
+        for rows, w, y in zip(self.chain.rows, self.weights, of_rows, strict=True):
+            weighed = w[:, None, None] * y
+            for i, J in rows.states:
+                _add(states, i, np.swapaxes(J, 1, 2) @ weighed)
+            shared += rows.shared.reshape(-1, p).T @ weighed.reshape(-1, k)
+        return states.reshape(n * d, k), shared
+
+    def spread(self, states: Array, shared: Array) -> list[Array]:
+        """A x, whitened rows (n, m, k) of each kind, of states (N d, k) and shared parameters (p, k)."""
+        n, d = self.chain.size
+        each, out = states.reshape(n, d, -1), []
+        for rows, w in zip(self.chain.rows, self.weights, strict=True):
+            y = rows.shared @ shared
+            for i, J in rows.states:
+                y += J @ each[i]
+            out.append(w[:, None, None] * y)
+        return out
+
+    def residuals(self) -> list[Array]:
+        """Whitened (n, m) of each kind."""
+        moved = self.spread(self.states[:, None], self.shared[:, None])
+        return [
+            w[:, None] * rows.residuals + y[..., 0]
+            for rows, w, y in zip(self.chain.rows, self.weights, moved, strict=True)
+        ]
+
+    def score(self, parts: Sequence[Sequence[Array]], signs: Sequence[Array]) -> tuple[Array, Array]:
+        """Half the gradient (q,) of -2 log L by the logarithms of levels, and the average information (q, q).
+
+        With v a row's variance, f the part of it that is a level's, e its whitened residual and l its leverage, the
+        gradient is sum f (1 - l - e^2), traces by random signs (Hutchinson 1989), and the information 2 (f e)' P (f e)
+        with P = I - A H^-1 A' (Gilmour, Thompson, Cullis, Biometrics 1995).
+
+        Args:
+            parts: f of each level, (n,) for each kind of rows.
+            signs: (n, m, k) for each kind of rows.
+        """
+        e, q = self.residuals(), len(parts)
+        scaled = [
+            np.stack([part[i][:, None] * e[i] for part in parts], axis=2) if q else np.zeros((*e[i].shape, 0))
+            for i in range(len(e))
+        ]
+        drawn = [(w > 0.0)[:, None, None] * sign for w, sign in zip(self.weights, signs, strict=True)]
+        both = [np.concatenate([y, sign], axis=2) for y, sign in zip(scaled, drawn, strict=True)]
+        projected = self.spread(*self.solve(*self.gathered(both)))
+        gradient, information = np.zeros(q), np.zeros((q, q))
+        for i, (y, hat) in enumerate(zip(scaled, projected, strict=True)):
+            information += 2.0 * np.einsum("nmc,nmd->cd", y, y - hat[..., :q])
+            counted = self.weights[i] > 0.0
+            leverage = (drawn[i] * hat[..., q:]).sum(axis=1).mean(axis=1)
+            left = np.where(counted, e[i].shape[1] - leverage - (e[i] ** 2).sum(axis=1), 0.0)
+            gradient += [float((part[i] * left).sum()) for part in parts]
+        return gradient, 0.5 * (information + information.T)
+
+
+@dataclass(frozen=True, eq=False)
+class LevelEstimate:
+    """Levels at a linearisation, with their sigmas, and -2 log L there, the levels' own prior included."""
+
+    levels: tuple[Level, ...]
+    minus_two_log_likelihood: float
+
+
+def estimate_levels(
+    chain: LinearChain,
+    levels: Sequence[Level],
+    widening: Mapping[int, Array] | None = None,
+    rejected: Mapping[int, NDArray[np.bool_]] | None = None,
+) -> LevelEstimate:
+    """Levels that maximise the marginal likelihood at a linearisation, by Newton steps with average information.
+
+    What is stated counts as roughly known at first, which gives what the recording says; then as well as it is known,
+    unless the recording contradicts it.
+
+    Args:
+        chain: the problem about a solution.
+        levels: to begin with.
+        widening: group -> (n,) as it is, None: none.
+        rejected: group -> (n,) measurements that are taken for outliers, which have no say.
+    """
+    wide, out = _by_row(chain, widening, 1.0), _by_row(chain, rejected, 0.0)
+    factors = [np.where(o > 0.0, np.inf, w**2) for w, o in zip(wide, out, strict=True)]
+    some, own = chain.liveliest(factors)
+    free = [i for i, level in enumerate(levels) if level.noise.estimated and _present(chain, level)]
+    if not free:
+        return LevelEstimate(tuple(levels), np.inf)
+    roughly = np.array([max(levels[i].noise.known, ROUGHLY) for i in free])
+    found = _maximum(some, own, levels, free, roughly)
+    closely = np.array([found.levels[i].known for i in free])
+    if (closely >= roughly).all():
+        return found
+    used = _maximum(some, own, found.levels, free, closely)
+    pairs = zip(used.levels, found.levels, strict=True)
+    told = tuple(replace(now, found=then.found, sigma=then.sigma) for now, then in pairs)
+    return replace(used, levels=told)
+
+
+def _maximum(
+    chain: LinearChain, factors: Sequence[Array], levels: Sequence[Level], free: Sequence[int], known: Array
+) -> LevelEstimate:
+    """The maximum with some levels free, known (k,) as sigmas of their logarithms; `factors` multiply variances."""
+    generator = np.random.default_rng(0)
+    signs = [generator.choice([-1.0, 1.0], (*rows.residuals.shape, _SIGNS)) for rows in chain.rows]
+
+    def at(u: Array) -> tuple[float, tuple[Level, ...], _Solution | None]:
+        tried = _at(levels, free, u)
+        found = chain.solved([v * f for v, f in zip(chain.variances(tried), factors, strict=True)])
+        return np.inf if found is None else found.value + float(((u / known) ** 2).sum()), tried, found
+
+    u = np.log([levels[i].scale for i in free])
+    value, tried, solution = at(u)
+    information = np.diag(known**-2.0)
+    for _ in range(_MOST_STEPS):
+        if solution is None:
+            break
+        gradient, information = solution.score([_parts(chain, tried, i) for i in free], signs)
+        gradient, information = gradient + u / known**2, information + np.diag(known**-2.0)
+        move = -np.linalg.solve(information, gradient)
+        move *= min(1.0, _LONGEST_STEP / max(float(np.abs(move).max()), 1e-300))
+        for _ in range(_HALVINGS):
+            ahead = at(u + move)
+            if ahead[0] < value + _FINE:
+                break
+            move = 0.3 * move
+        else:
+            break
+        u = u + move
+        value, tried, solution = ahead
+        if float(np.abs(move).max()) < _SETTLED:
+            break
+    return LevelEstimate(_known(tried, free, np.sqrt(np.diag(np.linalg.inv(information)))), value)
+
+
+def widened(
+    chain: LinearChain, levels: Sequence[Level], rejected: Mapping[int, NDArray[np.bool_]]
+) -> tuple[dict[int, Array], dict[int, NDArray[np.bool_]]]:
+    """By group, by how much its measurements are widened at some levels (n,), and which are outliers (n,).
+
+    An outlier is what was rejected and still lies beyond `OUTLIER_GATES` gates.
+    """
+    before = [np.asarray(each, dtype=bool) for each in _by_row(chain, rejected, 0.0)]
+    limits = [gate(rows.residuals.shape[1]) ** 2 for rows in chain.rows]
+    wide: dict[int, Array] = {}
+    outlying: dict[int, NDArray[np.bool_]] = {}
+    for kind, each in chain.innovations(chain.variances(levels), limits).items():
+        squares = each.squares
+        out = before[kind] & (squares > OUTLIER_GATES**2 * limits[kind])
+        by = np.where(out, 1.0, np.sqrt(np.maximum(squares / limits[kind], 1.0)))
+        wide[chain.rows[kind].group], outlying[chain.rows[kind].group] = by, out
+    return wide, outlying
+
+
+def step(
+    chain: LinearChain,
+    levels: Sequence[Level],
+    widening: Mapping[int, Array],
+    rejected: Mapping[int, NDArray[np.bool_]],
+) -> tuple[Array, Array]:
+    """The Gauss-Newton step at some levels: states (N, d) and shared parameters (p,); zero where undetermined."""
+    wide, out = _by_row(chain, widening, 1.0), _by_row(chain, rejected, 0.0)
+    factors = [np.where(o > 0.0, np.inf, w**2) for w, o in zip(wide, out, strict=True)]
+    solution = chain.solved([v * f for v, f in zip(chain.variances(levels), factors, strict=True)])
+    if solution is None:
+        return np.zeros(chain.size), np.zeros(chain.prior.shape[1] - 1)
+    return solution.states.reshape(chain.size), solution.shared
+
+
+def sandwich_ratio(
+    chain: LinearChain, levels: Sequence[Level], rejected: Mapping[int, NDArray[np.bool_]], reported: Array
+) -> Array:
+    """Sandwich over nominal sigma of numbers that are linear in the shared parameters, (r,).
+
+    With innovations e and their derivatives G by the shared parameters, C = (G'G + prior)^-1 is the nominal covariance,
+    and C B C, B the sum over blocks of `SANDWICH_BLOCK_S` of G'e e'G and the prior's information, what it is whatever
+    is correlated within blocks (Liang, Zeger, Biometrika 1986). Above 1 where something errs slowly that no noise of
+    the model has, as with the pose.
+
+    Args:
+        chain: about the solution.
+        levels: in force.
+        rejected: group -> (n,) outliers.
+        reported: (r, p) derivatives of the numbers.
+    """
+    out = _by_row(chain, rejected, 0.0)
+    variances = [np.where(o > 0.0, 1e12 * v, v) for o, v in zip(out, chain.variances(levels), strict=True)]
+    limits = [gate(rows.residuals.shape[1]) ** 2 for rows in chain.rows]
+    p = chain.prior.shape[1] - 1
+    known = chain.prior[:, :p].T @ chain.prior[:, :p]
+    information, middle = known.copy(), known.copy()
+    for kind, each in chain.innovations(variances, limits, by_shared=True).items():
+        time = chain.rows[kind].time
+        e, G = each.whitened[..., 0], each.whitened[..., 1:]
+        information += np.einsum("nmi,nmj->ij", G, G)
+        block = ((time - time.min()) / SANDWICH_BLOCK_S).astype(int)
+        sums = np.zeros((int(block.max()) + 1, p))
+        np.add.at(sums, block, np.einsum("nmi,nm->ni", G, e))
+        middle += sums.T @ sums
+    C = np.linalg.pinv(information, hermitian=True)
+    nominal = np.einsum("ri,ij,rj->r", reported, C, reported)
+    robust = np.einsum("ri,ij,rj->r", reported, C @ middle @ C, reported)
+    return np.sqrt(np.divide(robust, nominal, out=np.ones_like(nominal), where=nominal > 0.0))
+
+
+def _square(S: Array, y: Array) -> Array:
+    """y' S^-1 y, (n,)."""
+    return np.asarray(np.einsum("ni,ni->n", y, np.linalg.solve(S, y[..., None])[..., 0]))
+
+
+def _by_row(chain: LinearChain, of: Mapping[int, NDArray[Any]] | None, otherwise: float) -> list[Array]:
+    """(n,) of each kind of rows, from what groups have."""
+    known = of or {}
+    return [np.asarray(known.get(r.group, np.full(len(r.time), otherwise)), dtype=float) for r in chain.rows]
+
+
+def _present(chain: LinearChain, level: Level) -> bool:
+    """Whether rows tell of a noise."""
+    return any(
+        rows.family in level.noise.families and (rows.beside is not None or not level.noise.beside)
+        for rows in chain.rows
+    )
+
+
+def _variance(rows: Rows, levels: Sequence[Level]) -> Array:
+    """(n,) over what was stated."""
+    out = np.ones(len(rows.time))
+    for level in levels:
+        if rows.family in level.noise.families and not level.noise.beside:
+            out *= level.scale**2
+    for level in levels:
+        if rows.family in level.noise.families and level.noise.beside and rows.beside is not None:
+            out += (level.used * rows.beside) ** 2
+    return out
+
+
+def _at(levels: Sequence[Level], free: Sequence[int], u: Array) -> tuple[Level, ...]:
+    """The levels with logarithms of some scales."""
+    out = list(levels)
+    for i, each in zip(free, u.tolist(), strict=True):
+        out[i] = replace(out[i], scale=float(np.exp(each)))
+    return tuple(out)
+
+
+def _parts(chain: LinearChain, levels: Sequence[Level], which: int) -> list[Array]:
+    """(n,) of each kind of rows, the part of their variance that is one of the levels'."""
+    level, out = levels[which], []
+    for rows in chain.rows:
+        if rows.family not in level.noise.families or (level.noise.beside and rows.beside is None):
+            out.append(np.zeros(len(rows.time)))
+            continue
+        beside = own = np.zeros(len(rows.time))
+        for other in levels:
+            if other.noise.beside and rows.family in other.noise.families and rows.beside is not None:
+                part = (other.used * rows.beside) ** 2
+                beside = beside + part
+                if other is level:
+                    own = part
+        if not level.noise.beside:
+            own = _variance(rows, levels) - beside
+        out.append(own / _variance(rows, levels))
+    return out
+
+
+def _known(levels: Sequence[Level], free: Sequence[int], spread: Array) -> tuple[Level, ...]:
+    """The levels with what was found and how well."""
+    out = list(levels)
+    for i, sigma in zip(free, spread.tolist(), strict=True):
+        out[i] = replace(out[i], found=out[i].scale, sigma=out[i].scale * sigma)
+    return tuple(out)
+
+
+def _products(rows: Rows) -> tuple[Array, list[Array], Array | None, list[Array], list[Array]]:
+    """See LinearChain._products."""
+    r = rows.residuals
+    transposed = [np.swapaxes(J, 1, 2) for _, J in rows.states]
+    crossed = transposed[0] @ rows.states[1][1] if len(rows.states) == 2 else None
+    return (
+        np.asarray((r**2).sum(axis=1)),
+        [Jt @ J for Jt, (_, J) in zip(transposed, rows.states, strict=True)],
+        crossed,
+        [(Jt @ r[..., None])[..., 0] for Jt in transposed],
+        [Jt @ rows.shared for Jt in transposed],
+    )
+
+
+def _add(to: Array, at: Index, blocks: Array) -> None:
+    """Add blocks (n, ...) at positions that may repeat."""
+    if len(at) and (np.diff(at) > 0).all():
+        to[at] += blocks
+    else:
+        np.add.at(to, at, blocks)
+
+
+def _banded(diagonal: Array, ahead: Array) -> Array:
+    """Upper band of a block-tridiagonal matrix from its diagonal blocks (n, d, d) and those to the next state."""
+    n, d, _ = diagonal.shape
+    u = 2 * d - 1
+    band = np.zeros((u + 1, n * d))
+    for a in range(d):
+        for b in range(d):
+            if b >= a:
+                band[u + a - b, b::d] = diagonal[:, a, b]
+            band[u + a - b - d, d + b :: d] = ahead[:-1, a, b]
+    return band
+
+
+def _queue(state: Index, n: int) -> tuple[Index, Index, Index]:
+    """Measurements in order of their states, where those of each state begin (n,) and how many it has (n,)."""
+    counts = np.bincount(state, minlength=n)
+    return np.argsort(state, kind="stable"), np.cumsum(counts) - counts, counts
+
+
+@dataclass(frozen=True, eq=False)
+class LikelihoodMaximum:
+    """Values and levels of the largest marginal likelihood.
+
+    Attributes:
+        values: of all variables.
+        levels: of the noises.
+        widening: group -> (n,) by which sigmas of measurements are multiplied.
+        outliers: group -> (n,) which are rejected.
+    """
+
+    values: Values
+    levels: tuple[Level, ...]
+    widening: Mapping[int, Array]
+    outliers: Outliers
+
+
+def maximise_likelihood(
+    linearization: Linearization,
+    values: Values,
+    levels: Sequence[Level],
+    outliers: Outliers,
+    rounds: int = _MOST_ROUNDS,
+) -> LikelihoodMaximum:
+    """Levels and values in turn: levels at a linearisation, a Gauss-Newton step with them, and again.
+
+    Args:
+        linearization: of the factors, with the noise stated.
+        values: to begin with, near the solution.
+        levels: to begin with.
+        outliers: group -> (n,) which measurements are rejected.
+        rounds: linearisations.
+    """
+    wide: dict[int, Array] = {}
+    found = tuple(levels)
+    _, _, nodes, c, _ = linearization.layout.sizes
+    for number in range(rounds):
+        chain = LinearChain.of(linearization, values)
+        before, found = found, estimate_levels(chain, found, wide, outliers).levels
+        if number < _WIDENING_ROUNDS:
+            wide, outliers = widened(chain, found, outliers)
+        states, shared = step(chain, found, wide, outliers)
+        values = linearization.layout.retract(values, Tangent(states, np.zeros((nodes, c)), shared))
+        changed = max((abs(np.log(a.scale / b.scale)) for a, b in zip(found, before, strict=True)), default=0.0)
+        if number >= _WIDENING_ROUNDS and changed < _STEADY:
+            break
+    return LikelihoodMaximum(values, found, wide, outliers)
+
+
+def rejected(engine: Linearization, values: Values) -> dict[int, NDArray[np.bool_]]:
+    """Group -> (n,) which measurements the loss in force rejects."""
+    return {
+        i: group.used(group.evaluate(values)[0]) < 0.5 for i, group in enumerate(engine.groups) if group.is_measurement
+    }
+
+
+def solution_at(
+    linearization: Linearization, problem: Problem, found: LikelihoodMaximum, config: LevenbergConfig
+) -> Solution:
+    """The solution near a maximum: outliers are rejected, all other measurements wide enough to count."""
+    weighted, groups = apply_levels(linearization, found.levels), []
+    for i, group in enumerate(weighted.groups):
+        if not group.is_measurement:
+            groups.append(group)
+            continue
+        weights = group_weights(group)
+        if i in found.widening:
+            weights = weights / found.widening[i][:, None]
+        if problem.loss is not None:
+            norms = np.linalg.norm(weights * group.evaluate(found.values)[0], axis=1)
+            by = np.maximum(norms / (_INSIDE * problem.loss.gate), 1.0)
+            weights = weights / np.where(found.outliers.get(i, np.zeros(len(by), bool)), 1.0, by)[:, None]
+        groups.append(replace(group, weights=weights))
+    return minimize(weighted.with_groups(groups).under(problem.loss), found.values, config)
+
+
+def solve_likelihood(
+    compiled: Compiled, solution: Solution, levels: Sequence[Level], config: LevenbergConfig
+) -> tuple[Compiled, Solution, tuple[Level, ...]]:
+    """The solution at the noise levels of the largest marginal likelihood, of a problem fine enough for them.
+
+    Args:
+        compiled: the problem, compiled for the chain.
+        solution: with the levels given.
+        levels: to begin with.
+        config: of the last minimisation.
+    """
+    problem, engine = compiled.problem, compiled.engine
+    assert isinstance(engine, Linearization)
+    assert isinstance(solution.engine, Linearization)
+    values = solution.values
+    outliers: Outliers = rejected(solution.engine, values)
+    if problem.finer is not None:
+        first = maximise_likelihood(engine, values, levels, outliers, rounds=1)
+        values, levels, outliers = first.values, first.levels, first.outliers
+        finer = problem.finer(levels)
+        if finer is not None:
+            known = compiled
+            compiled = Compiled.of(finer, "chain")
+            problem, engine = finer, compiled.engine
+            assert isinstance(engine, Linearization)
+            late = _times(known.engine.groups, outliers)
+            outliers = {i: np.isin(g.model.time, late) for i, g in enumerate(engine.groups) if g.is_measurement}
+            values = _with_parameters(compiled, known, values)
+    found = maximise_likelihood(engine, values, levels, outliers)
+    return compiled, solution_at(engine, problem, found, config), found.levels
+
+
+def _times(groups: Sequence[Any], outliers: Outliers) -> Array:
+    """Times of measurements that are rejected, s."""
+    parts = [np.asarray(groups[i].model.time)[out] for i, out in outliers.items()]
+    return np.concatenate([np.empty(0), *parts])
+
+
+def _with_parameters(compiled: Compiled, known: Compiled, values: Values) -> Values:
+    """First values of a problem, with the parameters as they are known of another graph of it."""
+    layout, arrays = compiled.layout, {block: array.copy() for block, array in compiled.initial.arrays.items()}
+    keys = [p.key for p in compiled.problem.parameters]
+    for key, at in zip(keys, layout.at(keys).tolist(), strict=True):
+        arrays[layout.blocks[layout.block[at]]][layout.row[at]] = known.layout.of_key(values, key)
+    return Values(arrays)
+
+
+def sandwich_of(compiled: Compiled, levels: Sequence[Level], solution: Solution) -> Array:
+    """(n,) ratio of sandwich to nominal sigma of the reported numbers, at least 1."""
+    engine, layout = compiled.engine, compiled.layout
+    assert isinstance(engine, Linearization)
+    assert isinstance(solution.engine, Linearization)
+    chain = LinearChain.of(engine, solution.values)
+    at, columns = layout.to_gtsam(solution.values, _keys(compiled)), []
+    for p, key in zip(compiled.problem.parameters, _keys(compiled), strict=True):
+        _, J = p.coordinates(at, key)
+        columns.append(J @ layout.root_columns(key)[:, layout.sizes[3] :])
+    outliers = rejected(solution.engine, solution.values)
+    return np.maximum(sandwich_ratio(chain, levels, outliers, np.concatenate(columns)), 1.0)
+
+
+def _keys(compiled: Compiled) -> list[int]:
+    return [compiled.current_keys.get(p.key, p.key) for p in compiled.problem.parameters]
