@@ -194,7 +194,9 @@ def _with_priors_as_found(
         if size is None or abs(size) < _BEYOND:
             continue
         added = 1.0 / (size * prior) ** 2 - 1.0 / prior**2
-        column = P[:, :, i] / (1.0 + added * P[:, i, i])[:, None]
+        # Weak directions at their priors leave a variance a little beyond the prior's; more than that none can have.
+        left = np.maximum(1.0 + added * P[:, i, i], size**-2.0)
+        column = P[:, :, i] / left[:, None]
         values = values - added * (values[:, i] - q.prior_mean)[:, None] * column
         P = P - added * column[:, :, None] * P[:, i, None, :]
     return values, P
