@@ -185,7 +185,8 @@ def _with_priors_as_found(
 ) -> tuple[Array, Array]:
     """The course (k, n), (k, n, n) as it is when no parameter lies far beyond its prior.
 
-    Widening one prior changes the information by a number on the diagonal (Sherman, Morrison 1950).
+    Widening one prior changes the information by a number on the diagonal (Sherman, Morrison 1950). A variance above
+    the prior's, as terms of second order may make it, counts as the prior's.
     """
     for i, q in enumerate(quantities):
         prior = q.prior_sigma or 0.0
@@ -194,9 +195,7 @@ def _with_priors_as_found(
         if size is None or abs(size) < _BEYOND:
             continue
         added = 1.0 / (size * prior) ** 2 - 1.0 / prior**2
-        # Weak directions at their priors leave a variance a little beyond the prior's; more than that none can have.
-        left = np.maximum(1.0 + added * P[:, i, i], size**-2.0)
-        column = P[:, :, i] / left[:, None]
+        column = P[:, :, i] / np.maximum(1.0 + added * P[:, i, i], size**-2)[:, None]
         values = values - added * (values[:, i] - q.prior_mean)[:, None] * column
         P = P - added * column[:, :, None] * P[:, i, None, :]
     return values, P
