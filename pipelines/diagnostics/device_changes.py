@@ -25,7 +25,7 @@ from alidade.pipelines.belief import Belief
 from alidade.pipelines.estimation.assumptions import kind
 from alidade.pipelines.estimation.problem import Array, Quantity, Told
 from alidade.pipelines.solvers.joint import Joined, join
-from alidade.pipelines.solvers.told import told_of
+from alidade.pipelines.solvers.posterior import told_of
 
 # How often a history in which nothing changed is taken for one in which something did: by a number, by all at once.
 LEVEL, _JOINTLY = 0.05, 0.2

@@ -258,4 +258,9 @@ def inflation(names: Sequence[str], covariance: Array, free: Sequence[str], adde
     more = dict(zip(free, np.sum(list(added.values()), axis=0), strict=True)) if added else {}
     variance = np.diag(covariance)
     grown = variance + np.array([more.get(name, 0.0) for name in names])
+    return sigma_ratio(variance, grown)
+
+
+def sigma_ratio(variance: Array, grown: Array) -> Array:
+    """(n,) ratio of the sigmas of grown variances to those of variances; 1 for fixed numbers."""
     return np.sqrt(np.divide(grown, variance, out=np.ones_like(variance), where=variance > 0.0))

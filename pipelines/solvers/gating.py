@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from alidade.factors.chi_square import gate
 from alidade.pipelines.estimation.problem import Array, ChiSquare, Factor, Problem, Residuals
-from alidade.pipelines.solvers.coloured import correlations
+from alidade.pipelines.solvers.error_budget import autocorrelation
 from alidade.pipelines.solvers.linear_system import linear_graph_of
 from alidade.pipelines.solvers.marginals import ordering_of
 from alidade.pipelines.solvers.smoother import Smoother, slices
@@ -291,7 +291,7 @@ def correlation_inflation(
     """
     lengths = {}
     for family, found in gate.residuals().items():
-        lags = correlations(np.where(found.used[:, None], found.whitened, 0.0))
+        lags = autocorrelation(np.where(found.used[:, None], found.whitened, 0.0))
         if len(lags):
             lengths[family] = 1.0 + 2.0 * float(lags.sum())
     if not lengths:

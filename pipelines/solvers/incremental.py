@@ -46,8 +46,8 @@ from alidade.pipelines.estimation.problem import (
 )
 from alidade.pipelines.solvers.assembly import CHUNK, Assembly
 from alidade.pipelines.solvers.checkpoint import MarginalState, SavedRun, require_finite, require_known_variables
-from alidade.pipelines.solvers.coloured import growth
 from alidade.pipelines.solvers.curvature import second_order
+from alidade.pipelines.solvers.error_budget import sigma_ratio
 from alidade.pipelines.solvers.gating import InnovationGate, Prediction, RowBuffer, correlation_inflation
 from alidade.pipelines.solvers.history import sequential_history
 from alidade.pipelines.solvers.marginals import (
@@ -408,7 +408,7 @@ class IncrementalSolver:
         history, n = self.history.array.copy(), len(values)
         to_tangents = coordinate_inverse(self.problem.parameters, self._current(), self.keys)
         grown, lengths = correlation_inflation(self.problem, covariance, self.gate, to_tangents)
-        inflation = growth(np.diag(covariance), np.diag(grown))
+        inflation = sigma_ratio(np.diag(covariance), np.diag(grown))
         attitudes = self.attitudes.array.copy()
         return Estimate(
             solver="incremental",

@@ -21,8 +21,7 @@ from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import Array, Problem, Told
 from alidade.pipelines.solvers.batch import minimum
 from alidade.pipelines.solvers.engines import Compiled
-from alidade.pipelines.solvers.posterior import sqrt_information
-from alidade.pipelines.solvers.told import fewest
+from alidade.pipelines.solvers.posterior import fewest, sqrt_information
 
 # Two dates are never nearer than this, days.
 _LEAST_DAYS = 1e-6

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.pipelines.belief import Belief, root_of_information
 from alidade.pipelines.estimation.problem import ChiSquare, Problem, Told
 from alidade.pipelines.solvers.chain import Array, ChainFactorization, ChainSystem
 from alidade.pipelines.solvers.layout import Layout, Tangent, Values
@@ -357,11 +358,11 @@ def sqrt_information(
         else:
             groups.append(group)
     found = reported.root(engine.with_groups(groups).at(values)[0].eliminate().root)
-    rows, d = _fewest(found.R, found.d)
+    rows, d = fewest(found.R / reported.scale, found.d, reported.scale)
     return Told(
         names=tuple(reported.names[i] for i in reported.free),
         at=reported.numbers[reported.free],
-        R=rows / reported.scale,
+        R=rows,
         d=d,
         prior_R=np.concatenate(prior_R),
         prior_d=np.concatenate(prior_d),
@@ -393,8 +394,17 @@ def _about_alone(rows: Array, named: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray((about & named).any(axis=1) & ~(about & ~named).any(axis=1))
 
 
-def _fewest(R: Array, d: Array) -> tuple[Array, Array]:
-    """The rows R u = d without combinations that nothing is known of."""
-    u, sizes, axes = np.linalg.svd(R)
-    kept = sizes > 1.0 / MAX_TOLD
-    return sizes[kept, None] * axes[kept], u.T[kept] @ d
+def told_of(belief: Belief, scales: Sequence[float]) -> Told:
+    """A belief, none of whose numbers is exactly known, as rows of unit variance; `scales` (n,) of the usual priors."""
+    n, sigmas = len(belief.names), belief.sigmas
+    R = root_of_information(belief.covariance / np.outer(sigmas, sigmas), sigmas)
+    return Told(belief.names, belief.mean, R, np.zeros(n), np.empty((0, n)), np.empty(0), np.array(scales, dtype=float))
+
+
+def fewest(R: Array, d: Array, scales: Array) -> tuple[Array, Array]:
+    """As few rows that say the same, what nothing is told of left out."""
+    if not len(R):
+        return R, d
+    u, s, vt = np.linalg.svd(R * scales, full_matrices=False)
+    kept = s > 1.0 / MAX_TOLD
+    return (s[kept, None] * vt[kept]) / scales, u.T[kept] @ d

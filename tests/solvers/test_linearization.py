@@ -82,3 +82,18 @@ def test_gtsam_engine_gives_what_the_chain_gives(name: str) -> None:
     assert (np.abs(flat - other_flat) <= 1e-7 * draws).all()
     if layout.sizes[3] == 0:  # the chain damps deviations of nodes, gtsam the nodes
         assert other.eliminate(0.1).minimum == pytest.approx(system.eliminate(0.1).minimum, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", ["head with a bias that walks", "cube", "indexer", "tumble", "los"])
+def test_graph_works_with_gtsams_own_optimizer_marginals_and_isam2(name: str) -> None:
+    made = problem(name)
+    graph, initial = made.graph()
+    params = gtsam.LevenbergMarquardtParams()
+    params.setMaxIterations(2)
+    found = gtsam.LevenbergMarquardtOptimizer(graph, initial, params).optimize()
+    assert graph.error(found) <= graph.error(initial)
+    key = made.parameters[0].key
+    assert np.linalg.eigvalsh(gtsam.Marginals(graph, found).marginalCovariance(key)).min() > 0.0
+    isam = gtsam.ISAM2()
+    isam.update(graph, found)
+    assert isam.calculateEstimate().size() == initial.size()

@@ -264,7 +264,7 @@ def _summary(calibration: Calibration) -> Result:
 
 def _says(calibration: Calibration) -> Told:
     """What a calibration says of its numbers; of solvers that do not tell it, by their covariance."""
-    from alidade.pipelines.solvers.told import told_of
+    from alidade.pipelines.solvers.posterior import told_of
 
     estimate = calibration.estimate
     if estimate.told is not None:

@@ -3,9 +3,9 @@
 A tag's corners err by what its print, its blur and the camera's model have wrong: nearly the same in the next picture,
 and the more so in one in which nothing has moved. The layout errs by L r, L the influence of the whitened errors r, so
 with autocovariance g of r its covariance is the sum over tags, views and lags of L' g(lag) L, as for noise coloured in
-time (alidade.pipelines.solvers.coloured). g is that of the errors left, all tags together, up to the lag where it has
-died out; tags that fit worse than the others have a variance of their own. What stays the same in all pictures of a tag
-is in `bending`.
+time (alidade.pipelines.solvers.error_budget). g is that of the errors left, all tags together, up to the lag where it
+has died out; tags that fit worse than the others have a variance of their own. What stays the same in all pictures of a
+tag is in `bending`.
 
 Priors of additional parameters are weighed against such errors, not against independent ones: with the information A
 of independent errors, of which the gradient has covariance S, and that of the priors P, the best linear estimate has

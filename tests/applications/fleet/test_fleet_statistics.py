@@ -12,7 +12,7 @@ from alidade.pipelines.applications.fleet.attention import units_of_interest
 from alidade.pipelines.applications.fleet.histories import History, change_table, histories, packed
 from alidade.pipelines.applications.fleet.store import Result
 from alidade.pipelines.belief import independent
-from alidade.pipelines.solvers.told import told_of
+from alidade.pipelines.solvers.posterior import told_of
 
 
 @pytest.mark.parametrize("dof", [3, 6, 36])
