@@ -114,8 +114,8 @@ class LevenbergConfig:
         max_iterations: linear systems solved.
         cost_tolerance: stop when the predicted decrease is below it (squared sigmas): no number is off its minimum by
             more than the root of it, in its own sigmas, and by far less once the step is taken.
-        curved_tolerance: predicted decrease of an undamped step below which it may raise the cost at a minimum: what the
-            data hardly determine is curved by more than the linear system knows. .01 is .1 sigma.
+        curved_tolerance: predicted decrease of an undamped step below which it may raise the cost at a minimum: what
+            the data hardly determine is curved by more than the linear system knows. .01 is .1 sigma.
         initial_damping: of the first damped step, relative to the diagonal of A'A.
         max_damping: above it no step is left.
     """
