@@ -89,7 +89,7 @@ def read_table(path: Path, data: Path) -> ArrayContainer:
     """
     form = table_form(path, data)
     if not form.width:
-        raise InputError(f"{path}: not a table, nor any other recording that is known: no line of numbers in it")
+        raise _unknown(path, ": no line of numbers in it")
     if _is_trajectory(path, data, form):
         return ArrayContainer(path, {"/trajectory": _trajectory(path, data, form)})
     columns = ", ".join(form.names[:40])
@@ -102,6 +102,11 @@ class CsvFile(ArrayContainer):
     def __init__(self, path: Path, data: Path, remarks: Sequence[str] = ()) -> None:
         super().__init__(path, {}, remarks)
         self.data = data
+
+
+def _unknown(path: Path, why: str = "") -> InputError:
+    named = "an MCAP file" if path.suffix == ".mcap" else "a table"
+    return InputError(f"{path}: not {named}, nor any other recording that is known{why}")
 
 
 def looks_like_text(start: bytes) -> bool:
@@ -121,16 +126,16 @@ def table_form(path: Path, data: Path) -> TableForm:
     # The last line may be cut.
     lines = lines[:-1] if len(start) == _HEAD else lines
     if "\0" in text or not lines or max(map(len, lines)) > _LONGEST_LINE:
-        raise InputError(f"{path}: not a table, nor any other recording that is known")
+        raise _unknown(path)
     delimiter, decimal = _separators(lines)
     cells = [_cells(line, delimiter) for line in lines]
     if max(map(len, cells)) > _MOST_COLUMNS:
-        raise InputError(f"{path}: not a table, nor any other recording that is known")
+        raise _unknown(path)
     first = next((i for i, row in enumerate(cells) if _is_row(row) and not _is_comment(lines[i])), len(lines))
     width = len(cells[first]) if first < len(lines) else 0
     header, units = _header(lines[:first], delimiter, width)
     if not width and header is None:
-        raise InputError(f"{path}: not a table, nor any other recording that is known: no line of numbers in it")
+        raise _unknown(path, ": no line of numbers in it")
     names = (
         [f"column {i + 1}" for i in range(width)] if header is None else _cells(_uncommented(lines[header]), delimiter)
     )
