@@ -92,7 +92,7 @@ def change_finding(
     if not steps and (parts or found.differences):
         return None
     required = {q.name: q.require for q in quantities}
-    immaterial = bool(steps) and all(abs(step) < _MATERIAL * required[name] for name, (step, _) in steps.items())
+    immaterial = bool(parts) and all(abs(step) < _MATERIAL * required[name] for name, (step, _) in steps.items())
     severity = Severity.NOTE if immaterial else Severity.INCONSISTENT
     return Finding("change", severity, {"time_s": found.time_s, "steps": steps})
 

@@ -538,7 +538,11 @@ def step(
 
 
 def sandwich_ratio(
-    chain: LinearChain, levels: Sequence[Level], rejected: Mapping[int, NDArray[np.bool_]], reported: Array
+    chain: LinearChain,
+    levels: Sequence[Level],
+    rejected: Mapping[int, NDArray[np.bool_]],
+    reported: Array,
+    at: Array | None = None,
 ) -> Array:
     """Sandwich over nominal sigma of numbers that are linear in the shared parameters, (r,).
 
@@ -553,6 +557,7 @@ def sandwich_ratio(
         levels: in force.
         rejected: group -> (n,) outliers.
         reported: (r, p) derivatives of the numbers.
+        at: (p,) the solution, from where the chain is about it; None: there.
     """
     out = _by_row(chain, rejected, 0.0)
     variances = [np.where(o > 0.0, 1e12 * v, v) for o, v in zip(out, chain.variances(levels), strict=True)]
@@ -562,7 +567,8 @@ def sandwich_ratio(
     information, middle, blocks = known.copy(), known.copy(), 0
     for kind, each in chain.innovations(variances, limits, by_shared=True).items():
         time = chain.rows[kind].time
-        e, G = each.whitened[..., 0], each.whitened[..., 1:]
+        G = each.whitened[..., 1:]
+        e = each.whitened[..., 0] + (0.0 if at is None else G @ at)
         information += np.einsum("nmi,nmj->ij", G, G)
         block = ((time - time.min()) / SANDWICH_BLOCK_S).astype(int)
         blocks = int(block.max()) + 1
@@ -859,7 +865,7 @@ def largest_step(compiled: Compiled, levels: Sequence[Level], solution: Solution
     covariance = np.linalg.inv(solved.small @ solved.small.T)[p:, p:]
     _, J = parameter.coordinates(layout.to_gtsam(solution.values, [key]), key)
     steps, sigmas = J @ solved.shared[p:], np.sqrt(np.diag(J @ covariance @ J.T))
-    ratio = sandwich_ratio(one, after.levels, outliers, np.pad(J, ((0, 0), (p, 0))))
+    ratio = sandwich_ratio(one, after.levels, outliers, np.pad(J, ((0, 0), (p, 0))), solved.shared)
     named = zip((q.name for q in parameter.quantities), steps.tolist(), sigmas.tolist(), strict=True)
     fall = before.minus_two_log_likelihood - after.minus_two_log_likelihood
     # Log det of the step's own information is what a prior of its width would pay: no evidence for a step.
