@@ -28,7 +28,7 @@ _PATHS, _BATCH = 4000, 500
 # Directions in which the rest of the recording added less than this share of the variance say nothing of a change.
 _LEAST = 1e-3
 # A step between the segments is significant beyond so many sigmas, and material from this share of the requirement on.
-_STEP, _MATERIAL = 3.0, 0.5
+_STEP, _MATERIAL, _SURE = 3.0, 0.5, 2.0
 # s between times at which a step would look different.
 _EVERY_S = 2.0
 # Differences that are named where no segment has a solution.
@@ -76,7 +76,7 @@ def change_finding(
 
     Its steps are those between the segments that are significant, the most significant first; where the segments have
     none, the estimate of the whole recording less that until the change, if that is significant by itself. A step is
-    material from half of what is required on; nuisance parameters have no requirement.
+    material that is by two sigmas more than half of what is required; nuisance parameters have no requirement.
 
     Args:
         found: a change that is more than chance.
@@ -92,7 +92,8 @@ def change_finding(
     if not steps and (parts or found.differences):
         return None
     required = {q.name: q.require for q in quantities}
-    immaterial = bool(parts) and all(abs(step) < _MATERIAL * required[name] for name, (step, _) in steps.items())
+    material = any(abs(step) - _SURE * s > _MATERIAL * required[name] for name, (step, s) in steps.items())
+    immaterial = bool(parts) and not material
     severity = Severity.NOTE if immaterial else Severity.INCONSISTENT
     return Finding("change", severity, {"time_s": found.time_s, "steps": steps})
 
@@ -101,7 +102,7 @@ def step_finding(step: StepEstimate, duration: float, quantities: Sequence[Quant
     """The finding of kind `change` of a step that is certain and material; None of another.
 
     Certain: the fall of -2 log L exceeds chi-square's quantile at `LEVEL` over the recording, which has a time to step
-    every `_EVERY_S`; material: by two sigmas, times the sandwich ratio, the step is more than half of what is required.
+    every `_EVERY_S`; material: by three sigmas, times the sandwich ratio, the step is more than half of what is required.
 
     Args:
         step: that explains the recording best.
@@ -115,7 +116,7 @@ def step_finding(step: StepEstimate, duration: float, quantities: Sequence[Quant
         return None
     required = {q.name: q.require for q in quantities}
     wide = {name: (size, ratio * sigma) for name, (size, sigma) in step.steps.items()}
-    if not any(abs(size) - 2.0 * sigma > _MATERIAL * required[name] for name, (size, sigma) in wide.items()):
+    if not any(abs(size) - _STEP * sigma > _MATERIAL * required[name] for name, (size, sigma) in wide.items()):
         return None
     steps = dict(sorted(wide.items(), key=lambda item: -abs(item[1][0]) / max(item[1][1], 1e-300)))
     return Finding("change", Severity.INCONSISTENT, {"time_s": step.time_s, "steps": steps})
