@@ -102,7 +102,7 @@ def step_finding(step: StepEstimate, duration: float, quantities: Sequence[Quant
     """The finding of kind `change` of a step that is certain and material; None of another.
 
     Certain: the fall of -2 log L exceeds chi-square's quantile at `LEVEL` over the recording, which has a time to step
-    every `_EVERY_S`; material: by three sigmas, times the sandwich ratio, the step is more than half of what is required.
+    every `_EVERY_S`; material: by three sigmas, times the sandwich ratio, it is more than half of what is required.
 
     Args:
         step: that explains the recording best.
