@@ -115,7 +115,7 @@ class Noise(Section):
 # Where neither the config nor a message says anything.
 DEFAULT_NOISE = Noise(
     gyro_density=5.0e-5,
-    gyro_rate_noise=3.0e-4,
+    gyro_rate_noise=5.0e-5,
     gyro_bias_walk=1.0e-6,
     gyro_scale=0.0,
     platform_gyro_density=1.0e-5,

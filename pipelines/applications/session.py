@@ -23,7 +23,7 @@ from alidade.pipelines.applications.discovery import empty, idle, nearest_sugges
 from alidade.pipelines.applications.sharing import device_belief, walks
 from alidade.pipelines.applications.table_discovery import propose_columns, with_columns
 from alidade.pipelines.config import load_config, recorded_config
-from alidade.pipelines.diagnostics.change_test import Stability, change_finding, stability, with_change
+from alidade.pipelines.diagnostics.change_test import Stability, change_finding, stability, step_finding, with_change
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf, solve_segments, split_halves
 from alidade.pipelines.diagnostics.diagnose import diagnose, is_suspect
 from alidade.pipelines.diagnostics.fault_models import FaultModel
@@ -371,15 +371,22 @@ class Session:
         """The test for a change, and the finding where there is one, with the steps between its two sides."""
         if estimate.solver == "published" or not estimate.converged:
             return None, None
+        ratios = [] if estimate.sandwich is None else estimate.sandwich[[q.judged for q in quantities]].tolist()
+        ratio = max(ratios, default=1.0)
         stable = stability(estimate, quantities)
+        times = [r.time for r in estimate.residuals.values()]
+        if estimate.step is not None and times:
+            span = float(np.ptp(np.concatenate(times)))
+            slipped = step_finding(estimate.step, span, quantities)
+            if slipped is not None:
+                return stable, slipped
         if stable is None or not stable.changed:
             return stable, None
         parts: Mapping[str, SplitHalf] = {}
         if self.faults.cut and not deadline.passed(_SEGMENTS):
             with progress.doing("solving both sides of a change"):
                 parts = solve_segments(self.method.graph, self.faults, self.data, self.config, stable.time_s)
-        ratios = [] if estimate.sandwich is None else estimate.sandwich[[q.judged for q in quantities]].tolist()
-        return stable, change_finding(stable, parts, quantities, max(ratios, default=1.0))
+        return stable, change_finding(stable, parts, quantities, ratio)
 
     def _difference(self, estimate: Estimate) -> SolverDifference | None:
         """An incremental estimate compared with batch's, which has nothing of what a report needs."""

@@ -19,7 +19,7 @@ import numpy as np
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf
 from alidade.pipelines.estimation.assumptions import pull
 from alidade.pipelines.estimation.finding import Finding, Severity
-from alidade.pipelines.estimation.problem import Array, Estimate, Quantity, Told
+from alidade.pipelines.estimation.problem import Array, Estimate, Quantity, StepEstimate, Told
 
 # A recording in which nothing changed is taken for one in which something did so often.
 LEVEL = 1e-3
@@ -28,7 +28,9 @@ _PATHS, _BATCH = 4000, 500
 # Directions in which the rest of the recording added less than this share of the variance say nothing of a change.
 _LEAST = 1e-3
 # A step between the segments is significant beyond so many sigmas, and material from this share of the requirement on.
-_STEP, _MATERIAL, _CERTAIN = 3.0, 0.5, 2.0
+_STEP, _MATERIAL, _SURE = 3.0, 0.5, 2.0
+# s between times at which a step would look different.
+_EVERY_S = 2.0
 # Differences that are named where no segment has a solution.
 _MAX_NAMED = 3
 # Source of variance, as in the budget.
@@ -69,12 +71,12 @@ class Stability:
 
 def change_finding(
     found: Stability, parts: Mapping[str, SplitHalf], quantities: Sequence[Quantity], ratio: float = 1.0
-) -> Finding:
-    """The finding of kind `change`: a NOTE where no step is material.
+) -> Finding | None:
+    """The finding of kind `change`: a NOTE where no step is material; None where no step is significant.
 
     Its steps are those between the segments that are significant, the most significant first; where the segments have
-    none, the estimate of the whole recording less that until the change. A step is material that is certainly, by two
-    sigmas, more than half of what is required.
+    none, the estimate of the whole recording less that until the change, if that is significant by itself. A step is
+    material that is by two sigmas more than half of what is required; nuisance parameters have no requirement.
 
     Args:
         found: a change that is more than chance.
@@ -84,11 +86,40 @@ def change_finding(
     """
     significant = sorted((n for n in parts if abs(parts[n].z) > _STEP), key=lambda name: -abs(parts[name].z))
     steps = {name: (parts[name].step, parts[name].step_sigma) for name in significant}
-    steps = steps or {name: (size, ratio * sigma) for name, (size, sigma) in found.differences.items()}
+    if not steps:
+        wide = {name: (size, ratio * sigma) for name, (size, sigma) in found.differences.items()}
+        steps = {name: (size, sigma) for name, (size, sigma) in wide.items() if abs(size) > _STEP * sigma}
+    if not steps and (parts or found.differences):
+        return None
     required = {q.name: q.require for q in quantities}
-    material = any(abs(step) - _CERTAIN * sigma > _MATERIAL * required[name] for name, (step, sigma) in steps.items())
-    severity = Severity.INCONSISTENT if material else Severity.NOTE
+    material = any(abs(step) - _SURE * s > _MATERIAL * required[name] for name, (step, s) in steps.items())
+    immaterial = bool(parts) and not material
+    severity = Severity.NOTE if immaterial else Severity.INCONSISTENT
     return Finding("change", severity, {"time_s": found.time_s, "steps": steps})
+
+
+def step_finding(step: StepEstimate, duration: float, quantities: Sequence[Quantity]) -> Finding | None:
+    """The finding of kind `change` of a step that is certain and material; None of another.
+
+    Certain: the fall of -2 log L exceeds chi-square's quantile at `LEVEL` over the recording, which has a time to step
+    every `_EVERY_S`; material: by three sigmas, times the sandwich ratio, it is more than half of what is required.
+
+    Args:
+        step: that explains the recording best.
+        duration: of the recording, s.
+        quantities: of the estimate.
+    """
+    from scipy.special import chdtri
+
+    ratio = step.ratio
+    if step.fall < chdtri(len(step.steps), LEVEL * min(_EVERY_S / max(duration, _EVERY_S), 1.0)) * ratio**2:
+        return None
+    required = {q.name: q.require for q in quantities}
+    wide = {name: (size, ratio * sigma) for name, (size, sigma) in step.steps.items()}
+    if not any(abs(size) - _STEP * sigma > _MATERIAL * required[name] for name, (size, sigma) in wide.items()):
+        return None
+    steps = dict(sorted(wide.items(), key=lambda item: -abs(item[1][0]) / max(item[1][1], 1e-300)))
+    return Finding("change", Severity.INCONSISTENT, {"time_s": step.time_s, "steps": steps})
 
 
 def with_change(estimate: Estimate, change: Finding) -> Estimate:
@@ -222,7 +253,7 @@ def _exceeded(P: Array, whitening: Sequence[Array], ranks: Array, size: float) -
     """Share of drawn paths whose largest difference is as large or larger."""
     rng = np.random.default_rng(0)
     n = P.shape[1]
-    roots = [_root(P[i] - P[i + 1]) for i in range(len(P) - 1)]
+    roots = [_root(P[i] - P[i + 1], P[i]) for i in range(len(P) - 1)]
     count = 0
     for _ in range(_PATHS // _BATCH):
         difference = np.zeros((_BATCH, n))
@@ -235,8 +266,8 @@ def _exceeded(P: Array, whitening: Sequence[Array], ranks: Array, size: float) -
     return count / _PATHS
 
 
-def _root(covariance: Array) -> Array:
-    """R with R R' the covariance, what rounding made negative left out."""
-    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+def _root(covariance: Array, larger: Array) -> Array:
+    """R with R R' the covariance, what rounding made negative left out; `larger` is one that is, with its scale."""
+    scale = np.sqrt(np.maximum(np.diag(larger), 1e-300))
     eigenvalues, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(eigenvalues, 0.0)))

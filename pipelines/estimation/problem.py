@@ -288,6 +288,7 @@ class Problem:
             other minima. None: the method has no such.
         layout: how its variables are a chain; None: they are none, and gtsam eliminates them.
         marginal_likelihood: whether noise levels are those that maximise it, for which it needs a layout.
+        may_step: variable that may change at one moment, as a mount that slips; None: none is looked at.
         finer: the graph for noise levels, where keyframes stand closer than in this one; None: where this one serves.
     """
 
@@ -309,6 +310,7 @@ class Problem:
     elsewhere: Callable[[gtsam.Values], Iterator[gtsam.Values]] | None = None
     layout: ChainLayout | None = None
     marginal_likelihood: bool = False
+    may_step: int | None = None
     finer: Callable[[Sequence[Level]], Problem | None] | None = None
 
     def near(self, numbers: Mapping[str, float]) -> Problem:
@@ -462,6 +464,23 @@ class Minimum:
     chi_square: float
 
 
+@dataclass(frozen=True)
+class StepEstimate:
+    """The step of some parameters, at one moment of a recording, that explains it best.
+
+    Attributes:
+        time_s: when, s.
+        steps: parameter -> its step and the sigma of that, SI.
+        fall: of -2 log L with the step and noise levels found anew.
+        ratio: of sandwich to nominal sigmas with the step, the largest of its parameters, at least 1.
+    """
+
+    time_s: float
+    steps: Mapping[str, tuple[float, float]]
+    fall: float
+    ratio: float
+
+
 # Ratio of sandwich to nominal sigmas from which on it counts: over 25 blocks chance makes 1.3 in one of a hundred.
 SLOW_ERROR = 1.3
 
@@ -493,6 +512,7 @@ class Estimate:
         sandwich: (n,) ratio of sandwich to nominal sigma, at least 1, where noise levels maximise the likelihood: what
             errs slowly and is no noise of the model makes it large. Above SLOW_ERROR it is in the covariance. None: not
             looked for.
+        step: the step that explains the recording best, where noise levels maximise the likelihood: levels hide steps.
         inflation: (n,) by what the sigmas are larger because residuals are correlated in time; None: by nothing.
         told: what the graph says without the device's priors; None: not asked for.
         second: the second best solution of several, if it is nearly as likely; None: there is none, or not looked for.
@@ -519,6 +539,7 @@ class Estimate:
     colours: Mapping[str, float] = field(default_factory=dict)
     inflation: Array | None = None
     sandwich: Array | None = None
+    step: StepEstimate | None = None
     told: Told | None = None
     second: Minimum | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)

@@ -174,7 +174,7 @@ def test_an_immaterial_step_is_a_note_and_in_the_covariance_of_everybody() -> No
     np.testing.assert_allclose(np.linalg.inv(wide.told.R.T @ wide.told.R), expected)
     np.testing.assert_allclose(np.linalg.solve(wide.told.R, wide.told.d), np.linalg.solve(R, told.d))
     assert wide.budget["a"] == pytest.approx({CHANGE: 0.16 / 0.17, "vision": 0.01 / 0.17})
-    large = change_finding(found, {"a": SplitHalf(0.0, 0.05, 0.6, 0.05)}, quantities)
+    large = change_finding(found, {"a": SplitHalf(0.0, 0.05, 0.7, 0.05)}, quantities)
     assert large.severity == Severity.INCONSISTENT
     unknown = change_finding(found, {}, quantities)
     assert unknown.severity == Severity.INCONSISTENT

@@ -102,6 +102,13 @@ GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
         "Residuals of vision are correlated over 24 % of the recording.",
     ),
     (
+        "slow_error",
+        NOTE,
+        {"parameter": "helmet_mount_z", "ratio": 2.46},
+        "Warning: a sensor errs slowly, as with the pose, which no noise explains: by blocks of 5 s the sigma of "
+        "helmet_mount_z is 2.5 times the nominal one. Sigmas include it.",
+    ),
+    (
         "misfit",
         INCONSISTENT,
         {"family": None, "chi_square": 71571.0, "dof": 5397.0, "largest": "vision", "noise_factor": 3.64},

@@ -147,7 +147,7 @@ class View:
         if self.change is not None:
             when = datetime.fromtimestamp(self.epoch_ns * 1e-9 + self.change.time_s, UTC)
             found = change_finding(self.change, {}, self.quantities)
-            text = sentences.sentence(found, {q.name: q for q in self.quantities})
+            text = sentences.sentence(found, {q.name: q for q in self.quantities}) if found else "Something changed."
             return f"{text} It was {when:%H:%M:%S} UTC: {_BEGIN_ANEW.words}"
         if self.done:
             return "the accuracy wanted is reached: recording may end"

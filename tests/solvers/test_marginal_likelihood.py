@@ -1,0 +1,111 @@
+"""Noise levels of the largest marginal likelihood: gradient, widening, innovations, steps that levels would hide."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from alidade.factors import so3
+from alidade.pipelines import methods
+from alidade.pipelines.config import load_config
+from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.problem import Problem
+from alidade.pipelines.methods.head.recording import HeadData
+from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.engines import Compiled
+from alidade.pipelines.solvers.linearization import Linearization
+from alidade.pipelines.solvers.marginal_likelihood import LinearChain, estimate_levels, widened
+from alidade.pipelines.solvers.robust import RobustConfig, solve_robust
+
+SCENARIO = HeadScenario.model_validate(
+    {"duration_s": 30.0, "vision_rate_hz": 20.0, "gyro_rate_hz": 100.0, "latitude_deg": None, "sensors": {}}
+)
+
+
+def made(data: HeadData) -> Problem:
+    return methods.method("head").problem(data, load_config(head_config(SCENARIO).encode()))
+
+
+@cache
+def chain() -> tuple[LinearChain, tuple[Level, ...]]:
+    """A recording about its solution, and its noises as stated."""
+    compiled = Compiled.of(made(simulate_head(SCENARIO, 1)[0]), "chain")
+    assert isinstance(compiled.engine, Linearization)
+    solution = solve_robust(compiled.engine, compiled.initial, compiled.problem.loss, RobustConfig())
+    return LinearChain.of(compiled.engine, solution.values), compiled.problem.noises
+
+
+def test_levels_found_are_where_the_likelihood_is_largest() -> None:
+    linear, levels = chain()
+    found = estimate_levels(linear, levels)
+    free = [i for i, level in enumerate(levels) if level.noise.estimated]
+    assert len(free) == 3
+
+    def value(scales: np.ndarray) -> float:
+        tried = list(found.levels)
+        for i, scale in zip(free, scales, strict=True):
+            tried[i] = replace(tried[i], scale=float(scale))
+        solved = linear.solved(linear.variances(tried))
+        assert solved is not None
+        known = np.array([found.levels[i].known for i in free])
+        return solved.value + float(((np.log(scales) / known) ** 2).sum())
+
+    best = np.array([found.levels[i].scale for i in free])
+    for i in range(len(free)):
+        for by in (0.5, 2.0):
+            assert value(best * np.where(np.arange(len(free)) == i, by, 1.0)) > value(best) - 0.1
+
+
+def test_level_of_vision_is_that_simulated() -> None:
+    linear, levels = chain()
+    (vision,) = (level for level in estimate_levels(linear, levels).levels if level.noise.name == "vision_attitude")
+    assert vision.found is not None
+    assert vision.sigma is not None
+    assert abs(vision.found - 1.0) < 4.0 * vision.sigma
+    assert vision.sigma < 0.03
+
+
+def test_innovations_are_white_and_of_unit_variance() -> None:
+    linear, levels = chain()
+    (found,) = linear.innovations(linear.variances(levels), [np.inf] * len(linear.rows)).values()
+    e = found.whitened[..., 0]
+    n = e.size
+    assert abs((e**2).mean() - 1.0) < 4.0 * (2.0 / n) ** 0.5
+    assert abs((e[1:] * e[:-1]).mean()) < 4.0 * n**-0.5
+
+
+def test_glitches_are_widened_and_nothing_is_left_out() -> None:
+    data, _ = simulate_head(SCENARIO, 1)
+    wxyz = data.vision_wxyz.copy()
+    glitches = [100, 250, 400]
+    wxyz[glitches] = so3.multiply(wxyz[glitches], so3.exp(np.full(3, 0.03)))
+    estimate = solve_batch(made(replace(data, vision_wxyz=wxyz)))
+    right = solve_batch(made(data))
+    assert estimate.rejected["vision"] == 0
+    names = [i for i, name in enumerate(estimate.names) if name.startswith(("gyro_bias", "helmet_mount", "time"))]
+    assert np.abs((estimate.values - right.values)[names] / right.sigmas[names]).max() < 1.0
+
+
+def test_few_rows_of_clean_noise_are_widened() -> None:
+    linear, levels = chain()
+    wide, out = widened(linear, levels, {})
+    assert np.mean(np.concatenate(list(wide.values())) > 1.0) < 0.01
+    assert not np.concatenate(list(out.values())).any()
+
+
+def test_a_slip_is_found_that_levels_would_hide() -> None:
+    """2 deg at 30 %: without the step the gyro's noise rises, and the recording would be calibrated."""
+    data, _ = simulate_head(SCENARIO, 2)
+    wxyz, late = data.vision_wxyz.copy(), data.vision_t > 9.0
+    wxyz[late] = so3.multiply(wxyz[late], so3.exp(np.deg2rad([2.0, 0.0, 0.0])))
+    slipped, right = solve_batch(made(replace(data, vision_wxyz=wxyz))), solve_batch(made(data))
+    assert slipped.step is not None
+    assert right.step is not None
+    assert abs(slipped.step.time_s - 9.0) < 0.5
+    size, sigma = slipped.step.steps["helmet_mount_x"]
+    assert abs(size - np.deg2rad(2.0)) < 4.0 * sigma
+    assert slipped.step.fall > 100.0
+    assert right.step.fall < 30.0
