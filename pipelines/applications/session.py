@@ -385,7 +385,9 @@ class Session:
         parts: Mapping[str, SplitHalf] = {}
         if self.faults.cut and not deadline.passed(_SEGMENTS):
             with progress.doing("solving both sides of a change"):
-                parts = solve_segments(self.method.graph, self.faults, self.data, self.config, stable.time_s)
+                parts = solve_segments(
+                    self.method.graph, self.faults, self.data, self.config, stable.time_s, estimate.levels
+                )
         return stable, change_finding(stable, parts, quantities, ratio)
 
     def _difference(self, estimate: Estimate) -> SolverDifference | None:

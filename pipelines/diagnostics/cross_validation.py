@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -11,7 +12,8 @@ import numpy as np
 from alidade.pipelines import parallel
 from alidade.pipelines.diagnostics.fault_models import FaultModel
 from alidade.pipelines.diagnostics.trial_fit import Build, max_concurrent, solve_trial
-from alidade.pipelines.estimation.problem import Array, Quantity
+from alidade.pipelines.estimation.noise import Level
+from alidade.pipelines.estimation.problem import Array, Problem, Quantity
 from alidade.pipelines.settings import Config
 
 
@@ -46,12 +48,22 @@ def split_halves(build: Build, faults: FaultModel, data: Any, config: Config) ->
     return solve_segments(build, faults, data, config, 0.5 * (start + stop))
 
 
-def solve_segments(build: Build, faults: FaultModel, data: Any, config: Config, middle: float) -> dict[str, SplitHalf]:
+def solve_segments(
+    build: Build, faults: FaultModel, data: Any, config: Config, middle: float, levels: Sequence[Level] = ()
+) -> dict[str, SplitHalf]:
     """The parameters that a recording determines both before and after a time (s); none when a part has no solution.
 
     Parameters that a prior determines in either part are left out: they would agree whatever was recorded. A bias that
     walks differs between the parts by its walk too.
+
+    Args:
+        build: data and config -> problem.
+        faults: how data are cut.
+        data, config: of the whole recording.
+        middle: s, where it is cut.
+        levels: noise levels of the whole recording, which both parts have; those of other noises are estimated anew.
     """
+    build = partial(_at_levels, build, {level.noise.name: level for level in levels})
     start, stop = faults.span(data)
     parts = [partial(_solved, build, faults, data, config, *part) for part in ((start, middle), (middle, stop + 1.0))]
     first, second = parallel.done(parts, "either side", max_concurrent(faults.times(data)))
@@ -61,6 +73,17 @@ def solve_segments(build: Build, faults: FaultModel, data: Any, config: Config, 
         for name, ((quantity, value, sigma), (_, other, other_sigma)) in both.items()
         if quantity.determined(max(sigma, other_sigma))
     }
+
+
+def _at_levels(build: Build, levels: Mapping[str, Level], data: Any, config: Config) -> Problem:
+    """The problem with noise levels that are known."""
+    problem = build(data, config)
+    known = (levels.get(level.noise.name, level) for level in problem.noises)
+    noises = tuple(
+        replace(level, noise=replace(level.noise, known=0.0), least=None) if level.noise.name in levels else level
+        for level in known
+    )
+    return replace(problem, noises=noises)
 
 
 # A quantity with its value and sigma.

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from alidade.pipelines.applications.session import calibrate
-from alidade.pipelines.estimation.finding import Severity
 from alidade.pipelines.reports.result import Calibration
 
 # Found by an independent fit with the scales free, repeatable to 0.05 deg on another recording of the device.
@@ -26,11 +25,12 @@ def recording(shared_data: Path) -> Path:
 
 
 def test_the_scale_is_named_first(recording: Path, tmp_path: Path) -> None:
+    """Its effect on the mount, .28 deg, is just below half of the accuracy required, so that it is a note."""
     found = calibrated(recording, "{}", tmp_path)
-    assert found.status == "inconsistent"
-    first = next(finding for finding in found.findings if finding.severity == Severity.INCONSISTENT)
-    assert first.kind == "prior_conflict"
-    assert first.evidence["parameter"].startswith("gyro_scale_")
+    conflicts = [finding.evidence for finding in found.findings if finding.kind == "prior_conflict"]
+    assert conflicts[0]["parameter"] == "gyro_scale_x"
+    assert abs(conflicts[0]["z"]) > 10.0
+    assert 0.2 < np.rad2deg(abs(conflicts[0]["effect"]["helmet_mount_y"])) < 0.4
 
 
 def test_with_its_true_data_sheet_the_mount_is_right(recording: Path, tmp_path: Path) -> None:
@@ -38,5 +38,6 @@ def test_with_its_true_data_sheet_the_mount_is_right(recording: Path, tmp_path: 
     mount = [found.parameters[f"helmet_mount_{axis}"] for axis in "xyz"]
     off = [p.value - np.deg2rad(true) for p, true in zip(mount, MOUNT_DEG, strict=True)]
     assert max(abs(error) / p.sigma for error, p in zip(off, mount, strict=True)) < 3.0
-    scales = [found.parameters[f"gyro_scale_{axis}"] for axis in "xyz"]
-    assert all(abs(p.value) > 5.0 * p.sigma for p in scales)
+    assert found.status == "calibrated"
+    scales = [found.parameters[f"gyro_scale_{axis}"] for axis in "xy"]
+    assert all(p.value > 5.0 * p.sigma for p in scales)
