@@ -167,6 +167,9 @@ def minimize(engine: Engine, values: Values, config: LevenbergConfig) -> Solutio
             undamped = predicted if damping == 0.0 else undamped
             near = min(predicted, abs(decrease)) < _enough(config, cost)
             near &= damping == 0.0 or undamped < config.curved_tolerance
+            # In a curved valley, which only what the data hardly determine has, all steps left are too short to matter.
+            left = (config.max_iterations - iteration) * max(predicted, abs(decrease))
+            near |= 0.0 < damping <= 1.0 and left < config.curved_tolerance
             if decrease > 0.0 or (near and decrease > -_enough(config, cost)):
                 values, system, cost = candidate, new_system, new_cost
                 if near:
