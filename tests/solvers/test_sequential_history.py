@@ -19,7 +19,8 @@ from tests.support.short_problems import head_problem, los_problem
 
 
 def _until(problem: Problem, stop: float) -> Problem:
-    return replace(problem, steps=lambda chunk: (step for step in problem.steps(chunk) if step.time <= stop))
+    """The steps of one measurement each until then; all of them would be one."""
+    return replace(problem, steps=lambda _: (step for step in problem.steps(1) if step.time <= stop), finer=None)
 
 
 @pytest.mark.parametrize("make", [los_problem, head_problem])
