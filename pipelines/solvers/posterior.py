@@ -209,7 +209,8 @@ def leverages(engine: Engine, factorization: Factorization, values: Values) -> l
     In a chain random signs e stand as more right sides in the columns of the system, so that one elimination solves for
     all of them: h is the mean of e A x(e), which has the trace of the projection without the scatter of its diagonal
     (Hutchinson, Comm. Statist. Simul. Comput. 1989). Rows about nodes alone, and all rows of another engine, have the
-    mean square of A x over draws of the posterior, but for rows about shared unknowns alone, which are exact. That all leverages together are the number of unknowns is exact.
+    mean square of A x over draws of the posterior, but for rows about shared unknowns alone, which are exact. That all
+    leverages together are the number of unknowns is exact.
 
     Args:
         engine: of the factors.

@@ -17,7 +17,7 @@ from alidade.pipelines.applications.session import Session
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.assumptions import Assumption, pull, quantities
-from alidade.pipelines.estimation.problem import SLOW_ERROR, Estimate, Quantity
+from alidade.pipelines.estimation.problem import Estimate, Quantity
 from alidade.pipelines.methods.head.findings import findings
 from alidade.pipelines.methods.head.graph import problem
 from alidade.pipelines.methods.head.recording import HeadData, read_head, write_head
