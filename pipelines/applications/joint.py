@@ -97,7 +97,9 @@ class Alone:
             levels=estimate.levels,
             inflation=estimate.inflation,
         )
-        problem = replace(calibration.problem, steps=_no_steps, steps_after=None, onward=None, attitudes=None)
+        problem = replace(
+            calibration.problem, steps=_no_steps, steps_after=None, onward=None, finer=None, attitudes=None
+        )
         return cls(
             calibration=replace(calibration, estimate=small, problem=problem, plots=None, beside=None),
             day=_day(session),

@@ -99,7 +99,7 @@ def _believing(problem: Problem, belief: Belief, before: Earlier = tuple) -> Pro
         for p in problem.parameters
     )
     told = _Told(parameters, known, replaced)
-    steps, after, onward = problem.steps, problem.steps_after, problem.onward
+    steps, after, onward, finer = problem.steps, problem.steps_after, problem.onward, problem.finer
     premise = f"The prior of {len(replaced)} parameters is {belief.source}." if belief.source else ""
     return replace(
         problem,
@@ -109,6 +109,7 @@ def _believing(problem: Problem, belief: Belief, before: Earlier = tuple) -> Pro
         onward=None
         if onward is None
         else lambda data, time: _grown(onward(data, time), belief, lambda: _until(steps, time)),
+        finer=None if finer is None else lambda levels: _grown(finer(levels), belief, tuple),
         premises=(*problem.premises, *filter(None, [premise])),
     )
 

@@ -315,14 +315,23 @@ class Problem:
 
     def near(self, numbers: Mapping[str, float]) -> Problem:
         """The same problem; rotations are reported by the rotation vectors nearest to these numbers (rad, by name)."""
-        onward = self.onward
+        onward, finer = self.onward, self.finer
 
         def grown(data: Any, time: float) -> Problem | None:
             more = onward(data, time) if onward is not None else None
             return None if more is None else more.near(numbers)
 
+        def closer(levels: Sequence[Level]) -> Problem | None:
+            more = finer(levels) if finer is not None else None
+            return None if more is None else more.near(numbers)
+
         parameters = tuple(parameter.near(numbers) for parameter in self.parameters)
-        return replace(self, parameters=parameters, onward=None if onward is None else grown)
+        return replace(
+            self,
+            parameters=parameters,
+            onward=None if onward is None else grown,
+            finer=None if finer is None else closer,
+        )
 
     def numbers(self, estimate: Estimate) -> dict[str, float]:
         """What formulas need, by name: an estimate's values and the constants."""

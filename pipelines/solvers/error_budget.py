@@ -1,7 +1,8 @@
 """Influence of every measurement on the reported numbers, and what follows from it.
 
 That is the error budget, the most influential measurements, the effect of fixed inputs, and the inflation by residuals
-that are correlated in time. At the minimum a small change r of the whitened residuals moves the numbers by L r,
+that are correlated in time. At the minimum a small change r of the right side, minus the whitened residuals, moves the
+numbers by L r,
 
     L = J B (B'N B)^-1 B'A',    N = A'A
 
@@ -154,8 +155,8 @@ def _sources(influence: Influence, group: Group, squares: Array) -> list[tuple[s
 def most_influential(influence: Influence, sigmas: Mapping[str, float], count: int) -> tuple[Pull, ...]:
     """The measurements that move a number most, in its sigmas, each with that number.
 
-    A measurement with whitened residuals r moves the numbers by its columns of L times r; at the minimum all of these
-    and the priors' are in balance. Rejected measurements have no influence.
+    A measurement with the right side b, minus its whitened residuals, moves the numbers by its columns of L times b; at
+    the minimum all of these and the priors' are in balance. Rejected measurements have no influence.
 
     Args:
         influence: of the residuals.
@@ -172,7 +173,7 @@ def most_influential(influence: Influence, sigmas: Mapping[str, float], count: i
         if group.target == "shared" and group.family == "prior":
             continue
         L, right = influence.rows(group)
-        moves = np.einsum("nrm,nr->nm", L[..., columns], -right) / scale
+        moves = np.einsum("nrm,nr->nm", L[..., columns], right) / scale
         which = np.abs(moves).argmax(axis=1)
         moved = moves[np.arange(len(moves)), which]
         first = np.argsort(-np.abs(moved), kind="stable")[:count].tolist()

@@ -10,6 +10,7 @@ way is not asked for.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -132,7 +133,7 @@ class GtsamSystem:
         try:
             tree, left = graph.eliminatePartialMultifrontal(ordering, gtsam.EliminateQR)
         except RuntimeError as error:
-            raise IndeterminateStateError(UNDETERMINED) from error
+            raise _undetermined(error) from error
         columns = {int(key): layout.root_columns(int(key)) for key in layout.key[last]}
         rows = [np.zeros((0, c + s + 1))]
         for i in range(left.size()):
@@ -178,6 +179,12 @@ class GtsamSystem:
         for key, own in squares.items():
             graph.push_back(_factor([key], [np.diag(np.sqrt(damping * own))], np.zeros(len(own))))
         return graph
+
+
+def _undetermined(error: RuntimeError) -> IndeterminateStateError:
+    """Names the state that gtsam was working near."""
+    found = re.search(r"Symbol: (\w+)", str(error))
+    return IndeterminateStateError(UNDETERMINED.replace("a state", f"state {found[1]}") if found else UNDETERMINED)
 
 
 def _conditionals_of(tree: gtsam.GaussianBayesTree, ordering: gtsam.Ordering) -> list[gtsam.GaussianConditional]:

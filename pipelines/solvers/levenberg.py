@@ -106,6 +106,11 @@ class Engine(Protocol):
         """With other measurements in the same places."""
 
 
+# Decrease of the cost over the one predicted above which a step is lengthened: along it the cost is no parabola, and
+# falls on, as it does about a saddle, where the ratio is 2.
+_DOUBLE = 1.5
+
+
 @dataclass(frozen=True)
 class LevenbergConfig:
     """Termination and damping.
@@ -167,6 +172,11 @@ def minimize(engine: Engine, values: Values, config: LevenbergConfig) -> Solutio
             undamped = predicted if damping == 0.0 else undamped
             near = min(predicted, abs(decrease)) < _enough(config, cost)
             near &= damping == 0.0 or undamped < config.curved_tolerance
+            # In a curved valley, which only what the data hardly determine has, all steps left are too short to matter.
+            left = (config.max_iterations - iteration) * max(predicted, abs(decrease))
+            near |= 0.0 < damping <= 1.0 and left < config.curved_tolerance
+            if decrease > _DOUBLE * predicted > _DOUBLE * _enough(config, cost):
+                candidate, new_system, new_cost = _lengthened(engine, values, step, new_cost)
             if decrease > 0.0 or (near and decrease > -_enough(config, cost)):
                 values, system, cost = candidate, new_system, new_cost
                 if near:
@@ -181,6 +191,20 @@ def minimize(engine: Engine, values: Values, config: LevenbergConfig) -> Solutio
         if damping > config.max_damping:
             return solution(False, f"no step lowers chi-square of {cost:.6g}", iteration)
     return solution(False, f"not converged after {config.max_iterations} iterations", config.max_iterations)
+
+
+def _lengthened(engine: Engine, values: Values, step: Tangent, cost: float) -> tuple[Values, System, float]:
+    """Where a step leads that is doubled as long as the cost, `cost` after it as it is, falls."""
+    length = 1.0
+
+    def ahead(length: float) -> Values:
+        return engine.layout.retract(
+            values, Tangent(*(length * part for part in (step.states, step.nodes, step.shared)))
+        )
+
+    while (further := engine.cost(ahead(2.0 * length))) < cost:
+        length, cost = 2.0 * length, further
+    return ahead(length), *engine.at(ahead(length))
 
 
 def _enough(config: LevenbergConfig, cost: float) -> float:

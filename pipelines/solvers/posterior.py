@@ -209,7 +209,8 @@ def leverages(engine: Engine, factorization: Factorization, values: Values) -> l
     In a chain random signs e stand as more right sides in the columns of the system, so that one elimination solves for
     all of them: h is the mean of e A x(e), which has the trace of the projection without the scatter of its diagonal
     (Hutchinson, Comm. Statist. Simul. Comput. 1989). Rows about nodes alone, and all rows of another engine, have the
-    mean square of A x over draws of the posterior. That all leverages together are the number of unknowns is exact.
+    mean square of A x over draws of the posterior, but for rows about shared unknowns alone, which are exact. That all
+    leverages together are the number of unknowns is exact.
 
     Args:
         engine: of the factors.
@@ -234,8 +235,19 @@ def leverages(engine: Engine, factorization: Factorization, values: Values) -> l
         assert tangent is not None
         moves, right = engine.products(group, values, tangent)
         h = (np.square(moves) if own is None else own * moves).mean(axis=2)
+        if chain is None and group.target == "shared":
+            h = _of_shared(engine.layout, factorization, group, values)
         found.append(Leverage(group, counted(group, values), h, np.square(right)))
     return _summing_to(found, _unknowns(engine.layout))
+
+
+def _of_shared(layout: Layout, factorization: Factorization, group: Group, values: Values) -> Array:
+    """Leverages (n, m) of rows about the shared unknowns alone, exact."""
+    s = layout.sizes[4]
+    rows, _ = group.rows(values, s + 1)
+    A = np.pad(rows[..., :-1].reshape(-1, s), ((0, 0), (factorization.c, 0)))
+    root = np.linalg.lstsq(factorization.root[:-1, :-1].T, A.T, rcond=None)[0]
+    return np.asarray(np.square(root).sum(axis=0).reshape(rows.shape[:2]))
 
 
 def _summing_to(found: Sequence[Leverage], unknowns: int) -> list[Leverage]:

@@ -113,6 +113,11 @@ def _known(
 ) -> tuple[Array, Array]:
     """Numbers (n,) and their covariance (n, n) at a moment, `keys` the variables that hold the parameters then."""
     end = Reported.of(problem, layout, values, last_keys)
+    if layout.sizes[3] and set(keys.values()) == set(_keys_at(layout, keys, 0).values()):
+        # The first node is among the shared unknowns, and has no numbers beside these.
+        jacobian = end.jacobian.copy()
+        jacobian[:, : layout.sizes[3]] = 0.0
+        end = replace(end, jacobian=jacobian)
     known = layout.to_gtsam(values, keys.values())
     here = np.concatenate([p.coordinates(known, keys[p.key])[0] for p in problem.parameters])
     width = end.jacobian.shape[1] + 1

@@ -41,7 +41,9 @@ def one_graph(problems: Sequence[Problem], shared: Collection[str]) -> Problem:
 
     parameters = [_renamed(p, same, i) for i, problem in enumerate(problems) for p in problem.parameters]
     kept = {p.key: p for p in reversed(parameters)}
-    return replace(problems[0], parameters=tuple(kept.values()), steps=steps, attitudes=None, noises=())
+    # Noise as stated, that beside other noise included.
+    noises = tuple(replace(n, noise=replace(n.noise, known=0.0), least=None) for n in problems[0].noises)
+    return replace(problems[0], parameters=tuple(kept.values()), steps=steps, attitudes=None, noises=noises, finer=None)
 
 
 def _key(key: int, same: Collection[int], i: int) -> int:

@@ -37,7 +37,7 @@ def solved() -> Solved:
 
 def _plots(solved: Solved) -> dict[str, Any]:
     data, config, estimate, found, _ = solved
-    told = SimpleNamespace(config=config, problem=problem(data, config), estimate=estimate, findings=found)
+    told = SimpleNamespace(config=config, problem=problem(data, config), estimate=estimate, tables=found)
     return {each.title: each for each in cube_plots(data, cast(Calibration, told))}
 
 
