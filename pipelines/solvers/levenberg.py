@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol, Self
 
 import numpy as np
@@ -146,6 +147,11 @@ class Solution:
     converged: bool
     message: str
     iterations: int
+
+    @cached_property
+    def factorization(self) -> Factorization:
+        """Of the system. Raises IndeterminateStateError."""
+        return self.system.eliminate()
 
 
 def minimize(engine: Engine, values: Values, config: LevenbergConfig) -> Solution:

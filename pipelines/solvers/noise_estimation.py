@@ -23,7 +23,7 @@ from alidade.pipelines.estimation.noise import Level, Noise
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.solvers.chain import Array
 from alidade.pipelines.solvers.layout import Values
-from alidade.pipelines.solvers.levenberg import Engine, Factorization, Solution, minimize
+from alidade.pipelines.solvers.levenberg import Engine, Factorization, Solution, System, minimize
 from alidade.pipelines.solvers.linearization import Group
 from alidade.pipelines.solvers.robust import RobustConfig, solve_robust, solve_truncated
 
@@ -66,7 +66,7 @@ def estimate_noise(
     levels: tuple[Level, ...],
     loss: TruncatedLoss | None,
     robust: RobustConfig,
-    expected_squares: Callable[[Engine, Factorization, Values], ExpectedSquares],
+    expected_squares: Callable[[Engine, System, Factorization, Values], ExpectedSquares],
     config: NoiseConfig = CONFIG,
 ) -> tuple[Solution, tuple[Level, ...]]:
     """The solution with the noise levels that the recording has, and these.
@@ -90,7 +90,7 @@ def estimate_noise(
         if not solution.converged:
             break
         before, values = levels, solution.values
-        expected = expected_squares(solution.engine, solution.system.eliminate(), values)
+        expected = expected_squares(solution.engine, solution.system, solution.factorization, values)
         levels, steady = refine(levels, solution.engine, values, expected, levels is first, config)
         if steady:
             break

@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 from alidade.pipelines.estimation.problem import Problem
 from alidade.pipelines.solvers.chain import Array
 from alidade.pipelines.solvers.layout import Tangent, Values
-from alidade.pipelines.solvers.levenberg import Engine, Factorization
+from alidade.pipelines.solvers.levenberg import Engine, Factorization, Solution, System
 from alidade.pipelines.solvers.posterior import Reported, ReportedRoot
 
 # Posterior sigma of a direction, in sigmas of the priors in force, above which the direction is weak.
@@ -208,13 +208,14 @@ class Posterior:
 
     Attributes:
         values: of all variables, weak directions at their prior means.
-        factorization: of the system there.
+        system, factorization: of the factors there.
         reported: the numbers there.
         directions: strong and weak ones, second order included.
         converged: whether there is a constrained minimum; else all that is calibrated has its prior.
     """
 
     values: Values
+    system: System
     factorization: Factorization
     reported: Reported
     directions: WeakDirections
@@ -226,27 +227,26 @@ class Posterior:
         return self.reported.covariance(self.directions.covariance())
 
 
-def constrained_solution(
-    problem: Problem, engine: Engine, values: Values, current_keys: Mapping[int, int]
-) -> Posterior:
+def constrained_solution(problem: Problem, minimum: Solution, current_keys: Mapping[int, int]) -> Posterior:
     """The posterior near a minimum, its weak directions at the prior.
 
     Args:
         problem: of which the reported numbers are.
-        engine: of its factors, without the measurements that are rejected: elsewhere the loss would reject others.
-        values: at a minimum.
+        minimum: of its factors, without the measurements that are rejected: elsewhere the loss would reject others.
         current_keys: parameter key -> variable that holds its value.
 
     Raises:
         IndeterminateStateError: a state is not determined.
     """
-    found = _constrained(problem, engine, values, current_keys, None)
+    engine, known = minimum.engine, (minimum.system, minimum.factorization)
+    found = _constrained(problem, engine, minimum.values, current_keys, None, known)
     for _ in range(ROUNDS):
         second_order = curvature(found.directions, partial(_roots, problem, engine, found, current_keys))
         directions = found.directions.with_curvature(second_order)
         if directions.weak.shape[1] == found.directions.weak.shape[1]:
             break
-        found = _constrained(problem, engine, found.values, current_keys, directions)
+        known = found.system, found.factorization
+        found = _constrained(problem, engine, found.values, current_keys, directions, known)
     return replace(found, directions=directions)
 
 
@@ -265,11 +265,17 @@ def _constrained(
     values: Values,
     current_keys: Mapping[int, int],
     fixed: WeakDirections | None,
+    known: tuple[System, Factorization],
 ) -> Posterior:
-    """The minimum with the weak directions at their prior means: those of the system there, or fixed ones."""
-    weak, cost = 0, np.inf
-    for _ in range(MAX_STEPS):
-        factorization = engine.at(values)[0].eliminate()
+    """The minimum with the weak directions at their prior means: those of the system there, or fixed ones.
+
+    `known` is the system at the values, and its factorization.
+    """
+    weak, cost, (system, factorization) = 0, np.inf, known
+    for step in range(MAX_STEPS):
+        if step:
+            system = engine.at(values)[0]
+            factorization = system.eliminate()
         reported = Reported.of(problem, engine.layout, values, current_keys)
         found = reported.root(factorization.root)
         directions = (
@@ -281,7 +287,7 @@ def _constrained(
         du = constrained_step(directions, found.R, found.d, reported.u)
         size = np.linalg.norm(directions.strong.T @ du / directions.sigmas), np.linalg.norm(directions.weak.T @ du)
         if max(size) < NEAR:
-            return Posterior(values, factorization, reported, directions, True)
+            return Posterior(values, system, factorization, reported, directions, True)
         share, there = 1.0, _moved(engine, factorization, values, found, du)
         if size[1] < NEAR:  # the weak directions are where they are to be: from here on the cost falls
             while engine.cost(there) > cost and share > 1e-3:
@@ -289,7 +295,7 @@ def _constrained(
                 there = _moved(engine, factorization, values, found, share * du)
             cost = engine.cost(there)
         values = there
-    return Posterior(values, factorization, reported, directions, False)
+    return Posterior(values, system, factorization, reported, directions, False)
 
 
 def _moved(engine: Engine, factorization: Factorization, values: Values, found: ReportedRoot, du: Array) -> Values:
