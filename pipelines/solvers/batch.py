@@ -314,7 +314,8 @@ def _smoothed(solved: Solved, covariance: Array) -> History | None:
     names = [q.name for q in compiled.problem.quantities]
     at = [names.index(q.name) for q in parameter.quantities]
     whole = np.tile(solved.posterior.reported.numbers, (count, 1)), np.tile(np.sqrt(np.diag(covariance)), (count, 1))
-    whole[0][:, at], whole[1][:, at] = bias.values, bias.sigmas
+    beside = np.diag(covariance)[at] - bias.sigmas[-1] ** 2  # what the last node's has more: errors without a model
+    whole[0][:, at], whole[1][:, at] = bias.values, np.sqrt(np.maximum(bias.sigmas**2 + beside, 0.0))
     return History(begins, *whole)
 
 
