@@ -135,9 +135,9 @@ def solve(compiled: Compiled, config: BatchConfig | None = None, levels: tuple[L
     elif levels is None:
         solution, start = estimate_noise(engine, solution, start, problem.loss, config.robust, expected_squares)
     solution, second = _best(compiled, solution, config)
-    posterior = constrained_solution(
-        problem, without_rejected(solution.engine, solution.values), solution.values, compiled.current_keys
-    )
+    kept = replace(solution, engine=without_rejected(solution.engine, solution.values))
+    vars(kept).update(factorization=solution.factorization)
+    posterior = constrained_solution(problem, kept, compiled.current_keys)
     return Solved(compiled, solution, start, posterior, second)
 
 
@@ -234,8 +234,7 @@ def _estimate(solved: Solved, config: BatchConfig, budget: bool, changed: Iterab
         step = largest_step(compiled, solved.levels, solved.solution)
         wide = by * np.where(sandwich > SLOW_ERROR, sandwich, 1.0)
     covariance = posterior.covariance * np.outer(wide, wide)
-    system = engine.at(values)[0]
-    course = None
+    system, course = posterior.system, None
     if isinstance(engine, Linearization) and isinstance(system, ChainSystem) and isinstance(found, ChainFactorization):
         final = posterior.reported.numbers, posterior.covariance
         course = posterior_history(problem, engine, system, found, values, compiled.current_keys, engine.time, final)
@@ -252,7 +251,7 @@ def _estimate(solved: Solved, config: BatchConfig, budget: bool, changed: Iterab
         converged=solved.solution.converged,
         message=solved.solution.message,
         residuals=residuals,
-        chi_square=chi_square(leverages(engine, found, values)),
+        chi_square=chi_square(leverages(engine, system, found, values)),
         history=None if course is None else course.history.inflated(wide),
         course=course,
         smoothed=_smoothed(solved, covariance),
@@ -315,7 +314,8 @@ def _smoothed(solved: Solved, covariance: Array) -> History | None:
     names = [q.name for q in compiled.problem.quantities]
     at = [names.index(q.name) for q in parameter.quantities]
     whole = np.tile(solved.posterior.reported.numbers, (count, 1)), np.tile(np.sqrt(np.diag(covariance)), (count, 1))
-    whole[0][:, at], whole[1][:, at] = bias.values, bias.sigmas
+    beside = np.diag(covariance)[at] - bias.sigmas[-1] ** 2  # what the last node's has more: errors without a model
+    whole[0][:, at], whole[1][:, at] = bias.values, np.sqrt(np.maximum(bias.sigmas**2 + beside, 0.0))
     return History(begins, *whole)
 
 

@@ -185,6 +185,28 @@ class _Level:
             x[state] = _solved(R[..., :d], right, generator)
         return x[:-1]
 
+    def covariances(self, ends: Array) -> Array:
+        """Those (N, 2 d + c, .) of (state, state before, node), from those (B, 2 d + c, .) of the segments' last."""
+        d, c = self.rows.shape[1], ends.shape[1] - 2 * self.rows.shape[1]
+        swap, out = np.r_[d : 2 * d, :d, 2 * d : 2 * d + c], np.zeros((len(self.rows), *ends.shape[1:]))
+        before, node = slice(d), slice(2 * d, None)
+        P = _block(ends[self.order], swap)  # of (state before, last state of the segment, node)
+        for k in range(len(self.active) - 2, 0, -1):
+            some, R = P[: self.active[k]], self.rows[self.ends[: self.active[k]] - k]
+            T = -np.linalg.solve(R[..., :d], R[..., d : 3 * d + c])
+            found = np.empty_like(some)
+            cross = T @ some
+            found[:, :d, :d] = cross @ np.swapaxes(T, 1, 2) + _inverse_gram(R[..., :d])
+            found[:, :d, d : 2 * d], found[:, :d, 2 * d :] = cross[..., before], cross[..., node]
+            found[:, d:, :d] = np.swapaxes(found[:, :d, d:], 1, 2)
+            found[:, d : 2 * d, d : 2 * d], found[:, 2 * d :, 2 * d :] = some[:, before, before], some[:, node, node]
+            found[:, d : 2 * d, 2 * d :], found[:, 2 * d :, d : 2 * d] = some[:, before, node], some[:, node, before]
+            out[self.ends[: self.active[k]] - k] = found
+            some[:, :d, :d], some[:, :d, d:] = found[:, :d, :d], cross[..., d:]
+            some[:, d:, :d] = np.swapaxes(cross[..., d:], 1, 2)
+        out[self.ends] = _block(P, swap)
+        return out
+
 
 @dataclass(frozen=True, eq=False)
 class ChainFactorization:
@@ -247,6 +269,29 @@ class ChainFactorization:
         """Draws from the posterior, as deviations from its mean: states, nodes, shared unknowns (s, n)."""
         last = _solved(self.root[:-1, :-1], np.zeros((len(self.root) - 1, count)), generator)
         return *self._back(last, 0.0, generator), last[self.c :]
+
+    def given_shared(self) -> tuple[Array, Array]:
+        """Covariances where the shared unknowns are known, those that rows need.
+
+        Returns (N, 2 d + c, 2 d + c) of (x_k, x_k-1, z_j) and (J, 2 c, 2 c) of (z_j, z_j-1), zero for what is before
+        the first. Of all unknowns `propagate(shared_roots)` adds its square.
+        """
+        d, c = self.d, self.c
+        pairs, nodes = self._ends.covariances(_inverse_gram(self.root[:c, :c]), c)
+        for level in reversed(self._levels):
+            if level is None:
+                x, z, before = np.arange(d), np.arange(d, d + c), d + c
+                nodes = _block(pairs, np.r_[z, z + before])
+                pairs = _block(pairs, np.r_[x, x + before, z])
+            else:
+                pairs = level.covariances(pairs)
+        return pairs, nodes
+
+    @property
+    def shared_roots(self) -> Array:
+        """(c + s, s) columns whose squares sum to the covariance of the last node and the shared unknowns, but for
+        what the last node has of its own."""
+        return np.asarray(np.linalg.inv(self.root[:-1, :-1])[:, self.c :])
 
     def prefix_roots(self) -> tuple[Index, list[Array]]:
         """(M,) keyframes, and R of (their node, shared, right side) by all until then; few rows at first."""
@@ -334,6 +379,49 @@ class _TimeOrder:
             if len(R) > d:
                 nodes[self.piece[k]] = found[d:]
         return x, nodes
+
+    def covariances(self, last: Array, tail: int) -> tuple[Array, Array]:
+        """Those (M, 2 d + c, .) of (state, state before, node), (J, 2 c, .) of (node, node before).
+
+        `last` (tail, tail) is the last node's, all where the shared unknowns are known.
+        """
+        d, c, e, count = self.d, self.c, self.d + self.c, len(self.rows)
+        pairs, nodes = np.zeros((count, d + e, d + e)), np.zeros((int(self.piece[-1]) + 1, 2 * c, 2 * c))
+        of_pair, of_node = np.r_[:d, e : e + d, d:e], np.r_[d:e, e + d : 2 * e]
+        joint, P = np.zeros((2 * e, 2 * e)), _before(self.rows[-1], last, np.eye(tail))[0]
+        for k in range(count - 1, -1, -1):
+            joint[:e, :e], joint[e:] = P, 0.0
+            if k:
+                R = self.rows[k - 1]
+                P, joint[e:, :e] = _before(R, P, np.eye(e)[len(R) :])
+                joint[e:, e:] = P
+            joint[:e, e:] = joint[e:, :e].T
+            pairs[k] = _block(joint, of_pair)
+            if k == 0 or self.piece[k - 1] < self.piece[k]:
+                nodes[self.piece[k]] = _block(joint, of_node)
+        return pairs, nodes
+
+
+def _before(R: Array, following: Array, same: Array) -> tuple[Array, Array]:
+    """Covariance of what rows R [it | following | .] are about and, with it, of what follows by `same` rows; the part
+    with what follows."""
+    own = len(R)
+    T = np.vstack([-np.linalg.solve(R[:, :own], R[:, own : own + len(following)]), same])
+    cross = T @ following
+    out = cross @ T.T
+    out[:own, :own] += _inverse_gram(R[:, :own])
+    return out, cross
+
+
+def _inverse_gram(R: Array) -> Array:
+    """(R'R)^-1 of triangles (..., d, d)."""
+    inverse = np.linalg.inv(R)
+    return np.asarray(inverse @ np.swapaxes(inverse, -1, -2))
+
+
+def _block(matrices: Array, some: Index) -> Array:
+    """Some rows, and the same columns, of matrices (..., n, n)."""
+    return matrices[..., some[:, None], some]
 
 
 def _last_of_piece(

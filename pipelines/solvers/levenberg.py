@@ -5,6 +5,9 @@ The ratio of the decrease of the cost to the one that the linear system predicts
 down: Madsen, Nielsen, Tingleff, "Methods for non-linear least squares problems", 2004, section 3.2. Under a robust loss
 the rows have its weights at the values (iteratively reweighted least squares), and the prediction is that of these.
 
+What a linear system foresaw wrongly of its step is about what is left for the next one: a small step that does what it
+was to do ends at the minimum.
+
 Limits: a minimum is a local one. A cost is a sum of squares, in units of squared sigmas, with the losses in force.
 """
 
@@ -12,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol, Self
 
 import numpy as np
@@ -119,16 +123,24 @@ class LevenbergConfig:
         max_iterations: linear systems solved.
         cost_tolerance: stop when the predicted decrease is below it (squared sigmas): no number is off its minimum by
             more than the root of it, in its own sigmas, and by far less once the step is taken.
+        foreseen: error of the predicted decrease of an undamped step below which no other step is asked for.
         curved_tolerance: predicted decrease of an undamped step below which it may raise the cost at a minimum: what
             the data hardly determine is curved by more than the linear system knows. .01 is .1 sigma.
+        determined_tolerance: predicted decrease of the first damped step below which all is at its minimum that has
+            more information than the damping: the full step raises the cost along what has less, which is curved, and
+            where that is to be priors tell (`weak_directions`). .001 is .03 sigma.
         initial_damping: of the first damped step, relative to the diagonal of A'A.
+        min_damping: below it steps are full ones again; along a curved valley damping between lets them be longest.
         max_damping: above it no step is left.
     """
 
     max_iterations: int = 60
     cost_tolerance: float = 2e-5
+    foreseen: float = 2e-6
     curved_tolerance: float = 1e-2
+    determined_tolerance: float = 1e-3
     initial_damping: float = 1e-6
+    min_damping: float = 1e-9
     max_damping: float = 1e8
 
 
@@ -152,10 +164,17 @@ class Solution:
     message: str
     iterations: int
 
+    @cached_property
+    def factorization(self) -> Factorization:
+        """Of the system. Raises IndeterminateStateError."""
+        return self.system.eliminate()
 
-def minimize(engine: Engine, values: Values, config: LevenbergConfig) -> Solution:
-    """Minimise an engine's cost from some values."""
-    system, cost = engine.at(values)
+
+def minimize(
+    engine: Engine, values: Values, config: LevenbergConfig, known: tuple[System, float] | None = None
+) -> Solution:
+    """Minimise an engine's cost from some values; `known`: the system about these, and the cost."""
+    system, cost = known or engine.at(values)
     damping, growth, undamped = 0.0, 2.0, np.inf
 
     def solution(converged: bool, message: str, iterations: int) -> Solution:
@@ -175,15 +194,18 @@ def minimize(engine: Engine, values: Values, config: LevenbergConfig) -> Solutio
             # In a curved valley, which only what the data hardly determine has, all steps left are too short to matter.
             left = (config.max_iterations - iteration) * max(predicted, abs(decrease))
             near |= 0.0 < damping <= 1.0 and left < config.curved_tolerance
+            near |= damping == config.initial_damping and predicted < config.determined_tolerance
             if decrease > _DOUBLE * predicted > _DOUBLE * _enough(config, cost):
                 candidate, new_system, new_cost = _lengthened(engine, values, step, new_cost)
             if decrease > 0.0 or (near and decrease > -_enough(config, cost)):
                 values, system, cost = candidate, new_system, new_cost
-                if near:
+                foreseen = damping == 0.0 and predicted < 1.0 and abs(decrease - predicted) < config.foreseen
+                if near or foreseen:
                     return solution(True, f"converged after {iteration} iterations", iteration)
                 ratio = decrease / predicted if predicted > 0.0 else 1.0
                 damping *= max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
-                damping, growth = (damping if damping > config.initial_damping else 0.0), 2.0
+                damped = damping > config.min_damping and predicted > config.determined_tolerance
+                damping, growth = (damping if damped else 0.0), 2.0
                 continue
             if near:
                 return solution(True, f"converged after {iteration} iterations", iteration)

@@ -23,7 +23,7 @@ from alidade.pipelines.estimation.noise import Level, Noise
 from alidade.pipelines.estimation.robust import robust_sigma
 from alidade.pipelines.solvers.chain import Array
 from alidade.pipelines.solvers.layout import Values
-from alidade.pipelines.solvers.levenberg import Engine, Factorization, Solution, minimize
+from alidade.pipelines.solvers.levenberg import Engine, Factorization, Solution, System, minimize
 from alidade.pipelines.solvers.linearization import Group
 from alidade.pipelines.solvers.robust import RobustConfig, solve_robust, solve_truncated
 
@@ -44,6 +44,7 @@ class NoiseConfig:
         max_additional: bound of the logarithm of a noise beside others, over what was stated.
         clipped: of a noise beside others a residual counts as no more than this, in sigmas; `clipped_square` is what
             the square of a normal number is then expected to be.
+        least: of a level: without any noise residuals are of rounding, which no step makes less.
         too_small: sigmas by which a sum of squares is too small for its process.
     """
 
@@ -54,6 +55,7 @@ class NoiseConfig:
     max_additional: float = 7.0
     clipped: float = 2.0
     clipped_square: float = 0.9205
+    least: float = 1e-6
     too_small: float = 3.0
 
 
@@ -66,7 +68,7 @@ def estimate_noise(
     levels: tuple[Level, ...],
     loss: TruncatedLoss | None,
     robust: RobustConfig,
-    expected_squares: Callable[[Engine, Factorization, Values], ExpectedSquares],
+    expected_squares: Callable[[Engine, System, Factorization, Values], ExpectedSquares],
     config: NoiseConfig = CONFIG,
 ) -> tuple[Solution, tuple[Level, ...]]:
     """The solution with the noise levels that the recording has, and these.
@@ -90,7 +92,7 @@ def estimate_noise(
         if not solution.converged:
             break
         before, values = levels, solution.values
-        expected = expected_squares(solution.engine, solution.system.eliminate(), values)
+        expected = expected_squares(solution.engine, solution.system, solution.factorization, values)
         levels, steady = refine(levels, solution.engine, values, expected, levels is first, config)
         if steady:
             break
@@ -197,10 +199,10 @@ def _refined(
     square, typical = _size(level.noise, groups, values, config)
     if first and typical > 0.0 and not config.misplaced**-2 < square / typical < config.misplaced**2:
         square = typical
-    found = level.scale * float(np.sqrt(max(square / redundancy, 1e-12)))
+    found = max(level.scale * float(np.sqrt(max(square / redundancy, 0.0))), config.least)
     told = replace(level, found=found, sigma=found * (2.0 * redundancy) ** -0.5)
     scale = float(np.exp(_level(float(np.log(level.scale)), square, redundancy, told.known)))
-    return replace(told, scale=max(scale, level.noise.least))
+    return replace(told, scale=max(scale, level.noise.least, config.least))
 
 
 def _found_beside(

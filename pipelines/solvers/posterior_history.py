@@ -16,13 +16,11 @@ from alidade.pipelines.estimation.problem import Course, History, Problem
 from alidade.pipelines.solvers.chain import Array, ChainFactorization, ChainSystem, IndeterminateStateError, Index
 from alidade.pipelines.solvers.layout import Layout, Values
 from alidade.pipelines.solvers.linearization import Linearization
-from alidade.pipelines.solvers.posterior import Reported, draws
+from alidade.pipelines.solvers.posterior import Reported
 from alidade.pipelines.solvers.weak_directions import WeakDirections, constrained_step
 
 # Moments of the history, and how many keyframes may be eliminated once more for them (2 s at 20 us each).
 MOMENTS, ELIMINATED = 48, 100_000
-# Draws of the posterior of a walking bias at a time, and how often: 200 draws give sigmas to 5 %.
-DRAWS, TIMES = 20, 10
 
 
 def posterior_history(
@@ -158,10 +156,14 @@ def smoothed_bias(
         nodes: (k,) keys of the variables.
         part: numbers of a node that the bias is.
     """
-    generator, squares = np.random.default_rng(0), 0.0
-    columns = layout.shared[layout.at(nodes[:1])][0] + np.arange(part.stop - part.start)
-    for _ in range(TIMES):
-        drawn = draws(factorization, DRAWS, generator)
-        squares = squares + np.square(drawn.nodes[:, part] + drawn.shared[columns]).sum(axis=2)
+    _, given = factorization.given_shared()
+    roots, c, own = factorization.shared_roots, factorization.c, np.arange(part.start, part.stop)
+    columns = layout.shared[layout.at(nodes[:1])][0] + own - part.start
+    squares = given[:, own, own]
+    squares[0] = 0.0  # the first node does not deviate from itself
+    for last in np.split(roots, range(1, roots.shape[1]), axis=1):
+        moved = factorization.propagate(last)[1][:, own, 0]
+        moved[0] = 0.0
+        squares = squares + np.square(moved + last[c + columns, 0])
     numbers = np.array([layout.of_key(values, int(key)) for key in nodes])
-    return History(node_time, numbers, np.sqrt(np.asarray(squares) / (DRAWS * TIMES)))
+    return History(node_time, numbers, np.sqrt(squares))

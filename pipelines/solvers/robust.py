@@ -22,7 +22,7 @@ import numpy as np
 from alidade.factors.loss import TruncatedLoss
 from alidade.pipelines.solvers.chain import Array, IndeterminateStateError
 from alidade.pipelines.solvers.layout import Tangent, Values
-from alidade.pipelines.solvers.levenberg import Engine, LevenbergConfig, Solution, minimize
+from alidade.pipelines.solvers.levenberg import Engine, LevenbergConfig, Solution, System, minimize
 from alidade.pipelines.solvers.linearization import Group
 
 
@@ -64,21 +64,32 @@ def solve_robust(engine: Engine, values: Values, loss: TruncatedLoss | None, con
     truncated = engine.under(loss)
     start = min(values, found.values, key=truncated.cost) if np.isfinite(found.cost) else values
     start, more = _graduated(engine, start, loss, config)
-    final = solve_truncated(engine, start, loss, config)
+    # Inside the gate the truncated loss is no other than plain least squares.
+    same = start is found.values and truncated.cost(start) == found.cost
+    final = solve_truncated(engine, start, loss, config, (found.system, found.cost) if same else None)
     return replace(final, iterations=iterations + more + final.iterations)
 
 
-def solve_truncated(engine: Engine, values: Values, loss: TruncatedLoss, config: RobustConfig) -> Solution:
-    """Least squares on what lies inside the gate near some values, and on all of a family that loses too much."""
+def solve_truncated(
+    engine: Engine,
+    values: Values,
+    loss: TruncatedLoss,
+    config: RobustConfig,
+    known: tuple[System, float] | None = None,
+) -> Solution:
+    """Least squares on what lies inside the gate near some values, and on all of a family that loses too much.
+
+    `known` is the system about the values, and the cost.
+    """
     current, iterations = engine.under(loss), 0
     while True:
-        final = minimize(current, values, config.minimizer)
+        final = minimize(current, values, config.minimizer, known)
         iterations += final.iterations
         wrong = _mostly_rejected(final.engine, final.values, config.max_chance)
         if not wrong:
             return replace(final, iterations=iterations)
         groups = [replace(g, loss=None) if g.family in wrong else g for g in current.groups]
-        current = current.with_groups(groups)
+        current, known = current.with_groups(groups), None
 
 
 def _graduated(engine: Engine, values: Values, loss: TruncatedLoss, config: RobustConfig) -> tuple[Values, int]:
@@ -95,7 +106,11 @@ def _graduated(engine: Engine, values: Values, loss: TruncatedLoss, config: Robu
             step = Tangent(*relaxed.at(values)[0].eliminate().solve())
         except (IndeterminateStateError, np.linalg.LinAlgError):
             break
-        values, iterations = engine.layout.retract(values, step), iterations + 1
+        there = engine.layout.retract(values, step)
+        if not relaxed.cost(there) < relaxed.cost(values):
+            few = replace(config.minimizer, max_iterations=config.rough_iterations)
+            there = minimize(relaxed, values, few).values
+        values, iterations = there, iterations + 1
         mu *= config.mu_step
     return values, iterations
 

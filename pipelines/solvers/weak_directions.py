@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 from alidade.pipelines.estimation.problem import Problem
 from alidade.pipelines.solvers.chain import Array
 from alidade.pipelines.solvers.layout import Tangent, Values
-from alidade.pipelines.solvers.levenberg import Engine, Factorization
+from alidade.pipelines.solvers.levenberg import Engine, Factorization, Solution, System
 from alidade.pipelines.solvers.posterior import Reported, ReportedRoot
 
 # Posterior sigma of a direction, in sigmas of the priors in force, above which the direction is weak.
@@ -51,9 +51,14 @@ FOLLOWS = 0.5
 UNDETERMINED = 1e-4
 # Steps to the constrained solution, and how near it has to be, in sigmas; how often strong directions may turn weak.
 MAX_STEPS, NEAR, ROUNDS = 15, 0.02, 3
+# Part of their priors by which weak directions go to these at a time: what is curved would lead a longer step astray.
+LEAP = 0.5
 # Random moves whose slopes show along which ways anything is curved, and the share of its sigma, as root mean square,
 # by which all that is curved has to follow a way.
 DRAWS, STRAIGHT = 3, 0.1
+# Chance that moves drawn so far happen to be across a way that something follows by its sigma: of one normal number to
+# be below x it is .8 x. Below this chance no more moves are drawn where all look straight.
+MISSED = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,10 +167,12 @@ def constrained_step(directions: WeakDirections, R: Array, d: Array, u: Array) -
         R, d: square-root information of the move, |R du - d| minimal.
         u: (m,) where the system is linearised.
     """
-    strong, *_ = np.linalg.lstsq(R @ directions.strong, d, rcond=None)
-    there = u + directions.strong @ strong
-    strong_part = directions.strong @ (directions.strong.T @ there)
-    return np.asarray(strong_part + directions.weak @ directions.prior_mean(there) - u)
+    strong, weak, there = directions.strong, directions.weak, u
+    for _ in range(2):  # to where the weak ones go the others follow
+        move = directions.prior_mean(there) - weak.T @ u
+        own, *_ = np.linalg.lstsq(R @ strong, d - R @ weak @ move, rcond=None)
+        there = u + strong @ own + weak @ move
+    return np.asarray(there - u)
 
 
 def curvature(directions: WeakDirections, roots: Callable[[Array], Iterable[Array]]) -> Array:
@@ -191,8 +198,13 @@ def curvature(directions: WeakDirections, roots: Callable[[Array], Iterable[Arra
         triangles = [np.asarray(np.linalg.qr(R @ axes, mode="r"), dtype=float)[:k] for R in there]
         return np.array([np.where(follows, -R / np.diag(R)[:, None], 0.0) * sigmas for R in triangles])
 
-    drawn = slopes(np.random.default_rng(0).standard_normal((m, DRAWS)))
-    spread = np.sqrt(directions.sigmas**2 + np.square(drawn).sum(axis=2).mean(axis=0))
+    drawn = np.empty((0, k, m))
+    for way in np.random.default_rng(0).standard_normal((DRAWS, m)):
+        drawn = np.concatenate([drawn, slopes(way[:, None])])
+        spread = np.sqrt(directions.sigmas**2 + np.square(drawn).sum(axis=2).mean(axis=0))
+        found = np.sqrt(np.square(drawn / spread[:, None]).sum(axis=(1, 2)))
+        if found.max() < STRAIGHT and (0.8 * found).prod() < MISSED:
+            return np.zeros((k, k))
     sizes, ways = np.linalg.svd((drawn / spread[:, None]).reshape(-1, m), full_matrices=False)[1:]
     ways = ways[sizes > STRAIGHT * np.sqrt(DRAWS)]
     if not len(ways):
@@ -208,13 +220,14 @@ class Posterior:
 
     Attributes:
         values: of all variables, weak directions at their prior means.
-        factorization: of the system there.
+        system, factorization: of the factors there.
         reported: the numbers there.
         directions: strong and weak ones, second order included.
         converged: whether there is a constrained minimum; else all that is calibrated has its prior.
     """
 
     values: Values
+    system: System
     factorization: Factorization
     reported: Reported
     directions: WeakDirections
@@ -226,37 +239,37 @@ class Posterior:
         return self.reported.covariance(self.directions.covariance())
 
 
-def constrained_solution(
-    problem: Problem, engine: Engine, values: Values, current_keys: Mapping[int, int]
-) -> Posterior:
+def constrained_solution(problem: Problem, minimum: Solution, current_keys: Mapping[int, int]) -> Posterior:
     """The posterior near a minimum, its weak directions at the prior.
 
     Args:
         problem: of which the reported numbers are.
-        engine: of its factors, without the measurements that are rejected: elsewhere the loss would reject others.
-        values: at a minimum.
+        minimum: of its factors, without the measurements that are rejected: elsewhere the loss would reject others.
         current_keys: parameter key -> variable that holds its value.
 
     Raises:
         IndeterminateStateError: a state is not determined.
     """
-    found = _constrained(problem, engine, values, current_keys, None)
+    engine, known = minimum.engine, (minimum.system, minimum.factorization)
+    found = _constrained(problem, engine, minimum.values, current_keys, None, known)
+    if not found.converged:
+        return _unknown(problem, minimum, current_keys)
     for _ in range(ROUNDS):
         second_order = curvature(found.directions, partial(_roots, problem, engine, found, current_keys))
         directions = found.directions.with_curvature(second_order)
         if directions.weak.shape[1] == found.directions.weak.shape[1]:
             break
-        found = _constrained(problem, engine, found.values, current_keys, directions)
+        known = found.system, found.factorization
+        found = _constrained(problem, engine, found.values, current_keys, directions, known)
     return replace(found, directions=directions)
 
 
-def _unknown(problem: Problem, engine: Engine, values: Values, current_keys: Mapping[int, int]) -> Posterior:
+def _unknown(problem: Problem, minimum: Solution, current_keys: Mapping[int, int]) -> Posterior:
     """The posterior where no constrained minimum is found: all that is calibrated has its prior."""
-    reported = Reported.of(problem, engine.layout, values, current_keys)
-    R = reported.root(engine.at(values)[0].eliminate().root).R
-    weak = np.eye(len(R))[:, reported.calibrated]
-    fixed = WeakDirections.given(R, weak, reported.prior, reported.calibrated)
-    return replace(_constrained(problem, engine, values, current_keys, fixed), converged=False)
+    reported = Reported.of(problem, minimum.engine.layout, minimum.values, current_keys)
+    R, known = reported.root(minimum.factorization.root).R, (minimum.system, minimum.factorization)
+    fixed = WeakDirections.given(R, np.eye(len(R))[:, reported.calibrated], reported.prior, reported.calibrated)
+    return replace(_constrained(problem, minimum.engine, minimum.values, current_keys, fixed, known), converged=False)
 
 
 def _constrained(
@@ -265,11 +278,17 @@ def _constrained(
     values: Values,
     current_keys: Mapping[int, int],
     fixed: WeakDirections | None,
+    known: tuple[System, Factorization],
 ) -> Posterior:
-    """The minimum with the weak directions at their prior means: those of the system there, or fixed ones."""
-    weak, cost = 0, np.inf
-    for _ in range(MAX_STEPS):
-        factorization = engine.at(values)[0].eliminate()
+    """The minimum with the weak directions at their prior means: those of the system there, or fixed ones.
+
+    `known` is the system at the values, and its factorization.
+    """
+    weak, cost, (system, factorization) = 0, np.inf, known
+    for step in range(MAX_STEPS):
+        if step:
+            system = engine.at(values)[0]
+            factorization = system.eliminate()
         reported = Reported.of(problem, engine.layout, values, current_keys)
         found = reported.root(factorization.root)
         directions = (
@@ -281,7 +300,11 @@ def _constrained(
         du = constrained_step(directions, found.R, found.d, reported.u)
         size = np.linalg.norm(directions.strong.T @ du / directions.sigmas), np.linalg.norm(directions.weak.T @ du)
         if max(size) < NEAR:
-            return Posterior(values, factorization, reported, directions, True)
+            return Posterior(values, system, factorization, reported, directions, True)
+        if size[1] > LEAP:
+            du *= LEAP / size[1]
+        elif size[1] > NEAR and fixed is None:
+            fixed = directions
         share, there = 1.0, _moved(engine, factorization, values, found, du)
         if size[1] < NEAR:  # the weak directions are where they are to be: from here on the cost falls
             while engine.cost(there) > cost and share > 1e-3:
@@ -289,7 +312,7 @@ def _constrained(
                 there = _moved(engine, factorization, values, found, share * du)
             cost = engine.cost(there)
         values = there
-    return Posterior(values, factorization, reported, directions, False)
+    return Posterior(values, system, factorization, reported, directions, False)
 
 
 def _moved(engine: Engine, factorization: Factorization, values: Values, found: ReportedRoot, du: Array) -> Values:

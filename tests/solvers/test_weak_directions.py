@@ -48,7 +48,7 @@ def posterior(recorded: Problem, until: float) -> Posterior:
         for g in solution.engine.groups
     ]
     engine = solution.engine.with_groups(groups).under(None)
-    return constrained_solution(recorded, engine, solution.values, current)
+    return constrained_solution(recorded, replace(solution, engine=engine), current)
 
 
 def errors(method: str, case: str, share: float, seeds: range) -> tuple[list[float], int, int]:
