@@ -1,33 +1,33 @@
-"""The batch solver against graphs of native GTSAM factors and against GTSAM's own optimizer."""
+"""The batch solver against graphs of native GTSAM factors, solved by GTSAM's own optimizer."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import partial
 
 import gtsam
 import numpy as np
 
+from alidade.factors import so3
+from alidade.factors.attitude import ahrs_factors
 from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.config import load_config
-from alidade.pipelines.estimation.gyro_chain import GyroChain, state
-from alidade.pipelines.estimation.problem import Factor, Problem, Step
-from alidade.pipelines.estimation.walking_bias import FIRST as FIRST_BIAS
+from alidade.pipelines.estimation.problem import Array, Problem
 from alidade.pipelines.methods.head import graph as head
 from alidade.pipelines.methods.head.recording import HeadData
 from alidade.pipelines.methods.head.simulation import HeadScenario, head_config, simulate_head
 from alidade.pipelines.methods.los import graph as los
+from alidade.pipelines.methods.los.recording import LosData
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
 from alidade.pipelines.settings import Config, Sensors
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
-from alidade.pipelines.solvers.assembly import CHUNK, Assembly, StepBoundary
-from alidade.pipelines.solvers.batch import solve_batch
-from alidade.pipelines.solvers.gauss_newton import Solution
-from alidade.pipelines.solvers.weighing import optimize
+from alidade.pipelines.solvers.batch import minimum, solve_batch
+from alidade.pipelines.solvers.engines import Compiled
+from alidade.pipelines.solvers.levenberg import Solution
 from benchmarks.measure import Ratio, costs, growth
 
 IDEAL = Config.model_validate({"sensors": "ideal"}).sensors
-MOUNT = int(gtsam.symbol("M", 0))
+MOUNT, BIAS = (int(gtsam.symbol(c, 0)) for c in "Mb")
 IMAGES_PER_S = 50.0
 # Three-axis, for the platform of the head benchmark.
 SWAY = EulerMotion(
@@ -36,16 +36,21 @@ SWAY = EulerMotion(
     roll=[Swing(amplitude_deg=12, frequency_hz=0.07)],
 )
 
-# Factors, first guesses, and the ends of the steps.
-Graph = tuple[list[Factor], gtsam.Values, Sequence[StepBoundary]]
+# Of native factors, with first guesses.
+Graph = tuple[gtsam.NonlinearFactorGraph, gtsam.Values]
 
 
 def los_problem(keyframes: int, sensors: Sensors | None = None) -> Problem:
     """50 LOS errors/s, gyro at 1 kHz; the sensors as the config has them, by default with all assumptions free."""
-    scenario = LosScenario(duration_s=keyframes / IMAGES_PER_S, gyro_rate_hz=1000.0, image_rate_hz=IMAGES_PER_S)
-    data, _ = simulate_los(scenario, 0)
+    scenario, data = los_recording(keyframes)
     config = los_config(scenario.model_copy(update={"sensors": sensors}))
     return los.problem(data, load_config(config.encode()))
+
+
+def los_recording(keyframes: int) -> tuple[LosScenario, LosData]:
+    """A scenario and its recording."""
+    scenario = LosScenario(duration_s=keyframes / IMAGES_PER_S, gyro_rate_hz=1000.0, image_rate_hz=IMAGES_PER_S)
+    return scenario, simulate_los(scenario, 0)[0]
 
 
 def head_recording(frames: int) -> tuple[HeadData, Config]:
@@ -64,82 +69,80 @@ def head_recording(frames: int) -> tuple[HeadData, Config]:
     return data, load_config(head_config(scenario).encode())
 
 
-def build(problem: Problem, chunk: int) -> Graph:
-    """The whole graph, `chunk` measurements in a factor."""
-    whole = Assembly.of(problem.steps(chunk))
-    return whole.factors, whole.initial, whole.boundaries
-
-
-def native(problem: Problem) -> Graph:
-    """The same keyframes, gyro factors and biases, each measurement a native factor.
-
-    It is a BetweenFactorRot3 of the keyframe and one mount that all share: three rows where a LOS error has two, three
-    shared unknowns where it has four and vision has ten.
-    """
-    factors, values, _ = build(problem, CHUNK)
-    mounts = {p.key for p in problem.parameters} - {int(gtsam.symbol("b", 0))}
-    kept = [f for f in factors if f.measurement is None and not mounts & set(f.factor.keys())]
-    for key in mounts:
-        values.erase(key)
-    seen = [key for f in factors if f.measurement is not None for key in f.factor.keys()]
-    return with_mount(kept, values, [key for key in seen if gtsam.Symbol(key).chr() == ord("x")], "los", 2e-5)
+def native_los(data: LosData) -> Graph:
+    """A native graph with a keyframe for every picture."""
+    return native(data.gyro_t, data.gyro, data.image_t, 2e-5)
 
 
 def native_head(data: HeadData) -> Graph:
-    """The same for a head recording, with a keyframe for every picture and the bias as the gyro's only error."""
-    time = data.vision_t[(data.vision_t >= data.head_t[0]) & (data.vision_t <= data.head_t[-1])]
-    gyro = GyroPath(data.head_t, data.head_gyro)
-    starts = np.arange(len(time)) == 0
-    chain = GyroChain.over(time, starts, gyro.attitude(time), gyro, density=1e-4, walk=1e-6)
-    step = Step(float(time[-1]), keyframes=range(len(time)))
-    chain.add(step, step.keyframes)
-    noise = gtsam.noiseModel.Isotropic.Sigma(3, 0.05)
-    step.factors.append(Factor("prior", gtsam.PriorFactorVector(FIRST_BIAS, np.zeros(3), noise)))
-    return with_mount(step.factors, step.initial, [state(k) for k in step.keyframes], "vision", 8.7e-3)
+    """A native graph with a keyframe for every picture and the helmet gyro's bias as the only error of the gyros."""
+    return native(data.head_t, data.head_gyro, data.vision_t, 8.7e-3)
 
 
-def with_mount(kept: list[Factor], values: gtsam.Values, seen: list[int], family: str, sigma: float) -> Graph:
-    """A graph with measurements (rad) of keyframes by native factors."""
+def native(t: Array, gyro: Array, seen: Array, sigma: float) -> Graph:
+    """A graph of three shared angles: AHRSFactors between keyframes and a BetweenFactorRot3 to the mount at each.
+
+    It has three rows where a LOS error has two, and six shared unknowns where the methods' have tens.
+
+    Args:
+        t: (N,) s of the gyro's samples.
+        gyro: (N, 3) rad/s.
+        seen: (K,) s of the measurements.
+        sigma: of these, rad.
+    """
+    time, path = seen[(seen >= t[0]) & (seen <= t[-1])], GyroPath(t, gyro)
+    keys, n = [int(gtsam.symbol("x", k)) for k in range(len(time))], len(time)
+    turns = path.increments(time[:-1], time[1:])
+    graph, values, rng = gtsam.NonlinearFactorGraph(), gtsam.Values(), np.random.default_rng(0)
+    variance = 1e-4**2 * np.diff(time)
+    for factor in ahrs_factors(keys[:-1], keys[1:], [BIAS] * (n - 1), turns, path.bias_hat, variance):
+        graph.add(factor)
+    values.insert(BIAS, np.zeros(3))
+    graph.add(gtsam.PriorFactorVector(BIAS, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 0.05)))
     values.insert(MOUNT, gtsam.Rot3.Expmap(np.full(3, 0.01)))
     # Without it nothing holds mount and keyframes where they are.
-    kept.append(Factor("prior", gtsam.PriorFactorRot3(MOUNT, gtsam.Rot3(), gtsam.noiseModel.Isotropic.Sigma(3, 0.1))))
-    rng = np.random.default_rng(0)
+    graph.add(gtsam.PriorFactorRot3(MOUNT, gtsam.Rot3(), gtsam.noiseModel.Isotropic.Sigma(3, 0.1)))
     noise = gtsam.noiseModel.Isotropic.Sigma(3, sigma)
-    for key in seen:
-        measured = values.atRot3(key).compose(gtsam.Rot3.Expmap(sigma * rng.standard_normal(3)))
-        kept.append(Factor(family, gtsam.BetweenFactorRot3(MOUNT, key, measured, noise)))
-    return kept, values, ()
+    for key, wxyz in zip(keys, path.attitude(time), strict=True):
+        attitude = so3.to_gtsam(wxyz)
+        values.insert(key, attitude)
+        measured = attitude.compose(gtsam.Rot3.Expmap(sigma * rng.standard_normal(3)))
+        graph.add(gtsam.BetweenFactorRot3(MOUNT, key, measured, noise))
+    return graph, values
 
 
-def solve(problem: Problem, graph: Graph) -> Solution:
-    """By the batch solver's outer loop, ordering included."""
-    present = set(graph[1].keys())
-    shared = [key for key in [*(p.key for p in problem.parameters), MOUNT] if key in present]
-    factors, values, boundaries = graph
-    loss = problem.loss if any(f.measurement for f in factors) else None
-    return optimize(factors, values, shared, loss, boundaries=boundaries)
+def solve(compiled: Compiled) -> Solution:
+    """By the batch solver's outer loop, gate included, noise levels as stated."""
+    return minimum(compiled, compiled.problem.noises)
 
 
-def default_optimizer(graph: Graph) -> int:
-    """By gtsam.LevenbergMarquardtOptimizer as it comes, plain least squares; returns its iterations."""
-    whole = gtsam.NonlinearFactorGraph()
-    for f in graph[0]:
-        whole.add(f.factor if f.measurement is None else f.measurement.under(None).factor)
-    optimizer = gtsam.LevenbergMarquardtOptimizer(whole, graph[1])
+def solve_native(graph: Graph) -> int:
+    """By gtsam.LevenbergMarquardtOptimizer as it comes; returns its iterations."""
+    optimizer = gtsam.LevenbergMarquardtOptimizer(*graph)
     optimizer.optimize()
     return int(optimizer.iterations())
 
 
+def in_gtsam(problem: Problem) -> Graph:
+    """The whole problem as a graph of gtsam, a CustomFactor a measurement, without loss."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for step in problem.steps(1):
+        values.insert(step.initial)
+        for f in step.factors:
+            graph.add(f.factor if f.measurement is None else f.measurement.under(None).factor)
+    return graph, values
+
+
 def against_native(name: str, problem: Problem, theirs: Graph, compared: str, wanted: float) -> Ratio:
-    """The batch solver's outer loop, gate included, on our graph and on one of native factors."""
-    ours = build(problem, CHUNK)
-    a, b = costs([lambda: solve(problem, ours), lambda: solve(problem, theirs)])
+    """The batch solver's outer loop on our problem, compiled, and gtsam's optimizer on a graph of native factors."""
+    ours = Compiled.of(problem)
+    a, b = costs([lambda: solve(ours), lambda: solve_native(theirs)])
     return Ratio(name, compared, a.seconds / b.seconds, wanted=wanted, ours=a, theirs=b)
 
 
 def whole_answer(name: str, problem: Problem, theirs: Graph, compared: str) -> Ratio:
     """All that is computed of a recording, noise levels, covariance and influence included, against the same graph."""
-    a, b = costs([lambda: solve_batch(problem, budget=True), lambda: solve(problem, theirs)])
+    a, b = costs([lambda: solve_batch(problem, budget=True), lambda: solve_native(theirs)])
     return Ratio(name, compared, a.seconds / b.seconds, ours=a, theirs=b)
 
 
@@ -154,8 +157,8 @@ def against_ideal(keyframes: int) -> Ratio:
 def against_default(keyframes: int) -> Ratio:
     """The default route's time over ours."""
     problem = los_problem(keyframes)
-    single, chunks = build(problem, 1), build(problem, CHUNK)
-    a, b = costs([lambda: solve(problem, chunks), lambda: default_optimizer(single)], 1, warm=False)
+    single, compiled = in_gtsam(problem), Compiled.of(problem)
+    a, b = costs([lambda: solve(compiled), lambda: solve_native(single)], 1, warm=False)
     compared = f"LevenbergMarquardtOptimizer with a CustomFactor a measurement over ours, {keyframes} keyframes"
     return Ratio(f"batch.default.{keyframes}", compared, b.seconds / a.seconds, "higher", 0.4, 20.0, a, b)
 
@@ -168,7 +171,7 @@ def run() -> Iterator[Ratio]:
         problem = los_problem(n)
         if n == 30_000:
             compared = "los direction graph with all assumptions over native-only, 30,000 keyframes"
-            theirs = native(problem)
+            theirs = native_los(los_recording(n)[1])
             ratio = against_native("batch.los", problem, theirs, compared, 1.3)
             yield ratio
             compared = "the same with noise levels, covariance, influence and all else computed, over native-only"
@@ -177,8 +180,7 @@ def run() -> Iterator[Ratio]:
             assert ratio.ours is not None
             seconds.append(ratio.ours.seconds)
         else:
-            graph = build(problem, CHUNK)
-            seconds += [costs([partial(solve, problem, graph)])[0].seconds]
+            seconds += [costs([partial(solve, Compiled.of(problem))])[0].seconds]
     yield Ratio(
         "batch.los.growth",
         "exponent from 3,000 to 100,000 keyframes",

@@ -13,11 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from alidade.pipelines.config import load_config
-from alidade.pipelines.methods.los import graph as los
 from alidade.pipelines.methods.los.recording import write_los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from benchmarks.batch import native, solve
+from benchmarks.batch import native_los, solve_native
 from benchmarks.measure import Cost, Ratio, costs
 
 MINUTES = LosScenario(duration_s=600.0, gyro_rate_hz=1000.0, gimbal_rate_hz=1000.0, image_rate_hz=50.0)
@@ -57,9 +55,8 @@ def run() -> Iterator[Ratio]:
         command = (*_ALIDADE, "calibrate", str(session), "--out", str(Path(folder) / "out"))
         a = process(*command, rounds=2)
         two, one = (process(*command, "--jobs", jobs, clock=time.perf_counter) for jobs in ("2", "1"))
-    problem = los.problem(data, load_config(los_config(MINUTES).encode()))
-    graph = native(problem)
-    (b,) = costs([lambda: solve(problem, graph)])
+    graph = native_los(data)
+    (b,) = costs([lambda: solve_native(graph)])
     compared = "alidade calibrate, 10 min of los at 1 kHz, all outputs, over solving its native-only graph"
     yield Ratio("command.calibrate", compared, a.seconds / b.seconds, wanted=3.0, ours=a, theirs=b)
     compared = "alidade calibrate, 10 min of los, by two processes over one, on the clock"

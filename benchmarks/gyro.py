@@ -11,12 +11,14 @@ from alidade.factors import so3
 from alidade.factors.attitude import ahrs_factors
 from alidade.factors.gyro import GyroIncrementFactor
 from alidade.factors.preintegration import GyroPath
-from alidade.factors.vectorized import Ensemble
-from alidade.pipelines.solvers.assembly import CHUNK
+from alidade.pipelines.estimation.problem import ChainLayout, Factor
+from alidade.pipelines.solvers.layout import Layout
+from alidade.pipelines.solvers.linearization import Linearization
 from benchmarks.measure import Ratio, costs
 
 SAMPLES, WINDOWS = 300_000, 36_000
 BIAS, ERRORS = (int(gtsam.symbol(c, 0)) for c in "be")
+KEYS = [int(gtsam.symbol("x", k)) for k in range(WINDOWS + 1)]
 
 
 def run() -> Iterator[Ratio]:
@@ -39,23 +41,17 @@ def run() -> Iterator[Ratio]:
     turns = path.increments(*windows, scale=True)
     values = gtsam.Values()
     for k, attitude in enumerate(path.attitude(edges)):
-        values.insert(k, so3.to_gtsam(attitude))
+        values.insert(KEYS[k], so3.to_gtsam(attitude))
     for key, size in [(BIAS, 3), (ERRORS, 15)]:
         values.insert(key, np.zeros(size))
-    factors = [
-        GyroIncrementFactor(edges[k + 1], turns[k], path, np.full(len(k), 1e-5)).on(k, k + 1, BIAS, ERRORS)
-        for k in np.array_split(np.arange(WINDOWS), WINDOWS // CHUNK)
-    ]
+    model = GyroIncrementFactor(edges[1:], turns, path, np.full(WINDOWS, 1e-5))
+    factor = Factor.process_of("gyro", model.on(KEYS[:-1], KEYS[1:], BIAS, ERRORS))
+    layout, ours = Layout.of(ChainLayout("x"), values)
+    linearization = Linearization.of([factor], layout)
     native = gtsam.NonlinearFactorGraph()
-    keys = list(range(WINDOWS + 1))
-    for each in ahrs_factors(keys[:-1], keys[1:], [BIAS] * WINDOWS, turns, path.bias_hat, np.full(WINDOWS, 1e-10)):
+    for each in ahrs_factors(KEYS[:-1], KEYS[1:], [BIAS] * WINDOWS, turns, path.bias_hat, np.full(WINDOWS, 1e-10)):
         native.add(each)
 
-    def linearize() -> None:
-        with Ensemble(factors).at(values):
-            for factor in factors:
-                factor.linearized(values)
-
-    chain, plain = costs([linearize, lambda: native.linearize(values)])
+    chain, plain = costs([lambda: linearization.at(ours), lambda: native.linearize(values)])
     compared = "linearising increments with scale and g-sensitivity over native AHRSFactors, 36,000 keyframes"
     yield Ratio("gyro.linearisation", compared, chain.seconds / plain.seconds, ours=chain, theirs=plain)

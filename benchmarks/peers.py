@@ -24,9 +24,9 @@ from alidade.pipelines.estimation.problem import Problem
 from alidade.pipelines.methods.los import graph as los
 from alidade.pipelines.methods.los.recording import LosData
 from alidade.pipelines.methods.los.simulation import LosNoise, LosScenario, los_config, simulate_los
-from alidade.pipelines.solvers.assembly import CHUNK
+from alidade.pipelines.solvers.engines import Compiled
 from benchmarks import static
-from benchmarks.batch import IDEAL, build, solve
+from benchmarks.batch import IDEAL, solve
 from benchmarks.measure import Ratio, costs
 
 Array = NDArray[np.float64]
@@ -161,10 +161,10 @@ def los_peers() -> tuple[Problem, LosRows]:
 def run() -> Iterator[Ratio]:
     """Both peers. Raises AssertionError when the answers differ."""
     problem, rows = los_peers()
-    graph = build(problem, CHUNK)
-    angles = solve(problem, graph).values.atVector(problem.parameters[0].key)
+    compiled = Compiled.of(problem)
+    angles = compiled.layout.of_key(solve(compiled).values, problem.parameters[0].key)
     found: list[Array] = []
-    a, b = costs([partial(solve, problem, graph), lambda: found.append(rows.solve())], 1, warm=False)
+    a, b = costs([partial(solve, compiled), lambda: found.append(rows.solve())], 1, warm=False)
     off = np.abs(found[0] - angles)
     assert off.max() < _SAME, f"scipy's angles are {off} rad off"
     compared = f"scipy's sparse least_squares over ours, los direction graph of {KEYFRAMES:,} keyframes"

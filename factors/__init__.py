@@ -23,7 +23,6 @@ _HOMES = {
         "GyroStaticFactor",
         "MagFactor",
         "TriadPriorFactor",
-        "WeightedSumFactor",
     ),
     "turns": ("GyroRotationFactor",),
     "vectorized": ("Ensemble", "VectorizedFactor"),

@@ -226,30 +226,3 @@ def _by_triad(nominal: Array, weight: Array) -> Array:
         J[:, i, 3 * i : 3 * i + 3] = nominal * weight[:, None]
         J[:, i, 9 + i] = weight
     return J
-
-
-@dataclass(frozen=True)
-class WeightedSumFactor(Model):
-    """The weighted sum of several vectors is zero. Blocks: as many vectors (3) as weights.
-
-    Attributes:
-        time: (1,) s.
-        weights: (k,).
-        sigma: of the sum.
-    """
-
-    time: Array
-    weights: Array
-    sigma: float
-    rows: int = 3
-
-    @property
-    def blocks(self) -> tuple[Block, ...]:
-        """A vector for each weight."""
-        return (3,) * len(self.weights)
-
-    def __call__(self, *vectors: Array) -> Residuals:
-        """Residual sum / sigma, (1, 3)."""
-        scaled = self.weights / self.sigma
-        total = sum((w * v for w, v in zip(scaled, vectors, strict=True)), start=np.zeros((1, 3)))
-        return total, lambda: tuple(w * np.eye(3)[None] for w in scaled)

@@ -191,9 +191,6 @@ def minimize(
             undamped = predicted if damping == 0.0 else undamped
             near = min(predicted, abs(decrease)) < _enough(config, cost)
             near &= damping == 0.0 or undamped < config.curved_tolerance
-            # In a curved valley, which only what the data hardly determine has, all steps left are too short to matter.
-            left = (config.max_iterations - iteration) * max(predicted, abs(decrease))
-            near |= 0.0 < damping <= 1.0 and left < config.curved_tolerance
             near |= damping == config.initial_damping and predicted < config.determined_tolerance
             if decrease > _DOUBLE * predicted > _DOUBLE * _enough(config, cost):
                 candidate, new_system, new_cost = _lengthened(engine, values, step, new_cost)

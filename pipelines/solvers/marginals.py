@@ -1,4 +1,4 @@
-"""Joint marginal covariance of the parameters and degrees of freedom of chi-square, from a linearised graph."""
+"""Joint marginal covariance of the parameters from a linearised graph."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.estimation.problem import Array, ChiSquare, Factor, History, Parameter, Problem
+from alidade.pipelines.estimation.problem import Array, Factor, Parameter, Problem
 from alidade.pipelines.solvers.chain import IndeterminateError as IndeterminateError
 
 if TYPE_CHECKING:
@@ -19,10 +19,6 @@ if TYPE_CHECKING:
 # A direction the data and priors say nothing about gets this many times its prior scale as sigma, so that it can be
 # named with the others instead of making the system unsolvable.
 _UNKNOWN = 1e4
-# Forces that hold combinations of numbers at their priors: neither measured nor believed.
-HELD = "held"
-# Families whose residuals say nothing about the noise of the recording.
-_NO_MEASUREMENTS = ("prior", "definition", HELD)
 
 
 def reported(problem: Problem, values: gtsam.Values, current_keys: Mapping[int, int]) -> Array:
@@ -104,52 +100,6 @@ def eliminated(
     return tree, left
 
 
-def smoothed(
-    problem: Problem,
-    tree: gtsam.GaussianBayesTree,
-    values: gtsam.Values,
-    held: Sequence[tuple[float, Mapping[int, int]]],
-    covariance: Array,
-) -> History | None:
-    """Smoothed values and sigmas over time of parameters that move along; the others as they are at the end.
-
-    Args:
-        problem: the graph's.
-        tree: the graph linearised at the values, eliminated.
-        values: of all variables.
-        held: time and, from then on, parameter key -> variable that held it.
-        covariance: (n, n) of the reported numbers, for those that do not move.
-
-    Returns None when the system is singular.
-    """
-    try:
-        sigmas = [_sigmas_of(problem, tree, values, current_keys, covariance) for _, current_keys in held]
-    except RuntimeError:
-        return None
-    times = np.array([time for time, _ in held])
-    return History(times, np.array([reported(problem, values, s) for _, s in held]), np.array(sigmas))
-
-
-def _sigmas_of(
-    problem: Problem,
-    tree: gtsam.GaussianBayesTree,
-    values: gtsam.Values,
-    current_keys: Mapping[int, int],
-    covariance: Array,
-) -> Array:
-    """(n,) sigmas, of the current keys where there are others, else from the covariance."""
-    sigmas = np.sqrt(np.diag(covariance))
-    start = 0
-    for p in problem.parameters:
-        stop = start + len(p.quantities)
-        if p.key in current_keys:
-            key = current_keys[p.key]
-            moving = reported_covariance([p], tree.marginalInformation(key), values, [key])
-            sigmas[start:stop] = np.sqrt(np.diag(moving))
-        start = stop
-    return sigmas
-
-
 def reported_covariance(
     parameters: Sequence[Parameter],
     information: Array,
@@ -220,41 +170,6 @@ def _inverse(J: Array) -> Array:
     return J if own else np.asarray(np.linalg.pinv(J), dtype=float)
 
 
-def chi_square(
-    problem: Problem,
-    factors: Sequence[Factor],
-    values: gtsam.Values,
-    covariance: Array,
-    expected: Mapping[tuple[str, int], float],
-) -> ChiSquare:
-    """Sum of squares of measurements and processes (not of priors) and its degrees of freedom, whole and by family.
-
-    The whole: rows used, less unknowns, plus what the priors contribute to the unknowns. The families' shares are
-    sampled, the largest family's taken as what is left of the whole.
-
-    Args:
-        problem: the graph's.
-        factors: of the graph.
-        values: the estimate.
-        covariance: of the reported numbers.
-        expected: see redundancy.expected_squares.
-    """
-    value: dict[str, float] = {}
-    rows = rows_used(factors, values)
-    for f in factors:
-        if f.family not in _NO_MEASUREMENTS:
-            value[f.family] = value.get(f.family, 0.0) + sum_of_squares(f, values)
-    counted = sum(count for f, count in zip(factors, rows, strict=True) if f.family not in ("prior", HELD))
-    dof = counted - values.dim() + _from_priors(problem, covariance)
-    families = dict.fromkeys(value, 0.0)
-    for (family, _), square in expected.items():
-        if family in families:
-            families[family] += square
-    largest = max(value, key=lambda family: families[family])
-    families[largest] = dof - sum(families[family] for family in value if family != largest)
-    return ChiSquare(sum(value.values()), dof, {family: (value[family], families[family]) for family in value})
-
-
 def rows_used(factors: Sequence[Factor], values: gtsam.Values) -> list[int]:
     """How many rows each factor stands for, rejected measurements left out."""
     return [
@@ -268,17 +183,6 @@ def sum_of_squares(factor: Factor, values: gtsam.Values) -> float:
     if factor.measurement is None:
         return 2.0 * float(factor.factor.error(values))
     return float((factor.measurement.residuals(values)[factor.measurement.used(values)] ** 2).sum())
-
-
-def _from_priors(problem: Problem, covariance: Array) -> float:
-    """How many unknowns the priors determine: the sum of posterior over prior variance."""
-    share = 0.0
-    for q, variance in zip(problem.quantities, np.diag(covariance), strict=True):
-        if q.prior_sigma == 0.0:
-            share += 1.0
-        elif q.prior_sigma is not None:
-            share += min((variance - q.extra_sigma**2) / q.prior_sigma**2, 1.0)
-    return share
 
 
 def explain(message: str) -> str:

@@ -6,12 +6,14 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 
-from alidade.pipelines.solvers.assembly import CHUNK
+from alidade.pipelines.solvers.engines import Compiled
 from benchmarks import __main__ as runner
-from benchmarks.batch import build
+from benchmarks import static
+from benchmarks.batch import los_problem, los_recording, native_los, solve
 from benchmarks.measure import Ratio, costs, growth, worse
 
 SLOW = """
@@ -85,10 +87,28 @@ def test_committed_baseline_names_what_is_measured() -> None:
     assert all(value > 0.0 for value in baseline.values())
 
 
+def test_the_native_graph_has_the_gyro_between_its_keyframes_and_converges() -> None:
+    _, data = los_recording(200)
+    graph, values = native_los(data)
+    keyframes = values.size() - 2
+    assert graph.size() == (keyframes - 1) + keyframes + 2
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values)
+    optimizer.optimize()
+    # Only the measurements have noise, part of which the keyframes follow.
+    assert 0.3 < 2.0 * optimizer.error() / (3 * keyframes) < 1.0
+    assert solve(Compiled.of(los_problem(200))).converged
+
+
+def test_static_minimum_is_that_of_the_normal_equations(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(static, "ROWS", 3_000)
+    for model, start in (static.los_rates(), static.accelerometer()):
+        np.testing.assert_allclose(static.ours(model, start), static.normal_equations(model, start), rtol=1e-6)
+
+
 def test_scipy_gets_the_rows_of_our_graph() -> None:
     from benchmarks.peers import los_peers
 
     problem, rows = los_peers()
-    factors, values, _ = build(problem, CHUNK)
-    ours = sum(f.factor.error(values) for f in factors)
-    assert 0.5 * np.square(rows.residuals(rows.x0)).sum() == pytest.approx(ours, rel=1e-2)
+    compiled = Compiled.of(problem)
+    ours = compiled.engine.under(None).cost(compiled.initial)
+    assert np.square(rows.residuals(rows.x0)).sum() == pytest.approx(ours, rel=1e-2)

@@ -17,7 +17,6 @@ from alidade.factors.triad import (
     GyroStaticFactor,
     MagFactor,
     TriadPriorFactor,
-    WeightedSumFactor,
     calibration,
     parts,
     triad,
@@ -272,12 +271,3 @@ def test_an_unknown_quantity_has_no_prior() -> None:
     residual, jacobians = TriadPriorFactor(TIMES, rng.normal(size=(N, 12)), sigma)(_triads(rng))
     assert not residual.any()
     assert not jacobians()[0].any()
-
-
-def test_weighted_sum_jacobians() -> None:
-    rng = _rng(11)
-    model = WeightedSumFactor(TIMES[:1], np.array([0.2, 0.5, 0.3]), 0.1)
-    blocks = list(rng.normal(size=(3, 1, 3)))
-    assert_jacobians(model, blocks)
-    blocks[2] = -(0.2 * blocks[0] + 0.5 * blocks[1]) / 0.3
-    np.testing.assert_allclose(model(*blocks)[0], 0.0, atol=1e-14)

@@ -12,7 +12,7 @@ import pytest
 from gtsam.symbol_shorthand import A, X
 
 import alidade.factors
-from alidade.factors import AccelFactor, MagFactor, TriadPriorFactor, TruncatedLoss, WeightedSumFactor, so3
+from alidade.factors import AccelFactor, MagFactor, TriadPriorFactor, TruncatedLoss, so3
 from alidade.factors.model import Array, Model, Residuals
 
 N = 20
@@ -61,8 +61,6 @@ def test_what_cannot_be_is_refused_when_the_model_is_made(case: str) -> None:
 def test_other_ways_to_make_a_model_are_looked_at_too() -> None:
     with pytest.raises(ValueError, match=re.escape("AccelFactor: sigma[0] is 0")):
         replace(AccelFactor(**GOOD), sigma=np.zeros(N))
-    with pytest.raises(ValueError, match="WeightedSumFactor: sigma is 0"):
-        WeightedSumFactor(np.zeros(1), np.ones(2), 0.0)
     with pytest.raises(ValueError, match=re.escape("MagFactor: raw of 2 measurements has shape (2, 2), not (2, 3)")):
         MagFactor(np.zeros(2), np.zeros((2, 2)), np.ones(2))
 

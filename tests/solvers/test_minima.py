@@ -13,9 +13,8 @@ from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.estimation.problem import Problem, Step
 from alidade.pipelines.methods.tumble.scenario import TumbledAccelerometer, TumbledMagnetometer, TumbleScenario
-from alidade.pipelines.solvers.assembly import CHUNK, Assembly
 from alidade.pipelines.solvers.batch import BatchConfig, solve_batch
-from alidade.pipelines.solvers.system import System
+from alidade.pipelines.solvers.engines import ALL, Compiled
 
 # Iron by which one axis of the magnetometer says little.
 STRONG = TumbleScenario(magnetometer=TumbledMagnetometer(soft_iron=0.2))
@@ -30,12 +29,13 @@ def test_mirrored_values_explain_all_measurements_alike() -> None:
     both = TumbleScenario(attitudes=12, rest_s=2.0, accelerometer=TumbledAccelerometer())
     problem = tumbled(both, 0).problem()
     assert problem.elsewhere is not None
-    whole = Assembly.of(problem.steps(CHUNK))
-    measured = [f for f in whole.factors if f.measurement is not None]
-    system = System.of(measured, whole.shared(problem), None)
-    errors = [system.error(values) for values in problem.elsewhere(whole.initial)]
-    assert len(errors) == 7
-    np.testing.assert_allclose(errors, system.error(whole.initial), rtol=1e-9)
+    compiled = Compiled.of(problem)
+    layout, engine = compiled.layout, compiled.engine.under(None)
+    measured = engine.with_groups([group for group in engine.groups if group.is_measurement])
+    mirrored = problem.elsewhere(layout.to_gtsam(compiled.initial))
+    costs = [measured.cost(layout.from_gtsam(values)) for values in mirrored]
+    assert len(costs) == 7
+    np.testing.assert_allclose(costs, measured.cost(compiled.initial), rtol=1e-9)
 
 
 def test_a_solution_nearly_as_likely_is_told(tmp_path: Path) -> None:
@@ -64,7 +64,7 @@ def test_the_deepest_minimum_is_found_from_another() -> None:
     problem = tumbled(STRONG, 1).problem()
     assert problem.elsewhere is not None
     best = solve_batch(problem)
-    (first, *rest) = problem.steps(CHUNK)
+    (first, *rest) = problem.steps(ALL)
     others = list(problem.elsewhere(first.initial))
     alone = []
     for other in others:
