@@ -385,7 +385,9 @@ def test_an_accelerometer_that_shows_gravity_down_is_told_and_the_magnetometer_k
     assert calibration.status == "calibrated"
     assert "shows gravity down" in " ".join(calibration.notes)
     found = calibration.parameters
-    for name, sign in {f"{sensor}_k{i}{i}": sign for sensor, sign in (("accel", -1.0), ("mag", 1.0)) for i in "123"}.items():
+    for name, sign in {
+        f"{sensor}_k{i}{i}": sign for sensor, sign in (("accel", -1.0), ("mag", 1.0)) for i in "123"
+    }.items():
         assert abs(found[name].value - sign * simulated.truth[name]) < 4.0 * found[name].sigma, name
     assert found["field_dip"].value == pytest.approx(simulated.truth["field_dip"], abs=4.0 * found["field_dip"].sigma)
 
