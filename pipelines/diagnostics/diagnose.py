@@ -18,6 +18,7 @@ from alidade.pipelines.estimation.problem import SLOW_ERROR, ChiSquare, Estimate
 from alidade.pipelines.estimation.robust import robust_sigma
 
 NOTE, WEAK, INCONSISTENT = Severity.NOTE, Severity.WEAK, Severity.INCONSISTENT
+_CORNERS = "corner_px"
 # Kinds about the residuals, as opposed to priors and requirements.
 _RESIDUAL = ("not_converged", "misfit", "noise", "correlation", "rejection")
 
@@ -28,9 +29,12 @@ class Thresholds:
 
     rejected_note: float = 0.10
     rejected: float = 0.25
-    min_family: int = 10  # fewer measurements have no share worth the name
+    min_family: int = 10  # fewer measurements have no share worth the name, unless it is most of them
+    rejected_few: float = 0.5  # of at least `min_few`: three independent outliers of 1 % each are none
+    min_few: int = 4
     noise_factor: float = 4.0  # a larger estimate over statement, by `noise_sigmas` of the estimate, is no noise
     noise_sigmas: float = 3.0
+    corner_factor: float = 5.0  # corners over their default: blurred and distant tags scatter by two or three times it
     noise_note: float = 2.0
     noise_suspect: float = 1.5  # with correlated residuals
     process_dof: float = 100.0  # processes with fewer are not tested
@@ -136,13 +140,16 @@ def _prior_conflict(
 
 
 def _rejections(estimate: Estimate, limits: Thresholds) -> list[Finding]:
-    shares = {f: float(np.mean(~r.used)) for f, r in estimate.residuals.items() if len(r.used) >= limits.min_family}
+    every = {f: r.used for f, r in estimate.residuals.items() if len(r.used) >= limits.min_few}
+    least = {
+        f: limits.rejected_note if len(used) >= limits.min_family else limits.rejected_few for f, used in every.items()
+    }
+    shares = {f: share for f, used in every.items() if (share := float(np.mean(~used))) > least[f]}
     found = []
     for family in sorted(shares, key=lambda family: -shares[family]):
-        if (share := shares[family]) > limits.rejected_note:
-            factor = robust_sigma(estimate.residuals[family].whitened)
-            evidence = {"family": family, "share": share, "noise_factor": factor}
-            found.append(Finding("rejection", INCONSISTENT if share > limits.rejected else NOTE, evidence))
+        share, factor = shares[family], robust_sigma(estimate.residuals[family].whitened)
+        evidence = {"family": family, "share": share, "noise_factor": factor}
+        found.append(Finding("rejection", INCONSISTENT if share > limits.rejected else NOTE, evidence))
     return found
 
 
@@ -152,10 +159,12 @@ def _noise(estimate: Estimate, limits: Thresholds) -> Iterator[Finding]:
         least = -np.inf if level.sigma is None else (level.found or 0.0) - limits.noise_sigmas * level.sigma
         no_noise = bool(level.noise.families) and least > limits.noise_factor
         differs = level.contradicted or not 1.0 / limits.noise_note < level.scale < limits.noise_note
-        if level.noise.source != "default" and (no_noise or (differs and level.scale != 1.0)):
+        # Of corners the default is no guess: what scatters by many times it does not fit the camera or the layout.
+        corners = level.noise.name == _CORNERS and level.scale > limits.corner_factor
+        if corners or (level.noise.source != "default" and (no_noise or (differs and level.scale != 1.0))):
             numbers = {"used": level.used, "factor": level.scale, "estimated_factor": level.found}
             evidence = {"noise": level.noise.name, "unit": level.noise.unit, "source": level.noise.source, **numbers}
-            yield Finding("noise", INCONSISTENT if no_noise else NOTE, evidence)
+            yield Finding("noise", INCONSISTENT if no_noise or corners else NOTE, evidence)
 
 
 def _correlations(estimate: Estimate, limits: Thresholds) -> Iterator[Finding]:

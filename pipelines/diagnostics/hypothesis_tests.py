@@ -29,6 +29,8 @@ _SEGMENT_S, _SCORE_SEGMENT_S = 30.0, 8.0
 _SIGNIFICANT = 5.0
 # A correction that leaves more than this share of the noise factor explains little.
 _MAX_REMAINING = 0.8
+# One that leaves chi-square above so many times its degrees of freedom leaves the cause unknown, and is no explanation.
+_MAX_LEFT = 10.0
 # Larger noise explains anything, and is never offered.
 _MAX_NOISE_FACTOR = 4.0
 _MAX_TESTED, _MAX_REPORTED = 3, 3
@@ -151,7 +153,8 @@ def _with_delays(label: str, after: TrialFit) -> str:
 def _explains(before: TrialFit, after: TrialFit) -> bool:
     """Whether chi-square falls by far more than chance, and to (nearly) what it should be."""
     fall = (before.cost - after.cost) / max(after.factor, 1.0) ** 2
-    return fall > _SIGNIFICANT**2 and (after.fits or after.factor < _MAX_REMAINING * before.factor)
+    explains = after.factor < _MAX_REMAINING * before.factor and after.factor**2 <= _MAX_LEFT
+    return fall > _SIGNIFICANT**2 and (after.fits or explains)
 
 
 def _noise(build: Build, data: Any, config: Config) -> list[_Tested]:

@@ -34,6 +34,7 @@ _NEXT = {
     "inconsistent": ("Do not apply it before the cause is found: see Goodness of fit below.",),
 }
 _WALK = "Calibrate the recordings after the last change together, or let the parameter walk: `share` in the config."
+_CHECK = {"corner_px": "camera_info (lens, size and rectification of the pictures) and the layout of the tags"}
 _FAR = "check the orientation and the axis order of the sensor, or widen the prior"
 
 
@@ -182,8 +183,9 @@ def _rejection(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
 def _noise(e: Mapping[str, Any], severity: Severity, _: Quantities) -> str:
     unit, factor = noise_unit(e["noise"], e["unit"])
     if severity > Severity.NOTE:
-        estimated = f"estimated {e['estimated_factor']:.2g} times the {e['source']}'s value"
-        return f"Noise {e['noise']}: {estimated}; not white noise: check the model or the unit."
+        estimated = f"estimated {e['estimated_factor'] or e['factor']:.2g} times the {e['source']}'s value"
+        what = _CHECK.get(e["noise"], "the model or the unit")
+        return f"Noise {e['noise']}: {estimated}; not white noise: check {what}."
     used = f"{rounded(factor * e['used'], 3)} {unit}".strip()
     return f"Noise {e['noise']}: {used} used, {e['factor']:.2g} times the {e['source']}'s value."
 

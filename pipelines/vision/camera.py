@@ -72,6 +72,7 @@ class Camera:
         distortion_model: `plumb_bob` (k1 k2 p1 p2 k3), `rational_polynomial` (k1 k2 p1 p2 k3 k4 k5 k6) or `equidistant`
             (k1 k2 k3 k4), or another name of the same formula.
         coefficients: in ROS's order, which is OpenCV's; empty stands for no distortion.
+        rectified: (3, 3) camera matrix of its rectified pictures (P of CameraInfo), px; None where unknown.
 
     Raises:
         InputError: sizes, K or coefficients that no camera can have.
@@ -84,6 +85,7 @@ class Camera:
     K: Array
     distortion_model: str = "plumb_bob"
     coefficients: Array = ()  # type: ignore[assignment]
+    rectified: Array | None = None
 
     def __post_init__(self) -> None:
         K = np.asarray(self.K, dtype=float).reshape(3, 3)

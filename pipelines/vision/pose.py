@@ -296,6 +296,8 @@ def _colmap_camera(camera: Camera) -> Any:
 def _refine(camera: Camera, tags: TagBody, pixels: Array, cRb: Array, position: Array) -> _Fit | None:
     import pycolmap
 
+    # A pose that the corners leave open is no fault; its covariance says so.
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR
     options = pycolmap.AbsolutePoseRefinementOptions()
     options.gradient_tolerance = 1e-5
     # Its loss is Cauchy's. This wide (px) it is least squares; much wider, its log(1 + r^2 / scale^2) loses the digits.

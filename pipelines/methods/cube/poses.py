@@ -19,6 +19,7 @@ from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
 if TYPE_CHECKING:
     from alidade.pipelines.vision.pose import BodyPose, TagBody
+    from alidade.pipelines.vision.tags import Detections
 
 Array = NDArray[np.float64]
 
@@ -131,14 +132,19 @@ def _seen_tags(
     found: list[SeenTags | None] = []
     last: tuple[float, Array] | None = None
     wrong: dict[int, int] = {}
+    several: list[Detections] = []
     for start, stop in span:
         expected = None
         if last is not None:
             expected = so3.multiply(last[1], path.increments(np.array([last[0]]), np.array([start])).wxyz[0])
-        seen = _seen_in(data, config, body, start, stop, expected, wrong, dropped)
+        tags = _tags_in(data, config, start, stop)
+        if len(tags.ids) > 1:
+            several.append(tags)
+        seen = _seen_in(tags, data, body, expected, wrong, dropped)
         found.append(seen)
         if seen is not None:
             last = float(stop), seen.pose.cRb
+    _check_camera(data, config, body, several, bool(wrong), found)
     _check_rigid(wrong, found)
     if not any(found):
         reasons = ", ".join(f"{reason} ({n})" for reason, n in dropped.items()) or "no tag in sight"
@@ -146,35 +152,41 @@ def _seen_tags(
     return tuple(found)
 
 
+def _tags_in(data: CubeData, config: Config, start: float, stop: float) -> Detections:
+    """The tags in the pictures taken from start to stop, their corners averaged."""
+    from alidade.pipelines.vision.tags import Detections
+
+    seen = data.sightings
+    assert seen is not None
+    rows = np.flatnonzero((seen.t[seen.frame] >= start) & (seen.t[seen.frame] <= stop))
+    ids = np.unique(seen.ids[rows])
+    if not len(ids):
+        return Detections(ids, np.empty((0, 4, 2)), np.empty((0, 4, 2, 2)))
+    averages = [_mean_corners(data, config, rows[seen.ids[rows] == tag]) for tag in ids]
+    corners, covariance = (np.array(column) for column in zip(*averages, strict=True))
+    return Detections(ids, corners, covariance)
+
+
 def _seen_in(
+    tags: Detections,
     data: CubeData,
-    config: Config,
     body: TagBody,
-    start: float,
-    stop: float,
     expected: Array | None,
     wrong: dict[int, int],
     dropped: dict[str, int],
 ) -> SeenTags | None:
-    """The tags in the pictures taken from start to stop; counts those that do not fit in `wrong`."""
+    """The tags that fit their pose; counts those that do not in `wrong`."""
     from alidade.pipelines.vision.pose import estimate_pose
-    from alidade.pipelines.vision.tags import Detections
 
-    seen, camera = data.sightings, data.camera
-    assert seen is not None
-    assert camera is not None
-    rows = np.flatnonzero((seen.t[seen.frame] >= start) & (seen.t[seen.frame] <= stop))
-    ids = np.unique(seen.ids[rows])
-    if not len(ids):
+    assert data.camera is not None
+    if not len(tags.ids):
         count(dropped, "static pose without a tag in sight", 1)
         return None
-    averages = [_mean_corners(data, config, rows[seen.ids[rows] == tag]) for tag in ids]
-    corners, covariance = (np.array(column) for column in zip(*averages, strict=True))
-    pose = estimate_pose(camera, body, Detections(ids, corners, covariance), None, expected)
+    pose = estimate_pose(data.camera, body, tags, None, expected)
     if pose is None or pose.ambiguous:
         count(dropped, "static pose with its tags' planar flip not told" if pose else "static pose not solved", 1)
         return None
-    side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean()
+    side = np.linalg.norm(tags.corners - np.roll(tags.corners, 1, axis=1), axis=2).mean()
     misfit = bool((pose.tag_rms_px > _MISFIT_SHARE * side).any())
     # Of two tags that disagree either may be the wrong one.
     for tag in [*pose.rejected, *(pose.ids.tolist() if misfit else [])]:
@@ -182,8 +194,8 @@ def _seen_in(
     if misfit:
         count(dropped, "static pose whose tags do not fit the layout", 1)
         return None
-    keep = np.isin(ids, pose.ids)
-    return SeenTags(ids[keep], corners[keep], covariance[keep], pose)
+    keep = np.isin(tags.ids, pose.ids)
+    return SeenTags(tags.ids[keep], tags.corners[keep], tags.covariance[keep], pose)
 
 
 def _mean_corners(data: CubeData, config: Config, rows: NDArray[np.intp]) -> tuple[Array, Array]:
@@ -191,16 +203,41 @@ def _mean_corners(data: CubeData, config: Config, rows: NDArray[np.intp]) -> tup
     seen = data.sightings
     assert seen is not None
     corners = seen.corners[rows]
-    given = config.noise.corner_px
-    if given is None and seen.covariance is not None:
+    if config.noise.corner_px is None and seen.covariance is not None:
         covariance = seen.covariance[rows].mean(axis=0)
     else:
-        covariance = np.tile(first_given(given, DEFAULT_NOISE.corner_px) ** 2 * np.eye(2), (4, 1, 1))
+        covariance = np.tile(_corner_px(config) ** 2 * np.eye(2), (4, 1, 1))
     away = np.abs(corners - np.median(corners, axis=0)).max(axis=(1, 2))
     sigma = float(np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).max()))
     good = away <= _FAR * max(sigma, float(np.median(away)))
     bias = 0.0 if seen.covariance is None else _CORNER_BIAS
     return corners[good].mean(axis=0), covariance / int(good.sum()) + bias**2 * np.eye(2)
+
+
+def _corner_px(config: Config) -> float:
+    """Sigma of a corner in one picture, px per axis, as the config or nobody states it."""
+    return first_given(config.noise.corner_px, DEFAULT_NOISE.corner_px)
+
+
+def _check_camera(
+    data: CubeData,
+    config: Config,
+    body: TagBody,
+    several: list[Detections],
+    disagree: bool,
+    found: list[SeenTags | None],
+) -> None:
+    """Raise InputError where tags do not fit and another description of the camera makes all of them fit."""
+    from alidade.pipelines.methods.cube.camera_faults import camera_fault
+
+    assert data.camera is not None
+    errors = [seen.pose.rms_px for seen in found if seen is not None and len(seen.ids) > 1]
+    sigma = _corner_px(config)
+    if errors and not disagree and np.median(errors) <= 2.0 * sigma:
+        return
+    fault = camera_fault(data.camera, body, several, sigma)
+    if fault is not None:
+        raise InputError(fault)
 
 
 def _check_rigid(wrong: dict[int, int], found: list[SeenTags | None]) -> None:

@@ -49,6 +49,14 @@ _LEFT_HANDED = (
     "Beside the accelerometer the magnetometer's axes are left-handed: an axis of one of them has the wrong sign, or "
     "the accelerometer shows gravity down where it has to show up; K of the magnetometer mends the first."
 )
+_GRAVITY_DOWN = (
+    "The accelerometer shows gravity down where it has to show the force that holds it, up: all its three signs are "
+    "inverted, which its K mends (about -1); the magnetometer keeps its signs."
+)
+_NEGATIVE_DIP = (
+    "The field rises: right south of the magnetic equator; north of it the accelerometer shows gravity down, and all "
+    "signs of K of the magnetometer rest on that. State latitude_deg and longitude_deg in the config to tell."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,8 +207,10 @@ def prepare(data: TumbleData, config: Config) -> Model:
         sensors, dip, gyro, more = _chained(sensors, gyro, modelled)
         premises += more
     elif len(sensors) > 1:
-        sensors[1], dip, moments, more = _together(data, config, sensors[0], sensors[1], rests, modelled)
+        sensors, dip, moments, more = _together(data, config, sensors[0], sensors[1], rests, modelled)
         premises += more
+    if modelled is None and len(sensors) > 1 and dip is not None and np.sin(dip.start) < -_SINE:
+        premises.append(_NEGATIVE_DIP)
     declination = 0.0 if field is None else float(np.arctan2(field[0], field[1]))
     return Model(tuple(sensors), dip, moments, gyro, declination, tuple(premises), data.dropped)
 
@@ -235,9 +245,14 @@ def _chained(
         rows = np.clip(np.searchsorted(mag.time, accel.time), 0, len(mag.time) - 1)
         sine = -float(np.mean((accel.directions * found.directions[rows]).sum(axis=1)))
         if model is not None and _contradicts(sine, model[0]):
-            gyro, sine = gyro.mirrored, -sine
-            found = _of_guess(mag, gyro)
-            premises.append(_LEFT_HANDED)
+            sine = -sine
+            if _is_mounted_straight(found.turned):
+                beside = [_inverted(accel)]
+                premises.append(_GRAVITY_DOWN)
+            else:
+                gyro = gyro.mirrored
+                found = _of_guess(mag, gyro)
+                premises.append(_LEFT_HANDED)
     elif model is None:
         model = 0.0, 0.0
     dip = Dip(float(np.arcsin(np.clip(sine, -0.99, 0.99))), model)
@@ -270,6 +285,19 @@ def _of_hand(accel: Sensor) -> Sensor:
 def _contradicts(sine: float, dip: float) -> bool:
     """Whether the sine of a dip has the wrong sign."""
     return bool(abs(np.sin(dip)) > _SINE and sine * np.sin(dip) < 0.0)
+
+
+def _is_mounted_straight(rotation: Array) -> bool:
+    """Whether the axes that a rotation (3, 3) brings together have the same names.
+
+    Of a contradicted dip the accelerometer with all signs inverted is then the one cause, one axis that is not another.
+    """
+    return bool((nearest_axes(rotation) == np.eye(3)).all())
+
+
+def _inverted(accel: Sensor) -> Sensor:
+    """An accelerometer whose readings all have the opposite sign."""
+    return replace(accel, start=-accel.start, turned=-accel.turned)
 
 
 def _turned(mag: Sensor, rotation: Array) -> Sensor:
@@ -440,8 +468,8 @@ def _together(
     mag: Sensor,
     rests: Array | None,
     model: tuple[float, float] | None,
-) -> tuple[Sensor, Dip, Moments, list[str]]:
-    """The magnetometer turned into the accelerometer's axes, and the angles between what they measured."""
+) -> tuple[list[Sensor], Dip, Moments, list[str]]:
+    """Accelerometer, magnetometer turned into its axes, and the angles between what they measured."""
     assert data.mag_t is not None
     assert data.mag is not None
     rows, time, readings, number = _beside(data.mag_t, data.mag, accel.time, rests)
@@ -453,8 +481,13 @@ def _together(
     if not clear:
         rotation, sine = np.eye(3), -float(np.mean((up * seen).sum(axis=1)))
     elif model is not None and _contradicts(sine, model[0]):
-        rotation, sine = -rotation, -sine
-        premises.append(_LEFT_HANDED)
+        sine = -sine
+        if _is_mounted_straight(rotation):
+            accel = _inverted(accel)
+            premises.append(_GRAVITY_DOWN)
+        else:
+            rotation = -rotation
+            premises.append(_LEFT_HANDED)
     turned = _turned(mag, rotation)
     interval = float(np.median(np.diff(mag.time)))
     own = mag.noise.stated * interval**-0.5 / mag.radius / np.sqrt(number)
@@ -463,7 +496,8 @@ def _together(
     noise = Noise("dip", float(np.median(sigma)), "default", 0.0 if config.noise_known == 0.0 else ROUGHLY, ("dip",))
     warmth = None if accel.warmth is None else accel.warmth[rows]
     moments = Moments(time, accel.scaled[rows], readings / mag.radius, sigma, noise, warmth)
-    return turned, Dip(float(np.arcsin(np.clip(sine, -0.99, 0.99))), model), moments, premises
+    dip = Dip(float(np.arcsin(np.clip(sine, -0.99, 0.99))), model)
+    return [accel, turned], dip, moments, premises
 
 
 def _beside(t: Array, values: Array, at: Array, rests: Array | None) -> tuple[NDArray[np.intp], Array, Array, Array]:

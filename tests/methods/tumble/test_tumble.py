@@ -375,6 +375,32 @@ def test_left_handed_axes_are_told() -> None:
         assert abs(error) < 4.0 * calibration.parameters[f"mag_k{i}3"].sigma
 
 
+@pytest.mark.parametrize("beside_a_gyro", [False, True])
+def test_an_accelerometer_that_shows_gravity_down_is_told_and_the_magnetometer_keeps_its_signs(
+    beside_a_gyro: bool,
+) -> None:
+    simulated = _simulated(replace_scenario(TURNING, rest_s=1.5) if beside_a_gyro else RESTING, 2)
+    data = replace(simulated.data, accel=-simulated.data.accel)
+    calibration = Session.of(TUMBLE, replace(simulated, data=data)).calibrate()
+    assert calibration.status == "calibrated"
+    assert "shows gravity down" in " ".join(calibration.notes)
+    found = calibration.parameters
+    for name, sign in {
+        f"{sensor}_k{i}{i}": sign for sensor, sign in (("accel", -1.0), ("mag", 1.0)) for i in "123"
+    }.items():
+        assert abs(found[name].value - sign * simulated.truth[name]) < 4.0 * found[name].sigma, name
+    assert found["field_dip"].value == pytest.approx(simulated.truth["field_dip"], abs=4.0 * found["field_dip"].sigma)
+
+
+def test_a_field_that_rises_at_an_unknown_place_is_told() -> None:
+    simulated = _simulated(RESTING, 2)
+    nowhere = replace(simulated.data, latitude=None, longitude=None)
+    for sign in (1.0, -1.0):
+        assert nowhere.accel is not None
+        problem = TUMBLE.problem(replace(nowhere, accel=sign * nowhere.accel), Config())
+        assert ("The field rises" in " ".join(problem.premises)) == (sign < 0.0)
+
+
 def test_a_magnetometer_on_other_axes_is_turned_into_those_of_the_accelerometer() -> None:
     simulated = _simulated(RESTING, 4)
     turned = so3.exp(np.array([np.pi, 0.0, 0.0]))
