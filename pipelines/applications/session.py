@@ -532,7 +532,9 @@ def checked_facts(recording: Recording, config: Config) -> SessionFacts:
     to_ask = {name: (f"`--method {name}`, by which it has to be asked for",) for name in asked}
     facts = replace(facts, missing={**facts.missing, **to_ask})
     refused = {name: said for name in facts.methods if (said := _refused(methods.method(name), recording, config))}
-    return replace(facts, missing={**facts.missing, **{name: (said,) for name, said in refused.items()}})
+    facts = replace(facts, missing={**facts.missing, **{name: (said,) for name, said in refused.items()}})
+    proposed = {name: tuple(methods.method(name).proposed(recording, config)) for name in facts.methods}
+    return replace(facts, proposed={name: keys for name, keys in proposed.items() if keys})
 
 
 def _refused(method: Method, recording: Recording, config: Config) -> str:
@@ -607,6 +609,13 @@ def _feed(digest: hashlib._Hash, data: Any) -> None:
 
 
 def _check_sheets(method: Method, config: Config) -> None:
+    """Raise InputError when something is stated that the method has no use for: it would be ignored in silence."""
+    if "vision" in config.model_fields_set and "vision_attitude" not in {topic.key for topic in method.topics}:
+        raise InputError(f"vision: method {method.name} has no use for it; it reads no attitudes by vision")
+    _check_figures(method, config)
+
+
+def _check_figures(method: Method, config: Config) -> None:
     """Raise InputError when a figure is stated that the method has no use for: it would be ignored in silence."""
     for name in sorted(config.sensors.model_fields_set):
         sheet, figures = getattr(config.sensors, name), method.sheets.get(name, ())
