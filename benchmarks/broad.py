@@ -21,8 +21,9 @@ from alidade.factors import so3
 from alidade.pipelines import methods
 from alidade.pipelines.applications.session import Arrays, Session
 from alidade.pipelines.config import load_config
+from alidade.pipelines.methods.head.trajectory import helmet_gyro
 from alidade.pipelines.reports.result import Calibration
-from datasets.broad import Trial, corrected_gyro, marker_attitudes, read_trial, score, to_session
+from datasets.broad import Trial, marker_attitudes, read_trial, score, to_session
 
 Array = NDArray[np.float64]
 
@@ -100,7 +101,7 @@ def judged(path: Path, trial: Trial, calibration: Calibration) -> str:
 
     estimate = calibration.estimate
     values = dict(zip(estimate.names, estimate.values.tolist(), strict=True))
-    position, gyro = loadmat(str(path))["opt_pos"], corrected_gyro(trial, values)
+    position, gyro = loadmat(str(path))["opt_pos"], helmet_gyro(to_session(trial, 0), values)
     assert estimate.attitudes is not None
     left: dict[str, list[tuple[Array, Array]]] = {"motion capture": [], "estimate": []}
     for piece in _pieces(trial, position):

@@ -19,18 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
-from alidade.factors.preintegration import GyroPath
 from alidade.pipelines.errors import InputError
+from alidade.pipelines.estimation.problem import Attitudes
 from alidade.pipelines.methods.head.recording import HeadData, write_head
+from alidade.pipelines.methods.head.trajectory import carried, helmet_gyro
 
 Array = NDArray[np.float64]
 
-# Names of scale and skew by row and column.
-_ERRORS = (
-    ("scale_x", "skew_xy", "skew_xz"),
-    ("skew_xy", "scale_y", "skew_yz"),
-    ("skew_xz", "skew_yz", "scale_z"),
-)
 EPOCH_NS = 1_600_000_000_000_000_000  # the trials carry no date
 VISION_RATE_HZ = 25.0
 VISION_SIGMA = float(np.deg2rad(0.5))  # noise added to the motion capture, rad per axis
@@ -166,24 +161,16 @@ def marker_attitudes(
 ) -> Array:
     """Attitudes bRh (n, 4) that motion capture shows at times (n,) of the gyro's clock, s.
 
-    bRv at the nearest time of the trajectory, carried by the gyro less its bias and errors, then the rotation that
-    motion capture's own filter adds, Exp(vision_filter * angular acceleration), and the mount.
+    bRv carried by the gyro less its bias and errors, then the rotation that motion capture's own filter adds,
+    Exp(vision_filter * angular acceleration), and the mount.
     """
-    i = np.clip(np.searchsorted(attitude_t, at), 1, len(attitude_t) - 1)
-    i = np.where(at - attitude_t[i - 1] < attitude_t[i] - at, i - 1, i)
-    gyro = corrected_gyro(trial, values)
+    data = to_session(trial, 0)
+    gyro = helmet_gyro(data, values)
     h = 2.0 * (trial.t[1] - trial.t[0])
     filtered = values.get("vision_filter", 0.0) * (gyro.rate(at + h) - gyro.rate(at - h)) / (2.0 * h)
     vRh = so3.exp(np.array([values[f"helmet_mount_{axis}"] for axis in "xyz"]))
-    carried = so3.multiply(attitude_wxyz[i], gyro.increments(attitude_t[i], at).wxyz)
-    return so3.compose(carried, so3.exp(filtered), np.broadcast_to(vRh, (len(at), 4)))
-
-
-def corrected_gyro(trial: Trial, values: Mapping[str, float]) -> GyroPath:
-    """The trial's gyro less bias, g-sensitivity, scale and skew."""
-    symmetric = [[values.get(f"gyro_{_ERRORS[row][column]}", 0.0) for column in range(3)] for row in range(3)]
-    rate = trial.gyro - np.array([values[f"gyro_bias_{axis}"] for axis in "xyz"]) - trial.force @ _g(values).T
-    return GyroPath(trial.t, rate @ np.linalg.inv(np.eye(3) + np.array(symmetric)).T)
+    bRv = carried(data, Attitudes(attitude_t, attitude_wxyz), values, at)
+    return so3.compose(bRv, so3.exp(filtered), np.broadcast_to(vRh, (len(at), 4)))
 
 
 def at_rest(trial: Trial, values: Mapping[str, float]) -> Array:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Collection, Iterable
-from typing import Annotated, ClassVar, TypeVar
+from typing import Annotated, ClassVar, Literal, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -250,6 +250,12 @@ def _ideal(value: object) -> object:
 SensorSheets = Annotated[Sensors, BeforeValidator(_ideal)]
 
 
+class Vision(Section):
+    """What measures attitudes."""
+
+    kind: Literal["mocap", "pnp", "vio", "other"] = "other"  # mocap: its vision_scale is 0
+
+
 class Tag(Section):
     """A tag on a body."""
 
@@ -313,6 +319,7 @@ class Config(Section):
     share: dict[str, Share] = {}  # parameter or pattern: device, recording, walks, or how far in the root of a day
     require: dict[str, Sigma] = {}  # parameter: sigma wanted
     sensors: SensorSheets = Sensors()  # data sheets; ideal: all figures 0
+    vision: Vision = Vision()  # what measures attitudes
     latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None  # deg north; wins over fixes
     longitude_deg: Annotated[float, Field(ge=-180.0, le=360.0)] | None = None  # deg east
     altitude_m: float | None = None  # above the ellipsoid

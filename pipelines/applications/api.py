@@ -21,7 +21,7 @@ from alidade.pipelines.applications.session import Arrays, Session
 from alidade.pipelines.config import load_config
 from alidade.pipelines.config import model as _config_model
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.problem import EngineName
+from alidade.pipelines.estimation.problem import AttitudeRate, EngineName
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.checks import (
     SLOWEST_GYRO_S,
@@ -132,10 +132,14 @@ def calibrate(
     window: float | None = 1.0,
     prior: str | Path | None = None,
     engine: EngineName = "auto",
+    attitude_rate: AttitudeRate = "vision",
 ) -> Calibration:
     """Open and calibrate in one go (arguments as `open` and `Session.calibrate` have them).
 
     `engine` eliminates batch's linear systems: "chain" (numpy), "gtsam", or "auto", the chain where the problem is one.
+
+    `attitude_rate` is that of the trajectory: "vision", where the method estimates it, or "gyro", carried from there to
+    each sample of the gyro.
 
     A list of sources is several recordings of one device, calibrated together by batch; the files of one recording are
     opened first: `open([...]).calibrate()`.
@@ -144,6 +148,12 @@ def calibrate(
         InputError: source or config cannot be used, or there is no such solver or window.
         IndeterminateError: states other than the parameters are not determined.
     """
+    if attitude_rate not in get_args(AttitudeRate):
+        raise InputError(f"no attitude rate {attitude_rate!r}; there are {', '.join(get_args(AttitudeRate))}")
+
+    def opened(one: Source) -> Session:
+        return replace(open(one, method, config, prior=prior), attitude_rate=attitude_rate)
+
     if isinstance(source, list | tuple):
         if solver != "batch":
             raise InputError(f"solver {solver!r}: several recordings are calibrated together by batch alone")
@@ -151,10 +161,10 @@ def calibrate(
             raise InputError(f"engine {engine!r}: of several recordings each has the one that fits it; leave it out")
         from alidade.pipelines.applications.joint import calibrate_together
 
-        return calibrate_together([partial(open, each, method, config, prior=prior) for each in source])
+        return calibrate_together([partial(opened, each) for each in source])
     if engine not in get_args(EngineName):
         raise InputError(f"no engine {engine!r}; there are {', '.join(get_args(EngineName))}")
-    return replace(open(source, method, config, prior=prior), engine=engine).calibrate(solver, window)
+    return replace(opened(source), engine=engine).calibrate(solver, window)
 
 
 def load(path: str | Path, config: Settings = None) -> SavedCalibration:

@@ -21,6 +21,7 @@ from alidade.pipelines.applications.options import ConfigFile, Json, Quiet, Reco
 from alidade.pipelines.solvers.window import parse_window
 
 if TYPE_CHECKING:
+    from alidade.pipelines.estimation.problem import AttitudeRate
     from alidade.pipelines.reports.result import Calibration
 
 # Errors that are told in one line, by name: to import the second takes gtsam's quarter of a second.
@@ -92,6 +93,13 @@ class Engine(StrEnum):
     auto = "auto"
     chain = "chain"
     gtsam = "gtsam"
+
+
+class Rate(StrEnum):
+    """When attitudes are reported."""
+
+    vision = "vision"
+    gyro = "gyro"
 
 
 _METHODS = "los, indexer, head, cube, tumble or an installed plug-in"
@@ -173,6 +181,9 @@ def calibrate(
     engine: Annotated[
         Engine, typer.Option(help="Linear solver of batch: by chain elimination, or gtsam.")
     ] = Engine.auto,
+    attitude_rate: Annotated[
+        Rate, typer.Option(help="Attitudes in attitude.tum: at those of vision, or at each gyro sample.")
+    ] = Rate.vision,
     time_limit: _TimeLimit = None,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -192,6 +203,7 @@ def calibrate(
     from alidade.pipelines.reports.whole import require_room
     from alidade.pipelines.reports.write import adopt_parts, write_part, write_results
 
+    rate: AttitudeRate = attitude_rate.value
     recordings, folder = recordings_of(sessions), out or _beside(sessions[0], solver.value)
     if len(recordings) > 1:
         if solver != Solver.batch:
@@ -210,7 +222,7 @@ def calibrate(
     ):
         if len(recordings) > 1:
             by_itself = partial(write_part, Path(parts))
-            calibration = calibrate_device(recordings, method, config, strict, auto_topics, prior, by_itself)
+            calibration = calibrate_device(recordings, method, config, strict, auto_topics, prior, by_itself, rate)
         else:
             (calibration,) = run(
                 recordings[0],
@@ -224,6 +236,7 @@ def calibrate(
                 prior,
                 engine=engine.value,
                 auto_columns=auto_columns,
+                attitude_rate=rate,
             )
         with progress.doing("writing"):
             if len(recordings) > 1:

@@ -35,7 +35,17 @@ from alidade.pipelines.estimation.assumptions import kind
 from alidade.pipelines.estimation.believing import believing
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
 from alidade.pipelines.estimation.noise import Level
-from alidade.pipelines.estimation.problem import Array, ChiSquare, Estimate, Parameter, Problem, Quantity, Step, Told
+from alidade.pipelines.estimation.problem import (
+    Array,
+    AttitudeRate,
+    ChiSquare,
+    Estimate,
+    Parameter,
+    Problem,
+    Quantity,
+    Step,
+    Told,
+)
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.info import SessionFacts
 from alidade.pipelines.recording.opening import Where
@@ -98,7 +108,13 @@ class Alone:
             inflation=estimate.inflation,
         )
         problem = replace(
-            calibration.problem, steps=_no_steps, steps_after=None, onward=None, finer=None, attitudes=None
+            calibration.problem,
+            steps=_no_steps,
+            steps_after=None,
+            onward=None,
+            attitudes=None,
+            at_gyro_rate=None,
+            finer=None,
         )
         return cls(
             calibration=replace(calibration, estimate=small, problem=problem, plots=None, beside=None),
@@ -147,6 +163,7 @@ def calibrate_device(
     auto_topics: bool = False,
     prior: Path | None = None,
     written: Callable[[Calibration], None] = lambda _: None,
+    attitude_rate: AttitudeRate = "vision",
 ) -> Calibration:
     """The joint calibration of several recordings of one device (arguments as `session.calibrate` has them).
 
@@ -156,7 +173,8 @@ def calibrate_device(
     """
 
     def read(where: Where) -> Session:
-        return Session.read(open_recording(where, strict), method_name, config_file, auto_topics, prior)
+        session = Session.read(open_recording(where, strict), method_name, config_file, auto_topics, prior)
+        return replace(session, attitude_rate=attitude_rate)
 
     return calibrate_together([partial(read, where) for where in recordings], written)
 

@@ -33,7 +33,16 @@ from alidade.pipelines.diagnostics.observability import finite_covariance
 from alidade.pipelines.diagnostics.trial_fit import held_out_residuals
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
-from alidade.pipelines.estimation.problem import EngineName, Estimate, Problem, Quantity, Step, Told
+from alidade.pipelines.estimation.problem import (
+    AttitudeRate,
+    Attitudes,
+    EngineName,
+    Estimate,
+    Problem,
+    Quantity,
+    Step,
+    Told,
+)
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.checks import COPIED, OVERTAKEN
 from alidade.pipelines.recording.info import SessionFacts, facts_of, lacking
@@ -162,6 +171,7 @@ class Session:
         method, data, config, origin: as above.
         engine: that eliminates batch's linear systems.
         near: numbers that rotations are reported near of, as another recording of the device has them.
+        attitude_rate: of the trajectory that is reported.
     """
 
     method: Method
@@ -170,6 +180,7 @@ class Session:
     origin: Origin
     engine: EngineName = "auto"
     near: Mapping[str, float] = field(default_factory=dict)
+    attitude_rate: AttitudeRate = "vision"
 
     @classmethod
     def read(
@@ -303,7 +314,12 @@ class Session:
             seconds: what reading took.
             check: hold incremental estimates against batch.
             report: with the method's findings.
+
+        Raises:
+            InputError: attitudes are wanted at the gyro's rate, and the method has none.
         """
+        if self.attitude_rate == "gyro" and self.problem().at_gyro_rate is None:
+            raise InputError(f"attitude rate gyro: {self.method.name} has no attitudes between those it estimates")
         # The facts before anything is solved, so that the stamps need not be kept meanwhile.
         sha256, truth, facts = self.origin.sha256(), self.origin.truth(), self.facts
         found, published = [], None
@@ -318,6 +334,8 @@ class Session:
             if change is not None and change.severity == Severity.NOTE:
                 estimate = with_change(estimate, change)
             difference = self._difference(estimate) if check and not deadline.passed(_COMPARISON) else None
+            tables = self.method.findings(self.data, self.config, estimate) if report else {}
+            estimate, carried = self._at_gyro_rate(problem, estimate)
             found.append(
                 Calibration(
                     method=self.method,
@@ -327,6 +345,7 @@ class Session:
                         [
                             *self._findings(problem, estimate, quantities, change),
                             *_remarks(problem, estimate, difference),
+                            *carried,
                             *_stopped(),
                         ]
                     ),
@@ -340,10 +359,17 @@ class Session:
                     beside=published if estimate.solver == "incremental" else None,
                     stability=stable,
                     solver_difference=difference,
-                    tables=self.method.findings(self.data, self.config, estimate) if report else {},
+                    tables=tables,
                 )
             )
         return found
+
+    def _at_gyro_rate(self, problem: Problem, estimate: Estimate) -> tuple[Estimate, list[Finding]]:
+        """The estimate with its attitudes at the rate that is wanted, and a note of how far apart they were."""
+        if self.attitude_rate == "vision" or estimate.attitudes is None or problem.at_gyro_rate is None:
+            return estimate, []
+        dense = problem.at_gyro_rate(estimate.attitudes, problem.numbers(estimate))
+        return replace(estimate, attitudes=dense), [_carried(estimate.attitudes, dense)]
 
     @property
     def faults(self) -> FaultModel:
@@ -459,6 +485,7 @@ def calibrate(
     report: bool = True,
     engine: EngineName = "auto",
     auto_columns: bool = False,
+    attitude_rate: AttitudeRate = "vision",
 ) -> list[Calibration]:
     """One calibration a solver, from one reading of the recording.
 
@@ -475,6 +502,7 @@ def calibrate(
         prior: an earlier calibration of the device to begin from, result.json or calibration.yaml.
         report: with what only a report tells, see `Session.calibrate`.
         engine: that eliminates batch's linear systems: "chain", "gtsam", or "auto".
+        attitude_rate: of the trajectory that is reported: "vision", or "gyro" for one at each sample of the gyro.
 
     Raises:
         InputError: recording or config cannot be used, or there is no such solver.
@@ -484,7 +512,8 @@ def calibrate(
     with progress.doing("reading"):
         session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics, prior, auto_columns)
     seconds = {"read": time.perf_counter() - start}
-    return replace(session, engine=engine).calibrations(solvers, window, seconds, check, report)
+    session = replace(session, engine=engine, attitude_rate=attitude_rate)
+    return session.calibrations(solvers, window, seconds, check, report)
 
 
 def session_facts(recording: Recording, config: Config) -> SessionFacts:
@@ -503,7 +532,9 @@ def checked_facts(recording: Recording, config: Config) -> SessionFacts:
     to_ask = {name: (f"`--method {name}`, by which it has to be asked for",) for name in asked}
     facts = replace(facts, missing={**facts.missing, **to_ask})
     refused = {name: said for name in facts.methods if (said := _refused(methods.method(name), recording, config))}
-    return replace(facts, missing={**facts.missing, **{name: (said,) for name, said in refused.items()}})
+    facts = replace(facts, missing={**facts.missing, **{name: (said,) for name, said in refused.items()}})
+    proposed = {name: tuple(methods.method(name).proposed(recording, config)) for name in facts.methods}
+    return replace(facts, proposed={name: keys for name, keys in proposed.items() if keys})
 
 
 def _refused(method: Method, recording: Recording, config: Config) -> str:
@@ -578,6 +609,13 @@ def _feed(digest: hashlib._Hash, data: Any) -> None:
 
 
 def _check_sheets(method: Method, config: Config) -> None:
+    """Raise InputError when something is stated that the method has no use for: it would be ignored in silence."""
+    if "vision" in config.model_fields_set and "vision_attitude" not in {topic.key for topic in method.topics}:
+        raise InputError(f"vision: method {method.name} has no use for it; it reads no attitudes by vision")
+    _check_figures(method, config)
+
+
+def _check_figures(method: Method, config: Config) -> None:
     """Raise InputError when a figure is stated that the method has no use for: it would be ignored in silence."""
     for name in sorted(config.sensors.model_fields_set):
         sheet, figures = getattr(config.sensors, name), method.sheets.get(name, ())
@@ -605,6 +643,18 @@ def _shown(problem: Problem, duration: float, chunk: int) -> Iterator[Step]:
     name = "the run at {:.1f} s of {:.1f} s".format
     steps = deadline.until_passed(problem.steps(chunk), lambda step: name(step.time, duration), _LEAST_STEPS)
     return progress.track(steps, "step by step", duration, lambda step: step.time)
+
+
+def _carried(seen: Attitudes, dense: Attitudes) -> Finding:
+    """What was done where there are no attitudes nearby."""
+    time = np.sort(seen.time)
+    gaps = np.diff(time)
+    where = f", over {gaps.max():.2g} s at most, at {time[gaps.argmax()]:.6g} s" if len(gaps) else ""
+    text = (
+        f"attitude.tum has {len(dense.time)} attitudes at the gyro's samples: the gyro carries them from those by "
+        f"vision before and after{where}, and the difference between both is distributed evenly over that time"
+    )
+    return Finding("remark", Severity.NOTE, {"text": text})
 
 
 def _stopped() -> list[Finding]:

@@ -30,6 +30,8 @@ Array = NDArray[np.float64]
 
 # What eliminates the linear systems of the batch solver, see solvers.engines.
 EngineName = Literal["auto", "chain", "gtsam"]
+# When attitudes are reported: where vision has one, or at each sample of the gyro.
+AttitudeRate = Literal["vision", "gyro"]
 # Frames in one vectorised factor of a gtsam graph: past this the Jacobians' zeros cost more than the calls they save.
 CHUNK = 20
 
@@ -271,6 +273,8 @@ class Problem:
         loss: shared by all measurements that may be outliers; the batch solver anneals it. None: no outliers expected.
         attitudes: the trajectory at some keyframes, given values that hold them; None when the method has none.
         attitude_name: what the trajectory is, e.g. "bRv".
+        at_gyro_rate: the trajectory at each sample of the gyro, from an estimate's and its values by name. None: the
+            method has no such.
         advice: what to do about a weak direction, given its weights by parameter name.
         dropped: measurements left out before solving, reason -> count.
         premises: what is taken for granted and a reader has to know, sentences.
@@ -298,6 +302,7 @@ class Problem:
     loss: TruncatedLoss | None = None
     attitudes: Callable[[Sequence[int], gtsam.Values], Attitudes] | None = None
     attitude_name: str = ""
+    at_gyro_rate: Callable[[Attitudes, Mapping[str, float]], Attitudes] | None = None
     advice: Callable[[Mapping[str, float]], Motion] | None = None
     dropped: Mapping[str, int] = field(default_factory=dict)
     premises: tuple[str, ...] = ()

@@ -105,6 +105,10 @@ class Method(ABC):
     def read(self, recording: Recording, config: Config) -> Any:
         """The method's data. Raises InputError when the recording cannot be used."""
 
+    def proposed(self, recording: Recording, config: Config) -> Sequence[str]:  # noqa: ARG002
+        """Keys of the config that a recording it can read suggests, each with the reason; nothing takes them."""
+        return ()
+
     @abstractmethod
     def problem(self, data: Any, config: Config) -> Problem:
         """The graph. Raises InputError when the data are too few, or the config names no such parameter."""

@@ -37,7 +37,8 @@ class TopicFacts:
 class SessionFacts:
     """A recording: its start (Unix ns), its length, its topics, and for every method what it lacks for it.
 
-    lost: topic -> messages that are known to be lost; notes: sentences about what of the file cannot be used.
+    lost: topic -> messages that are known to be lost; notes: sentences about what of the file cannot be used;
+    proposed: method -> keys of the config that the recording suggests, each with the reason.
     """
 
     epoch_ns: int
@@ -47,6 +48,7 @@ class SessionFacts:
     missing: dict[str, tuple[str, ...]]
     lost: dict[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    proposed: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def methods(self) -> tuple[str, ...]:

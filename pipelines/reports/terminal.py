@@ -123,10 +123,12 @@ def facts_json(
 
     suggested = {suggestion.method: suggestion for suggestion in found}
     told = dataclasses.asdict(facts)
+    proposed = told.pop("proposed")
     told["methods"] = {
         name: {
             "served": not missing,
             "missing": missing,
+            "proposed": proposed.get(name, ()),
             "suggested": {key: source.model_dump() for key, source in suggested[name].topics.items()}
             if name in suggested
             else {},
@@ -201,6 +203,8 @@ def _show_methods(facts: SessionFacts, found: Sequence[Suggestion]) -> None:
     for method, missing in facts.missing.items():
         if not missing:
             console.print(f"[green]{method}: yes[/]")
+            for key in facts.proposed.get(method, ()):
+                _say_wrapped(f"  proposed for the config: {key}")
     for suggestion in found:
         if not suggestion.missing:
             name = f"--method {suggestion.method} " if suggestion.has_to_be_asked_for else ""

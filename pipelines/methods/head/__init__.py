@@ -74,6 +74,11 @@ class Head(Method):
 
         return read_head(recording, config)
 
+    def proposed(self, recording: Recording, config: Config) -> Sequence[str]:
+        from alidade.pipelines.methods.head.vision_kind import proposed
+
+        return proposed(recording, config)
+
     def problem(self, data: HeadData, config: Config) -> Problem:
         from alidade.pipelines.methods.head.graph import problem
 

@@ -32,6 +32,7 @@ from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.head.guess import guess, guess_picture_clock
 from alidade.pipelines.methods.head.parameters import CAMERA, HELMET, OFFSET, SENSITIVITY, TEMPERATURE, HeadParameters
 from alidade.pipelines.methods.head.recording import HeadData
+from alidade.pipelines.methods.head.trajectory import at_gyro_rate
 from alidade.pipelines.methods.noise import estimated, sampled, stated, typical
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 
@@ -90,6 +91,7 @@ def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
         loss=model.loss,
         attitudes=partial(_attitudes, model),
         attitude_name="bRv",
+        at_gyro_rate=partial(at_gyro_rate, data),
         advice=_advice,
         dropped=data.dropped,
         premises=() if data.platform_t is not None else (_AT_REST,),

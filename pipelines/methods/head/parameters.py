@@ -72,6 +72,8 @@ class HeadParameters:
     ) -> HeadParameters:
         """With the priors in force; a camera without a moving platform is fixed by default.
 
+        Motion capture has no scale of its angles, unless the config says something of it.
+
         Args:
             config: priors, data sheets, accuracies wanted.
             platform: whether there is a platform gyro.
@@ -99,7 +101,8 @@ class HeadParameters:
         bias = triple(BIAS, "rad/s", 0.05, 2e-3, extra=0.0 if platform else EARTH_RATE)
         mounts = triple(HELMET, "rad", 0.35, 1e-2), triple(CAMERA, "rad", 0.35, 1e-2, fixed=not platform)
         offset = quantity(OFFSET, "s", 0.05, 5e-3, False, stamp_sigma)
-        if all_around and "scale" not in config.sensors.camera.model_fields_set:
+        unscaled = all_around or config.vision.kind == "mocap"
+        if unscaled and "scale" not in config.sensors.camera.model_fields_set:
             config = config.model_copy(update={"priors": {"vision_scale": 0.0, **config.priors}})
         assumed = chain.from_iterable(quantities(each, config) for each in ASSUMPTIONS)
         known = [q.name for q in (*bias, *mounts[0], *mounts[1], offset, *assumed)]
