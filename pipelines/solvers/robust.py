@@ -4,9 +4,8 @@ Yang, Antonante, Tzoumas, Carlone, "Graduated non-convexity for robust spatial p
 loss, the first one convex for the largest residual that there is, lead to the truncated loss one after the other. What
 the last one leaves is plain least squares on the measurements inside the gate, so its covariance means what it says.
 
-It begins where most measurements are explained: with plain least squares, at the first guess, or, where plain least
-squares does not converge, with the noise of all measurements as large as the largest residual. Gross outliers take
-plain least squares, and small effects that priors alone hold, out of all bounds; among large noise priors have a say.
+It begins with plain least squares, or at the first guess where that explains more measurements: gross outliers take
+plain least squares, and small effects that priors alone hold, out of all bounds.
 
 Outliers are a minority. A family of measurements of which more than half are rejected, beyond what chance could make
 of one in which every second is an outlier (binomial in the normal approximation, one sided, p = `max_chance`), has
@@ -63,13 +62,7 @@ def solve_robust(engine: Engine, values: Values, loss: TruncatedLoss | None, con
     found = minimize(plain, values, rough)
     iterations = found.iterations
     truncated = engine.under(loss)
-    starts = [values, found.values] if np.isfinite(found.cost) else [values]
-    if not found.converged:
-        by = max(_largest(plain, found.values) / loss.gate, 1.0)
-        soft = minimize(_softened(plain, by), values, rough)
-        starts.append(soft.values)
-        iterations += soft.iterations
-    start = min(starts, key=truncated.cost)
+    start = min(values, found.values, key=truncated.cost) if np.isfinite(found.cost) else values
     start, more = _graduated(engine, start, loss, config)
     # Inside the gate the truncated loss is no other than plain least squares.
     same = start is found.values and truncated.cost(start) == found.cost
@@ -97,18 +90,6 @@ def solve_truncated(
             return replace(final, iterations=iterations)
         groups = [replace(g, loss=None) if g.family in wrong else g for g in current.groups]
         current, known = current.with_groups(groups), None
-
-
-def _largest(engine: Engine, values: Values) -> float:
-    """Largest whitened norm of a measurement."""
-    return max((float(_norms(g, values).max(initial=0.0)) for g in engine.groups if g.is_measurement), default=0.0)
-
-
-def _softened(engine: Engine, by: float) -> Engine:
-    """With the noise of all measurements so many times as large, so that priors keep their say beside outliers."""
-    ones = [np.ones((len(g.model.time), g.model.rows)) if g.weights is None else g.weights for g in engine.groups]
-    pairs = zip(engine.groups, ones, strict=True)
-    return engine.with_groups([replace(g, weights=w / by) if g.is_measurement else g for g, w in pairs])
 
 
 def _graduated(engine: Engine, values: Values, loss: TruncatedLoss, config: RobustConfig) -> tuple[Values, int]:
