@@ -153,6 +153,7 @@ def test_an_immaterial_step_is_a_note_and_in_the_covariance_of_everybody() -> No
     found = Stability(7.0, 0.0, 30.0, {"a": -8.0}, {"a": (0.2, 0.02)})
     parts = {"a": SplitHalf(0.0, 0.05, 0.4, 0.05), "b": SplitHalf(0.0, 0.05, 0.3, 0.05)}
     small = change_finding(found, parts, quantities)
+    assert small is not None
     assert small.severity == Severity.NOTE
     assert list(small.evidence["steps"]) == ["a", "b"]
     R = np.linalg.cholesky(np.linalg.inv(0.01 * np.eye(2))).T
@@ -175,8 +176,10 @@ def test_an_immaterial_step_is_a_note_and_in_the_covariance_of_everybody() -> No
     np.testing.assert_allclose(np.linalg.solve(wide.told.R, wide.told.d), np.linalg.solve(R, told.d))
     assert wide.budget["a"] == pytest.approx({CHANGE: 0.16 / 0.17, "vision": 0.01 / 0.17})
     large = change_finding(found, {"a": SplitHalf(0.0, 0.05, 0.7, 0.05)}, quantities)
+    assert large is not None
     assert large.severity == Severity.INCONSISTENT
     unknown = change_finding(found, {}, quantities)
+    assert unknown is not None
     assert unknown.severity == Severity.INCONSISTENT
     assert unknown.evidence["steps"] == {"a": (0.2, 0.02)}
 
