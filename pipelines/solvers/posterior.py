@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,12 +101,17 @@ class Reported:
         """(m,) the free numbers in prior units, from their prior means."""
         return np.asarray((self.numbers[self.free] - self.mean) / self.scale)
 
-    def root(self, root: Array) -> ReportedRoot:
-        """The square-root information of the free numbers from that of (last node, shared unknowns, right side)."""
+    @cached_property
+    def basis(self) -> Array:
+        """(c + s, p + m) moves of the last node and the shared unknowns: p that no number sees, then those of u."""
         inverse = np.linalg.pinv(self.jacobian)
         _, sizes, axes = np.linalg.svd(self.jacobian, full_matrices=True)
         seen = int(np.count_nonzero(sizes > UNSEEN * sizes.max(initial=0.0)))
-        basis = np.hstack([axes[seen:].T, inverse[:, self.free] * self.scale])
+        return np.hstack([axes[seen:].T, inverse[:, self.free] * self.scale])
+
+    def root(self, root: Array) -> ReportedRoot:
+        """The square-root information of the free numbers from that of (last node, shared unknowns, right side)."""
+        basis = self.basis
         R = np.asarray(np.linalg.qr(np.column_stack([root[:, :-1] @ basis, root[:, -1]]), mode="r"), dtype=float)
         return ReportedRoot(basis, R, basis.shape[1] - len(self.free))
 

@@ -52,8 +52,9 @@ def posterior_history(
         return None
     layout, nodes = linearization.layout, linearization.piece[keyframes]
     own = {p.key: current_keys.get(p.key, p.key) for p in problem.parameters}
+    end = Reported.of(problem, layout, values, current_keys)
     found = [
-        _known(problem, layout, values, _keys_at(layout, own, int(node)), current_keys, root)
+        _known(problem, layout, values, _keys_at(layout, own, int(node)), end, root)
         for node, root in zip(nodes, roots, strict=True)
     ]
     if final is not None:
@@ -106,11 +107,13 @@ def _known(
     layout: Layout,
     values: Values,
     keys: Mapping[int, int],
-    last_keys: Mapping[int, int],
+    end: Reported,
     root: Array,
 ) -> tuple[Array, Array]:
-    """Numbers (n,) and their covariance (n, n) at a moment, `keys` the variables that hold the parameters then."""
-    end = Reported.of(problem, layout, values, last_keys)
+    """Numbers (n,) and their covariance (n, n) at a moment, `keys` the variables that hold the parameters then.
+
+    `end` is the same at the end, which `root` is about.
+    """
     if layout.sizes[3] and set(keys.values()) == set(_keys_at(layout, keys, 0).values()):
         # The first node is among the shared unknowns, and has no numbers beside these.
         jacobian = end.jacobian.copy()
