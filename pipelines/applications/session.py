@@ -38,6 +38,7 @@ from alidade.pipelines.estimation.problem import (
     Attitudes,
     EngineName,
     Estimate,
+    History,
     Problem,
     Quantity,
     Step,
@@ -67,6 +68,8 @@ _HYPOTHESES, _SEGMENTS, _COMPARISON, _SENSITIVITY = (
     "the comparison with batch",
     "the sensitivity to fixed inputs",
 )
+# What an online run ends with where noise levels maximise the marginal likelihood.
+_CONCLUDED = "at the end all measurements were solved together, at the noise levels of their marginal likelihood"
 # Difference between incremental and batch that is worth a note, in sigmas.
 _NOTABLE_DIFFERENCE = 1.0
 
@@ -326,6 +329,9 @@ class Session:
         for estimate, problem in solved:
             quantities = tuple(q for q in problem.quantities if q.name in estimate.names)
             estimate = replace(estimate, covariance=finite_covariance(quantities, estimate.covariance))
+            difference = None
+            if check and estimate.solver == "incremental" and not deadline.passed(_COMPARISON):
+                estimate, difference = self._compared(problem, estimate, quantities)
             if estimate.solver == "published":
                 published = estimate
             elif report and estimate.solver == "incremental" and published is None:
@@ -333,7 +339,6 @@ class Session:
             stable, change = self._change(estimate, quantities)
             if change is not None and change.severity == Severity.NOTE:
                 estimate = with_change(estimate, change)
-            difference = self._difference(estimate) if check and not deadline.passed(_COMPARISON) else None
             tables = self.method.findings(self.data, self.config, estimate) if report else {}
             estimate, carried = self._at_gyro_rate(problem, estimate)
             found.append(
@@ -416,14 +421,23 @@ class Session:
                 )
         return stable, change_finding(stable, parts, quantities, ratio)
 
-    def _difference(self, estimate: Estimate) -> SolverDifference | None:
-        """An incremental estimate compared with batch's, which has nothing of what a report needs."""
-        if estimate.solver != "incremental":
-            return None
+    def _compared(
+        self, problem: Problem, estimate: Estimate, quantities: Sequence[Quantity]
+    ) -> tuple[Estimate, SolverDifference | None]:
+        """An incremental estimate, and its difference from batch's, which has nothing of what a report needs.
+
+        Where noise levels maximise the marginal likelihood the estimate is that of all rows then, by batch; the course
+        until there stays that of the run.
+        """
         from alidade.pipelines.solvers.batch import solve_batch
 
         with progress.doing("solving"):
-            return solver_difference(estimate, solve_batch(self.problem()))
+            batch = solve_batch(self.problem())
+        difference = solver_difference(estimate, batch)
+        if not problem.marginal_likelihood or not batch.converged:
+            return estimate, difference
+        batch = replace(batch, covariance=finite_covariance(quantities, batch.covariance))
+        return _concluded(estimate, batch), difference
 
     def _solve(
         self,
@@ -632,6 +646,8 @@ def _remarks(problem: Problem, estimate: Estimate, difference: SolverDifference 
     """Findings beside those on the estimate: a difference from batch, and the premises of the method."""
     if difference is not None and abs(difference.z) >= _NOTABLE_DIFFERENCE:
         yield Finding("solver_difference", Severity.NOTE, asdict(difference))
+    if estimate.concluded:
+        yield Finding("remark", Severity.NOTE, {"text": f"{_CONCLUDED}; estimates over time are the run's"})
     for premise in problem.premises if estimate.solver != "published" else ():
         yield Finding("remark", Severity.NOTE, {"text": premise})
 
@@ -643,6 +659,19 @@ def _shown(problem: Problem, duration: float, chunk: int) -> Iterator[Step]:
     name = "the run at {:.1f} s of {:.1f} s".format
     steps = deadline.until_passed(problem.steps(chunk), lambda step: name(step.time, duration), _LEAST_STEPS)
     return progress.track(steps, "step by step", duration, lambda step: step.time)
+
+
+def _concluded(online: Estimate, batch: Estimate) -> Estimate:
+    """The solution of all rows at the end of an online run, whose estimates over time are that run's until then."""
+    history = online.history
+    if history is not None and len(history.time):
+        history = History(
+            history.time,
+            np.vstack([history.values[:-1], batch.values]),
+            np.vstack([history.sigmas[:-1], batch.sigmas]),
+        )
+    seconds = {**online.seconds, "conclusion": sum(batch.seconds.values())}
+    return replace(batch, solver=online.solver, message=_CONCLUDED, history=history, concluded=True, seconds=seconds)
 
 
 def _carried(seen: Attitudes, dense: Attitudes) -> Finding:

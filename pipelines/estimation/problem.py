@@ -510,7 +510,7 @@ class Estimate:
         covariance: (n, n), joint, of the reported numbers, everything else marginalised out. Rows of fixed quantities
             are zero. Directions without any information have the variance of a very wide prior, never infinity.
         converged: whether the solver says so; `message` says how or why not.
-        residuals: family -> residuals of measurements at the estimate (innovations for an incremental solver).
+        residuals: family -> residuals of measurements at the estimate; innovations if `has_innovations`.
         chi_square: None for solvers that have none.
         history: values and sigmas from what was recorded until each moment.
         course: the same at some moments, jointly; None where moments are not weighed alike.
@@ -530,6 +530,7 @@ class Estimate:
         inflation: (n,) by what the sigmas are larger because residuals are correlated in time; None: by nothing.
         told: what the graph says without the device's priors; None: not asked for.
         second: the second best solution of several, if it is nearly as likely; None: there is none, or not looked for.
+        concluded: whether an incremental solver's run ended with the solution of all rows together.
         seconds: phase -> wall time.
     """
 
@@ -556,12 +557,18 @@ class Estimate:
     step: StepEstimate | None = None
     told: Told | None = None
     second: Minimum | None = None
+    concluded: bool = False
     seconds: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def sigmas(self) -> Array:
         """(n,) standard deviations."""
         return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def has_innovations(self) -> bool:
+        """Whether residuals are those of measurements against what was predicted before them."""
+        return self.solver == "incremental" and not self.concluded
 
     @property
     def inflations(self) -> Array:

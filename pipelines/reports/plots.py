@@ -36,8 +36,8 @@ def common_plots(calibration: Calibration) -> list[Plot]:
     for family, residuals in estimate.residuals.items():
         if len(residuals.time):
             names = components(calibration.method.components.get(family), residuals)
-            plots.append(_residuals(family, residuals, names, estimate.solver == "incremental"))
-            if estimate.solver == "incremental":
+            plots.append(_residuals(family, residuals, names, estimate.has_innovations))
+            if estimate.has_innovations:
                 plots.append(_squares(family, residuals))
     correlation, ellipses = _correlation(calibration), _ellipses(calibration)
     return [*plots, *([correlation] if correlation else []), *([ellipses] if ellipses else [])]

@@ -355,8 +355,8 @@ class Calibration:
 
     @property
     def innovations(self) -> dict[str, InnovationTest]:
-        """Family -> whiteness and size of its innovations; only the incremental solver has innovations."""
-        if self.estimate.solver != "incremental":
+        """Family -> whiteness and size of its innovations; of an incremental run that ended as it went."""
+        if not self.estimate.has_innovations:
             return {}
         found = {family: InnovationTest.of(r) for family, r in self.estimate.residuals.items()}
         return {family: innovations for family, innovations in found.items() if innovations is not None}
