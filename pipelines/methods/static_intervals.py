@@ -27,6 +27,10 @@ _MOVED, _UNMOVED = 5.0, 1.0
 _SLOW_SHARE, _SLOW = 0.1, 0.4
 # Samples whose means tell whether noise is white, and how many such means it takes.
 _TOGETHER, _FEWEST_BLOCKS, _TINY = 8, 4, np.finfo(float).tiny
+# Brief rests, of a second and less, are looked for with this share of span, margin and shortest; there readings scatter
+# by less than so many times what they differ by from one to the next, over sqrt(2): 1 for white noise, beyond 5 where
+# a hand turns back.
+_BRIEF, _WHITE = 0.5, 2.0
 # The noise is what the quietest twentieth of the recording shows, between these multiples of the stated one.
 _FLOOR_SHARE, _FLOOR_LIMITS = 0.05, (0.2, 10.0)
 # A steady turn is as quiet; its mean rate departs from that of the static intervals by more than this, rad/s, when what
@@ -78,21 +82,38 @@ def find_static_intervals(t: Array, gyro: Array, accel: Array, gyro_sigma: float
     return t[runs[still]]
 
 
-def quiet_intervals(t: Array, streams: Sequence[tuple[Array, float]]) -> Array:
+def quiet_intervals(t: Array, streams: Sequence[tuple[Array, float]], fewest: int) -> Array:
     """Beginnings and ends, (P, 2) s, of intervals in which vectors (N, 3) are quiet, each with its noise; maybe none.
 
-    For a device without a gyro: a steady turn about what a sensor feels does not show in it.
+    For a device without a gyro: a steady turn about what a sensor feels does not show in it. Where that finds fewer
+    than `fewest`, brief ones count in which the first vectors scatter by white noise: at turning points they do not.
     """
-    return np.asarray(t[_quiet_runs(t, streams)[0]])
+    runs = _quiet_runs(t, streams)[0]
+    if len(runs) >= fewest:
+        return np.asarray(t[runs])
+    brief = _quiet_runs(t, streams, _BRIEF)[0]
+    return np.asarray(t[brief if len(brief) >= fewest and _is_white(streams[0][0], brief) else runs])
 
 
-def _quiet_runs(t: Array, streams: Sequence[tuple[Array, float]]) -> tuple[NDArray[np.intp], Array, Array]:
+def _is_white(values: Array, runs: NDArray[np.intp]) -> bool:
+    """Whether vectors (N, 3) scatter in runs (P, 2) about as much as they differ from one sample to the next."""
+    within = [values[first : last + 1] for first, last in runs]
+    scatter = np.median([np.sqrt(each.var(axis=0).mean()) for each in within])
+    steps = np.median([np.sqrt(0.5 * (np.diff(each, axis=0) ** 2).mean()) for each in within])
+    return bool(scatter < _WHITE * steps)
+
+
+def _quiet_runs(
+    t: Array, streams: Sequence[tuple[Array, float]], share: float = 1.0
+) -> tuple[NDArray[np.intp], Array, Array]:
     """First and last sample of each quiet run (P, 2), and for each stream its scatter (N,) and the floor of that.
+
+    `share` is what the test looks at, cuts off and takes for shortest, over what is usual.
 
     Raises InputError when the record is shorter than what is looked at.
     """
     interval = float(np.median(np.diff(t)))
-    half = max(2, round(0.5 * _SPAN / interval))
+    half = max(2, round(0.5 * share * _SPAN / interval))
     if len(t) < 2 * half + 1:
         raise InputError(f"the device's record is {t[-1] - t[0]:.3g} s long, shorter than one static pose")
     scatter = np.stack([_scatter(values, half) for values, _ in streams])
@@ -105,10 +126,10 @@ def _quiet_runs(t: Array, streams: Sequence[tuple[Array, float]]) -> tuple[NDArr
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(int))).reshape(-1, 2)
     counted = np.append(0, np.cumsum(quiet & still))
     edges = edges[counted[edges[:, 1]] > counted[edges[:, 0]]]
-    margin = round(_MARGIN / interval)
+    margin = round(share * _MARGIN / interval)
     runs = edges + np.array([margin, -1 - margin])
     runs = runs[runs[:, 1] > runs[:, 0]]
-    return runs[t[runs[:, 1]] - t[runs[:, 0]] >= _SHORTEST], scatter, floor
+    return runs[t[runs[:, 1]] - t[runs[:, 0]] >= share * _SHORTEST], scatter, floor
 
 
 def _unmoved(run: NDArray[np.intp], streams: Sequence[tuple[Array, float]], interval: float) -> tuple[int, int]:

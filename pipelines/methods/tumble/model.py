@@ -321,7 +321,7 @@ def _rests(data: TumbleData, config: Config) -> Array | None:
         mag = np.stack([np.interp(t, data.mag_t, axis) for axis in data.mag.T], axis=1)
         streams.append((mag / mag.std(), 1e-3))
     try:
-        found = quiet_intervals(t, streams)
+        found = quiet_intervals(t, streams, FEWEST)
     except InputError:
         return None
     return found if len(found) >= _FEWEST_RESTS else None

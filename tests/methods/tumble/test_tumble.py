@@ -528,6 +528,28 @@ def test_the_mean_of_points_of_an_ellipsoid_lies_inside_it() -> None:
     np.testing.assert_allclose(sagitta(means, scatter, numbers), inside, rtol=0.03)
 
 
+SECOND = TumbleScenario(attitudes=20, rest_s=1.0, gyro=TumbledGyro(), accelerometer=TumbledAccelerometer())
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_rests_of_a_second_are_found_and_turning_points_are_none(seed: int) -> None:
+    for rest_s, found in ((1.0, True), (0.0, False)):
+        simulated = _simulated(replace_scenario(SECOND, rest_s=rest_s), seed)
+        model = prepare(simulated.data, load_config(simulated.config.encode()))
+        assert model.sensors[0].rested is found
+        assert not found or len(model.sensors[0].time) == 20
+
+
+@pytest.mark.parametrize("seed", [3, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
+def test_nothing_changed_in_a_clean_recording_with_rests_of_a_second(seed: int) -> None:
+    simulated = _simulated(SECOND, seed)
+    calibration = Session.of(TUMBLE, simulated).calibrate()
+    assert calibration.status == "calibrated"
+    found = {name: each for name, each in calibration.parameters.items() if each.sigma}
+    off = [(found[name].value - true) / found[name].sigma for name, true in simulated.truth.items() if name in found]
+    assert np.abs(off).max() < 4.0
+
+
 def test_a_rest_counts_as_one_attitude() -> None:
     data = _simulated(TumbleScenario(attitudes=4, rest_s=3.0), 1).data
     (sensor,) = prepare(data, Config.model_validate({"noise": {"mag_density": 5e-8}})).sensors
