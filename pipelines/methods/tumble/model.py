@@ -35,6 +35,8 @@ _PLAUSIBLE = {"accel": (3.0, 30.0), "mag": (1e-6, 1e-3)}
 _GRAVITY, _GRAVITY_SIGMA = 9.80665, 0.02
 # Fewer rests than this and every sample of an accelerometer counts as one at rest.
 _FEWEST_RESTS = 9
+# No sensor resolves a smaller share of what it measures; numbers without noise leave rounding.
+_RESOLUTION = 1e-9
 # Samples this many sigmas from the ellipsoid are left out of the first guess.
 _FAR, _ROUNDS = 5.0, 5
 # A rotation is told by pairs of vectors if the second-best answer fits this many times worse.
@@ -385,7 +387,7 @@ def _sensor(
     numbers, root_number = start @ entries(True).T, np.sqrt(number)
     apart = StrengthFactor(time, raw / radius, np.ones(len(raw)), np.zeros(len(raw)), symmetric=True)
     distances = apart(np.tile(start, (len(raw), 1)), np.ones((len(raw), 1)))[0][:, 0]
-    seen = radius * robust_sigma(distances * root_number)
+    seen = radius * max(robust_sigma(distances * root_number), _RESOLUTION)
     interval = float(np.median(np.diff(stream[0])))
     noise = _noise(name, config, stream[1], is_si, seen * interval**0.5)
     stated_sigma = noise.stated * interval**-0.5
