@@ -21,7 +21,7 @@ from alidade.pipelines.methods.head.simulation import HeadScenario, head_config,
 from alidade.pipelines.methods.los import graph as los
 from alidade.pipelines.methods.los.recording import read_los, write_los
 from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
-from alidade.pipelines.methods.tumble.scenario import TumbledAccelerometer
+from alidade.pipelines.methods.tumble.scenario import TumbledAccelerometer, TumbledGyro
 from alidade.pipelines.recording.faults import drop_faults
 from alidade.pipelines.recording.reading import Recording, open_recording
 from alidade.pipelines.settings import Config
@@ -162,6 +162,7 @@ def test_a_faulty_gyro_moves_no_parameter(name: str, fault: Fault, tmp_path: Pat
         ("indexer", "gyro", {}),
         ("cube", "gyro", {"poses": 3, "static_s": 2.0, "camera": None}),
         ("cube", "accel", {"poses": 3, "static_s": 2.0, "camera": None}),
+        ("tumble", "gyro", {"attitudes": 10, "gyro": TumbledGyro()}),
     ],
 )
 def test_saturated_samples_are_left_out_and_reported_by_every_method(

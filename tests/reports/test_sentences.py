@@ -90,6 +90,14 @@ GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
     ),
     (
         "noise",
+        INCONSISTENT,
+        {"noise": "corner_px", "unit": "px", "source": "default", "used": 6.9}
+        | {"factor": 23.0, "estimated_factor": None},
+        "Noise corner_px: estimated 23 times the default's value; not white noise: check camera_info (lens, size and "
+        "rectification of the pictures) and the layout of the tags.",
+    ),
+    (
+        "noise",
         NOTE,
         {"noise": "vision_attitude", "unit": "rad", "source": "config", "used": 0.0087}
         | {"factor": 3.0, "estimated_factor": 3.0},

@@ -151,13 +151,18 @@ def _check_gravity(topic: str, accel: Array) -> None:
 def _gyro(
     topic: str, imu: series.ImuSeries, epoch: int, dropped: dict[str, int]
 ) -> tuple[Array | None, Array | None, float | None]:
-    """Times, rates and density; None where there is none, or one that is not in rad/s."""
+    """Times, rates and density; None where there is none, or one that is not in rad/s.
+
+    Raises InputError where an axis is dead beside others, or a fifth of the samples is lost.
+    """
     if not is_there("gyro", imu.gyro, imu.gyro_cov):
         return None, None, None
     t, keep = clean(topic, imu.t_ns, epoch, imu.gyro, {})
     if too_fast(topic, t, imu.gyro[keep]):
         count(dropped, f"{topic}: {NO_RATE}", len(t))
         return None, None, None
+    sound = drop_faults(topic, t, imu.gyro[keep], dropped, "rad/s", may_stand=True)
+    t, keep = t[sound], keep[sound]
     return t, imu.gyro[keep], density(topic, "gyro", t, imu.gyro_cov[keep], LEAST_GYRO, dropped)
 
 

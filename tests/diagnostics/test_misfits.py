@@ -1,0 +1,45 @@
+"""A misfit is never taken for noise without the word: corners that scatter, families of which most is rejected."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from alidade.pipelines.diagnostics import hypothesis_tests
+from alidade.pipelines.diagnostics.diagnose import diagnose
+from alidade.pipelines.diagnostics.trial_fit import TrialFit
+from alidade.pipelines.estimation.finding import Severity
+from alidade.pipelines.estimation.noise import Level, Noise
+from alidade.pipelines.estimation.problem import ChiSquare, Residuals
+from tests.support.builders import make_calibration
+
+
+@pytest.mark.parametrize(("scale", "told"), [(4.0, False), (6.0, True)])
+def test_corners_beyond_five_times_their_default_do_not_fit(scale: float, told: bool) -> None:
+    calibration = make_calibration()
+    level = Level(Noise("corner_px", 0.3, "default", 1.0, ("tags",)), scale, scale, 0.1)
+    estimate = replace(calibration.estimate, levels=(level,))
+    found = [each for each in diagnose(estimate, calibration.problem.quantities) if each.kind == "noise"]
+    assert [(each.severity, each.evidence["noise"]) for each in found] == told * [(Severity.INCONSISTENT, "corner_px")]
+
+
+@pytest.mark.parametrize(("count", "rejected", "told"), [(6, 4, True), (6, 3, False), (3, 3, False), (20, 4, False)])
+def test_most_of_a_small_family_rejected_is_told(count: int, rejected: int, told: bool) -> None:
+    calibration = make_calibration()
+    used = np.arange(count) >= rejected
+    family = Residuals(np.arange(float(count)), np.ones((count, 3)), used)
+    estimate = replace(calibration.estimate, residuals={"tags": family})
+    found = [each for each in diagnose(estimate, calibration.problem.quantities) if each.kind == "rejection"]
+    assert [each.severity for each in found if each.severity > Severity.NOTE] == told * [Severity.INCONSISTENT]
+
+
+@pytest.mark.parametrize(("left", "explains"), [(1.0, True), (9.0, True), (11.0, False), (200.0, False)])
+def test_what_leaves_chi_square_far_above_its_freedom_is_no_explanation(left: float, explains: bool) -> None:
+    estimate = make_calibration().estimate
+
+    def fit(chi_square: float) -> TrialFit:
+        return TrialFit((), estimate, ChiSquare(chi_square, 1000, {}), 0.0, 1000.0)
+
+    assert hypothesis_tests._explains(fit(1e6), fit(1e3 * left)) is explains
