@@ -390,6 +390,8 @@ def _sensor(
     seen = radius * max(robust_sigma(distances * root_number), _RESOLUTION)
     interval = float(np.median(np.diff(stream[0])))
     noise = _noise(name, config, stream[1], is_si, seen * interval**0.5)
+    if noise.stated > 0.0:
+        noise = replace(noise, least=_RESOLUTION * radius * interval**0.5 / noise.stated)
     stated_sigma = noise.stated * interval**-0.5
     believed = (stated_sigma if noise.source != "default" or noise.known == 0.0 else seen) / radius
     return Sensor(
