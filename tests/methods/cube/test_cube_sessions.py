@@ -44,6 +44,8 @@ def _read_back(path: Path, data: CubeData, config: Config | None = None) -> Cube
 
 
 def _assert_same(a: Any, b: Any, where: str) -> None:
+    if where == "camera.rectified":  # P of CameraInfo, which a file has and a simulator need not
+        return
     if isinstance(a, Sightings | Camera):
         for field in fields(a):
             _assert_same(getattr(a, field.name), getattr(b, field.name), f"{where}.{field.name}")
