@@ -282,7 +282,7 @@ def _constrained(
 ) -> Posterior:
     """The minimum with the weak directions at their prior means: those of the system there, or fixed ones.
 
-    `known` is the system at the values, and its factorization.
+    `known` is the system at the values, a minimum without constraints, and its factorization.
     """
     weak, cost, (system, factorization) = 0, np.inf, known
     for step in range(MAX_STEPS):
@@ -299,7 +299,8 @@ def _constrained(
         weak = directions.weak.shape[1]
         du = constrained_step(directions, found.R, found.d, reported.u)
         size = np.linalg.norm(directions.strong.T @ du / directions.sigmas), np.linalg.norm(directions.weak.T @ du)
-        if max(size) < NEAR:
+        at_minimum = not step and not weak  # values are the minimum, and nothing is to be moved away from it
+        if at_minimum or max(size) < NEAR:
             return Posterior(values, system, factorization, reported, directions, True)
         if size[1] > LEAP:
             du *= LEAP / size[1]
@@ -307,6 +308,7 @@ def _constrained(
             fixed = directions
         share, there = 1.0, _moved(engine, factorization, values, found, du)
         if size[1] < NEAR:  # the weak directions are where they are to be: from here on the cost falls
+            cost = engine.cost(values) if np.isinf(cost) else cost
             while engine.cost(there) > cost and share > 1e-3:
                 share *= 0.3
                 there = _moved(engine, factorization, values, found, share * du)
