@@ -82,13 +82,12 @@ def change_finding(
         found: a change that is more than chance.
         parts: parameter -> values before and after it; none where the segments have no solution.
         quantities: of the estimate.
-        ratio: of sandwich to nominal sigmas, the largest of a required parameter: the segments' own sigmas have it.
+        ratio: of sandwich to nominal sigmas, the largest of a required parameter: what errs slowly over the whole
+            recording has few draws in a segment, whose sigmas do not show it.
     """
-    significant = sorted((n for n in parts if abs(parts[n].z) > _STEP), key=lambda name: -abs(parts[name].z))
-    steps = {name: (parts[name].step, parts[name].step_sigma) for name in significant}
+    steps = _significant({name: (part.step, part.step_sigma) for name, part in parts.items()}, ratio)
     if not steps:
-        wide = {name: (size, ratio * sigma) for name, (size, sigma) in found.differences.items()}
-        steps = {name: (size, sigma) for name, (size, sigma) in wide.items() if abs(size) > _STEP * sigma}
+        steps = _significant(found.differences, ratio)
     if not steps and (parts or found.differences):
         return None
     required = {q.name: q.require for q in quantities}
@@ -96,6 +95,13 @@ def change_finding(
     immaterial = bool(parts) and not material
     severity = Severity.NOTE if immaterial else Severity.INCONSISTENT
     return Finding("change", severity, {"time_s": found.time_s, "steps": steps})
+
+
+def _significant(steps: Mapping[str, tuple[float, float]], ratio: float) -> dict[str, tuple[float, float]]:
+    """Steps beyond `_STEP` of their sigmas times the ratio, with these; the most significant first."""
+    wide = {name: (size, ratio * sigma) for name, (size, sigma) in steps.items()}
+    beyond = {name: step for name, step in wide.items() if abs(step[0]) > _STEP * step[1]}
+    return dict(sorted(beyond.items(), key=lambda item: -abs(item[1][0]) / max(item[1][1], 1e-300)))
 
 
 def step_finding(step: StepEstimate, duration: float, quantities: Sequence[Quantity]) -> Finding | None:
