@@ -449,6 +449,8 @@ class Session:
         problem = self.problem()
         if solver == "published":
             return self.method.published(self.data, self.config, problem), problem
+        if all(q.prior_sigma == 0.0 for q in problem.quantities):
+            raise InputError("priors: every parameter is fixed (0), so that there is nothing to calibrate; free one")
         if solver == "incremental":
             from alidade.pipelines.solvers.incremental import solve_incremental
 
