@@ -646,7 +646,9 @@ def _check_figures(method: Method, config: Config) -> None:
 
 def _remarks(problem: Problem, estimate: Estimate, difference: SolverDifference | None) -> Iterator[Finding]:
     """Findings beside those on the estimate: a difference from batch, and the premises of the method."""
-    if difference is not None and abs(difference.z) >= _NOTABLE_DIFFERENCE:
+    # What was concluded is batch's own result.
+    notable = difference is not None and abs(difference.z) >= _NOTABLE_DIFFERENCE and not estimate.concluded
+    if difference is not None and notable:
         yield Finding("solver_difference", Severity.NOTE, asdict(difference))
     if estimate.concluded:
         yield Finding("remark", Severity.NOTE, {"text": f"{_CONCLUDED}; estimates over time are the run's"})
