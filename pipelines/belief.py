@@ -37,6 +37,13 @@ class Belief:
         known = tuple(self.names[i] for i in kept)
         return Belief(known, self.mean[rows], self.covariance[np.ix_(rows, rows)], self.source)
 
+    def given_others(self, names: Collection[str]) -> Belief:
+        """These of its numbers, all others exactly at their means."""
+        one, other = (np.array([(n in names) is among for n in self.names], dtype=bool) for among in (True, False))
+        shared, C = self.covariance[np.ix_(one, other)], self.of(names)
+        rest = np.linalg.pinv(self.covariance[np.ix_(other, other)], hermitian=True)
+        return Belief(C.names, C.mean, C.covariance - shared @ rest @ shared.T, self.source)
+
     @property
     def sigmas(self) -> Array:
         """(n,)."""

@@ -449,6 +449,8 @@ class Session:
         problem = self.problem()
         if solver == "published":
             return self.method.published(self.data, self.config, problem), problem
+        if all(q.prior_sigma == 0.0 for q in problem.quantities):
+            raise InputError("priors: every parameter is fixed (0), so that there is nothing to calibrate; free one")
         if solver == "incremental":
             from alidade.pipelines.solvers.incremental import solve_incremental
 
@@ -644,7 +646,9 @@ def _check_figures(method: Method, config: Config) -> None:
 
 def _remarks(problem: Problem, estimate: Estimate, difference: SolverDifference | None) -> Iterator[Finding]:
     """Findings beside those on the estimate: a difference from batch, and the premises of the method."""
-    if difference is not None and abs(difference.z) >= _NOTABLE_DIFFERENCE:
+    # What was concluded is batch's own result.
+    notable = difference is not None and abs(difference.z) >= _NOTABLE_DIFFERENCE and not estimate.concluded
+    if difference is not None and notable:
         yield Finding("solver_difference", Severity.NOTE, asdict(difference))
     if estimate.concluded:
         yield Finding("remark", Severity.NOTE, {"text": f"{_CONCLUDED}; estimates over time are the run's"})

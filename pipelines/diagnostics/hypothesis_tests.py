@@ -151,7 +151,12 @@ def _with_delays(label: str, after: TrialFit) -> str:
 
 
 def _explains(before: TrialFit, after: TrialFit) -> bool:
-    """Whether chi-square falls by far more than chance, and to (nearly) what it should be."""
+    """Whether chi-square falls by far more than chance, and to (nearly) what it should be.
+
+    A corrected gyro whose noise is far larger than its residuals fits any motion, as larger noise would.
+    """
+    if after.factor < 1.0 / _MAX_NOISE_FACTOR:
+        return False
     fall = (before.cost - after.cost) / max(after.factor, 1.0) ** 2
     explains = after.factor < _MAX_REMAINING * before.factor and after.factor**2 <= _MAX_LEFT
     return fall > _SIGNIFICANT**2 and (after.fits or explains)

@@ -104,6 +104,7 @@ def _believing(problem: Problem, belief: Belief, before: Earlier = tuple) -> Pro
     return replace(
         problem,
         parameters=parameters,
+        beliefs=(*problem.beliefs, known.given_others(replaced)),
         steps=lambda chunk: told.steps(steps(chunk), before),
         steps_after=None if after is None else lambda time: told.steps(after(time), lambda: _until(steps, time)),
         onward=None

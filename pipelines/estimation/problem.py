@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from alidade.factors import so3
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.vectorized import VectorizedFactor
+from alidade.pipelines.belief import Belief
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.noise import Level
 
@@ -294,6 +295,7 @@ class Problem:
         marginal_likelihood: whether noise levels are those that maximise it, for which it needs a layout.
         may_step: variable that may change at one moment, as a mount that slips; None: none is looked at.
         finer: the graph for noise levels, where keyframes stand closer than in this one; None: where this one serves.
+        beliefs: joint priors from elsewhere than data sheets; the last one about a number is in force.
     """
 
     method: str
@@ -317,6 +319,7 @@ class Problem:
     marginal_likelihood: bool = False
     may_step: int | None = None
     finer: Callable[[Sequence[Level]], Problem | None] | None = None
+    beliefs: tuple[Belief, ...] = ()
 
     def near(self, numbers: Mapping[str, float]) -> Problem:
         """The same problem; rotations are reported by the rotation vectors nearest to these numbers (rad, by name)."""
@@ -357,6 +360,16 @@ class Problem:
     def quantities(self) -> tuple[Quantity, ...]:
         """All reported numbers, in order."""
         return tuple(q for p in self.parameters for q in p.quantities)
+
+    def prior_covariance(self, names: Sequence[str], sigmas: Array) -> Array:
+        """(m, m) prior covariance of some reported numbers: their sigmas (m,) with the correlations of `beliefs`."""
+        covariance = np.diag(np.square(sigmas))
+        for belief in self.beliefs:
+            known = belief.of(names)
+            at = np.array([list(names).index(name) for name in known.names], dtype=np.intp)
+            covariance[at], covariance[:, at] = 0.0, 0.0
+            covariance[np.ix_(at, at)] = known.covariance
+        return covariance
 
     @property
     def assumed(self) -> tuple[int, ...]:

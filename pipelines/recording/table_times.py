@@ -45,7 +45,9 @@ def nanoseconds(path: Path, texts: NDArray[np.str_], unit: str) -> Stamps:
         exact = np.char.isdigit(np.char.lstrip(whole, "-")) & (np.char.isdigit(rest) | (rest == ""))
         if not exact.all():  # with an exponent, say
             values = texts.astype(float) * size
-            _check_size(path, float(np.nanmax(np.abs(values))), unit)
+            if np.isnan(values).any():
+                raise _no_time(path, texts[np.isnan(values)], unit)
+            _check_size(path, float(np.abs(values).max()), unit)
             return np.rint(values).astype(np.int64)
         _check_size(path, float(np.abs(whole.astype(float)).max()) * size, unit)
         fraction = np.array([one[:digits].ljust(digits, "0") or "0" for one in rest.tolist()], dtype=np.int64)

@@ -79,9 +79,9 @@ class Influence:
         basis = np.hstack([found.basis[:, :p], found.basis[:, p:] @ strong])
         step = responses(factorization, reported.jacobian[reported.free], basis)
         slope = np.linalg.lstsq(found.R @ strong, -found.R @ weak, rcond=None)[0]
+        root = np.linalg.cholesky(reported.prior)
         roots = [
-            scale[:, None] * (axes @ directions.prior_covariance @ weak.T) * np.sqrt(np.diag(reported.prior))
-            for axes in (weak, strong @ slope)
+            scale[:, None] * (axes @ directions.prior_covariance @ weak.T) @ root for axes in (weak, strong @ slope)
         ]
         return cls(engine, values, reported, step, np.hstack(roots))
 

@@ -300,7 +300,9 @@ def correlation_inflation(
     scale, extra = np.array([(problem.quantities[i].scale, problem.quantities[i].extra_sigma) for i in free]).T
     block = np.ix_(free, free)
     variance, vectors = np.linalg.eigh((covariance[block] - np.diag(extra**2)) / np.outer(scale, scale))
-    prior = np.diag([0.0 if problem.quantities[i].prior_sigma is None else 1.0 for i in free])
+    own = problem.prior_covariance([problem.quantities[i].name for i in free], scale) / np.outer(scale, scale)
+    known = np.array([problem.quantities[i].prior_sigma is not None for i in free], dtype=float)
+    prior = np.linalg.inv(own) * np.outer(known, known)
     measured = (vectors / np.maximum(variance, _ROUNDING**2)) @ vectors.T - prior
     unit = to_tangents[:, free] * scale
     added = {family: unit.T @ each @ unit for family, each in gate.information.items()}

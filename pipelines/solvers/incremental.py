@@ -178,7 +178,7 @@ class _Posterior:
         values: (n,) all reported numbers, SI.
         mean: (m,) of the free ones, less their prior means.
         covariance: (m, m), with terms of second order.
-        prior: (m,) their prior variances; infinite: no prior.
+        prior: (m, m) their prior covariance; infinite variances: no prior.
         calibrated: (m,) whether they are calibrated, and no nuisance parameters.
         free: (m,) their places among the reported numbers.
         scale: (m,) the usual priors' sigmas.
@@ -214,9 +214,9 @@ class _Posterior:
         Args:
             directions: (m, w), orthonormal.
         """
-        E = directions[:, ~(np.abs(directions[np.isinf(self.prior)]) > _ROUNDING).any(axis=0)]
+        E = directions[:, ~(np.abs(directions[np.isinf(np.diag(self.prior))]) > _ROUNDING).any(axis=0)]
         others = np.eye(len(self.mean)) - E @ E.T
-        own = others @ self.covariance @ others + (E @ E.T) @ np.diag(_finite(self.prior)) @ (E @ E.T)
+        own = others @ self.covariance @ others + (E @ E.T) @ _finite(self.prior) @ (E @ E.T)
         values, covariance = self.values.copy(), np.zeros((len(self.values), len(self.values)))
         values[self.free] -= self.scale * (E @ (E.T @ self.mean))
         covariance[np.ix_(self.free, self.free)] = own * np.outer(self.scale, self.scale) + np.diag(self.extra**2)
@@ -465,11 +465,12 @@ class IncrementalSolver:
         if self._second is not None:
             covariance += self._second[np.ix_(free, free)] / np.outer(scale, scale)
         own = [quantities[i] for i in free]
+        sigmas = np.array([np.inf if q.prior_sigma is None else q.prior_sigma for q in own])
         return _Posterior(
             values=numbers,
             mean=(numbers[free] - [q.prior_mean for q in own]) / scale,
             covariance=covariance,
-            prior=np.array([np.inf if q.prior_sigma is None else q.prior_sigma**2 for q in own]) / scale**2,
+            prior=self.problem.prior_covariance([q.name for q in own], sigmas) / np.outer(scale, scale),
             calibrated=np.array([not q.assumed for q in own], dtype=bool),
             free=free,
             scale=scale,

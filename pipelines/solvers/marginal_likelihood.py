@@ -845,16 +845,18 @@ def largest_step(compiled: Compiled, levels: Sequence[Level], solution: Solution
     if not span:
         return None
     at = np.sort(np.concatenate(span))
-    times = np.quantile(at, np.linspace(0.0, 1.0, _CANDIDATES + 2)[1:-1])
+    # Times of measurements, lest a candidate in an outage has none near it.
+    times = np.unique(np.quantile(at, np.linspace(0.0, 1.0, _CANDIDATES + 2)[1:-1], method="higher"))
+    when = float(times[0])
     out = _by_row(chain, outliers, 0.0)
     variances = [np.where(o > 0.0, 1e12 * v, v) for o, v in zip(out, chain.variances(levels), strict=True)]
     for _ in range(_SCANS):
+        if len(times) < 3:
+            break
         best = int(np.argmax(chain.step_scores(columns, times, variances)))
         when, spacing = float(times[best]), float(np.median(np.diff(times)))
         near = at[np.abs(at - when) <= spacing]
         times = np.unique(near[np.linspace(0, len(near) - 1, _CANDIDATES).astype(int)])
-        if len(times) < 3:
-            break
     p = chain.prior.shape[1] - 1
     one = chain.with_steps(columns, np.array([when]))
     before, after = estimate_levels(chain, levels, {}, outliers), estimate_levels(one, levels, {}, outliers)

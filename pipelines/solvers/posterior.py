@@ -84,6 +84,8 @@ class Reported:
         # The default priors are the yardstick: an earlier calibration as prior makes nothing weak that it determined.
         scale = np.array([quantities[i].prior_scale for i in free])
         sigma = np.array([quantities[i].prior_sigma or FREE_PRIOR * quantities[i].prior_scale for i in free])
+        names = [quantities[i].name for i in free]
+        prior = problem.prior_covariance(names, sigma) / np.outer(scale, scale)
         return cls(
             names=tuple(q.name for q in quantities),
             numbers=np.concatenate([numbers for _, numbers, _ in pairs]),
@@ -91,7 +93,7 @@ class Reported:
             free=free,
             mean=np.array([quantities[i].prior_mean for i in free]),
             scale=scale,
-            prior=np.diag((scale / sigma) ** 2),
+            prior=np.asarray(np.linalg.inv(prior), dtype=float),
             extra=np.array([0.0 if q.prior_sigma == 0.0 else q.extra_sigma for q in quantities]),
             calibrated=np.array([not quantities[i].assumed for i in free], dtype=bool),
         )

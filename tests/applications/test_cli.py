@@ -182,12 +182,17 @@ def test_bad_data_is_one_line(alidade: Command, data: HeadData, tmp_path: Path, 
     _refused(alidade("calibrate", tmp_path / "s.mcap", "--out", tmp_path / "out"), tmp_path / "out", words)
 
 
+_HEAD = [f"{name}_{axis}" for name in ("gyro_bias", "helmet_mount", "camera_mount") for axis in "xyz"]
+ALL_FIXED = f"sensors: ideal\npriors: {{{', '.join(f'{name}: 0' for name in [*_HEAD, 'time_offset'])}}}"
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [
         ("noise: {gyro_densty: 1e-4}", ("noise.gyro_densty", "gyro_density")),
         ("noise: [", ("YAML",)),
         ("priors: {helmet_mont_x: 0.1}", ("helmet_mont_x", "helmet_mount_x")),
+        (ALL_FIXED, ("priors", "every parameter is fixed")),
         ("topics: {vision_attitude: /nowhere}", ("/nowhere",)),
         ("noise: {gyro_density: -1}", ("noise.gyro_density",)),
         ("noise: {mag_density: 1.0e300}", ("noise.mag_density", "less than")),

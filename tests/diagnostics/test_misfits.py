@@ -35,8 +35,10 @@ def test_most_of_a_small_family_rejected_is_told(count: int, rejected: int, told
     assert [each.severity for each in found if each.severity > Severity.NOTE] == told * [Severity.INCONSISTENT]
 
 
-@pytest.mark.parametrize(("left", "explains"), [(1.0, True), (9.0, True), (11.0, False), (200.0, False)])
-def test_what_leaves_chi_square_far_above_its_freedom_is_no_explanation(left: float, explains: bool) -> None:
+@pytest.mark.parametrize(
+    ("left", "explains"), [(1.0, True), (0.1, True), (0.05, False), (9.0, True), (11.0, False), (200.0, False)]
+)
+def test_what_leaves_chi_square_far_from_its_freedom_is_no_explanation(left: float, explains: bool) -> None:
     estimate = make_calibration().estimate
 
     def fit(chi_square: float) -> TrialFit:

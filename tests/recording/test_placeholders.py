@@ -62,6 +62,7 @@ def test_a_held_reading_is_used_once() -> None:
     assert dropped == {"/mag: repeats the reading before, used once": 875}
     assert len(measured_once("/mag", RNG.normal(size=(1000, 3)), {})) == 1000
     coarse = np.round(0.4 * RNG.normal(size=(1000, 3)))
+    assert len(measured_once("/mag", np.ones((1000, 3)), {})) == 1000, "a coarse sensor at rest has one value"
     assert len(measured_once("/mag", coarse, {})) == 1000, "a coarse sensor repeats itself, but not each value alike"
 
 

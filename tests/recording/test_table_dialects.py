@@ -13,6 +13,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.recording.table_times import nanoseconds
 
 N = 60
 T = [f"{1000 + 0.02 * i:.3f}" for i in range(N)]
@@ -202,3 +203,8 @@ def test_signed_counts_written_as_unsigned_are_signed(bits: int, tmp_path: Path)
     (tmp_path / "y.csv").write_text("\n".join([HEADER, *lines]))
     again = magnetic(tmp_path / "y.csv", "columns: {/mag: {time: t, field: [mx, my, mz]}}")
     np.testing.assert_array_equal(again.field, counts + 2 ** (bits - 1))
+
+
+def test_a_time_that_is_not_a_number_is_refused() -> None:
+    with pytest.raises(InputError, match="a time that is no number in s: 'nan'"):
+        nanoseconds(Path("s.tum"), np.array(["0.1", "nan", "0.3"]), "s")

@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 
 from alidade.factors import so3
 from alidade.pipelines import methods
@@ -109,3 +110,15 @@ def test_a_slip_is_found_that_levels_would_hide() -> None:
     assert abs(size - np.deg2rad(2.0)) < 4.0 * sigma
     assert slipped.step.fall > 100.0
     assert right.step.fall < 30.0
+
+
+def test_step_that_fits_best_in_an_outage_is_one_at_a_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """50 pictures, none for 3 s in the middle: no candidate time is without a measurement near it."""
+    data, _ = simulate_head(SCENARIO, 2)
+    kept = np.flatnonzero((data.vision_t < 9.0) | (data.vision_t > 12.0))[::11]
+    cov = None if data.vision_cov is None else data.vision_cov[kept]
+    sparse = replace(data, vision_t=data.vision_t[kept], vision_wxyz=data.vision_wxyz[kept], vision_cov=cov)
+    monkeypatch.setattr(LinearChain, "step_scores", lambda _, __, times, ___: -np.abs(times - 11.2))
+    step = solve_batch(made(sparse)).step
+    assert step is not None
+    assert np.abs(sparse.vision_t - step.time_s).min() < 1e-9

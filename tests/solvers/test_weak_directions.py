@@ -8,7 +8,14 @@ import gtsam
 import numpy as np
 import pytest
 
+from alidade.pipelines import methods
+from alidade.pipelines.belief import Belief
+from alidade.pipelines.config import load_config
+from alidade.pipelines.estimation.believing import believing
 from alidade.pipelines.estimation.problem import Array, Problem
+from alidade.pipelines.methods.los.simulation import LosScenario, los_config, simulate_los
+from alidade.pipelines.solvers.batch import solve_batch
+from alidade.pipelines.solvers.incremental import solve_incremental
 from alidade.pipelines.solvers.layout import Layout
 from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.posterior import counted
@@ -159,3 +166,17 @@ def test_assumed_errors_are_never_held_at_their_priors() -> None:
     exact = np.linalg.inv(R.T @ R)
     # Every marginal is as wide as the exact one at least.
     assert (np.diag(covariance) >= np.diag(exact) * (1.0 - 1e-9)).all()
+
+
+def test_weak_direction_keeps_its_correlated_prior() -> None:
+    """One second of sway: the combination of two angles that the prior knows least has the prior's sigma, not less."""
+    scenario = LosScenario(duration_s=1.0)
+    data, _ = simulate_los(scenario, 0)
+    graph = methods.method("los").graph(data, load_config(los_config(scenario).encode()))
+    covariance = np.deg2rad(5.0) ** 2 * np.array([[1.0, 0.99], [0.99, 1.0]])
+    known = believing(graph, [Belief(("delta_px", "delta_gx"), np.zeros(2), covariance, "an earlier one")])
+    wide = np.ones(2) / np.sqrt(2.0)
+    for estimate in (solve_batch(known, budget=True), solve_incremental(known, 1.0)):
+        at = [estimate.names.index(name) for name in ("delta_px", "delta_gx")]
+        own = estimate.covariance[np.ix_(at, at)]
+        assert 0.8 < np.sqrt(wide @ own @ wide / (wide @ covariance @ wide)) <= 1.0
