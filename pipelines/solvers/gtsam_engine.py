@@ -84,11 +84,11 @@ class GtsamEngine:
         return self.linearization.products(group, values, tangent)
 
     def under(self, loss: TruncatedLoss | None) -> GtsamEngine:
-        """With another loss for measurements that have one."""
+        """The engine with another loss for the measurements that have one."""
         return GtsamEngine(self.linearization.under(loss))
 
     def with_groups(self, groups: Sequence[Group]) -> GtsamEngine:
-        """With other measurements in the same places."""
+        """The engine with other measurements at the same variables."""
         return GtsamEngine(self.linearization.with_groups(groups))
 
 
@@ -148,7 +148,7 @@ class GtsamSystem:
         if len(whole) < c + s + 1:
             whole = np.pad(whole, ((0, c + s + 1 - len(whole)), (0, 0)))
         root = np.triu(np.linalg.qr(whole, mode="r"))
-        conditionals = [_Conditional.of(each, layout) for each in _conditionals_of(tree, ordering)]
+        conditionals = [_Conditional.of(each, layout) for each in conditionals_of(tree, ordering)]
         found = GtsamFactorization(layout, root, conditionals)
         root[-1, -1] = np.sqrt(self._minimum(graph, found))  # gtsam drops what no variable can change
         return found
@@ -187,8 +187,8 @@ def _undetermined(error: RuntimeError) -> IndeterminateStateError:
     return IndeterminateStateError(UNDETERMINED.replace("a state", f"state {found[1]}") if found else UNDETERMINED)
 
 
-def _conditionals_of(tree: gtsam.GaussianBayesTree, ordering: gtsam.Ordering) -> list[gtsam.GaussianConditional]:
-    """Those of all variables of an ordering, each once, what is eliminated first before anything above it."""
+def conditionals_of(tree: gtsam.GaussianBayesTree, ordering: gtsam.Ordering) -> list[gtsam.GaussianConditional]:
+    """Conditionals of all variables of an ordering, each once, in the order of elimination."""
     # From the last one back: what is above a clique has been seen when the last of its own comes.
     found, seen = [], set[int]()
     for i in reversed(range(ordering.size())):

@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from alidade.factors.loss import TruncatedLoss
 from alidade.factors.vectorized import Ensemble, VectorizedFactor
 from alidade.pipelines.estimation.problem import Array, Factor
+from alidade.pipelines.solvers.gtsam_engine import conditionals_of
 from alidade.pipelines.solvers.linear_system import damped, elimination_ordering, graph_of, linear_graph_of
 from alidade.pipelines.solvers.marginals import IndeterminateError, eliminated, explain, ordering_of
-from alidade.pipelines.solvers.triangular import Triangular, conditionals_of, rows_of
+from alidade.pipelines.solvers.triangular import Triangular, rows_of
 
 # Variable and which of its numbers -> information about it that a linear system has too much.
 Excess = dict[tuple[int, int], Array]

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.estimation.problem import Array
+from alidade.pipelines.solvers.gtsam_engine import conditionals_of
 from alidade.pipelines.solvers.marginals import IndeterminateError, eliminated, explain
 
 
@@ -99,19 +100,6 @@ class Triangular:
             right = x[clique.own] - clique.S @ x[clique.above]
             x[clique.own] = np.linalg.solve(clique.R, right)
         return x
-
-
-def conditionals_of(tree: gtsam.GaussianBayesTree, ordering: gtsam.Ordering) -> list[gtsam.GaussianConditional]:
-    """Those of all variables of an ordering, each once, what is eliminated first before anything above it."""
-    # From the last one back: what is above a clique has been seen when the last of its own comes.
-    found, seen = [], set[int]()
-    for i in reversed(range(ordering.size())):
-        key = ordering.at(i)
-        if key not in seen:
-            conditional = tree[key].conditional()
-            seen.update(conditional.keys())
-            found.append(conditional)
-    return found[::-1]
 
 
 def places_of(linear: gtsam.GaussianFactorGraph) -> dict[int, slice]:
