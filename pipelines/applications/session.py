@@ -538,7 +538,7 @@ def session_facts(recording: Recording, config: Config) -> SessionFacts:
 
 
 def checked_facts(recording: Recording, config: Config) -> SessionFacts:
-    """As `session_facts`; of a method that lacks nothing, what `calibrate` would refuse the recording for.
+    """Facts about a recording, and why `calibrate` would refuse it for a method that lacks nothing.
 
     Pictures are not looked at.
     """

@@ -73,7 +73,7 @@ class BatchConfig:
 
     @classmethod
     def of(cls, max_iterations: int) -> BatchConfig:
-        """The defaults with other iterations of each minimisation."""
+        """Default options with a maximum number of iterations of each minimisation."""
         return cls(RobustConfig(LevenbergConfig(max_iterations=max_iterations)))
 
 

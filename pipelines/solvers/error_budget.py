@@ -87,7 +87,7 @@ class Influence:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(m,) of the numbers."""
+        """Names (m,) of the reported numbers that are free."""
         return tuple(self.reported.names[i] for i in self.reported.free)
 
     def rows(self, group: Group) -> tuple[Array, Array]:

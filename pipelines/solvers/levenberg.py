@@ -5,8 +5,8 @@ The ratio of the decrease of the cost to the one that the linear system predicts
 down: Madsen, Nielsen, Tingleff, "Methods for non-linear least squares problems", 2004, section 3.2. Under a robust loss
 the rows have its weights at the values (iteratively reweighted least squares), and the prediction is that of these.
 
-What a linear system foresaw wrongly of its step is about what is left for the next one: a small step that does what it
-was to do ends at the minimum.
+The error of a linear system's prediction is about what is left for the next step: a small step that does as predicted
+ends at the minimum.
 
 Limits: a minimum is a local one. A cost is a sum of squares, in units of squared sigmas, with the losses in force.
 """
@@ -104,10 +104,10 @@ class Engine(Protocol):
         """(N,) s of the keyframes."""
 
     def under(self, loss: TruncatedLoss | None) -> Self:
-        """With another loss for measurements that have one."""
+        """The engine with another loss for the measurements that have one."""
 
     def with_groups(self, groups: Sequence[Group]) -> Self:
-        """With other measurements in the same places."""
+        """The engine with other measurements at the same variables."""
 
 
 # Decrease of the cost over the one predicted above which a step is lengthened: along it the cost is no parabola, and
@@ -123,7 +123,7 @@ class LevenbergConfig:
         max_iterations: linear systems solved.
         cost_tolerance: stop when the predicted decrease is below it (squared sigmas): no number is off its minimum by
             more than the root of it, in its own sigmas, and by far less once the step is taken.
-        foreseen: error of the predicted decrease of an undamped step below which no other step is asked for.
+        prediction_tolerance: error of the predicted decrease of an undamped step below which that step is the last.
         curved_tolerance: predicted decrease of an undamped step below which it may raise the cost at a minimum: what
             the data hardly determine is curved by more than the linear system knows. .01 is .1 sigma.
         determined_tolerance: predicted decrease of the first damped step below which all is at its minimum that has
@@ -136,7 +136,7 @@ class LevenbergConfig:
 
     max_iterations: int = 60
     cost_tolerance: float = 2e-5
-    foreseen: float = 2e-6
+    prediction_tolerance: float = 2e-6
     curved_tolerance: float = 1e-2
     determined_tolerance: float = 1e-3
     initial_damping: float = 1e-6
@@ -196,8 +196,10 @@ def minimize(
                 candidate, new_system, new_cost = _lengthened(engine, values, step, new_cost)
             if decrease > 0.0 or (near and decrease > -_enough(config, cost)):
                 values, system, cost = candidate, new_system, new_cost
-                foreseen = damping == 0.0 and predicted < 1.0 and abs(decrease - predicted) < config.foreseen
-                if near or foreseen:
+                as_predicted = (
+                    damping == 0.0 and predicted < 1.0 and abs(decrease - predicted) < config.prediction_tolerance
+                )
+                if near or as_predicted:
                     return solution(True, f"converged after {iteration} iterations", iteration)
                 ratio = decrease / predicted if predicted > 0.0 else 1.0
                 damping *= max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)

@@ -236,7 +236,7 @@ class Linearization:
         return [group.weighted(group.evaluate(values)[0]) for group in self.groups]
 
     def with_groups(self, groups: Sequence[Group]) -> Linearization:
-        """The same with other measurements in the same places."""
+        """The linearisation with other measurements at the same variables."""
         return replace(self, groups=groups)
 
     def products(self, group: Group, values: Values, tangent: Tangent) -> tuple[Array, Array]:

@@ -77,7 +77,7 @@ class Gate:
             gone.close()
 
     def release(self, connection: Hashable) -> None:
-        """A connection is closed."""
+        """Count a connection as closed."""
         with self._lock:
             self._admitted.pop(connection, None)
 
