@@ -67,8 +67,7 @@ class MarginalState:
         except RuntimeError as error:
             raise IndeterminateError(explain(str(error))) from None
         own = gtsam.Values()
-        for key in keys:
-            _copy(values, key, own)
+        copy_values(values, keys, own)
         return cls(time, own, gtsam.JacobianFactor(conditional), {k: t for k, t in stamps.items() if k in kept})
 
     @property
@@ -84,11 +83,13 @@ class MarginalState:
         return Factor("prior", gtsam.LinearContainerFactor(self.linear, self.values))
 
 
-def _copy(values: gtsam.Values, key: int, out: gtsam.Values) -> None:
-    try:
-        out.insert(key, values.atRot3(key))
-    except RuntimeError:
-        out.insert(key, values.atVector(key))
+def copy_values(values: gtsam.Values, keys: Iterable[int], out: gtsam.Values) -> None:
+    """Insert some variables, vectors or rotations, into other values."""
+    for key in keys:
+        try:
+            out.insert(key, values.atRot3(key))
+        except RuntimeError:
+            out.insert(key, values.atVector(key))
 
 
 def require_known_variables(factors: Iterable[Factor], values: gtsam.Values, time: float) -> None:

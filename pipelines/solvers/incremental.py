@@ -25,7 +25,7 @@ at their priors, too, until it does.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -44,25 +44,26 @@ from alidade.pipelines.estimation.problem import (
     Problem,
     Step,
 )
-from alidade.pipelines.solvers.assembly import CHUNK, Assembly
-from alidade.pipelines.solvers.checkpoint import MarginalState, SavedRun, require_finite, require_known_variables
-from alidade.pipelines.solvers.curvature import second_order
+from alidade.pipelines.solvers.batch import Solved, residuals_by_family, solve, without_rejected
+from alidade.pipelines.solvers.chain import ChainFactorization, ChainSystem, IndeterminateError
+from alidade.pipelines.solvers.checkpoint import MarginalState, SavedRun, copy_values, require_finite, require_known_variables
+from alidade.pipelines.solvers.curvature import SecondOrder, beyond_second_order
+from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import sigma_ratio
 from alidade.pipelines.solvers.gating import InnovationGate, Prediction, RowBuffer, correlation_inflation
-from alidade.pipelines.solvers.history import sequential_history
-from alidade.pipelines.solvers.marginals import (
-    IndeterminateError,
-    coordinate_inverse,
-    explain,
-    information_of,
-    joint_covariance,
-    prior_units,
-    reported,
+from alidade.pipelines.solvers.gtsam_engine import GtsamEngine
+from alidade.pipelines.solvers.linearization import Linearization
+from alidade.pipelines.solvers.marginals import coordinate_inverse, explain, information_of, prior_units, reported
+from alidade.pipelines.solvers.posterior_history import posterior_history
+from alidade.pipelines.solvers.smoother import (
+    FixedLagSmoother,
+    Isam2,
+    Smoother,
+    inliers,
+    linearized,
+    weigh,
+    without_loss,
 )
-from alidade.pipelines.solvers.noise_levels import weigh
-from alidade.pipelines.solvers.smoother import FixedLagSmoother, Isam2, Smoother, inliers, linearized, without_loss
-from alidade.pipelines.solvers.system import Linear
-from alidade.pipelines.solvers.weighing import optimize, with_levels
 from alidade.pipelines.solvers.window import Keyframes, Window
 
 DEFAULT_WINDOW = 1.0
@@ -269,9 +270,10 @@ class IncrementalSolver:
         self._stamps: dict[int, float] = {}  # of the variables held that age, in the window's unit
         self._times: list[float] = []  # of the keyframes, where they are the window's unit
         self._before = 0.0  # number of keyframes before these
+        self._guess = gtsam.Values()  # of all variables since the marginal, in the initialisation phase
         self._solved = 0, 0.0  # number of steps in the last batch solution, and their time, s
         self._fewest_weak = len(problem.quantities)  # number of weak directions seen until now, at least
-        self._second: Array | None = None  # (n, n) covariance of second order in the last batch solution
+        self._second: Array | None = None  # (m, m) covariance of second order in the last batch solution, prior units
         self._beyond = np.ones(len(problem.quantities), dtype=bool)  # numbers that need more than second order
         self._course: Callable[[], Course | None] = lambda: None  # of the last batch solution
 
@@ -463,7 +465,7 @@ class IncrementalSolver:
         known, axes = np.linalg.eigh(unit.T @ information @ unit)
         covariance = (axes / np.maximum(known, _WIDEST**-2)) @ axes.T
         if self._second is not None:
-            covariance += self._second[np.ix_(free, free)] / np.outer(scale, scale)
+            covariance += self._second
         own = [quantities[i] for i in free]
         sigmas = np.array([np.inf if q.prior_sigma is None else q.prior_sigma for q in own])
         return _Posterior(
@@ -497,6 +499,8 @@ class IncrementalSolver:
             return
         values = smoother.estimate()
         self._stamps = {k: t for k, t in {**self._stamps, **stamps}.items() if values.exists(k)}
+        if self.initialising:
+            copy_values(values, step.initial.keys(), self._guess)
         self._record(step.keyframes, values)
 
     def _selected(self, smoother: Smoother, step: Step, about: gtsam.Values, new: gtsam.Values) -> list[Factor]:
@@ -557,86 +561,75 @@ class IncrementalSolver:
     def _solve_batch(self) -> None:
         """Solve everything since the marginal in batch, and start the smoother from the solution, without outliers."""
         from_start = self.marginal is None
-        whole = self._assembled()
-        about = self._batch_solution(whole)
-        values, system = about.values, about.system
+        steps = self._all_steps_since()
+        stamps = self._ages({key: time for step in self.steps_since for key, time in step.timestamps.items()})
+        if self.marginal is not None:
+            stamps = {**self.marginal.stamps, **stamps}
+        solved = self._batch_solution(steps)
+        values = solved.compiled.layout.to_gtsam(solved.solution.values)
         if from_start:
-            with system.at(values):
-                self.gate.adopt_inliers(system.factors, values)
+            self.gate.adopt_inliers(residuals_by_family(solved.engine, solved.solution.values))
         since = self.time - self.steps_since[0].time if from_start and self.steps_since else 0.0
         last = self.steps_since[-1].keyframes if self.steps_since else range(0)
-        self._restart(about, whole.timestamps, since)
+        self._restart(solved, values, stamps, since)
         if from_start:
             self.moments += 1
-            ends = whole.boundaries
-            self._course = cache(
-                lambda: sequential_history(
-                    self.problem, system.linearize(values), system.ordering, values, ends, ends[0].time
-                )
-            )
+            self._course = cache(lambda: _course_of(solved))
             if not self.initialising:
                 self.recorder, self._course = MomentRecorder.after(self._course()), lambda: None
             self.attitudes.clear()
-        self._record(whole.keyframes if from_start else last, values)
+        self._guess = gtsam.Values(values) if self.initialising else gtsam.Values()
+        self._record(solved.compiled.keyframes if from_start else last, values)
         self._solved = len(self.steps_since), since
         self._count_weak()
         self.gate.begin_count()
 
-    def _assembled(self) -> Assembly:
-        """The steps since the marginal as one graph, the marginal with them."""
-        whole = Assembly.of(self._all_steps_since())
-        whole.timestamps = self._ages(whole.timestamps)
-        if self.marginal is not None:
-            whole.factors.append(self.marginal.factor)
-            whole.initial.insert(self.marginal.estimate)
-            whole.timestamps = {**self.marginal.stamps, **whole.timestamps}
-        return whole
+    def _all_steps_since(self) -> list[Step]:
+        """The steps since the marginal, the marginal as the first of them."""
+        if self.marginal is None:
+            return self.steps_since
+        start = Step(self.marginal.time, self.marginal.estimate, [self.marginal.factor])
+        start.current_keys.update(self.current_keys)
+        return [start, *self.steps_since]
 
-    def _all_steps_since(self) -> Iterator[Step]:
-        """The steps since the marginal; those since the start with many measurements in each, which solve faster."""
-        now = -np.inf
-        for step in self.problem.steps(CHUNK) if self.marginal is None else ():
-            if step.time > self.time:
-                break
-            now = step.time
-            yield step
-        yield from (step for step in self.steps_since if step.time > now)
+    def _batch_solution(self, steps: Sequence[Step]) -> Solved:
+        """The most probable values of some steps and the posterior there; noise levels are estimated until the marginal.
 
-    def _batch_solution(self, whole: Assembly) -> Linear:
-        """The most probable values, with noise levels estimated; linearised there."""
-        solution = optimize(
-            weigh(whole.factors, self.levels),
-            whole.initial,
-            self.keys,
-            self.problem.loss,
-            held=self.problem.assumed,
-        )
-        about = None
-        if solution.converged:
-            solution, self.levels, about, _ = with_levels(self.problem, whole.factors, solution, self.levels)
-        if not solution.converged:
-            require_finite(whole.factors, whole.initial, self.time)
-        self.trouble = "" if solution.converged else f"the first {self.time:.1f} s: {solution.message}"
-        return about or solution.system.linearized(solution.values)
+        Raises:
+            InputError: a factor gives no finite numbers.
+            IndeterminateError: something is not determined.
+        """
+        compiled = Compiled.of(replace(self.problem, finer=None, elsewhere=None), steps=steps)
+        for step in steps:
+            copy_values(step.initial, [key for key in step.initial.keys() if not self._guess.exists(key)], self._guess)
+        compiled = replace(compiled, initial=compiled.layout.from_gtsam(self._guess))
+        if not np.isfinite(compiled.engine.cost(compiled.initial)):
+            factors = [f for step in steps for f in step.factors]
+            require_finite(factors, compiled.layout.to_gtsam(compiled.initial), self.time)
+        try:
+            solved = solve(compiled, levels=None if self.marginal is None else self.levels)
+        except np.linalg.LinAlgError as error:
+            raise IndeterminateError(f"the first {self.time:.3f} s do not determine the parameters: {error}") from error
+        self.levels = solved.levels
+        found = solved.solution
+        self.trouble = "" if found.converged else f"the first {self.time:.1f} s: {found.message}"
+        return solved
 
-    def _restart(self, about: Linear, stamps: Mapping[int, float], since: float) -> None:
+    def _restart(self, solved: Solved, values: gtsam.Values, stamps: Mapping[int, float], since: float) -> None:
         """Start the smoother from a batch solution `since` s after the first step; may end the initialisation phase."""
         before = self._posterior() if self._smoother is not None else None
-        self._start_from(about, stamps)
+        self._start_from(solved, values, stamps)
         if not self.initialising:
             return
-        covariance = joint_covariance(self.problem, about, self.current_keys)
-        second = second_order(self.problem, about, covariance, self.current_keys)
-        self._second = None if second is None else second.covariance
+        second = SecondOrder.of(solved.posterior)
+        self._second = second.covariance
         # Second order that has once gone far enough does so from then on.
-        if second is None:
-            self._beyond[:] = False
-        elif self._beyond.any():
-            self._beyond &= second.beyond()
-        is_curved = second is not None and second.share() > self.config.max_curvature
+        if self._beyond.any() and np.isfinite(second.share):
+            self._beyond &= beyond_second_order(solved)
+        is_curved = second.share > self.config.max_curvature
         if since >= self.config.max_initialisation or (not is_curved and self._is_settled(before)):
             self.initialising = False
-            self._start_from(about, stamps)
+            self._start_from(solved, values, stamps)
 
     def _is_settled(self, before: _Posterior | None) -> bool:
         """Whether no calibrated direction is weak, and a batch solution agrees with the smoother's posterior before."""
@@ -646,15 +639,17 @@ class IncrementalSolver:
         change = np.abs(now.mean - before.mean) / np.sqrt(np.diag(now.covariance))
         return now.weak().shape[1] == 0 and bool(change.max() < self.config.max_change)
 
-    def _start_from(self, about: Linear, stamps: Mapping[int, float]) -> None:
+    def _start_from(self, solved: Solved, values: gtsam.Values, stamps: Mapping[int, float]) -> None:
         """Start the smoother from a solution: from its active variables alone, or without a window from all of it."""
-        values, loss = about.values, about.system.loss
         if self.window is None:
             factors = (f for step in self.steps_since for f in weigh(step.factors, self.levels))
-            used = [without_loss(f) for f in (inliers(f, values, loss) for f in factors) if f is not None]
+            used = [without_loss(f) for f in (inliers(f, values, self.problem.loss) for f in factors) if f is not None]
             self._start(used, values, stamps)
             return
-        state = MarginalState.of(self.time, about.graph, values, active_variables(values, stamps), stamps)
+        at = solved.solution.values
+        engine = without_rejected(solved.engine, at)
+        graph = (GtsamEngine(engine) if isinstance(engine, Linearization) else engine).at(at)[0].graph
+        state = MarginalState.of(self.time, graph, values, active_variables(values, stamps), stamps)
         if self.initialising:
             self._start([state.factor], state.values, state.stamps)
         else:
@@ -679,3 +674,16 @@ def active_variables(values: gtsam.Values, stamps: Mapping[int, float]) -> list[
     """Keys of the variables that later steps may refer to: those of the last moment and those that never age."""
     latest = max(stamps.values(), default=-np.inf)
     return [key for key in values.keys() if stamps.get(key, np.inf) >= latest]
+
+
+def _course_of(solved: Solved) -> Course | None:
+    """What was known at moments before a batch solution."""
+    compiled, posterior = solved.compiled, solved.posterior
+    engine = without_rejected(solved.engine, solved.solution.values)
+    system, found = engine.at(posterior.values)[0], posterior.factorization
+    if not (isinstance(engine, Linearization) and isinstance(system, ChainSystem)):
+        return None
+    assert isinstance(found, ChainFactorization)
+    final = posterior.reported.numbers, posterior.covariance
+    keys = compiled.current_keys
+    return posterior_history(compiled.problem, engine, system, found, posterior.values, keys, engine.time, final)

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
+from typing import cast
 
 import gtsam
 import numpy as np
 
 from alidade.factors.loss import TruncatedLoss
+from alidade.factors.vectorized import VectorizedFactor
+from alidade.pipelines.estimation.noise import Level, Noise
 from alidade.pipelines.estimation.problem import Array, Factor
-from alidade.pipelines.solvers.linear_system import graph_of, linear_graph_of
 from alidade.pipelines.solvers.marginals import ordering_of
 
 # Move of a variable, in its own unit (rad, rad/s, s), above which iSAM2 linearises its factors again.
@@ -204,6 +206,22 @@ def slices(keys: Sequence[int], dims: Mapping[int, int]) -> dict[int, slice]:
     return found
 
 
+def graph_of(factors: Sequence[Factor]) -> gtsam.NonlinearFactorGraph:
+    """The gtsam graph of the factors, in their order."""
+    graph = gtsam.NonlinearFactorGraph()
+    for f in factors:
+        graph.add(f.factor)
+    return graph
+
+
+def linear_graph_of(factors: Sequence[Factor], values: gtsam.Values) -> gtsam.GaussianFactorGraph:
+    """The linear system of the factors about the values, in their order."""
+    graph = gtsam.GaussianFactorGraph()
+    for f in factors:
+        graph.push_back(f.linearized(values))
+    return graph
+
+
 def linearized(factor: Factor, values: gtsam.Values) -> Factor:
     """The factor linearised about the values for good."""
     return Factor(factor.family, gtsam.LinearContainerFactor(factor.linearized(values), values))
@@ -227,3 +245,51 @@ def inliers(factor: Factor, values: gtsam.Values, loss: TruncatedLoss | None) ->
     if not used.any() or not factor.measurement.divisible:
         return None
     return Factor.of(factor.family, factor.measurement.only(used))
+
+
+def weigh(factors: Sequence[Factor], levels: Sequence[Level]) -> list[Factor]:
+    """The factors with their measurements' noise at these levels."""
+    scaled = [level for level in levels if (level.used > 0.0 if level.noise.beside else level.scale != 1.0)]
+    if not scaled:
+        return list(factors)
+    families = {family for level in scaled for family in level.noise.families}
+    return [_weighed(f, scaled) if f.family in families else f for f in factors]
+
+
+def _weighed(factor: Factor, levels: Sequence[Level]) -> Factor:
+    for level in levels:
+        if factor.family in level.noise.families:
+            factor = _at_level(factor, level)
+    return factor
+
+
+def _at_level(factor: Factor, level: Level) -> Factor:
+    vectorized = factor.vectorized
+    if vectorized is not None:
+        weights = _weights(vectorized)
+        if level.noise.beside:
+            weights = (weights**-2.0 + _beside(factor, level.used)) ** -0.5
+        else:
+            weights[:, _rows(level.noise, weights.shape[1])] /= level.scale
+        weighed, of = vectorized.weighed(weights), Factor.process_of if factor.measurement is None else Factor.of
+        return of(factor.family, weighed, factor.beside)
+    native = cast(gtsam.NoiseModelFactor, factor.factor)
+    stated = cast(gtsam.noiseModel.Gaussian, native.noiseModel())
+    noise = gtsam.noiseModel.Gaussian.Information(stated.information() / level.scale**2)
+    return Factor(factor.family, native.cloneWithNewNoiseModel(noise))
+
+
+def _weights(vectorized: VectorizedFactor) -> Array:
+    """(n, m), those it has."""
+    shape = len(vectorized.model.time), vectorized.model.rows
+    return np.ones(shape) if vectorized.weights is None else vectorized.weights.copy()
+
+
+def _beside(factor: Factor, level: float) -> Array:
+    """(n, 1) variance of a noise beside others, in units of what the factor is whitened by."""
+    assert factor.beside is not None
+    return ((level * factor.beside) ** 2)[:, None]
+
+
+def _rows(noise: Noise, rows: int) -> list[int]:
+    return list(range(rows)) if noise.rows is None else [row for row in noise.rows if row < rows]
