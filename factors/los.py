@@ -132,11 +132,6 @@ class LosDirectionFactor(Model):
             return ROT3, len(self.names)
         return ROT3, len(self.names), 3, len(SIGHT_ERRORS), *([self.errors] if self.errors else [])
 
-    @property
-    def turning(self) -> tuple[int, int] | None:
-        """The camera's roll."""
-        return (1, self.names.index("camera_roll")) if "camera_roll" in self.names else None
-
     def __call__(
         self,
         tRm: Array,

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.factors import so3
+from alidade.factors.bridge import BoundModel
 from alidade.factors.loss import TruncatedLoss
-from alidade.factors.vectorized import VectorizedFactor
 from alidade.pipelines.belief import Belief
 from alidade.pipelines.estimation.advice import Motion
 from alidade.pipelines.estimation.noise import Level
@@ -168,17 +168,17 @@ class Factor:
 
     family: str
     native: gtsam.NonlinearFactor | None = None
-    measurement: VectorizedFactor | None = None
-    process: VectorizedFactor | None = None
+    measurement: BoundModel | None = None
+    process: BoundModel | None = None
     beside: Array | None = None
 
     @classmethod
-    def of(cls, family: str, measurement: VectorizedFactor, beside: Array | None = None) -> Factor:
+    def of(cls, family: str, measurement: BoundModel, beside: Array | None = None) -> Factor:
         """A measurement that may be an outlier."""
         return cls(family, measurement=measurement, beside=beside)
 
     @classmethod
-    def process_of(cls, family: str, process: VectorizedFactor, beside: Array | None = None) -> Factor:
+    def process_of(cls, family: str, process: BoundModel, beside: Array | None = None) -> Factor:
         """What joins variables and is no outlier."""
         return cls(family, process=process, beside=beside)
 
@@ -187,23 +187,23 @@ class Factor:
         """For a gtsam graph; of a vectorised factor a new one at every call."""
         if self.native is not None:
             return self.native
-        vectorized = self.vectorized
-        assert vectorized is not None
-        return vectorized.factor
+        bound = self.bound
+        assert bound is not None
+        return bound.factor
 
     @property
     def keys(self) -> list[int]:
         """The variables."""
-        return list(self.factor.keys()) if self.vectorized is None else self.vectorized.keys
+        return list(self.factor.keys()) if self.bound is None else self.bound.keys
 
     @property
-    def vectorized(self) -> VectorizedFactor | None:
+    def bound(self) -> BoundModel | None:
         """The vectorised factor behind it, whichever it is."""
         return self.measurement or self.process
 
     def linearized(self, values: gtsam.Values) -> gtsam.GaussianFactor:
         """About the values."""
-        return self.factor.linearize(values) if self.vectorized is None else self.vectorized.linearized(values)
+        return self.factor.linearize(values) if self.bound is None else self.bound.linearized(values)
 
 
 def _no_values() -> gtsam.Values:

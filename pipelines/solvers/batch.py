@@ -43,10 +43,10 @@ from alidade.pipelines.solvers.error_budget import (
     most_influential,
 )
 from alidade.pipelines.solvers.layout import Layout, Values
-from alidade.pipelines.solvers.levenberg import Engine, LevenbergConfig, Solution, minimize
-from alidade.pipelines.solvers.linearization import Group, Linearization
+from alidade.pipelines.solvers.levenberg import Engine, LevenbergConfig, Solution, minimize, without_rejected
+from alidade.pipelines.solvers.linearization import Linearization
 from alidade.pipelines.solvers.marginal_likelihood import largest_step, sandwich_of, solve_likelihood
-from alidade.pipelines.solvers.noise_estimation import apply_levels, estimate_noise, group_weights
+from alidade.pipelines.solvers.noise_estimation import apply_levels, estimate_noise
 from alidade.pipelines.solvers.posterior import Reported, chi_square, expected_squares, leverages, sqrt_information
 from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed_bias
 from alidade.pipelines.solvers.robust import RobustConfig, solve_robust
@@ -176,18 +176,6 @@ def solve_batch(
         estimate = replace(estimate, told=_told(solved, device, elsewhere))
     done = time.perf_counter()
     return replace(estimate, seconds={"build": built - begin, "solve": found - built, "marginals": done - found})
-
-
-def without_rejected(engine: Engine, values: Values) -> Engine:
-    """The measurements that count at some values, in full, whatever they are elsewhere."""
-    return engine.with_groups([_counting(group, values) for group in engine.groups])
-
-
-def _counting(group: Group, values: Values) -> Group:
-    if group.loss is None:
-        return group
-    used = group.used(group.evaluate(values)[0]) > 0.5
-    return replace(group, loss=None, weights=group_weights(group) * used[:, None])
 
 
 def _best(compiled: Compiled, solution: Solution, config: BatchConfig) -> tuple[Solution, Minimum | None]:
@@ -338,7 +326,7 @@ def _moves(solved: Solved, influence: Influence, changed: Problem) -> dict[str, 
     if not np.array_equal(other.layout.key, solved.compiled.layout.key) or shapes[0] != shapes[1]:
         return {}
     kept = [
-        replace(new, loss=None, weights=group_weights(new) * (g.used(g.evaluate(values)[0]) > 0.5)[:, None])
+        replace(new, loss=None, weights=new.all_weights * (g.used(g.evaluate(values)[0]) > 0.5)[:, None])
         for g, new in zip(own.groups, engine.groups, strict=True)
     ]
     moves = influence.moves(engine.with_groups(kept))

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.solvers.batch import Solved, without_rejected
+from alidade.pipelines.solvers.batch import Solved
 from alidade.pipelines.solvers.chain import Array, IndeterminateStateError
+from alidade.pipelines.solvers.levenberg import without_rejected
 from alidade.pipelines.solvers.weak_directions import FOLLOWS, Posterior, WeakDirections, moved_roots
 
 # Random ways along which slopes at half the way are compared with those at the whole.
@@ -34,7 +35,7 @@ class SecondOrder:
     """What a posterior has beside that of its linear system.
 
     Attributes:
-        covariance: (m, m) of the free reported numbers, in units of their usual priors' sigmas, no more than these leave.
+        covariance: (m, m) of the free reported numbers, in units of their usual priors' sigmas; no larger.
         share: largest ratio of it to the variance that the linear system has; infinite where directions are weak
             because of it.
     """

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from alidade.factors.chi_square import gate
 from alidade.pipelines.estimation.problem import Array, ChiSquare, Factor, Problem, Residuals
 from alidade.pipelines.solvers.error_budget import autocorrelation
-from alidade.pipelines.solvers.marginals import ordering_of
-from alidade.pipelines.solvers.smoother import Smoother, linear_graph_of, slices
+from alidade.pipelines.solvers.smoother import Smoother, linear_graph_of, ordering_of, slices
 
 # Steps in a row that are rejected whole before one is taken nevertheless: by then it is the prediction that is wrong.
 MAX_REJECTED_IN_A_ROW = 10

@@ -44,16 +44,23 @@ from alidade.pipelines.estimation.problem import (
     Problem,
     Step,
 )
-from alidade.pipelines.solvers.batch import Solved, residuals_by_family, solve, without_rejected
+from alidade.pipelines.solvers.batch import Solved, residuals_by_family, solve
 from alidade.pipelines.solvers.chain import ChainFactorization, ChainSystem, IndeterminateError
-from alidade.pipelines.solvers.checkpoint import MarginalState, SavedRun, copy_values, require_finite, require_known_variables
+from alidade.pipelines.solvers.checkpoint import (
+    MarginalState,
+    SavedRun,
+    finite_measurements,
+    require_finite,
+    require_known_variables,
+)
 from alidade.pipelines.solvers.curvature import SecondOrder, beyond_second_order
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.error_budget import sigma_ratio
 from alidade.pipelines.solvers.gating import InnovationGate, Prediction, RowBuffer, correlation_inflation
-from alidade.pipelines.solvers.gtsam_engine import GtsamEngine
+from alidade.pipelines.solvers.gtsam_engine import GtsamEngine, undetermined
+from alidade.pipelines.solvers.levenberg import without_rejected
 from alidade.pipelines.solvers.linearization import Linearization
-from alidade.pipelines.solvers.marginals import coordinate_inverse, explain, information_of, prior_units, reported
+from alidade.pipelines.solvers.posterior import WIDEST, Reported
 from alidade.pipelines.solvers.posterior_history import posterior_history
 from alidade.pipelines.solvers.smoother import (
     FixedLagSmoother,
@@ -61,19 +68,16 @@ from alidade.pipelines.solvers.smoother import (
     Smoother,
     inliers,
     linearized,
+    slices,
     weigh,
     without_loss,
 )
+from alidade.pipelines.solvers.weak_directions import MAX_SIGMA
 from alidade.pipelines.solvers.window import Keyframes, Window
 
 DEFAULT_WINDOW = 1.0
 # Steps freed with each new one, of those marginalised out: a thousand at once take longer than an update.
 _FREED = 10
-# Posterior sigma of a calibrated direction, in units of its usual prior's, above which it is weak: linear Gaussians are
-# wrong about it, and turn the noise of states into information about it.
-MAX_SIGMA = 0.3
-# Largest sigma of a direction, in units of its usual prior's.
-_WIDEST = 1e4
 # Elements of a unit vector below this are rounding.
 _ROUNDING = 1e-9
 
@@ -171,38 +175,26 @@ class MomentRecorder:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Posterior:
-    """Mean and covariance of the free reported numbers, in units of their usual priors' sigmas.
+    """Mean and covariance of the free reported numbers u, in units of their usual priors' sigmas.
 
     Attributes:
-        values: (n,) all reported numbers, SI.
-        mean: (m,) of the free ones, less their prior means.
-        covariance: (m, m), with terms of second order.
-        prior: (m, m) their prior covariance; infinite variances: no prior.
-        calibrated: (m,) whether they are calibrated, and no nuisance parameters.
-        free: (m,) their places among the reported numbers.
-        scale: (m,) the usual priors' sigmas.
-        extra: (m,) sigmas of errors that the graph does not model, SI.
+        reported: the numbers.
+        covariance: (m, m) of u, with terms of second order.
     """
 
-    values: Array
-    mean: Array
+    reported: Reported
     covariance: Array
-    prior: Array
-    calibrated: NDArray[np.bool_]
-    free: NDArray[np.intp]
-    scale: Array
-    extra: Array
 
     def weak(self, unknown: NDArray[np.bool_] | bool = False) -> Array:
         """(m, w) orthonormal weak directions: of calibrated numbers but some unknown, with sigmas above MAX_SIGMA.
 
         Nuisance parameters are small whatever they are: nothing is nonlinear across their priors.
         """
-        own = np.flatnonzero(self.calibrated & ~np.asarray(unknown))
+        own = np.flatnonzero(self.reported.calibrated & ~np.asarray(unknown))
         variance, vectors = np.linalg.eigh(self.covariance[np.ix_(own, own)])
-        weak = np.zeros((len(self.mean), int((variance > MAX_SIGMA**2).sum())))
+        weak = np.zeros((len(self.covariance), int((variance > MAX_SIGMA**2).sum())))
         weak[own] = vectors[:, len(own) - weak.shape[1] :]
         return weak
 
@@ -215,17 +207,13 @@ class _Posterior:
         Args:
             directions: (m, w), orthonormal.
         """
-        E = directions[:, ~(np.abs(directions[np.isinf(np.diag(self.prior))]) > _ROUNDING).any(axis=0)]
-        others = np.eye(len(self.mean)) - E @ E.T
-        own = others @ self.covariance @ others + (E @ E.T) @ _finite(self.prior) @ (E @ E.T)
-        values, covariance = self.values.copy(), np.zeros((len(self.values), len(self.values)))
-        values[self.free] -= self.scale * (E @ (E.T @ self.mean))
-        covariance[np.ix_(self.free, self.free)] = own * np.outer(self.scale, self.scale) + np.diag(self.extra**2)
-        return values, covariance
-
-
-def _finite(variance: Array) -> Array:
-    return np.where(np.isinf(variance), 0.0, variance)
+        reported = self.reported
+        E = directions[:, ~(np.abs(directions[~reported.bounded]) > _ROUNDING).any(axis=0)]
+        others = np.eye(len(self.covariance)) - E @ E.T
+        own = others @ self.covariance @ others + E @ (E.T @ np.linalg.inv(reported.prior) @ E) @ E.T
+        values = reported.numbers.copy()
+        values[reported.free] -= reported.scale * (E @ (E.T @ reported.u))
+        return values, reported.covariance(own)
 
 
 class IncrementalSolver:
@@ -270,7 +258,6 @@ class IncrementalSolver:
         self._stamps: dict[int, float] = {}  # of the variables held that age, in the window's unit
         self._times: list[float] = []  # of the keyframes, where they are the window's unit
         self._before = 0.0  # number of keyframes before these
-        self._guess = gtsam.Values()  # of all variables since the marginal, in the initialisation phase
         self._solved = 0, 0.0  # number of steps in the last batch solution, and their time, s
         self._fewest_weak = len(problem.quantities)  # number of weak directions seen until now, at least
         self._second: Array | None = None  # (m, m) covariance of second order in the last batch solution, prior units
@@ -408,7 +395,7 @@ class IncrementalSolver:
         if not (np.isfinite(values).all() and np.isfinite(covariance).all()):
             raise IndeterminateError(f"the estimate at {self.time:.3f} s is not a finite number")
         history, n = self.history.array.copy(), len(values)
-        to_tangents = coordinate_inverse(self.problem.parameters, self._current(), self.keys)
+        to_tangents = np.asarray(np.linalg.pinv(self._reported().jacobian), dtype=float)
         grown, lengths = correlation_inflation(self.problem, covariance, self.gate, to_tangents)
         inflation = sigma_ratio(np.diag(covariance), np.diag(grown))
         attitudes = self.attitudes.array.copy()
@@ -444,40 +431,31 @@ class IncrementalSolver:
         outliers cannot be told from measurements.
         """
         posterior = self._posterior()
-        unknown = np.zeros(len(posterior.mean), dtype=bool)
+        unknown = np.zeros(len(posterior.covariance), dtype=bool)
         if self.initialising and not decided:
-            unknown = self._beyond[posterior.free] | self.gate.too_few_to_decide()
+            unknown = self._beyond[posterior.reported.free] | self.gate.too_few_to_decide()
         return posterior.at_prior(np.hstack([np.eye(len(unknown))[:, unknown], posterior.weak(unknown)]))
 
     def _posterior(self) -> _Posterior:
         """The smoother's posterior of the reported numbers. Raises IndeterminateError when it is singular."""
-        values = self._current()
+        reported = self._reported()
         assert self._smoother is not None
+        J = reported.jacobian[reported.free] / reported.scale[:, None]
         try:
-            information = information_of(self._smoother.covariance(self.keys))
+            covariance = J @ self._smoother.covariance(self.keys) @ J.T
         except (RuntimeError, np.linalg.LinAlgError) as error:
             raise IndeterminateError(f"the parameters' covariance at {self.time:.3f} s is singular: {error}") from error
-        if not np.isfinite(information).all():
+        if not np.isfinite(covariance).all():
             raise IndeterminateError(f"the parameters' covariance at {self.time:.3f} s is not finite")
-        quantities = self.problem.quantities
-        numbers = reported(self.problem, values, self.current_keys)
-        free, scale, unit = prior_units(self.problem.parameters, values, self.keys)
-        known, axes = np.linalg.eigh(unit.T @ information @ unit)
-        covariance = (axes / np.maximum(known, _WIDEST**-2)) @ axes.T
-        if self._second is not None:
-            covariance += self._second
-        own = [quantities[i] for i in free]
-        sigmas = np.array([np.inf if q.prior_sigma is None else q.prior_sigma for q in own])
-        return _Posterior(
-            values=numbers,
-            mean=(numbers[free] - [q.prior_mean for q in own]) / scale,
-            covariance=covariance,
-            prior=self.problem.prior_covariance([q.name for q in own], sigmas) / np.outer(scale, scale),
-            calibrated=np.array([not q.assumed for q in own], dtype=bool),
-            free=free,
-            scale=scale,
-            extra=np.array([q.extra_sigma for q in own]),
-        )
+        variances, axes = np.linalg.eigh(covariance)
+        covariance = (axes * np.clip(variances, 0.0, WIDEST**2)) @ axes.T
+        return _Posterior(reported, covariance if self._second is None else covariance + self._second)
+
+    def _reported(self) -> Reported:
+        """The reported numbers now, with their Jacobian by the tangents of the variables that hold them."""
+        values, keys = self._current(), self.keys
+        where, dims = slices(keys, values.dims()), sum(values.dims()[key] for key in keys)
+        return Reported.at(self.problem, values, keys, [np.eye(dims)[where[key]] for key in keys])
 
     # -- step by step
 
@@ -499,8 +477,6 @@ class IncrementalSolver:
             return
         values = smoother.estimate()
         self._stamps = {k: t for k, t in {**self._stamps, **stamps}.items() if values.exists(k)}
-        if self.initialising:
-            copy_values(values, step.initial.keys(), self._guess)
         self._record(step.keyframes, values)
 
     def _selected(self, smoother: Smoother, step: Step, about: gtsam.Values, new: gtsam.Values) -> list[Factor]:
@@ -578,7 +554,6 @@ class IncrementalSolver:
             if not self.initialising:
                 self.recorder, self._course = MomentRecorder.after(self._course()), lambda: None
             self.attitudes.clear()
-        self._guess = gtsam.Values(values) if self.initialising else gtsam.Values()
         self._record(solved.compiled.keyframes if from_start else last, values)
         self._solved = len(self.steps_since), since
         self._count_weak()
@@ -593,19 +568,16 @@ class IncrementalSolver:
         return [start, *self.steps_since]
 
     def _batch_solution(self, steps: Sequence[Step]) -> Solved:
-        """The most probable values of some steps and the posterior there; noise levels are estimated until the marginal.
+        """The most probable values of some steps; noise levels are estimated until something was marginalised out.
 
         Raises:
             InputError: a factor gives no finite numbers.
             IndeterminateError: something is not determined.
         """
-        compiled = Compiled.of(replace(self.problem, finer=None, elsewhere=None), steps=steps)
-        for step in steps:
-            copy_values(step.initial, [key for key in step.initial.keys() if not self._guess.exists(key)], self._guess)
-        compiled = replace(compiled, initial=compiled.layout.from_gtsam(self._guess))
+        problem = replace(self.problem, finer=None, elsewhere=None)
+        compiled = Compiled.of(problem, steps=steps)
         if not np.isfinite(compiled.engine.cost(compiled.initial)):
-            factors = [f for step in steps for f in step.factors]
-            require_finite(factors, compiled.layout.to_gtsam(compiled.initial), self.time)
+            compiled = Compiled.of(problem, steps=self._finite(steps, compiled.layout.to_gtsam(compiled.initial)))
         try:
             solved = solve(compiled, levels=None if self.marginal is None else self.levels)
         except np.linalg.LinAlgError as error:
@@ -614,6 +586,17 @@ class IncrementalSolver:
         found = solved.solution
         self.trouble = "" if found.converged else f"the first {self.time:.1f} s: {found.message}"
         return solved
+
+    def _finite(self, steps: Sequence[Step], values: gtsam.Values) -> list[Step]:
+        """The steps without the measurements that the gate has found unusable: no finite numbers at the values.
+
+        Raises:
+            InputError: another factor gives none.
+        """
+        if self._smoother is not None:
+            steps = [finite_measurements(step, values) for step in steps]
+        require_finite([f for step in steps for f in step.factors], values, self.time)
+        return list(steps)
 
     def _restart(self, solved: Solved, values: gtsam.Values, stamps: Mapping[int, float], since: float) -> None:
         """Start the smoother from a batch solution `since` s after the first step; may end the initialisation phase."""
@@ -636,7 +619,7 @@ class IncrementalSolver:
         if self.trouble or before is None or len(self.steps_since) < self.config.min_steps:
             return False
         now = self._posterior()
-        change = np.abs(now.mean - before.mean) / np.sqrt(np.diag(now.covariance))
+        change = np.abs(now.reported.u - before.reported.u) / np.sqrt(np.diag(now.covariance))
         return now.weak().shape[1] == 0 and bool(change.max() < self.config.max_change)
 
     def _start_from(self, solved: Solved, values: gtsam.Values, stamps: Mapping[int, float]) -> None:
@@ -648,8 +631,9 @@ class IncrementalSolver:
             return
         at = solved.solution.values
         engine = without_rejected(solved.engine, at)
-        graph = (GtsamEngine(engine) if isinstance(engine, Linearization) else engine).at(at)[0].graph
-        state = MarginalState.of(self.time, graph, values, active_variables(values, stamps), stamps)
+        assert isinstance(engine, Linearization | GtsamEngine)
+        system, _ = (engine if isinstance(engine, GtsamEngine) else GtsamEngine(engine)).at(at)
+        state = MarginalState.of(self.time, system.graph, values, active_variables(values, stamps), stamps)
         if self.initialising:
             self._start([state.factor], state.values, state.stamps)
         else:
@@ -667,7 +651,7 @@ class IncrementalSolver:
         try:
             self._smoother.update(factors, values, stamps)
         except RuntimeError as error:
-            raise IndeterminateError(explain(str(error))) from None
+            raise undetermined(error) from None
 
 
 def active_variables(values: gtsam.Values, stamps: Mapping[int, float]) -> list[int]:

@@ -32,7 +32,7 @@ from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import LevenbergConfig, Solution, minimize
 from alidade.pipelines.solvers.linearization import Linearization
-from alidade.pipelines.solvers.noise_estimation import apply_levels, group_weights
+from alidade.pipelines.solvers.noise_estimation import apply_levels
 
 Outliers = Mapping[int, NDArray[np.bool_]]
 
@@ -755,7 +755,7 @@ def solution_at(
         if not group.is_measurement:
             groups.append(group)
             continue
-        weights = group_weights(group)
+        weights = group.all_weights
         if i in found.widening:
             weights = weights / found.widening[i][:, None]
         if problem.loss is not None:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import cast
 
 import gtsam
 import numpy as np
 
 from alidade.factors.loss import TruncatedLoss
-from alidade.factors.vectorized import VectorizedFactor
-from alidade.pipelines.estimation.noise import Level, Noise
+from alidade.pipelines.estimation.noise import Level
 from alidade.pipelines.estimation.problem import Array, Factor
-from alidade.pipelines.solvers.marginals import ordering_of
+from alidade.pipelines.solvers.noise_estimation import level_weights
 
 # Move of a variable, in its own unit (rad, rad/s, s), above which iSAM2 linearises its factors again.
 _RELINEARIZE_MOVE = 1e-2
@@ -197,6 +196,14 @@ def _is_vector(values: gtsam.Values, key: int) -> bool:
     return True
 
 
+def ordering_of(keys: Iterable[int]) -> gtsam.Ordering:
+    """The keys as gtsam's ordering."""
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    return ordering
+
+
 def slices(keys: Sequence[int], dims: Mapping[int, int]) -> dict[int, slice]:
     """Where each variable stands when their tangents are stacked in this order."""
     found, start = {}, 0
@@ -257,39 +264,15 @@ def weigh(factors: Sequence[Factor], levels: Sequence[Level]) -> list[Factor]:
 
 
 def _weighed(factor: Factor, levels: Sequence[Level]) -> Factor:
-    for level in levels:
-        if factor.family in level.noise.families:
-            factor = _at_level(factor, level)
-    return factor
-
-
-def _at_level(factor: Factor, level: Level) -> Factor:
-    vectorized = factor.vectorized
-    if vectorized is not None:
-        weights = _weights(vectorized)
-        if level.noise.beside:
-            weights = (weights**-2.0 + _beside(factor, level.used)) ** -0.5
-        else:
-            weights[:, _rows(level.noise, weights.shape[1])] /= level.scale
-        weighed, of = vectorized.weighed(weights), Factor.process_of if factor.measurement is None else Factor.of
-        return of(factor.family, weighed, factor.beside)
+    own = [level for level in levels if factor.family in level.noise.families]
+    bound = factor.bound
+    if bound is not None:
+        stated = np.ones((len(bound.model.time), bound.model.rows)) if bound.weights is None else bound.weights
+        of = Factor.process_of if factor.measurement is None else Factor.of
+        return of(factor.family, bound.weighed(level_weights(stated, own, factor.beside)), factor.beside)
     native = cast(gtsam.NoiseModelFactor, factor.factor)
-    stated = cast(gtsam.noiseModel.Gaussian, native.noiseModel())
-    noise = gtsam.noiseModel.Gaussian.Information(stated.information() / level.scale**2)
-    return Factor(factor.family, native.cloneWithNewNoiseModel(noise))
-
-
-def _weights(vectorized: VectorizedFactor) -> Array:
-    """(n, m), those it has."""
-    shape = len(vectorized.model.time), vectorized.model.rows
-    return np.ones(shape) if vectorized.weights is None else vectorized.weights.copy()
-
-
-def _beside(factor: Factor, level: float) -> Array:
-    """(n, 1) variance of a noise beside others, in units of what the factor is whitened by."""
-    assert factor.beside is not None
-    return ((level * factor.beside) ** 2)[:, None]
-
-
-def _rows(noise: Noise, rows: int) -> list[int]:
-    return list(range(rows)) if noise.rows is None else [row for row in noise.rows if row < rows]
+    for level in own:
+        noise = cast(gtsam.noiseModel.Gaussian, native.noiseModel())
+        wider = gtsam.noiseModel.Gaussian.Information(noise.information() / level.scale**2)
+        native = native.cloneWithNewNoiseModel(wider)
+    return Factor(factor.family, native)

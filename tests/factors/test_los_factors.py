@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gtsam
 import numpy as np
 import pytest
 
@@ -11,7 +10,6 @@ from alidade.factors.gimbal import GimbalPath, LocalMotion, command
 from alidade.factors.los import SIGHT_ERRORS, LosDirectionFactor, LosRateFactor, Surroundings, rate_matrix, roll_rate
 from alidade.factors.model import Array
 from alidade.factors.testing import assert_jacobians
-from alidade.factors.vectorized import Ensemble
 from tests.support.numerics import assert_rows_are_independent
 
 N = 12
@@ -252,60 +250,3 @@ def test_rate_jacobians_and_rows() -> None:
     blocks = [np.broadcast_to(np.random.default_rng(7).normal(size=4), (N, 4))]
     assert_jacobians(_rate_factor(np.arange(N)), blocks)
     assert_rows_are_independent(_rate_factor, blocks)
-
-
-def test_compressed_rate_factor_solves_least_squares() -> None:
-    model = _rate_factor(np.arange(N))
-    graph = gtsam.NonlinearFactorGraph()
-    graph.add(model.on(0, compress=True).factor)
-    values = gtsam.Values()
-    values.insert(0, np.array([0.1, -0.2, 0.3, 0.0]))
-    solution = gtsam.GaussNewtonOptimizer(graph, values).optimize()
-    A = (model.H / model.sigma[:, None, None]).reshape(-1, 4)
-    b = (model.measured / model.sigma[:, None]).ravel()
-    np.testing.assert_allclose(solution.atVector(0), np.linalg.lstsq(A, b)[0], atol=1e-12)
-    np.testing.assert_allclose(gtsam.Marginals(graph, solution).marginalCovariance(0), np.linalg.inv(A.T @ A))
-
-
-@pytest.mark.parametrize("sigmas", [(2e-5, 2e-5, 2e-4), (2e-5, 6e-5, 2e-4)])
-def test_mixed_second_derivatives_by_roll(sigmas: tuple[float, float, float]) -> None:
-    """What residuals add to the Hessian by roll and others: exact where noise is as large either way, else near it.
-
-    The gradient is what it is; the excess is what the Hessian by roll alone has too much.
-    """
-    tRm, angles = _blocks(ALL, 0.02, 0.01)
-    rng = np.random.default_rng(7)
-    level = LosDirectionFactor(TIMES, np.zeros((N, 3)), np.tile(np.eye(3), (N, 1, 1)), GIMBAL.at(TIMES), ALL)
-    noise = 30.0 * rng.normal(size=(N, 3)) * sigmas
-    root = np.tile(np.diag(1.0 / np.array(sigmas)), (N, 1, 1))
-    model = LosDirectionFactor(TIMES, level.predict(tRm, angles) + noise, root, GIMBAL.at(TIMES), ALL)
-    factor, shared, roll = model.on(list(range(N)), 100), 100, ALL.index("camera_roll")
-    values = gtsam.Values()
-    for k in range(N):
-        values.insert(k, so3.to_gtsam(tRm[k]))
-    values.insert(shared, angles[0])
-    graph = gtsam.NonlinearFactorGraph()
-    graph.add(factor.factor)
-    keys = [*range(N), shared]
-
-    def gradient(by: Array, mixed: bool = False) -> tuple[Array, Array]:
-        move = gtsam.VectorValues()
-        move.insert(shared, by)
-        with Ensemble([factor]).at(there := values.retract(move), mixed=mixed):
-            H, g = graph.linearize(there).hessian(gtsam.Ordering(keys))
-        return np.asarray(H), -np.asarray(g)
-
-    still, step = np.zeros(len(ALL)), 1e-6 * np.eye(len(ALL))[roll]
-    exact = (gradient(step)[1] - gradient(-step)[1]) / 2e-6
-    (H, g), (bent, same) = gradient(still), gradient(still, mixed=True)
-    np.testing.assert_allclose(same, g, atol=1e-12 * np.abs(g).max())
-    own = 3 * N + roll
-    states, left_out = slice(0, 3 * N), np.abs(exact - H[own])[: 3 * N].max()
-    near = 0.03 if sigmas[0] == sigmas[1] else 0.7
-    assert np.abs(exact - bent[own])[states].max() < near * left_out
-    ensemble = Ensemble([factor])
-    with ensemble.at(values):
-        (excess,) = ensemble.excess()
-    assert excess[:2] == (shared, roll)
-    assert excess[2][0] == pytest.approx(np.square(noise[:, :2] / sigmas[:2]).sum(), rel=1e-6)
-    assert bent[own, own] - excess[2].sum() == pytest.approx(exact[own], rel=0.01 if sigmas[0] == sigmas[1] else 0.5)
