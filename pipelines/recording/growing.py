@@ -47,7 +47,8 @@ class GrowingMcap(McapFile):
             blocks = self._index.blocks
             # Of the last one the index may not have been written yet.
             for block in blocks[max(0, self._checked - 1) :]:
-                if block.is_chunk and not (block.index_at and block.index_at.keys() <= self.channels.keys()):
+                indexed = block.index_at and block.index_at.keys() <= self.channels.keys()
+                if block.is_chunk and not block.is_lost and not indexed:
                     self._verify(stream, block)
             self._checked = len(blocks)
         # Blocks overlap little: those after the last one that is over by then.

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
+from mcap.summary import Summary
 
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording.growing import Growing
@@ -61,7 +64,31 @@ def test_a_damaged_chunk_is_left_out(tmp_path: Path) -> None:
     content = bytearray((tmp_path / "whole.mcap").read_bytes())
     content[len(content) // 2 : len(content) // 2 + 4] = b"\xff\xff\xff\xff"
     (tmp_path / "whole.mcap").write_bytes(content)
-    late = Recording(Growing().look([tmp_path / "whole.mcap"], None)).imu("/imu")
+    growing = Growing()
+    for _ in range(3):
+        late = Recording(growing.look([tmp_path / "whole.mcap"], None)).imu("/imu")
     wanted = open_recording(tmp_path / "whole.mcap").imu("/imu")
     np.testing.assert_array_equal(late.t_ns, wanted.t_ns)
     np.testing.assert_array_equal(late.gyro, wanted.gyro)
+
+
+def test_a_damaged_last_chunk_is_one_loss_however_often_it_is_looked_at(tmp_path: Path) -> None:
+    write_session(tmp_path / "s.mcap", session(500))
+    with (tmp_path / "whole.mcap").open("wb") as out:
+        write(messages(tmp_path / "s.mcap"), out, 2_000)
+    path = tmp_path / "grows.mcap"
+    content = bytearray((tmp_path / "whole.mcap").read_bytes())
+    with (tmp_path / "whole.mcap").open("rb") as stream:
+        last = get_summary(stream).chunk_indexes[-1]
+    middle = last.chunk_start_offset + last.chunk_length // 2
+    content[middle : middle + 4] = b"\xff\xff\xff\xff"
+    path.write_bytes(content[: last.chunk_start_offset + last.chunk_length])  # its index is not written yet
+    growing = Growing()
+    losses = [len(growing.look([path], None).losses) for _ in range(4)]
+    assert losses == [1, 1, 1, 1]
+
+
+def get_summary(stream: BinaryIO) -> Summary:
+    summary = make_reader(stream).get_summary()
+    assert summary is not None
+    return summary

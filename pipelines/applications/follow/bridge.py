@@ -112,6 +112,8 @@ class Bridge(Stream):
             if isinstance(data, bytes):
                 self._take(data, wanted, record)
                 continue
+            for number in self._unadvertised(data):
+                wanted.pop(number, None)
             new = {number: one for number, one in self._advertised(data) if number not in wanted}
             if new and len(wanted) + len(new) <= MAX_CHANNELS:
                 wanted |= new
@@ -130,6 +132,15 @@ class Bridge(Stream):
             record.add(wanted[subscription], log_ns, data[MESSAGE_HEAD.size :])
         except RefusedError as error:
             self._refuse(str(error))
+
+    def _unadvertised(self, text: str) -> list[int]:
+        """Channels that the bridge has withdrawn: their subscriptions end, and their ids may be used again."""
+        try:
+            content = read_message(text)
+            ids = content.get("channelIds") if content.get("op") == "unadvertise" else []
+            return [read_id(number) for number in ids] if isinstance(ids, list) else []
+        except RefusedError:
+            return []  # counted by `_advertised`, which reads every text
 
     def _advertised(self, text: str) -> list[tuple[int, dict[str, str]]]:
         """The channels that a bridge tells of in a message and that are of use, with its numbers."""
