@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.recording import messages
-from alidade.pipelines.recording.container import Channel, Rows, Schema, rows_of
+from alidade.pipelines.recording.container import Channel, MessageBlock, Schema
 from alidade.pipelines.recording.decoding import header_stamps, logged_at
 from alidade.pipelines.recording.messages import Definition, Language, MessageError, Wire
 from alidade.pipelines.recording.translation import Translation, is_foxglove, ros_type
@@ -75,7 +75,7 @@ class ChannelFormat:
         found.check()
         return found
 
-    def rows(self, rows: Rows) -> Rows:
+    def rows(self, rows: MessageBlock) -> MessageBlock:
         """The messages as `definition` tells them. Raises MessageError at one that cannot be translated."""
         if not self._is_translated:
             return rows
@@ -83,9 +83,9 @@ class ChannelFormat:
         for i, log_ns in enumerate(rows.log_ns.tolist()):
             with logged_at(log_ns):
                 translated.append(self._translation(rows.message(i)))
-        return rows_of(rows.channel, translated, rows.log_ns)
+        return MessageBlock.pack(rows.channel, translated, rows.log_ns)
 
-    def stamps(self, rows: Rows) -> NDArray[np.int64]:
+    def stamps(self, rows: MessageBlock) -> NDArray[np.int64]:
         """Header stamps of messages as the container has them, ns: 0 where there is none, log times if none is read."""
         stamps = rows.log_ns
         if self._wire and not self._is_translated and self._schema is not None and self._language == "msg":

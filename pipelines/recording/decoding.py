@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.recording.container import Rows
-from alidade.pipelines.recording.mcap_records import windows
+from alidade.pipelines.recording.container import MessageBlock, byte_windows
 from alidade.pipelines.recording.messages import Array, Definition, Layout, Leaf, MessageError, Wire, at
 
 # Which numbers of a field, as indexes, given the message; None if the message has not got them.
@@ -143,7 +142,7 @@ class Decoder:
         self._fields = fields
         self._plans: list[_Plan] = []
 
-    def append(self, rows: Rows, table: Table) -> None:
+    def append(self, rows: MessageBlock, table: Table) -> None:
         """Append the messages to the table; those for which an order is None stay unfilled."""
         if not len(rows.start):
             return
@@ -179,14 +178,14 @@ class Decoder:
         return _Plan(layout, runs, _frame_of(message))
 
     def _append_alike(
-        self, plan: _Plan, rows: Rows, left: NDArray[np.int64], table: Table, into: NDArray[np.int64]
+        self, plan: _Plan, rows: MessageBlock, left: NDArray[np.int64], table: Table, into: NDArray[np.int64]
     ) -> NDArray[np.bool_]:
         """Append those of the messages `left` that have the layout, all at once. Returns which ones those are."""
         if plan.layout is None or not len(left):
             return np.zeros(len(left), dtype=bool)
         size = len(plan.layout.first)
         alike = rows.size[left] == size
-        data = windows(rows.buffer, size)[rows.start[left[alike]]].view(np.uint8).reshape(-1, size)
+        data = byte_windows(rows.buffer, size)[rows.start[left[alike]]].view(np.uint8).reshape(-1, size)
         agrees = plan.layout.agrees(data)
         alike[alike] = agrees
         data = data if agrees.all() else data[agrees]
@@ -238,12 +237,12 @@ def with_log_times(stamps: Stamps, log_ns: Stamps) -> Times:
     return (stamps if stamps.all() else np.where(stamps == 0, log_ns, stamps)), log_ns
 
 
-def header_stamps(has_header: bool, rows: Rows, wire: Wire) -> NDArray[np.int64]:
+def header_stamps(has_header: bool, rows: MessageBlock, wire: Wire) -> NDArray[np.int64]:
     """Header stamps of messages, ns; 0 where the stamp is zero or the messages have no header."""
     stamps = np.zeros(len(rows.start), dtype=np.int64)
     long = rows.size >= _STAMP["<"].itemsize
     if has_header and long.any():
-        heads = windows(rows.buffer, _STAMP["<"].itemsize)[rows.start[long]]
+        heads = byte_windows(rows.buffer, _STAMP["<"].itemsize)[rows.start[long]]
         little, big = heads.view(_STAMP["<"]), heads.view(_STAMP[">"])
         is_little = (little["kind"][:, 1] == 1) | (wire == "ros1")
         stamps[long] = little["sec"].astype(np.int64) * 1_000_000_000 + little["nanosec"]

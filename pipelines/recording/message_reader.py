@@ -18,7 +18,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.channel_format import READABLE, ChannelFormat, converted
 from alidade.pipelines.recording.clocks import check_clock
-from alidade.pipelines.recording.container import Container, Rows
+from alidade.pipelines.recording.container import Container, MessageBlock
 from alidade.pipelines.recording.decoding import Decoder, Times, header_stamps, is_unstamped, logged_at, with_log_times
 from alidade.pipelines.recording.messages import Definition, MessageError
 from alidade.pipelines.recording.stamps import stamp_notes
@@ -81,13 +81,11 @@ class MessageReader:
         timed = {name for name, topic in self.topics.items() if topic.type in TIMED and topic.is_readable}
         channels, counts = self._container.channels, self._container.counts
         wanted = {number for number, channel in channels.items() if channel.topic in timed and counts.get(number)}
-        first: dict[int, int] = {}
-        for rows in self._container.rows(wanted):
-            if rows.channel not in first:
-                first[rows.channel] = int(with_log_times(self._formats[rows.channel].stamps(rows), rows.log_ns)[0][0])
-            if len(first) == len(wanted):
-                break
-        return min(first.values()) if first else self.span[0]
+        first = (
+            int(with_log_times(self._formats[number].stamps(block), block.log_ns)[0][0])
+            for number, block in self._container.first_blocks(wanted).items()
+        )
+        return min(first, default=self._container.first_log_ns)
 
     @cached_property
     def span(self) -> tuple[int, int]:
@@ -159,7 +157,7 @@ class MessageReader:
             for name, t in self.topics.items()
         ]
         more = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
-        ros1 = " (a ROS 1 recording)" if self._container.profile == "ros1" else ""
+        ros1 = " (a ROS 1 recording)" if any(t.encoding.startswith("ros1/") for t in self.topics.values()) else ""
         return "; ".join(
             [f"topics there{ros1}: {', '.join(named[:_MOST_NAMED]) or 'none'}{more}", *self._container.notes(None)]
         )
@@ -232,11 +230,11 @@ class MessageReader:
             topics[channel.topic] = Topic(channel.topic, found.type, count, found.encoding, found.is_readable)
         return dict(sorted(topics.items()))
 
-    def _blocks(self, topics: Iterable[str]) -> Iterator[tuple[str, Rows]]:
+    def _blocks(self, topics: Iterable[str]) -> Iterator[tuple[str, MessageBlock]]:
         """Topic and messages, block by block in the file's order."""
         wanted = set(topics)
         channels = {number for number, channel in self._container.channels.items() if channel.topic in wanted}
-        for rows in self._container.rows(channels) if channels else ():
+        for rows in self._container.blocks(channels) if channels else ():
             yield self._container.channels[rows.channel].topic, rows
 
     def _unreadable(self, topic: str, error: MessageError) -> InputError:

@@ -16,11 +16,10 @@ import zstandard
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes, require_regular
 from alidade.pipelines.recording import ros1_bag
-from alidade.pipelines.recording.arrays import ArrayContainer
-from alidade.pipelines.recording.container import Container
+from alidade.pipelines.recording.array_container import ArrayContainer
+from alidade.pipelines.recording.container import Container, MultiPartContainer
 from alidade.pipelines.recording.mcap_file import McapFile
 from alidade.pipelines.recording.mcap_records import MAGIC
-from alidade.pipelines.recording.parts import Parts
 from alidade.pipelines.recording.video import is_video
 
 _ZSTD, _SQLITE, _ULOG, _ARDUPILOT = b"\x28\xb5\x2f\xfd", b"SQLite format 3\0", b"ULog\x01\x12\x35", b"\xa3\x95"
@@ -47,19 +46,26 @@ def open_container(where: Where, strict: bool = False) -> Container:
     """The container that a path, a pattern or a list of paths names.
 
     Raises InputError when something is missing, is no recording, or cannot be read; with `strict` also when anything
-    is lost.
+    is lost, for which everything is read once.
     """
+    container = _open(where)
+    if strict:
+        container.require_complete()
+    return container
+
+
+def _open(where: Where) -> Container:
     if not isinstance(where, (str, Path)):
-        return _together([Path(one) for one in where], strict)
+        return _together([Path(one) for one in where])
     path = Path(where)
     if path.is_dir():
-        return _folder(path if path.name else path.resolve(), strict)
+        return _folder(path if path.name else path.resolve())
     if not path.exists() and any(letter in str(path) for letter in "*?["):
         found = [Path(name) for name in sorted(glob.glob(str(path)))]
         if not found:
             raise InputError(f"{path}: no file is named so")
-        return _together(found, strict)
-    return _together([path], strict)
+        return _together(found)
+    return _together([path])
 
 
 def recordings_of(paths: Sequence[Path]) -> list[Where]:
@@ -88,21 +94,20 @@ def told(recordings: Sequence[Where]) -> str:
     return ", ".join(" + ".join(Path(part).name for part in parts) for parts in each)
 
 
-def _together(paths: Sequence[Path], strict: bool, at: Path | None = None, remarks: Sequence[str] = ()) -> Container:
+def _together(paths: Sequence[Path], folder: Path | None = None) -> Container:
     """Several files as one recording."""
     if not paths:
         raise InputError("a recording of no files")
     if len({os.path.realpath(path) for path in paths}) < len(paths):
         raise InputError(f"{paths[0]}: the same file is named twice")
-    parts = [_file(path, strict) for path in paths]
-    if at is None:
-        remarks = _part_of(paths)
-    whole = parts[0] if len(parts) == 1 else Parts(at or paths[0], parts)
-    whole.remarks = (*remarks, *whole.remarks)
+    parts = [_file(path) for path in paths]
+    whole = parts[0] if len(parts) == 1 else MultiPartContainer(folder or paths[0], parts)
+    if folder is None:
+        whole.assumptions = (*_part_of(paths), *whole.assumptions)
     return whole
 
 
-def _file(path: Path, strict: bool) -> Container:
+def _file(path: Path) -> Container:
     """One file, by what it begins with."""
     require_regular(path)
     try:
@@ -110,23 +115,25 @@ def _file(path: Path, strict: bool) -> Container:
             start = stream.read(16)
     except OSError as error:
         raise InputError(f"{path}: cannot be opened ({error.strerror})") from error
-    return _unpacked(path, strict) if start.startswith(_ZSTD) else _by_content(path, path, strict)
+    container = _decompressed(path) if start.startswith(_ZSTD) else _by_content(path, path)
+    container.require_readable()
+    return container
 
 
-def _by_content(path: Path, data: Path, strict: bool) -> Container:
+def _by_content(path: Path, data: Path) -> Container:
     """The container in a file `data`, which is named `path`."""
     with data.open("rb") as stream:
         start = stream.read(_START)
     if start.startswith(ros1_bag.MAGIC):
-        return ros1_bag.Ros1Bag(path, strict, data)
+        return ros1_bag.Ros1Bag(path, data)
     if start.startswith(_SQLITE):
         from alidade.pipelines.recording.sqlite_file import SqliteFile
 
-        return SqliteFile(path, strict, data)
+        return SqliteFile(path, data)
     if start.startswith(_ULOG):
         from alidade.pipelines.recording.ulog import read_ulog
 
-        return read_ulog(path, strict, data)
+        return read_ulog(path, data)
     if start.startswith(_ARDUPILOT):
         raise InputError(
             f"{path}: an ArduPilot log; make CSV of it (`mavlogdump.py --format csv`, from pymavlink) and say under "
@@ -139,10 +146,10 @@ def _by_content(path: Path, data: Path, strict: bool) -> Container:
     from alidade.pipelines.recording.tables import looks_like_text, read_table
 
     is_table = looks_like_text(start) and not start.startswith(MAGIC)
-    return read_table(path, data) if is_table else McapFile(path, strict, data)
+    return read_table(path, data) if is_table else McapFile(path, data)
 
 
-def _unpacked(path: Path, strict: bool) -> Container:
+def _decompressed(path: Path) -> Container:
     """A file compressed as a whole: unpacked into a temporary one, which goes with the container."""
     whole = tempfile.NamedTemporaryFile(prefix="alidade-", suffix=".unpacked")  # noqa: SIM115
     limit = _SMALL + _LARGEST_RATIO * path.stat().st_size
@@ -157,16 +164,16 @@ def _unpacked(path: Path, strict: bool) -> Container:
         except zstandard.ZstdError:
             damaged = "its compression is damaged, what is behind cannot be read"
     whole.flush()
-    if damaged and (strict or whole.tell() == 0):
+    if damaged and whole.tell() == 0:
         raise InputError(f"{path}: {damaged}: record again")
-    container = _by_content(path, Path(whole.name), strict)
-    container.unpacked = (container.unpacked, whole)
+    container = _by_content(path, Path(whole.name))
+    container.temporary = (container.temporary, whole)
     if damaged:
-        container.remarks = (*container.remarks, damaged)
+        container.incomplete = (*container.incomplete, damaged)
     return container
 
 
-def _folder(path: Path, strict: bool) -> Container:
+def _folder(path: Path) -> Container:
     """A folder: of a bag with its metadata.yaml, of the parts of one recording, or of a data set in EuRoC's form."""
     metadata = _metadata(path / METADATA)
     listed = parts_of_bag(metadata)
@@ -175,15 +182,12 @@ def _folder(path: Path, strict: bool) -> Container:
         lost = [name for name in listed if _stored(path / name) is None]
         if not there:
             raise InputError(f"{path}: none of the files is there that its {METADATA} names: {', '.join(lost)}")
-        remarks = [f"{len(lost)} of {len(listed)} parts are not there: {', '.join(lost)}"] if lost else []
-        if remarks and strict:
-            raise InputError(f"{path}: {remarks[0]}; --strict reads nothing of which anything is lost")
-        whole = _together(there, strict, path, remarks)
-        if str(metadata.get("compression_mode")).lower() != "message":
-            return whole
-        from alidade.pipelines.recording.packed import PackedMessages
-
-        return PackedMessages(whole)
+        whole = _together(there, path)
+        if lost:
+            absent = f"{len(lost)} of {len(listed)} parts are not there: {', '.join(lost)}"
+            whole.incomplete = (absent, *whole.incomplete)
+        whole.message_compression = str(metadata.get("compression_mode")).lower() == "message"
+        return whole
     from alidade.pipelines.recording.euroc import find_euroc, read_euroc
 
     root = find_euroc(path)
@@ -192,7 +196,7 @@ def _folder(path: Path, strict: bool) -> Container:
     there = parts_in(path) or _tables_in(path)
     if not there:
         raise InputError(f"{path}: a folder without a recording")
-    return _together(there, strict, path)
+    return _together(there, path)
 
 
 def identity(path: Path) -> str:

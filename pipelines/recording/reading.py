@@ -23,8 +23,7 @@ from alidade.pipelines import progress
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages, series, video
 from alidade.pipelines.recording.clocks import check_clock
-from alidade.pipelines.recording.container import Container
-from alidade.pipelines.recording.data_loss import DataLoss
+from alidade.pipelines.recording.container import Container, DataLoss
 from alidade.pipelines.recording.decoding import Table, Times
 from alidade.pipelines.recording.message_reader import TIMED, MessageReader, Topic
 from alidade.pipelines.recording.netpbm import netpbm
@@ -90,8 +89,8 @@ class Recording:
 
     def remark(self, sentence: str) -> None:
         """Note something that was assumed about the recording, once."""
-        if sentence not in self._container.remarks:
-            self._container.remarks = (*self._container.remarks, sentence)
+        if sentence not in self._container.assumptions:
+            self._container.assumptions = (*self._container.assumptions, sentence)
 
     def use(self, sources: Iterable[TopicSource], columns: Mapping[str, TableTopic]) -> None:
         """Take what the config says of topics that are made of others, and of the columns of tables.
@@ -110,11 +109,6 @@ class Recording:
     def sha256(self) -> str:
         """SHA-256 of the file, hexadecimal."""
         return self._container.sha256()
-
-    @property
-    def profile(self) -> str:
-        """The profile the recorder gave, `ros2` for ROS 2."""
-        return self._container.profile
 
     @property
     def attachments(self) -> tuple[str, ...]:
@@ -143,7 +137,7 @@ class Recording:
         """Sentences about what is lost, what was assumed, and how stamps came about in the topics read by now."""
         container = self._container
         lost = container.notes(self.epoch_ns, self.duration_s) if container.losses or container.missing else ()
-        return (*container.remarks, *self._reader.stamp_notes, *lost)
+        return (*container.incomplete, *container.assumptions, *self._reader.stamp_notes, *lost)
 
     @property
     def epoch_ns(self) -> int:

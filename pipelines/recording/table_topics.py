@@ -20,10 +20,9 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from alidade.pipelines.errors import InputError, nearest
 from alidade.pipelines.recording import series
-from alidade.pipelines.recording.arrays import ArrayContainer
+from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.checks import SLOWEST_GYRO_S, SLOWEST_S
-from alidade.pipelines.recording.container import Container, sha256_of, sha256_together
-from alidade.pipelines.recording.parts import Parts
+from alidade.pipelines.recording.container import Container, MultiPartContainer, combined_sha256, file_sha256
 from alidade.pipelines.recording.sources import Axes, along
 from alidade.pipelines.recording.table_times import check_steps, nanoseconds, of_rate
 from alidade.pipelines.recording.table_units import COMPATIBLE, TIME_UNITS, UNITS, unit_of
@@ -249,7 +248,7 @@ def described(container: Container, columns: Mapping[str, TableTopic]) -> Contai
         of[name][topic], notes = table.read(tables[name].path, tables[name].data, topic)
         remarks += [note for note in notes if note not in remarks]
     whole = _with_topics(container, of)
-    whole.remarks = (*whole.remarks, *(remark for remark in remarks if remark not in whole.remarks))
+    whole.assumptions = (*whole.assumptions, *(remark for remark in remarks if remark not in whole.assumptions))
     return whole
 
 
@@ -257,18 +256,18 @@ def tables_of(container: Container) -> dict[str, CsvFile]:
     """The CSV files in a container, by name."""
     if isinstance(container, CsvFile):
         return {container.path.name: container}
-    parts = container.parts if isinstance(container, Parts) else ()
+    parts = container.parts if isinstance(container, MultiPartContainer) else ()
     return {name: table for part in parts for name, table in tables_of(part).items()}
 
 
 def _with_topics(container: Container, of: Mapping[str, Mapping[str, series.Topic]]) -> Container:
     if isinstance(container, CsvFile) and of.get(container.path.name):
         return _Described(container, of[container.path.name])
-    if isinstance(container, Parts):
+    if isinstance(container, MultiPartContainer):
         used = {video.path.resolve() for topics in of.values() for video in _videos(topics)}
         there = [part for part in container.parts if part.path.resolve() not in used]
-        whole = Parts(container.path, [_with_topics(part, of) for part in there])
-        whole.unpacked = container.unpacked
+        whole = MultiPartContainer(container.path, [_with_topics(part, of) for part in there])
+        whole.temporary, whole.incomplete = container.temporary, container.incomplete
         return whole
     return container
 
@@ -277,13 +276,13 @@ class _Described(ArrayContainer):
     """A table whose columns are known, with the videos that it has the stamps of."""
 
     def __init__(self, table: CsvFile, topics: Mapping[str, series.Topic]) -> None:
-        super().__init__(table.path, topics)
-        self.data, self._video_paths = table.data, [video.path for video in _videos(topics)]
+        super().__init__(table.path, topics, data=table.data)
+        self._video_paths = [video.path for video in _videos(topics)]
 
     def sha256(self) -> str:
         """SHA-256 of the table; with videos, of its digest and theirs, in order."""
         digest = super().sha256()
-        return sha256_together([digest, *map(sha256_of, self._video_paths)]) if self._video_paths else digest
+        return combined_sha256([digest, *map(file_sha256, self._video_paths)]) if self._video_paths else digest
 
 
 def _videos(topics: Mapping[str, series.Topic]) -> list[VideoFile]:

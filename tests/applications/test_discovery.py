@@ -16,10 +16,10 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods import simulate
 from alidade.pipelines.methods.head.recording import read_head
 from alidade.pipelines.recording import series
+from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.pairing import pair
 from alidade.pipelines.recording.reading import Recording, open_recording
 from alidade.pipelines.recording.sources import inverted
-from alidade.pipelines.recording.writing import write_session
 from tests.support import forms
 from tests.support.command import Command
 

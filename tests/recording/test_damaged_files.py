@@ -13,7 +13,7 @@ from mcap.opcode import Opcode
 
 from alidade.pipelines.applications.session import session_facts
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.recording import writing
+from alidade.pipelines.recording import mcap_writer
 from alidade.pipelines.recording.reading import open_recording
 from alidade.pipelines.settings import Config
 from tests.support.damage import (
@@ -60,8 +60,8 @@ def make(form: str, folder: Path) -> Small:
     path = folder / "s.mcap"
     if form == OWN:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(writing, "_CHUNK", 4000)
-            writing.write_session(path, topics(), {"alidade.yaml": CONFIG})
+            patch.setattr(mcap_writer, "CHUNK_BYTES", 4000)
+            mcap_writer.write_session(path, topics(), {"alidade.yaml": CONFIG})
     else:
         path = write_small(path, form)
     whole = read(open_recording(path))

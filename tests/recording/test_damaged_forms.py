@@ -21,9 +21,9 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages, video
+from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.reading import open_recording
 from alidade.pipelines.recording.ros1_bag import MAGIC
-from alidade.pipelines.recording.writing import write_session
 from tests.support import forms
 from tests.support.damage import CONFIG, Whole, flips, read, spoilt, topics
 from tests.support.turning import turning, write_csv

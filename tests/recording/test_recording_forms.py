@@ -23,11 +23,11 @@ from alidade.pipelines.methods.head.topics import VISION_ATTITUDE
 from alidade.pipelines.methods.indexer.simulation import Position
 from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.gyro import read_gyro
+from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.placeholders import density
 from alidade.pipelines.recording.reading import Recording, open_recording
 from alidade.pipelines.recording.sources import TopicSource, inverted
 from alidade.pipelines.recording.topics import IMU
-from alidade.pipelines.recording.writing import write_session
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from tests.support import forms, live

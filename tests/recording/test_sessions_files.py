@@ -16,8 +16,8 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import mcap_records as records
 from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.mcap_file import McapFile
+from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.reading import open_recording
-from alidade.pipelines.recording.writing import write_session
 from tests.support.recorded import T0, assert_same, session
 
 

@@ -17,9 +17,9 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.problem import Estimate
 from alidade.pipelines.methods import method
 from alidade.pipelines.recording import series
+from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.reading import open_recording
 from alidade.pipelines.recording.temperature import Temperature, read_temperature
-from alidade.pipelines.recording.writing import write_session
 from alidade.pipelines.reports.calibration import load_calibration
 from alidade.pipelines.simulation.simulated import Simulated
 from alidade.pipelines.solvers.batch import solve_batch

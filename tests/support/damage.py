@@ -14,8 +14,8 @@ from mcap.writer import CompressionType, Writer
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.mcap_records import HEAD, MAGIC
+from alidade.pipelines.recording.mcap_writer import write_session
 from alidade.pipelines.recording.reading import Recording, open_recording
-from alidade.pipelines.recording.writing import write_session
 
 T0 = 1_700_000_000_123_456_789
 CONFIG = b"method: head\n"

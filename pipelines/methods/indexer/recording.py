@@ -24,12 +24,12 @@ from alidade.pipelines.recording.checks import (
     unit_quaternions,
 )
 from alidade.pipelines.recording.gyro import usable
+from alidade.pipelines.recording.mcap_writer import attached, write_session
 from alidade.pipelines.recording.placeholders import density
 from alidade.pipelines.recording.reading import Recording
 from alidade.pipelines.recording.shapes import Numbers, Quaternions, Vectors
 from alidade.pipelines.recording.temperature import Temperature
 from alidade.pipelines.recording.topics import FIX, IMU, wanted
-from alidade.pipelines.recording.writing import attached, write_session
 from alidade.pipelines.settings import Config
 
 Array = NDArray[np.float64]

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import check_overlap, nanoseconds
 from alidade.pipelines.recording.gyro import read_gyro
+from alidade.pipelines.recording.mcap_writer import attached, write_session
 from alidade.pipelines.recording.reading import Recording
 from alidade.pipelines.recording.shapes import Numbers, Vectors
-from alidade.pipelines.recording.writing import attached, write_session
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 from alidade.pipelines.simulation.simulated import Simulated
 from gyro_pair.topics import GYRO_A, GYRO_B, GyroPairConfig
