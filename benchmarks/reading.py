@@ -15,7 +15,7 @@ from rosbags.highlevel import AnyReader
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.mcap_file import McapFile
 from alidade.pipelines.recording.mcap_writer import write_session
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from benchmarks.measure import Ratio, costs
 
 TOPIC = "/imu"

@@ -267,7 +267,7 @@ def compare(
 
     from alidade.pipelines import parallel, progress
     from alidade.pipelines.applications.session import Session
-    from alidade.pipelines.recording.reading import open_recording
+    from alidade.pipelines.recording.recording import open_recording
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.compare import write_compare
     from alidade.pipelines.reports.whole import require_room
@@ -493,16 +493,15 @@ def info(
     from alidade.pipelines.applications.discovery import suggestions, unused
     from alidade.pipelines.applications.session import checked_facts
     from alidade.pipelines.applications.table_discovery import propose_columns, with_columns
-    from alidade.pipelines.config import recorded_config
-    from alidade.pipelines.recording.reading import open_recording
+    from alidade.pipelines.config import configured
+    from alidade.pipelines.recording.recording import open_recording
     from alidade.pipelines.reports import terminal
 
     with progress.shown(quiet), progress.doing("reading"):
-        recording = open_recording(session, strict)
-        settings = recorded_config(recording, config)
+        recording, settings = configured(open_recording(session, strict), config)
         columns = None if settings.columns else propose_columns(recording)
         if columns is not None and columns.columns:
-            settings = with_columns(recording, settings)
+            recording, settings = with_columns(recording, settings)
         facts = checked_facts(recording, settings)
         found, left = suggestions(recording, settings), unused(recording, settings)
     if as_json:

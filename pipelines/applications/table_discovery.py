@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording.checks import MAX_RATE_RAD_S, SLOWEST_S
 from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, lacks_gravity
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.sources import TopicSource
 from alidade.pipelines.recording.table_topics import TableTopic
 from alidade.pipelines.recording.table_units import TIME_UNITS, UNITS, unit_hinted, unit_named, unit_of
@@ -107,22 +107,20 @@ def propose_columns(recording: Recording) -> Columns | None:
     return Columns(columns, topics, reasons, tuple(doubt for one in found for doubt in one.doubts))
 
 
-def with_columns(recording: Recording, config: Config) -> Config:
-    """The config with the columns that are proposed, where it has none; remarked in the recording.
+def with_columns(recording: Recording, config: Config) -> tuple[Recording, Config]:
+    """The recording and config with the columns that are proposed, where the config has none; noted in the recording.
 
     Raises InputError where nothing can be concluded.
     """
-    if config.columns:
-        return config
-    found = propose_columns(recording)
+    found = None if config.columns else propose_columns(recording)
     if found is None:
-        return config
+        return recording, config
     if not found.columns:
         raise InputError(f"{recording.path}: no columns could be concluded: {'; '.join(found.doubts)}")
     more = config.model_copy(update={"columns": found.columns, "topics": {**found.topics, **config.topics}})
-    recording.use(more.topics.values(), more.columns)
+    recording = recording.with_config(more.topics.values(), more.columns)
     recording.remark(f"columns taken as concluded: {'; '.join((*found.reasons, *found.doubts))}")
-    return more
+    return recording, more
 
 
 class _Table:

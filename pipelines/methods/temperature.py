@@ -10,7 +10,7 @@ from alidade.pipelines.estimation.assumptions import Assumption, parameter
 from alidade.pipelines.estimation.problem import Array
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.temperature import Temperature, read_temperature
 from alidade.pipelines.recording.topics import TEMPERATURE, wanted
 from alidade.pipelines.settings import Config

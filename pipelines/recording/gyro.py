@@ -9,7 +9,7 @@ from alidade.pipelines.recording.checks import LEAST_GYRO, SLOWEST_GYRO_S, check
 from alidade.pipelines.recording.faults import drop_faults
 from alidade.pipelines.recording.placeholders import density, is_there
 from alidade.pipelines.recording.plausibility import implausible
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.series import ImuSeries
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording.checks import clean, count
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.recording import Recording
 
 Array = NDArray[np.float64]
 

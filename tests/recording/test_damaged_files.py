@@ -14,7 +14,7 @@ from mcap.opcode import Opcode
 from alidade.pipelines.applications.session import session_facts
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import mcap_writer
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config
 from tests.support.damage import (
     CONFIG,

@@ -22,7 +22,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages, video
 from alidade.pipelines.recording.mcap_writer import write_session
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.recording.ros1_bag import MAGIC
 from tests.support import forms
 from tests.support.damage import CONFIG, Whole, flips, read, spoilt, topics
@@ -104,7 +104,7 @@ class Small:
         recording = open_recording(path.parents[FOLDERS[self.form]] if self.form in FOLDERS else path)
         if self.form == "csv":
             config = load_config(CSV)
-            recording.use(config.topics.values(), config.columns)
+            recording = recording.with_config(config.topics.values(), config.columns)
         if self.form == "tum":
             poses = recording.poses("/trajectory")
             return {"/trajectory": (poses.t_ns, np.hstack([poses.position, poses.wxyz]))}

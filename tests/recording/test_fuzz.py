@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages, video
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config
 from tests.support import forms
 from tests.support.damage import Whole, check_sound, read, write_small

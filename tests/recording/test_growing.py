@@ -13,7 +13,7 @@ from mcap.summary import Summary
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording.growing import GrowingFiles
 from alidade.pipelines.recording.mcap_writer import write_session
-from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.recording.recording import Recording, open_recording
 from tests.support.live import messages, write
 from tests.support.recorded import session
 

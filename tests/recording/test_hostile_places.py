@@ -18,7 +18,7 @@ from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml
 from alidade.pipelines.recording.opening import bag_metadata, recordings_of
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.reports.calibration import load_calibration
 from alidade.pipelines.reports.certificate import write_certificate
 from alidade.pipelines.reports.known import load_known

@@ -17,7 +17,7 @@ from alidade.pipelines.recording import mcap_records as records
 from alidade.pipelines.recording import messages, series
 from alidade.pipelines.recording.mcap_file import McapFile
 from alidade.pipelines.recording.mcap_writer import write_session
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from tests.support.recorded import T0, assert_same, session
 
 

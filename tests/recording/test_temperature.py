@@ -18,7 +18,7 @@ from alidade.pipelines.estimation.problem import Estimate
 from alidade.pipelines.methods import method
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.mcap_writer import write_session
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.recording.temperature import Temperature, read_temperature
 from alidade.pipelines.reports.calibration import load_calibration
 from alidade.pipelines.simulation.simulated import Simulated

@@ -15,7 +15,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.mcap_records import HEAD, MAGIC
 from alidade.pipelines.recording.mcap_writer import write_session
-from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.recording.recording import Recording, open_recording
 
 T0 = 1_700_000_000_123_456_789
 CONFIG = b"method: head\n"

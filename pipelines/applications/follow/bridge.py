@@ -28,8 +28,8 @@ from alidade.pipelines.applications.follow.protocol import (
 from alidade.pipelines.applications.follow.sources import Stream
 from alidade.pipelines.applications.follow.spool import Spool
 from alidade.pipelines.errors import printable
-from alidade.pipelines.recording.channel_format import ChannelFormat
 from alidade.pipelines.recording.container import Channel, Schema
+from alidade.pipelines.recording.decoding import MessageFormat
 from alidade.pipelines.recording.messages import SENSORS
 
 # Encoding of messages -> that of their schema, where a bridge does not say it.
@@ -231,5 +231,5 @@ def _is_of_use(channel: dict[str, str]) -> bool:
         schema = Schema(1, channel["schemaName"], channel["schemaEncoding"], _schema(channel))
     except (binascii.Error, ValueError) as error:
         raise RefusedError("a schema that is no base64") from error
-    form = ChannelFormat(Channel(1, channel["topic"], channel["encoding"], 1), schema)
+    form = MessageFormat(Channel(1, channel["topic"], channel["encoding"], 1), schema)
     return form.is_readable and form.type in SENSORS

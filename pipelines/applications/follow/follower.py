@@ -20,7 +20,7 @@ import numpy as np
 
 from alidade.pipelines.applications.follow.guidance import View, Watch, view_of
 from alidade.pipelines.applications.follow.sources import Source
-from alidade.pipelines.applications.session import Session
+from alidade.pipelines.applications.session import Recorded, Session
 from alidade.pipelines.diagnostics.checklist import ChecklistItem
 from alidade.pipelines.errors import InputError, NotARecordingError
 from alidade.pipelines.estimation.camera_clock import Clock
@@ -28,7 +28,7 @@ from alidade.pipelines.estimation.problem import Problem, Step
 from alidade.pipelines.recording.container import file_sha256
 from alidade.pipelines.recording.growing import GrowingFiles
 from alidade.pipelines.recording.opening import identity
-from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.reports.known import load_known
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.settings import Config
@@ -185,7 +185,7 @@ class Follower:
         problem = self._guessed_before(session) or _that_grows(session.problem(), session)
         steps = self._new_steps(session, problem)
         self._session, self._checklist = session, {}
-        self._delay_ns, self._attachments = recording.delay_ns, len(self._growing.attachments)
+        self._delay_ns, self._attachments = _min_delay_ns(session), len(self._growing.attachments)
         self._collect(session)
         return problem, steps
 
@@ -214,7 +214,7 @@ class Follower:
             late = session.again(recording)
             problem = run.problem.onward(late.data, run.marginal.time)
             if problem is not None and problem.steps_after is not None:
-                self._delay_ns = recording.delay_ns
+                self._delay_ns = _min_delay_ns(late)
                 self._collect(late)
                 run.update_problem(problem)
                 return problem, problem.steps_after(run.time)
@@ -346,6 +346,12 @@ def _first(steps: Iterable[Step]) -> Iterator[Step]:
     for step in steps:
         yield step
         return
+
+
+def _min_delay_ns(session: Session) -> int:
+    """Least delay of the log times after the stamps, ns, of the topics that were read."""
+    assert isinstance(session.origin, Recorded)
+    return session.origin.recording.delay_ns
 
 
 def _is_misplaced(run: IncrementalSolver) -> bool:

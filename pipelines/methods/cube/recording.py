@@ -27,7 +27,7 @@ from alidade.pipelines.recording.checks import (
 )
 from alidade.pipelines.recording.faults import drop_faults
 from alidade.pipelines.recording.placeholders import believed, density, measured_once
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.topics import IMAGE, IMU, MAG, wanted
 from alidade.pipelines.settings import Config
 

@@ -25,7 +25,7 @@ from alidade.pipelines.recording.checks import (
 from alidade.pipelines.recording.gyro import read_gyro, read_imu
 from alidade.pipelines.recording.mcap_writer import attached, write_session
 from alidade.pipelines.recording.placeholders import believed
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Covariances, Numbers, Quaternions, Vectors
 from alidade.pipelines.recording.temperature import Temperature
 from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, wanted

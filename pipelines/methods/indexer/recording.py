@@ -26,7 +26,7 @@ from alidade.pipelines.recording.checks import (
 from alidade.pipelines.recording.gyro import usable
 from alidade.pipelines.recording.mcap_writer import attached, write_session
 from alidade.pipelines.recording.placeholders import density
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Numbers, Quaternions, Vectors
 from alidade.pipelines.recording.temperature import Temperature
 from alidade.pipelines.recording.topics import FIX, IMU, wanted

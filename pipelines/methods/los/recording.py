@@ -20,7 +20,7 @@ from alidade.pipelines.recording.checks import check_overlap, clean, count, nano
 from alidade.pipelines.recording.faults import drop_frozen
 from alidade.pipelines.recording.gyro import read_imu
 from alidade.pipelines.recording.mcap_writer import attached, write_session
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Numbers, Pairs, Rows, Vectors
 from alidade.pipelines.recording.temperature import Temperature
 from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, wanted

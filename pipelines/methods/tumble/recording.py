@@ -27,7 +27,7 @@ from alidade.pipelines.recording.faults import drop_faults
 from alidade.pipelines.recording.mcap_writer import attached, write_session
 from alidade.pipelines.recording.placeholders import density, is_there, measured_once
 from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, lacks_gravity
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Numbers, Vectors
 from alidade.pipelines.recording.temperature import Temperature
 from alidade.pipelines.recording.topics import FIX, IMU, MAG, wanted

@@ -36,7 +36,7 @@ from alidade.pipelines.applications.follow.protocol import MESSAGE_DATA, MESSAGE
 from alidade.pipelines.applications.follow.serve import MAX_SUBSCRIPTIONS, LiveServer
 from alidade.pipelines.applications.follow.spool import Spool
 from alidade.pipelines.estimation.problem import Quantity
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 
 connect: Any = websockets().sync.client.connect
 serve: Any = websockets().sync.server.serve

@@ -12,7 +12,7 @@ from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import check_overlap, nanoseconds
 from alidade.pipelines.recording.gyro import read_gyro
 from alidade.pipelines.recording.mcap_writer import attached, write_session
-from alidade.pipelines.recording.reading import Recording
+from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.shapes import Numbers, Vectors
 from alidade.pipelines.settings import DEFAULT_NOISE, Config, first_given
 from alidade.pipelines.simulation.simulated import Simulated
