@@ -14,7 +14,7 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.info import lacking
 from alidade.pipelines.recording.pairing import MAX_MOUNT, Pairing, pair
-from alidade.pipelines.recording.placeholders import is_there
+from alidade.pipelines.recording.plausibility import is_there
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.series import ImuSeries
 from alidade.pipelines.recording.sources import TopicSource

@@ -20,8 +20,7 @@ from alidade.pipelines.recording import messages
 from alidade.pipelines.recording.checks import clean
 from alidade.pipelines.recording.even import even_pieces
 from alidade.pipelines.recording.faults import drop_faults
-from alidade.pipelines.recording.placeholders import is_there
-from alidade.pipelines.recording.plausibility import implausible
+from alidade.pipelines.recording.plausibility import implausible, is_there
 from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.settings import Config
 

@@ -49,7 +49,7 @@ from alidade.pipelines.recording.checks import COPIED, OVERTAKEN
 from alidade.pipelines.recording.decoding import ENCODING
 from alidade.pipelines.recording.info import SessionFacts, facts_of, lacking
 from alidade.pipelines.recording.opening import Where
-from alidade.pipelines.recording.placeholders import HELD
+from alidade.pipelines.recording.plausibility import HELD
 from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, wanted
 from alidade.pipelines.reports.known import load_known

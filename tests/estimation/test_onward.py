@@ -11,7 +11,7 @@ import pytest
 
 from alidade.pipelines.estimation.problem import Problem, Step
 from alidade.pipelines.methods import method
-from alidade.pipelines.recording.temperature import Temperature
+from alidade.pipelines.recording.streams import Temperature
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.temperature import Warming
 

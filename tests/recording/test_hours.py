@@ -14,7 +14,7 @@ from alidade.pipelines.applications.session import Session
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.los import recording as los
 from alidade.pipelines.recording.checks import taken
-from alidade.pipelines.recording.placeholders import density
+from alidade.pipelines.recording.plausibility import density
 from alidade.pipelines.recording.recording import open_recording
 
 # Of los at 1 kHz and 50 pictures a second, bytes a sample of the gyro: with ten hours, 36 million, in 8 GiB.

@@ -11,8 +11,14 @@ from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import clean, tracked
 from alidade.pipelines.recording.faults import drop_faults
-from alidade.pipelines.recording.placeholders import believed, density, is_there, measured_once
-from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, implausible
+from alidade.pipelines.recording.plausibility import (
+    GRAVITY_REMOVED,
+    believed,
+    density,
+    implausible,
+    is_there,
+    measured_once,
+)
 from alidade.pipelines.recording.recording import open_recording
 from tests.support import forms
 

@@ -22,11 +22,11 @@ from alidade.pipelines.methods import method, simulate
 from alidade.pipelines.methods.head.topics import VISION_ATTITUDE
 from alidade.pipelines.methods.indexer.simulation import Position
 from alidade.pipelines.recording import messages, series
-from alidade.pipelines.recording.gyro import read_gyro
 from alidade.pipelines.recording.mcap_writer import write_session
-from alidade.pipelines.recording.placeholders import density
+from alidade.pipelines.recording.plausibility import density
 from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.recording.sources import TopicSource, inverted
+from alidade.pipelines.recording.streams import StreamReader
 from alidade.pipelines.recording.topics import IMU
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
@@ -959,8 +959,8 @@ def test_a_covariance_no_gyro_has_is_not_believed(tmp_path: Path) -> None:
     for variance, believed in ((1e-12, None), (1e-6, 1e-4), (0.0, None), (-1.0, None)):
         imu = series.ImuSeries(t_ns, gyro, gyro_cov=variance * np.eye(3))
         write_session(tmp_path / "s.mcap", {"/imu": imu})
-        dropped: dict[str, int] = {}
-        _, _, density = read_gyro(open_recording(tmp_path / "s.mcap"), "/imu", T0, dropped)
+        reader = StreamReader(open_recording(tmp_path / "s.mcap"), {})
+        density, dropped = reader.density("/imu", "gyro", reader.gyro("/imu")), reader.dropped
         assert density == (None if believed is None else pytest.approx(believed))
         assert (500 in dropped.values()) == (variance in (1e-12, -1.0))
 
