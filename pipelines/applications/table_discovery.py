@@ -133,7 +133,7 @@ class _Table:
         self.reasons: list[str] = []
         self.doubts: list[str] = []
         names = [f"column {i + 1}" for i in range(len(self._form.names))]
-        texts, _ = read_columns(table.path, table.data, names)
+        texts, _ = read_columns(table.path, table.data, self._form, names)
         self._texts = [texts[name][:_ROWS] for name in names]
         self._values = [self._numbers(i) for i in range(len(names))]
 

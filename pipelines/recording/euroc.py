@@ -58,8 +58,9 @@ class _DataSet(ArrayContainer):
 
 def _topics(table: Path, name: str, sensor: Mapping[str, Any]) -> dict[str, series.Topic]:
     """What a sensor's table holds."""
-    names = table_form(table, table).names
-    columns, _ = read_columns(table, table, names)
+    layout = table_form(table, table)
+    names = layout.names
+    columns, _ = read_columns(table, table, layout, names)
     t_ns = nanoseconds(table, columns[names[0]], "ns")
 
     def chosen(letter: str) -> list[str]:

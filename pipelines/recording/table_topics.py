@@ -105,16 +105,27 @@ class TableTopic(BaseModel):
             raise ValueError("axes go with gyro, accel or field")
         return self
 
-    def read(self, path: Path, data: Path, topic: str = "") -> tuple[series.Topic, list[str]]:
-        """The topic, and sentences about what was concluded or left out.
+    @property
+    def names(self) -> list[str]:
+        """The columns that are needed."""
+        stamps = [] if self.time is None else [self.time]
+        return [*stamps, *self.where, *(name for found in self._given.values() for name in found)]
+
+    def to_series(
+        self, topic: str, path: Path, form: TableForm, columns: Mapping[str, NDArray[np.str_]]
+    ) -> tuple[series.Topic, list[str]]:
+        """The topic as a series, and sentences about what was concluded or left out.
 
         Rows without a number in any of its columns are left out. Raises InputError.
+
+        Args:
+            topic: its name.
+            path: of the table.
+            form: of the table.
+            columns: texts of its columns, `names` at least.
         """
-        given = {name: self._columns(name) for name in (*_NUMBERS, "joints") if getattr(self, name) is not None}
-        form = table_form(path, data)
-        stamps = [] if self.time is None else [self.time]
-        names = [*stamps, *self.where, *(name for found in given.values() for name in found)]
-        columns, notes = read_columns(path, data, list(dict.fromkeys(names)))
+        given, notes = self._given, list[str]()
+        columns = {name: columns[name] for name in self.names}
         rows = self._rows(path, columns)
         columns = {name: column[rows] for name, column in columns.items()}
         values = {name: numbers(path, columns, found) for name, found in given.items()}
@@ -149,6 +160,11 @@ class TableTopic(BaseModel):
         if kind is series.ImuSeries:
             shaped |= _absent({"gyro", "accel"} - values.keys())
         return kind(t_ns, **shaped), notes
+
+    @property
+    def _given(self) -> dict[str, list[str]]:
+        """Quantity -> its columns."""
+        return {name: self._columns(name) for name in (*_NUMBERS, "joints") if getattr(self, name) is not None}
 
     @property
     def _is_slow(self) -> bool:
@@ -235,8 +251,7 @@ _NUMBERS = (
 def described(container: Container, columns: Mapping[str, TableTopic]) -> Container:
     """A container with its tables read as the config describes them. Raises InputError at a table that is not there."""
     tables = tables_of(container)
-    of: dict[str, dict[str, series.Topic]] = {name: {} for name in tables}
-    remarks: list[str] = []
+    by_file: dict[str, dict[str, TableTopic]] = {}
     for topic, table in columns.items():
         if (table.file is None and len(tables) != 1) or (table.file is not None and table.file not in tables):
             there = ", ".join(tables) or "none"
@@ -244,11 +259,20 @@ def described(container: Container, columns: Mapping[str, TableTopic]) -> Contai
                 f"no table {table.file}{nearest(table.file, list(tables))}" if table.file else "which table is meant?"
             )
             raise InputError(f"{container.path}: columns.{topic}.file: {wanted}; tables there: {there}")
-        name = table.file or next(iter(tables))
-        of[name][topic], notes = table.read(tables[name].path, tables[name].data, topic)
-        remarks += [note for note in notes if note not in remarks]
+        by_file.setdefault(table.file or next(iter(tables)), {})[topic] = table
+    of: dict[str, dict[str, series.Topic]] = {}
+    notes: list[str] = []
+    for name, topics in by_file.items():
+        path, data = tables[name].path, tables[name].data
+        form = table_form(path, data)
+        needed = dict.fromkeys(column for table in topics.values() for column in table.names)
+        texts, left_out = read_columns(path, data, form, list(needed))
+        notes += left_out
+        found = {topic: table.to_series(topic, path, form, texts) for topic, table in topics.items()}
+        of[name] = {topic: made for topic, (made, _) in found.items()}
+        notes += [note for _, concluded in found.values() for note in concluded]
     whole = _with_topics(container, of)
-    whole.assumptions = (*whole.assumptions, *(remark for remark in remarks if remark not in whole.assumptions))
+    whole.assumptions = tuple(dict.fromkeys([*whole.assumptions, *notes]))
     return whole
 
 

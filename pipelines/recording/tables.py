@@ -153,7 +153,9 @@ def table_form(path: Path, data: Path) -> TableForm:
     )
 
 
-def read_columns(path: Path, data: Path, names: Sequence[str]) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
+def read_columns(
+    path: Path, data: Path, form: TableForm, names: Sequence[str]
+) -> tuple[dict[str, NDArray[np.str_]], list[str]]:
     """The named columns as texts, row by row, and sentences about rows that are left out.
 
     Decimal marks are points, what stands for no number is empty. Headers that are repeated, blank lines and comments
@@ -162,7 +164,6 @@ def read_columns(path: Path, data: Path, names: Sequence[str]) -> tuple[dict[str
     Raises:
         InputError: a column is missing, or more rows are too short; the first of them is named.
     """
-    form = table_form(path, data)
     wanted = [form.index(path, name) for name in names]
     rows, notes = _whole_rows(path, data, form, wanted)
     table = np.array(rows, dtype=np.str_).reshape(len(rows), len(names))

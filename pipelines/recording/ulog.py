@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from alidade.factors import so3
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.array_container import ArrayContainer
@@ -135,10 +136,7 @@ def _magnetic(data: Columns, offset: int) -> series.MagneticSeries:
 
 
 def _attitude(data: Columns, offset: int) -> series.QuaternionSeries:
-    w, x, y, z = _indexed(data, "q", 4).T
-    _, a, b, _ = _ENU_FROM_NED
-    turned = np.stack([-a * x - b * y, a * w + b * z, b * w - a * z, a * y - b * x], axis=1)
-    return series.QuaternionSeries(_stamps(data, offset), turned)
+    return series.QuaternionSeries(_stamps(data, offset), so3.multiply(_ENU_FROM_NED, _indexed(data, "q", 4)))
 
 
 def _odometry(data: Columns, offset: int) -> series.PoseSeries:
