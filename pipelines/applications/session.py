@@ -555,7 +555,7 @@ def checked_facts(recording: Recording, config: Config) -> SessionFacts:
 
 def _refused(method: Method, recording: Recording, config: Config) -> str:
     """Why a method cannot read the recording, as a phrase; empty where it can."""
-    from alidade.pipelines.vision.recorded import camera_of
+    from alidade.pipelines.vision.camera import camera_of
 
     by_key = {topic.key: topic for topic in method.topics}
     image, camera = by_key.get(IMAGE.key), by_key.get(CAMERA_INFO.key)

@@ -18,9 +18,9 @@ from alidade.pipelines.files import MAX_YAML_BYTES, load_yaml, read_bytes, requi
 from alidade.pipelines.recording import ros1_bag
 from alidade.pipelines.recording.array_container import ArrayContainer
 from alidade.pipelines.recording.container import Container, MultiPartContainer
+from alidade.pipelines.recording.images import is_video
 from alidade.pipelines.recording.mcap_file import McapFile
 from alidade.pipelines.recording.mcap_records import MAGIC
-from alidade.pipelines.recording.video import is_video
 
 _ZSTD, _SQLITE, _ULOG, _ARDUPILOT = b"\x28\xb5\x2f\xfd", b"SQLite format 3\0", b"ULog\x01\x12\x35", b"\xa3\x95"
 # So much of a file's beginning tells what it is, B.

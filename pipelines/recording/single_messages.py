@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from alidade.pipelines.recording import series, video
+from alidade.pipelines.recording import images, series
 from alidade.pipelines.recording.decoding import DecodedMessage
 from alidade.pipelines.recording.messages import MessageError
-from alidade.pipelines.recording.netpbm import netpbm
 
 
 def camera_info(message: DecodedMessage) -> series.CameraInfo:
@@ -31,12 +30,12 @@ def pictures(messages: Iterable[DecodedMessage], is_raw: bool) -> Iterator[tuple
     """(stamp in ns, file) of each picture: raw ones and those of a H.264 video in the Netpbm form."""
     files = (_file(message, is_raw) for message in messages)
     for t_ns, form, data in files:
-        if form in video.OTHERS:
+        if form in images.OTHERS:
             raise MessageError(f"a video in {form}; H.264 is read, or single pictures")
-        if form in video.H264:
+        if form in images.H264:
             packets = itertools.chain([(t_ns, data)], ((t_ns, data) for t_ns, _, data in files))
             try:
-                yield from video.decoded(packets)
+                yield from images.decode_video(packets)
             except ValueError as error:
                 raise MessageError(str(error)) from error
             return
@@ -47,7 +46,7 @@ def _file(message: DecodedMessage, is_raw: bool) -> tuple[int, str, bytes]:
     """Stamp, form, and file or packet of a video."""
     found = message.content
     if is_raw:
-        return message.t_ns, "netpbm", netpbm(found)
+        return message.t_ns, "netpbm", images.netpbm(found)
     return message.t_ns, found.format.lower(), found.data.tobytes()
 
 

@@ -15,7 +15,7 @@ from alidade.pipelines.recording.checks import clean, count
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.topics import IMAGE, wanted
 from alidade.pipelines.settings import Config
-from alidade.pipelines.vision.recorded import camera_of
+from alidade.pipelines.vision.camera import camera_of
 
 if TYPE_CHECKING:
     from alidade.pipelines.vision.camera import Camera

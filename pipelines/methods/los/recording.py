@@ -24,7 +24,7 @@ from alidade.pipelines.recording.shapes import Numbers, Pairs, Rows, Vectors
 from alidade.pipelines.recording.streams import StreamReader, Temperature, imu_series
 from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, IMU, wanted
 from alidade.pipelines.settings import Config
-from alidade.pipelines.vision.recorded import camera_of
+from alidade.pipelines.vision.camera import camera_of
 
 Array = NDArray[np.float64]
 
