@@ -198,13 +198,13 @@ def calibrate(
     from alidade.pipelines.applications.joint import calibrate_device
     from alidade.pipelines.applications.session import calibrate as run
     from alidade.pipelines.errors import InputError
-    from alidade.pipelines.recording.opening import recordings_of, told
+    from alidade.pipelines.recording.opening import describe_recordings, group_recordings
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.whole import require_room
     from alidade.pipelines.reports.write import adopt_parts, write_part, write_results
 
     rate: AttitudeRate = attitude_rate.value
-    recordings, folder = recordings_of(sessions), out or _beside(sessions[0], solver.value)
+    recordings, folder = group_recordings(sessions), out or _beside(sessions[0], solver.value)
     if len(recordings) > 1:
         if solver != Solver.batch:
             raise InputError(f"--solver {solver.value}: several recordings are calibrated together by batch alone")
@@ -212,7 +212,7 @@ def calibrate(
             raise InputError(f"--engine {engine.value}: with several recordings each uses the engine that fits it")
         folder = out or _beside(sessions[0], "device")
         if not as_json:
-            terminal.say(f"{len(recordings)} recordings of one device: {told(recordings)}")
+            terminal.say(f"{len(recordings)} recordings of one device: {describe_recordings(recordings)}")
     require_room(folder)
     with (
         progress.shown(quiet or as_json),

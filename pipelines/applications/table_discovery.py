@@ -21,7 +21,7 @@ from alidade.pipelines.recording.checks import MAX_RATE_RAD_S, SLOWEST_S
 from alidade.pipelines.recording.plausibility import GRAVITY_REMOVED, lacks_gravity
 from alidade.pipelines.recording.recording import Recording
 from alidade.pipelines.recording.sources import TopicSource
-from alidade.pipelines.recording.table_topics import TableTopic
+from alidade.pipelines.recording.table_topics import TableTopic, tables_of
 from alidade.pipelines.recording.table_units import TIME_UNITS, UNITS, unit_hinted, unit_named, unit_of
 from alidade.pipelines.recording.tables import CsvFile, TableForm, numbers, read_columns, table_form
 from alidade.pipelines.settings import Config
@@ -92,7 +92,7 @@ class Columns:
 
 def propose_columns(recording: Recording) -> Columns | None:
     """What the tables of a recording hold that no config describes; None where there is no such table."""
-    tables = recording.tables()
+    tables = tables_of(recording.container)
     if not tables:
         return None
     found = [_Table(table, len(tables) > 1) for table in tables.values()]

@@ -61,7 +61,13 @@ def facts_of(recording: Recording, config: Config, needs: Mapping[str, Sequence[
     topics = tuple(_facts(recording.topics[name], epoch, *times[name]) for name in recording.topics)
     missing = {method: lacking(wanted, recording, config) for method, wanted in needs.items()}
     return SessionFacts(
-        epoch, recording.duration_s, recording.attachments, topics, missing, recording.missing, recording.notes
+        epoch,
+        recording.duration_s,
+        recording.container.attachments,
+        topics,
+        missing,
+        recording.container.missing,
+        recording.notes,
     )
 
 

@@ -23,20 +23,20 @@ from alidade.pipelines.recording.mcap_file import McapFile
 from alidade.pipelines.recording.mcap_records import MAGIC
 
 _ZSTD, _SQLITE, _ULOG, _ARDUPILOT = b"\x28\xb5\x2f\xfd", b"SQLite format 3\0", b"ULog\x01\x12\x35", b"\xa3\x95"
-# So much of a file's beginning tells what it is, B.
+# Bytes of a file's beginning by which its form is recognised.
 _START = 1024
 # How tables may be called, in a folder that has nothing else of a recording.
 _TABLES = (".csv", ".txt", ".tsv", ".tum", ".log", ".dat")
 # How the parts of a recording may be called.
 PARTS = (".mcap", ".db3", ".bag", ".zstd", ".zst")
-# The bytes of a file that tell it from others of its form and stay as they are while it grows: the heads of some forms
-# count what has come. ROS 1: behind the bag's header; SQLite: of the first page, which defines the tables.
+# The bytes of a file that distinguish it from others of its form and stay as they are while it grows: the heads of some
+# forms count messages. ROS 1: behind the bag's header; SQLite: of the first page, which defines the tables.
 _IDENTITY = {ros1_bag.MAGIC: (4096, 8192), _SQLITE: (100, 4096)}
 _USUAL_IDENTITY = (0, 4096)
 # A compressed file may unpack to so many times its size, beyond so many bytes.
 _LARGEST_RATIO, _SMALL = 100, 1 << 28
 METADATA, BAG = "metadata.yaml", "rosbag2_bagfile_information"
-# What tells the parts of one recording from each other: their number, and their suffix.
+# What distinguishes the parts of one recording: their number, and their suffix.
 _PART_NAME = re.compile(r"(_\d+)?(\.[a-z0-9]+)+$")
 
 Where = Path | str | Sequence[Path | str]
@@ -68,7 +68,7 @@ def _open(where: Where) -> Container:
     return _together([path])
 
 
-def recordings_of(paths: Sequence[Path]) -> list[Where]:
+def group_recordings(paths: Sequence[Path]) -> list[Where]:
     """The recordings that several paths name: each is one, but for parts of one bag, by the metadata.yaml beside them.
 
     Folders and patterns stand for all of their parts.
@@ -88,7 +88,7 @@ def recordings_of(paths: Sequence[Path]) -> list[Where]:
     return [parts[0] if len(parts) == 1 else parts for parts in found]
 
 
-def told(recordings: Sequence[Where]) -> str:
+def describe_recordings(recordings: Sequence[Where]) -> str:
     """Recordings in words, parts of one side by side."""
     each = [[one] if isinstance(one, (str, Path)) else list(one) for one in recordings]
     return ", ".join(" + ".join(Path(part).name for part in parts) for parts in each)
@@ -199,8 +199,8 @@ def _folder(path: Path) -> Container:
     return _together(there, path)
 
 
-def identity(path: Path) -> str:
-    """What tells a file from others while it grows, in a few letters."""
+def file_identity(path: Path) -> str:
+    """Identity of a file that may still grow, twelve hexadecimal digits."""
     with path.open("rb") as stream:
         start = stream.read(16)
         first, last = next((at for mark, at in _IDENTITY.items() if start.startswith(mark)), _USUAL_IDENTITY)
@@ -245,7 +245,7 @@ def _tables_in(path: Path) -> list[Path]:
 
 
 def _metadata(path: Path) -> dict[str, Any]:
-    """What a bag's metadata.yaml says; nothing if it is not there or is something else."""
+    """Content of a bag's metadata.yaml; empty if it is not there or is something else."""
     if not path.is_file():
         return {}
     try:
@@ -255,7 +255,7 @@ def _metadata(path: Path) -> dict[str, Any]:
 
 
 def bag_metadata(text: bytes | str) -> dict[str, Any]:
-    """What a bag's metadata.yaml says, by its text; nothing if that is something else."""
+    """Content of a bag's metadata.yaml, by its text; empty if that is something else."""
     try:
         content = load_yaml(text, METADATA)
     except InputError:

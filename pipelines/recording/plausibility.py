@@ -56,14 +56,14 @@ def implausible(kind: str, values: Array) -> str:
         return ""
     norm = float(np.median(norms))
     what = {"accel": "acceleration", "mag": "field"}[kind]
-    said = f"{what} has a norm of {norm:.4g} (median), implausible in {SI[kind]}"
+    problem = f"{what} has a norm of {norm:.4g} (median), implausible in {SI[kind]}"
     if kind == "accel" and lacks_gravity(norms):
-        return f"{said}; {GRAVITY_REMOVED}"
+        return f"{problem}; {GRAVITY_REMOVED}"
     low, high = _PLAUSIBLE[kind]
     if low <= norm <= high:
         return ""
     likely = next((unit for unit, (a, b) in _LIKELY[kind].items() if a <= norm < b), None)
-    return f"{said}{f'; is it in {likely}?' if likely else ''}"
+    return f"{problem}{f'; is it in {likely}?' if likely else ''}"
 
 
 def lacks_gravity(norms: Array) -> bool:
@@ -107,11 +107,11 @@ def is_there(kind: str, values: Array, covariance: Array) -> bool:
         return False
     if not (covariance[:, 0, 0] == -1.0).any():
         return True
-    # Said to be absent, at least in some rows, as in the first: believed of what never moves or cannot be.
+    # Stated to be absent, at least in some rows, as in the first: accepted of what never moves or cannot be.
     return bool(np.ptp(finite, axis=0).all()) and not (kind == "accel" and implausible(kind, finite))
 
 
-def believed(topic: str, kind: str, covariance: Array, least: float, dropped: dict[str, int]) -> Array:
+def plausible_covariance(topic: str, kind: str, covariance: Array, least: float, dropped: dict[str, int]) -> Array:
     """Covariances (N, 3, 3), zero in place of those that say nothing, which are counted in `dropped`.
 
     Args:
@@ -147,10 +147,10 @@ def density(topic: str, kind: str, t: Array, covariance: Array, least: float, dr
         t: (N,) s.
         covariance: as recorded.
         least: density below which no sensor is.
-        dropped: reason -> samples, added to: what `believed` leaves out.
+        dropped: reason -> samples, added to: what `plausible_covariance` leaves out.
     """
     step = float(np.median(np.diff(t)))
-    covariance = believed(topic, kind, covariance, least**2 / step, dropped)
+    covariance = plausible_covariance(topic, kind, covariance, least**2 / step, dropped)
     variances = np.trace(covariance[:1] if covariance.strides[0] == 0 else covariance, axis1=1, axis2=2) / 3.0
     known = variances[variances > 0.0]
     return float(np.sqrt(np.mean(known) * step)) if len(known) else None

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from alidade.pipelines import progress
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.recording import messages, series, single_messages
-from alidade.pipelines.recording.container import Container, DataLoss, MessageBlock
+from alidade.pipelines.recording.container import Container, MessageBlock
 from alidade.pipelines.recording.decoding import (
     ENCODING,
     NUMERIC_TYPES,
@@ -49,8 +49,7 @@ from alidade.pipelines.recording.opening import Where, open_container
 from alidade.pipelines.recording.plausibility import to_signed, wrapped_bits
 from alidade.pipelines.recording.sources import TopicSource, along, inverted, joined
 from alidade.pipelines.recording.stamps import check_clock, jitter_ns, stamp_notes
-from alidade.pipelines.recording.table_topics import TableTopic, described, tables_of
-from alidade.pipelines.recording.tables import CsvFile
+from alidade.pipelines.recording.table_topics import TableTopic, described
 
 # Topics whose first stamp may start a session. Positions and intrinsics may be stamped long before it.
 SENSOR_STAMPED_TYPES = {
@@ -113,13 +112,14 @@ class Recording:
 
     Attributes:
         path: of the file or folder, as it was named.
+        container: the raw messages, and what of them is lost.
         recorded: topics in the file, by name, sorted.
         stamp_sigma_s: sigma of the stamps read by now, s: 0, but where log times stand in for them.
     """
 
     def __init__(self, container: Container, epoch_ns: int | None = None) -> None:
         self.path = container.path
-        self._container = self._undescribed = container
+        self.container = self._undescribed = container
         self._given_epoch_ns = epoch_ns
         if epoch_ns is not None:
             self.epoch_ns = epoch_ns
@@ -142,8 +142,8 @@ class Recording:
 
         Raises InputError when a table or a column is not there, or holds no numbers.
         """
-        container = described(self._undescribed, columns) if columns else self._container
-        known = self.__dict__.get("epoch_ns") if container is self._container else self._given_epoch_ns
+        container = described(self._undescribed, columns) if columns else self.container
+        known = self.__dict__.get("epoch_ns") if container is self.container else self._given_epoch_ns
         other = Recording(container, known)
         other._undescribed, other._assumptions = self._undescribed, self._assumptions
         other._sources = {source.name: source for source in sources if source.is_made}
@@ -160,37 +160,18 @@ class Recording:
         if sentence not in self._assumptions:
             self._assumptions = (*self._assumptions, sentence)
 
-    def tables(self) -> dict[str, CsvFile]:
-        """The tables that no config describes yet, by the names of their files."""
-        return tables_of(self._container)
-
     def sha256(self) -> str:
         """SHA-256 of the file, hexadecimal."""
-        return self._container.sha256()
-
-    @property
-    def attachments(self) -> tuple[str, ...]:
-        """Names of the attachments."""
-        return self._container.attachments
+        return self.container.sha256()
 
     def attachment(self, name: str, needed: bool = True) -> bytes | None:
         """Content of an attachment, None if there is none; see `Container.attachment`."""
-        return self._container.attachment(name, needed)
-
-    @property
-    def losses(self) -> tuple[DataLoss, ...]:
-        """Parts of the file that cannot be used; complete when all topics that matter have been read."""
-        return tuple(self._container.losses)
-
-    @property
-    def missing(self) -> dict[str, int]:
-        """Topic -> messages known to be lost."""
-        return self._container.missing
+        return self.container.attachment(name, needed)
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences about what is lost, what was assumed, and how stamps came about in the topics read by now."""
-        container = self._container
+        container = self.container
         lost = container.notes(self.epoch_ns, self.duration_s) if container.losses or container.missing else ()
         return (*container.incomplete, *container.assumptions, *self._assumptions, *self._stamp_notes, *lost)
 
@@ -200,9 +181,9 @@ class Recording:
         sensors = [n for n, each in self._formats.items() if each.type in SENSOR_STAMPED_TYPES and each.is_readable]
         first = (
             int(with_log_times(self._formats[number].stamps(block), block.log_ns)[0][0])
-            for number, block in self._container.first_blocks(sensors).items()
+            for number, block in self.container.first_blocks(sensors).items()
         )
-        return min(first, default=self._container.first_log_ns)
+        return min(first, default=self.container.first_log_ns)
 
     @cached_property
     def duration_s(self) -> float:
@@ -241,7 +222,7 @@ class Recording:
         more = f" and {len(named) - MAX_NAMED} more" if len(named) > MAX_NAMED else ""
         ros1 = " (a ROS 1 recording)" if any(t.encoding.startswith("ros1/") for t in self.recorded.values()) else ""
         return "; ".join(
-            [f"topics there{ros1}: {', '.join(named[:MAX_NAMED]) or 'none'}{more}", *self._container.notes(None)]
+            [f"topics there{ros1}: {', '.join(named[:MAX_NAMED]) or 'none'}{more}", *self.container.notes(None)]
         )
 
     # -- topics of numbers
@@ -420,14 +401,14 @@ class Recording:
 
     def _list_topics(self) -> dict[str, TopicInfo]:
         topics: dict[str, TopicInfo] = {}
-        for number, channel in self._container.channels.items():
+        for number, channel in self.container.channels.items():
             found = self._formats[number]
             before = topics.get(channel.topic)
             if before and (before.type, before.encoding) != (found.type, found.encoding):
                 raise InputError(
                     f"{self.path}: topic {channel.topic} has messages of two types, {before.type} and {found.type}"
                 )
-            count = self._container.counts.get(number, 0) + (before.count if before else 0)
+            count = self.container.counts.get(number, 0) + (before.count if before else 0)
             topics[channel.topic] = TopicInfo(channel.topic, found.type, count, found.encoding, found.is_readable)
         return dict(sorted(topics.items()))
 
@@ -452,14 +433,14 @@ class Recording:
         raise InputError(f"{self.path}: {problem}")
 
     def _advice(self, topic: str) -> str:
-        channels = self._container.channels.items()
+        channels = self.container.channels.items()
         return next(self._formats[number].advice for number, channel in channels if channel.topic == topic)
 
     def _blocks(self, topics: Iterable[str]) -> Iterator[tuple[str, MessageBlock]]:
         """(topic, messages) in file order."""
         names = set(topics)
-        wanted = {n: channel.topic for n, channel in self._container.channels.items() if channel.topic in names}
-        for block in self._container.blocks(set(wanted)) if wanted else ():
+        wanted = {n: channel.topic for n, channel in self.container.channels.items() if channel.topic in names}
+        for block in self.container.blocks(set(wanted)) if wanted else ():
             yield wanted[block.channel], block
 
     def _table(self, topic: str, joints: tuple[str, ...] = ()) -> ColumnTable:
@@ -508,7 +489,7 @@ class Recording:
     def _check_any(self, topic: str, number: int) -> None:
         """Raise InputError if no message of the topic is left."""
         if not number:
-            lost = "; ".join(self._container.notes(None))
+            lost = "; ".join(self.container.notes(None))
             raise InputError(f"{self.path}: topic {topic}: none of its messages can be read: {lost}")
 
     @contextmanager

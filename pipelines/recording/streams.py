@@ -52,7 +52,7 @@ class Samples(Generic[AnySeries]):
 
     def rows(self, rows: NDArray[np.intp]) -> Samples[AnySeries]:
         """Some of the samples."""
-        return Samples(checks.taken(self.t, rows), _rows(self.series, rows))
+        return Samples(checks.take_rows(self.t, rows), _rows(self.series, rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ class StreamReader:
         """Samples of a series in which all of the quantities (attributes of it) are finite and without faults.
 
         Args:
-            topic: for what is said.
+            topic: for messages.
             found: the series.
             quantities: (N, k) each; faults are looked for in those of inertial sensors and magnetometers.
             least: samples needed.
@@ -177,7 +177,7 @@ class StreamReader:
     def attitude(self, topic: str, least_variance: float, least: int = 2) -> tuple[Array, Array, Array]:
         """Times (N,) s, unit quaternions (N, 4) and covariances (N, 3, 3), rad^2, of a topic of poses or attitudes.
 
-        Rotations that a tracker lost are left out. A covariance that says nothing is zero, also where it is below
+        Rotations that a tracker lost are left out. An implausible covariance is zero, also where it is below
         `least_variance`, rad^2.
         """
         poses = self.recording.poses(topic)
@@ -186,7 +186,7 @@ class StreamReader:
         t, rows = self.clean(topic, poses.t_ns, given, least)
         wxyz = checks.unit_quaternions(topic, t, given[rows])
         cov = poses.cov[rows][:, 3:, 3:]
-        return t, wxyz, plausibility.believed(topic, "attitude", cov, least_variance, self.dropped)
+        return t, wxyz, plausibility.plausible_covariance(topic, "attitude", cov, least_variance, self.dropped)
 
     def temperature(self, topic: str, sensor_t: Array) -> Temperature:
         """Temperature of a sensor that has samples at sensor_t (N,), s from the session's start.
@@ -235,5 +235,5 @@ def imu_series(
 def _rows(found: AnySeries, rows: NDArray[np.intp]) -> AnySeries:
     """Rows of a series."""
     names = ("t_ns", *(found.COLUMNS if isinstance(found, Series) else ("position",)))
-    kept: dict[str, Any] = {name: checks.taken(getattr(found, name), rows) for name in names}
+    kept: dict[str, Any] = {name: checks.take_rows(getattr(found, name), rows) for name in names}
     return dataclasses.replace(found, **kept)

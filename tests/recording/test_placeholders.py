@@ -13,11 +13,11 @@ from alidade.pipelines.recording.checks import clean, tracked
 from alidade.pipelines.recording.faults import drop_faults
 from alidade.pipelines.recording.plausibility import (
     GRAVITY_REMOVED,
-    believed,
     density,
     implausible,
     is_there,
     measured_once,
+    plausible_covariance,
 )
 from alidade.pipelines.recording.recording import open_recording
 from tests.support import forms
@@ -46,8 +46,8 @@ def test_a_covariance_in_some_rows_alone_is_that_of_all() -> None:
 
 
 def test_an_attitude_known_to_a_radian_is_not_known() -> None:
-    assert not believed("/pose", "attitude", np.tile(np.eye(3), (5, 1, 1)), 1e-11, {}).any()
-    known = np.asarray(believed("/pose", "attitude", np.tile(1e-4 * np.eye(3), (5, 1, 1)), 1e-11, {}))
+    assert not plausible_covariance("/pose", "attitude", np.tile(np.eye(3), (5, 1, 1)), 1e-11, {}).any()
+    known = np.asarray(plausible_covariance("/pose", "attitude", np.tile(1e-4 * np.eye(3), (5, 1, 1)), 1e-11, {}))
     assert known[..., np.arange(3), np.arange(3)].all()
 
 

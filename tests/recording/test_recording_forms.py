@@ -164,7 +164,7 @@ def test_a_message_that_does_not_translate_is_one_line(
     text = b""
     if encoding == "protobuf":
         whole = open_recording(forms.mcap_protobuf(source, tmp_path / "p.mcap"))
-        text = next(s.data for s in whole._container.schemas.values() if s.name == "ros.Imu")
+        text = next(s.data for s in whole.container.schemas.values() if s.name == "ros.Imu")
     path = forms.mcap(
         [("/imu", "", T0, b"")],
         tmp_path / "x.mcap",

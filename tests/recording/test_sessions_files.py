@@ -44,7 +44,7 @@ def test_a_session_written_and_read_back_is_identical(tmp_path: Path) -> None:
     write_session(path, made, {"alidade.yaml": b"method: los\n", "truth.json": b"{}"})
     assert_same(read_all(path), made)
     recording = open_recording(path)
-    assert recording.attachments == ("alidade.yaml", "truth.json")
+    assert recording.container.attachments == ("alidade.yaml", "truth.json")
     assert recording.attachment("alidade.yaml") == b"method: los\n"
     assert recording.attachment("else") is None
     assert recording.epoch_ns == T0
@@ -226,7 +226,7 @@ def test_a_flipped_bit_in_a_chunk_is_found(imu_file: Path) -> None:
     left = broken.imu("/imu").gyro
     assert 0 < len(left) < len(gyro)
     assert not (left == gyro[150]).all(axis=1).any()
-    assert broken.missing == {"/imu": len(gyro) - len(left)}
+    assert broken.container.missing == {"/imu": len(gyro) - len(left)}
     assert "1 chunk" in broken.notes[0]
     assert "its checksum is another" in broken.notes[0]
     with pytest.raises(InputError, match=r"its checksum is another.*--strict"):

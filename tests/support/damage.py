@@ -148,6 +148,8 @@ def check_sound(path: Path, whole: Whole) -> str:
         assert len(set(rows.tolist())) == len(rows)
         lost += len(t_ns) - len(left_t)
     assert recording.notes or not lost
-    if recording.losses and not any(loss.kind in ("cut", "summary", "definition") for loss in recording.losses):
-        assert sum(recording.missing.values()) == lost
+    if recording.container.losses and not any(
+        loss.kind in ("cut", "summary", "definition") for loss in recording.container.losses
+    ):
+        assert sum(recording.container.missing.values()) == lost
     return "part" if lost else "whole"

@@ -27,7 +27,7 @@ from alidade.pipelines.estimation.camera_clock import Clock
 from alidade.pipelines.estimation.problem import Problem, Step
 from alidade.pipelines.recording.container import file_sha256
 from alidade.pipelines.recording.growing import GrowingFiles
-from alidade.pipelines.recording.opening import identity
+from alidade.pipelines.recording.opening import file_identity
 from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.reports.known import load_known
 from alidade.pipelines.reports.result import Calibration
@@ -299,7 +299,7 @@ class Follower:
     def _identify(self, session: Session) -> dict[str, str]:
         """What a checkpoint belongs to, in words."""
         return {
-            "recording": f"one that starts at {session.origin.epoch_ns} ns ({identity(self.source.parts[0])})",
+            "recording": f"one that starts at {session.origin.epoch_ns} ns ({file_identity(self.source.parts[0])})",
             "method": session.method.name,
             "config": session.config.model_dump_json(exclude_defaults=True),
             "window": str(self.settings.window),
