@@ -198,13 +198,13 @@ def calibrate(
     from alidade.pipelines.applications.joint import calibrate_device
     from alidade.pipelines.applications.session import calibrate as run
     from alidade.pipelines.errors import InputError
-    from alidade.pipelines.recording.opening import recordings_of, told
+    from alidade.pipelines.recording.opening import describe_recordings, group_recordings
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.whole import require_room
     from alidade.pipelines.reports.write import adopt_parts, write_part, write_results
 
     rate: AttitudeRate = attitude_rate.value
-    recordings, folder = recordings_of(sessions), out or _beside(sessions[0], solver.value)
+    recordings, folder = group_recordings(sessions), out or _beside(sessions[0], solver.value)
     if len(recordings) > 1:
         if solver != Solver.batch:
             raise InputError(f"--solver {solver.value}: several recordings are calibrated together by batch alone")
@@ -212,7 +212,7 @@ def calibrate(
             raise InputError(f"--engine {engine.value}: with several recordings each uses the engine that fits it")
         folder = out or _beside(sessions[0], "device")
         if not as_json:
-            terminal.say(f"{len(recordings)} recordings of one device: {told(recordings)}")
+            terminal.say(f"{len(recordings)} recordings of one device: {describe_recordings(recordings)}")
     require_room(folder)
     with (
         progress.shown(quiet or as_json),
@@ -267,7 +267,7 @@ def compare(
 
     from alidade.pipelines import parallel, progress
     from alidade.pipelines.applications.session import Session
-    from alidade.pipelines.recording.reading import open_recording
+    from alidade.pipelines.recording.recording import open_recording
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.compare import write_compare
     from alidade.pipelines.reports.whole import require_room
@@ -493,16 +493,15 @@ def info(
     from alidade.pipelines.applications.discovery import suggestions, unused
     from alidade.pipelines.applications.session import checked_facts
     from alidade.pipelines.applications.table_discovery import propose_columns, with_columns
-    from alidade.pipelines.config import recorded_config
-    from alidade.pipelines.recording.reading import open_recording
+    from alidade.pipelines.config import configured
+    from alidade.pipelines.recording.recording import open_recording
     from alidade.pipelines.reports import terminal
 
     with progress.shown(quiet), progress.doing("reading"):
-        recording = open_recording(session, strict)
-        settings = recorded_config(recording, config)
+        recording, settings = configured(open_recording(session, strict), config)
         columns = None if settings.columns else propose_columns(recording)
         if columns is not None and columns.columns:
-            settings = with_columns(recording, settings)
+            recording, settings = with_columns(recording, settings)
         facts = checked_facts(recording, settings)
         found, left = suggestions(recording, settings), unused(recording, settings)
     if as_json:

@@ -49,7 +49,7 @@ from alidade.pipelines.estimation.problem import (
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.info import SessionFacts
 from alidade.pipelines.recording.opening import Where
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.reports.over_time import recordings_shown
 from alidade.pipelines.reports.result import Calibration, PartParameter, PartResult
 from alidade.pipelines.solvers.joint import Joined, grown, join, tell

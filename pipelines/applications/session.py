@@ -22,7 +22,7 @@ from alidade.pipelines import deadline, methods, progress
 from alidade.pipelines.applications.discovery import empty, idle, nearest_suggestion, suggestions, with_suggested
 from alidade.pipelines.applications.sharing import device_belief, walks
 from alidade.pipelines.applications.table_discovery import propose_columns, with_columns
-from alidade.pipelines.config import load_config, recorded_config
+from alidade.pipelines.config import configured, load_config
 from alidade.pipelines.diagnostics.change_test import Stability, change_finding, stability, step_finding, with_change
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf, solve_segments, split_halves
 from alidade.pipelines.diagnostics.diagnose import diagnose, is_suspect
@@ -46,11 +46,11 @@ from alidade.pipelines.estimation.problem import (
 )
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.checks import COPIED, OVERTAKEN
+from alidade.pipelines.recording.decoding import ENCODING
 from alidade.pipelines.recording.info import SessionFacts, facts_of, lacking
-from alidade.pipelines.recording.message_reader import ENCODING
 from alidade.pipelines.recording.opening import Where
-from alidade.pipelines.recording.placeholders import HELD
-from alidade.pipelines.recording.reading import Recording, open_recording
+from alidade.pipelines.recording.plausibility import HELD
+from alidade.pipelines.recording.recording import Recording, open_recording
 from alidade.pipelines.recording.topics import CAMERA_INFO, IMAGE, wanted
 from alidade.pipelines.reports.known import load_known
 from alidade.pipelines.reports.result import Calibration
@@ -196,11 +196,11 @@ class Session:
         auto_columns: bool = False,
     ) -> Session:
         """Read and check a recording (arguments and exceptions as `calibrate` has them)."""
-        config = recorded_config(recording, config_file)
+        recording, config = configured(recording, config_file)
         if auto_columns:
-            config = with_columns(recording, config)
+            recording, config = with_columns(recording, config)
         if auto_topics:
-            config = with_suggested(recording, config, method_name)
+            recording, config = with_suggested(recording, config, method_name)
         chosen = methods.method(resolve_method(method_name, recording, config))
         try:
             data = chosen.read(recording, config)
@@ -228,7 +228,7 @@ class Session:
 
     def again(self, recording: Recording) -> Session:
         """The same method and config with another recording, or another part of it. Raises InputError."""
-        recording.use(self.config.topics.values(), self.config.columns)
+        recording = recording.with_config(self.config.topics.values(), self.config.columns)
         return replace(self, data=self.method.read(recording, self.config), origin=Recorded(recording))
 
     @classmethod
@@ -555,7 +555,7 @@ def checked_facts(recording: Recording, config: Config) -> SessionFacts:
 
 def _refused(method: Method, recording: Recording, config: Config) -> str:
     """Why a method cannot read the recording, as a phrase; empty where it can."""
-    from alidade.pipelines.vision.recorded import camera_of
+    from alidade.pipelines.vision.camera import camera_of
 
     by_key = {topic.key: topic for topic in method.topics}
     image, camera = by_key.get(IMAGE.key), by_key.get(CAMERA_INFO.key)

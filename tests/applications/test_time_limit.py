@@ -17,7 +17,7 @@ import pytest
 from alidade.pipelines import deadline, parallel
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.methods import simulate
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from tests.support.command import Command
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.methods.cube.scenario import CubeScenario
     from alidade.pipelines.methods.cube.topics import CubeConfig
     from alidade.pipelines.methods.formula import Formula
-    from alidade.pipelines.recording.reading import Recording
+    from alidade.pipelines.recording.recording import Recording
     from alidade.pipelines.recording.topics import Need, Topic
     from alidade.pipelines.reports.calibration import SavedCalibration
     from alidade.pipelines.reports.result import Calibration, Plot, Table

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from alidade.pipelines.methods.formula import Formula
     from alidade.pipelines.methods.tumble.recording import TumbleData
     from alidade.pipelines.methods.tumble.scenario import TumbleScenario
-    from alidade.pipelines.recording.reading import Recording
+    from alidade.pipelines.recording.recording import Recording
     from alidade.pipelines.recording.topics import Need, Topic
     from alidade.pipelines.reports.calibration import SavedCalibration
     from alidade.pipelines.reports.result import Calibration, Plot, Table

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from io import StringIO
 from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from alidade.pipelines.files import dump_yaml
 from alidade.pipelines.simulation.temperature import Warming
 
 # 2026-11-20 12:00 UTC: simulated sessions start here; and the year of that day for the field model.
@@ -73,8 +73,6 @@ class TumbleScenario(_Part):
 
 def tumble_config(scenario: TumbleScenario) -> str:
     """The recording's config, YAML: the noise simulated, the scenario's priors."""
-    from ruamel.yaml import YAML
-
     noise = {}
     if scenario.magnetometer is not None:
         noise["mag_density"] = scenario.magnetometer.density
@@ -83,6 +81,4 @@ def tumble_config(scenario: TumbleScenario) -> str:
     if scenario.gyro is not None:
         noise |= {"gyro_density": scenario.gyro.density, "gyro_bias_walk": 0.0}
     config: dict[str, Any] = {"method": "tumble", "noise": noise, "priors": scenario.priors, "date": "2026-11-20"}
-    text = StringIO()
-    YAML(typ="safe", pure=True).dump(config, text)
-    return text.getvalue()
+    return dump_yaml(config)

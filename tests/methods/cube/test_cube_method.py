@@ -38,7 +38,7 @@ from alidade.pipelines.methods.cube.static_intervals import static_intervals
 from alidade.pipelines.methods.cube.topics import CubeConfig, Raw, RawConversion
 from alidade.pipelines.methods.cube.validation import validate
 from alidade.pipelines.methods.static_intervals import find_static_intervals
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.temperature import Warming
 from alidade.pipelines.solvers.batch import solve_batch

@@ -18,7 +18,7 @@ from alidade.pipelines.methods.los.graph import problem
 from alidade.pipelines.methods.los.published import recursive_least_squares
 from alidade.pipelines.methods.los.recording import LosData, read_los
 from alidade.pipelines.methods.los.simulation import LosAngles, LosScenario, los_config, simulate_los
-from alidade.pipelines.recording.reading import open_recording
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config, Noise, Sensors
 from alidade.pipelines.simulation.motion import EulerMotion, Swing
 from alidade.pipelines.simulation.scenario import load_scenario

@@ -36,8 +36,8 @@ from alidade.pipelines.methods.tumble.scenario import (
 from alidade.pipelines.methods.tumble.unturned import unturned
 from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
-from alidade.pipelines.recording.reading import open_recording
-from alidade.pipelines.recording.writing import write_session
+from alidade.pipelines.recording.mcap_writer import write_session
+from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config
 from alidade.pipelines.simulation.simulated import Simulated
 from alidade.pipelines.simulation.temperature import Warming
