@@ -70,12 +70,12 @@ def diagnose(
     published = estimate.solver == "published"  # a reference, judged by its own covariance alone
     failure = Finding("not_converged", NOTE if published else INCONSISTENT, {"message": estimate.message})
     if not estimate.converged and not published:
-        return by_severity([*hypotheses, failure, *_rejections(estimate, limits)])
+        return by_severity([*hypotheses, failure, *rejections(estimate, limits)])
     directions = weak_directions(quantities, estimate.covariance, advise)
     found = [*directions, *hypotheses, *([] if estimate.converged else [failure])]
     if not published:
         found += [*_prior_conflicts(estimate, quantities, limits), *([change] if change else [])]
-        found += [*_rejections(estimate, limits), *_noise(estimate, limits), *_correlations(estimate, limits)]
+        found += [*rejections(estimate, limits), *_noise(estimate, limits), *_correlations(estimate, limits)]
         found += _slow_errors(estimate, quantities)
     found += misfits(estimate.chi_square, estimate.levels, limits)
     if any(finding.severity == WEAK for finding in directions):
@@ -139,7 +139,8 @@ def _prior_conflict(
     return Finding("prior_conflict", severity, evidence)
 
 
-def _rejections(estimate: Estimate, limits: Thresholds) -> list[Finding]:
+def rejections(estimate: Estimate, limits: Thresholds = DEFAULT) -> list[Finding]:
+    """Families of which more is rejected than outliers are, the largest share first."""
     every = {f: r.used for f, r in estimate.residuals.items() if len(r.used) >= limits.min_few}
     least = {
         f: limits.rejected_note if len(used) >= limits.min_family else limits.rejected_few for f, used in every.items()

@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from alidade.pipelines import parallel
-from alidade.pipelines.diagnostics.diagnose import DEFAULT
+from alidade.pipelines.diagnostics.diagnose import rejections
 from alidade.pipelines.diagnostics.fault_models import FaultModel
+from alidade.pipelines.diagnostics.observability import rejects_many
 from alidade.pipelines.diagnostics.trial_cases import TrialCase, data_faults, trial_cases
 from alidade.pipelines.diagnostics.trial_fit import Build, TrialFit, max_concurrent, score_trial, solve_trial
 from alidade.pipelines.estimation.finding import Finding, Severity
@@ -64,7 +65,7 @@ def find_hypotheses(
     if estimate is not None and model.cut and estimate.residuals:
         data = model.segment(data, *_worst_segment(estimate.residuals, _SEGMENT_S))
     before = solve_trial(build, data, config)
-    if before is None or (before.fits and not _rejects_many(before.estimate)):
+    if before is None or (before.fits and not rejects_many(rejections(before.estimate))):
         return ()
     concurrent = max_concurrent(model.times(data))
     found = _explaining(build, _promising(build, model, data, config, before), before, concurrent)
@@ -76,12 +77,6 @@ def find_hypotheses(
     if not found and known:
         found = _noise(build, data, config)
     return _findings(before, found[:_MAX_REPORTED])
-
-
-def _rejects_many(estimate: Estimate) -> bool:
-    """Whether so much of a family is rejected that these can be no outliers."""
-    shares = (np.mean(~r.used) for r in estimate.residuals.values() if len(r.used) >= DEFAULT.min_family)
-    return bool(max(shares, default=0.0) > DEFAULT.rejected)
 
 
 def _findings(before: TrialFit, found: Sequence[_Tested]) -> tuple[Finding, ...]:
