@@ -97,9 +97,10 @@ def contradictions(
 def _each_freed(told: Told, inside: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
     """Of f fixed numbers, in units of their scales: H_AA^-1 H_AF (a, f), x (f,), I (f,), correlations (f, f)."""
     R, a = told.R * told.scales, int(inside.sum())
-    T: Array = np.linalg.qr(np.column_stack([R[:, inside], R[:, ~inside], told.d]), mode="r")
-    gain = np.linalg.lstsq(T[:a, :a], T[:a, a:-1], rcond=None)[0]
+    rows = np.column_stack([R[:, inside], R[:, ~inside], told.d])
+    T = np.asarray(np.linalg.qr(rows, mode="r"), dtype=float)
+    gain: Array = np.linalg.lstsq(T[:a, :a], T[:a, a:-1], rcond=None)[0]
     own, right = T[a:, a:-1], T[a:, -1]
-    H = own.T @ own
-    information = np.maximum(np.diag(H), np.finfo(float).tiny)
+    H: Array = own.T @ own
+    information: Array = np.maximum(np.diag(H), np.finfo(float).tiny)
     return gain, own.T @ right / information, information, H / np.sqrt(np.outer(information, information))
