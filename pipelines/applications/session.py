@@ -30,6 +30,7 @@ from alidade.pipelines.diagnostics.fault_models import FaultModel
 from alidade.pipelines.diagnostics.goodness_of_fit import SolverDifference, solver_difference
 from alidade.pipelines.diagnostics.hypothesis_tests import find_hypotheses
 from alidade.pipelines.diagnostics.observability import finite_covariance
+from alidade.pipelines.diagnostics.stated_priors import contradictions, freed_config
 from alidade.pipelines.diagnostics.trial_fit import held_out_residuals
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Finding, Severity, by_severity
@@ -390,13 +391,37 @@ class Session:
         self, problem: Problem, estimate: Estimate, quantities: Sequence[Quantity], change: Finding | None
     ) -> tuple[Finding, ...]:
         """The findings on an estimate; hypotheses are tested where it is suspect."""
-        findings = diagnose(estimate, quantities, problem.advice, change)
+        contradicted = self._contradictions(estimate, quantities)
+        findings = diagnose(estimate, quantities, problem.advice, change, (), contradicted)
         if not is_suspect(estimate, findings) or deadline.passed(_HYPOTHESES):
             return findings
+        severe = any(each.severity > Severity.NOTE for each in contradicted)
+        freed = self._freed[0] if severe and self._freed is not None else None
         with progress.doing("testing hypotheses"):
-            hypotheses = find_hypotheses(self.method.graph, self.faults, self.data, self.config, estimate)
+            hypotheses = find_hypotheses(self.method.graph, self.faults, self.data, self.config, estimate, freed)
         deadline.passed(_HYPOTHESES)
-        return diagnose(estimate, quantities, problem.advice, change, hypotheses)
+        # A fault that explains more than freeing what is fixed is what these contradictions come from.
+        return diagnose(estimate, quantities, problem.advice, change, hypotheses, () if hypotheses else contradicted)
+
+    def _contradictions(self, estimate: Estimate, quantities: Sequence[Quantity]) -> tuple[Finding, ...]:
+        """What the config fixes and the recording contradicts."""
+        if estimate.solver == "published" or not estimate.converged or self._freed is None:
+            return ()
+        from alidade.pipelines.solvers.freed import freed_information
+
+        told = freed_information(self._freed[1], estimate)
+        ratios = estimate.inflations if estimate.sandwich is None else estimate.inflations * estimate.sandwich
+        ratio = max((r for r, q in zip(ratios.tolist(), quantities, strict=True) if q.judged), default=1.0)
+        return () if told is None else contradictions(told, self._freed[1].quantities, quantities, ratio)
+
+    @cached_property
+    def _freed(self) -> tuple[Config, Problem] | None:
+        """The config with everything free that it fixes, and its graph; None where it fixes nothing."""
+        config = freed_config(self.config, self.problem().quantities)
+        try:
+            return None if config is None else (config, self.method.graph(self.data, config).near(self.near))
+        except InputError:  # the method has to have it fixed
+            return None
 
     def _change(self, estimate: Estimate, quantities: Sequence[Quantity]) -> tuple[Stability | None, Finding | None]:
         """The test for a change, and the finding where there is one, with the steps between its two sides."""

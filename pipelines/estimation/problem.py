@@ -117,6 +117,11 @@ class Quantity:
         return self.nuisance or self.group is not None
 
     @property
+    def tight(self) -> bool:
+        """Whether its prior is tighter than the usual one, so that somebody states it."""
+        return 0.0 < (self.prior_sigma or 0.0) < self.prior_scale
+
+    @property
     def judged(self) -> bool:
         """Whether an accuracy is wanted of it, so that there is a verdict."""
         return math.isfinite(self.require)

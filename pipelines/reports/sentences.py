@@ -8,6 +8,7 @@ Present tense, standard terms, numbers with units: those of `display/units.py`, 
 from __future__ import annotations
 
 import datetime
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any
@@ -150,18 +151,36 @@ def _conflict(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> tupl
     unit, factor = human_unit(q)
     prior = f"prior {factor * q.prior_mean:.3g} ± {rounded(factor * q.scale)} {unit}".rstrip()
     numbers = f"{_number(q, e['value'], e['sigma'])}, {prior} (z = {e['z']:.1f})"
-    if not q.assumed:
+    if not (q.assumed or q.tight):
         return f"{q.name} is far from its prior", f"{numbers}; {_FAR}"
     inseparable = f" (or {', '.join(e['inseparable'])}, inseparable from it)" if e["inseparable"] else ""
     what = f"{q.name} contradicts its {'data sheet' if q.sheet else 'prior'}{inseparable}"
-    # Its largest effect on another parameter, in units of the requirement.
-    shifts = {name: shift / quantities[name].require for name, shift in e["effect"].items() if name != q.name}
-    moved = max(shifts, key=lambda name: abs(shifts[name]), default="")
+    return what, numbers + _shift(e["effect"], q.name, quantities, "its departure")
+
+
+def _shift(effect: Mapping[str, float], name: str, quantities: Quantities, what: str) -> str:
+    """The largest effect of a parameter on another one, in units of the requirement; empty where there is none."""
+    shifts = {other: effect[other] / quantities[other].require for other in effect if other != name}
+    moved = max(shifts, key=lambda other: abs(shifts[other]), default="")
     if not moved:
-        return what, numbers
+        return ""
     unit, factor = human_unit(quantities[moved])
-    shift = f"{rounded(factor * abs(e['effect'][moved]))} {unit}".rstrip()
-    return what, f"{numbers}; its departure shifts {moved} by {shift}, {abs(shifts[moved]):.2g} of its requirement"
+    shift = f"{rounded(factor * abs(effect[moved]))} {unit}".rstrip()
+    return f"; {what} shifts {moved} by {shift}, {abs(shifts[moved]):.2g} of its requirement"
+
+
+def _contradiction(e: Mapping[str, Any], severity: Severity, quantities: Quantities) -> str:
+    return f"{': '.join(_fixed(e, severity, quantities))}."
+
+
+def _fixed(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> tuple[str, str]:
+    q = quantities.get(e["parameter"]) or Quantity(e["parameter"], e["unit"], 0.0, 1.0, math.inf)
+    unit, factor = human_unit(q)
+    stated = f"{to_digits_of(factor * e['stated'], factor * e['sigma'])} {unit}".strip()
+    inseparable = f" (or {', '.join(e['inseparable'][:_MAX_NAMED])})" if e["inseparable"] else ""
+    what = f"{q.name} is fixed at {stated} by the config, and the recording contradicts it{inseparable}"
+    numbers = f"{_number(q, e['value'], e['sigma'])} if free (z = {e['z']:.1f})"
+    return what, numbers + _shift(e["effect"], q.name, quantities, "freeing it")
 
 
 def _change(e: Mapping[str, Any], severity: Severity, quantities: Quantities) -> str:
@@ -257,6 +276,7 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any], Severity, Quantities], str]] =
     "direction": _direction,
     "hypothesis": _hypothesis,
     "prior_conflict": _prior_conflict,
+    "contradiction": _contradiction,
     "change": _change,
     "device_change": _device_change,
     "rejection": _rejection,
@@ -273,7 +293,7 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any], Severity, Quantities], str]] =
 }
 
 
-_CAUSES = {"hypothesis": _corrected, "prior_conflict": _conflict}
+_CAUSES = {"hypothesis": _corrected, "prior_conflict": _conflict, "contradiction": _fixed}
 
 
 def _number(q: Quantity, value: float, sigma: float) -> str:

@@ -62,6 +62,14 @@ GOLDEN: list[tuple[str, Severity, dict[str, Any], str]] = [
         "and the axis order of the sensor, or widen the prior.",
     ),
     (
+        "contradiction",
+        INCONSISTENT,
+        {"parameter": "camera_roll", "unit": "rad", "stated": 1e-12, "value": 0.05, "sigma": 1e-3, "z": 50.0}
+        | {"inseparable": ("collimation",), "effect": {"helmet_mount_z": 7e-3}},
+        "camera_roll is fixed at 0.000 deg by the config, and the recording contradicts it (or collimation): 2.865 ± "
+        "0.057 deg if free (z = 50.0); freeing it shifts helmet_mount_z by 0.40 deg, 0.7 of its requirement.",
+    ),
+    (
         "change",
         INCONSISTENT,
         {"time_s": 42.2, "steps": {"helmet_mount_z": (8.9e-3, 7e-4)}},

@@ -31,7 +31,7 @@ class Tumble(Method):
     title = "Tumbled magnetometer and accelerometer"
     sheets: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "gyro": ("scale", "skew", "g_sensitivity", "temperature"),
-        "accel": ("temperature",),
+        "accel": ("square", "temperature"),
         "mag": ("delay",),
         "field": ("model_error",),
     }

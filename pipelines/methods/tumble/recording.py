@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from alidade.pipelines.errors import InputError
-from alidade.pipelines.estimation.assumptions import temperature_assumption
+from alidade.pipelines.estimation.assumptions import Assumption, temperature_assumption
 from alidade.pipelines.methods import temperature
 from alidade.pipelines.methods.place import read_place
 from alidade.pipelines.recording import series
@@ -38,6 +38,8 @@ SLOPES = GYRO_SLOPE, ACCEL_SLOPE = (
     temperature_assumption("gyro", "rad/s", 1e-4),
     temperature_assumption("accel", "m/s^2", 1e-2),
 )
+# Three of 1e-4 of what is felt at 1 g: what consumer accelerometers read beside it, along each axis.
+ACCEL_SQUARE = Assumption(tuple(f"accel_square_{i}" for i in "123"), "s^2/m", "accel", "square", 3e-5)
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,6 +38,7 @@ class TumbledAccelerometer(_Part):
     bias: NotNegative = 0.3  # m/s^2
     mounting_deg: NotNegative = 3.0  # sigma of the magnetometer's rotation against it, each component
     temperature: NotNegative = 1e-2  # m/s^2/K, sigma of each slope of b, where there is a temperature
+    square: NotNegative = 3e-5  # s^2/m, sigma of what is felt squared that each axis reads beside it
     arm: NotNegative = 0.1  # m, from the centre that the device is turned about
 
 
