@@ -121,7 +121,7 @@ def step_stability(step: StepEstimate, duration: float) -> Stability:
 
 
 def step_finding(steps: Sequence[StepEstimate], duration: float, quantities: Sequence[Quantity]) -> Finding | None:
-    """The finding of kind `change` or `jump` of steps of which one is significant; None where none is.
+    """The most severe finding, of kind `change` or `jump`, on a step that is significant; None where none is.
 
     A change is a step that motion alone shows too, and the same one; it is a NOTE where it is not material. A `jump` is
     a material one of which motion does not tell whether the mount or the reference made it.
@@ -131,18 +131,26 @@ def step_finding(steps: Sequence[StepEstimate], duration: float, quantities: Seq
         duration: of the recording, s.
         quantities: of the estimate.
     """
-    for step in steps:
-        significant = _significant(step.steps, step.ratio)
-        if step_stability(step, duration).changed and significant:
-            severity = Severity.INCONSISTENT if _is_material(step, quantities) else Severity.NOTE
-            return Finding("change", severity, {"since_s": step.since_s, "time_s": step.time_s, "steps": significant})
-    jumps = [step for step in steps if _is_jump(step, duration) and _is_material(step, quantities)]
-    if not jumps:
+    found = [f for s in steps if (f := _changed(s, duration, quantities)) is not None]
+    jumps = [s for s in steps if _is_jump(s, duration) and _is_material(s, quantities)]
+    found += [_jump(step) for step in sorted(jumps, key=_certain_size, reverse=True)]
+    return max(found, key=lambda finding: finding.severity, default=None)
+
+
+def _changed(step: StepEstimate, duration: float, quantities: Sequence[Quantity]) -> Finding | None:
+    """The finding that something changed; None where the step is not significant."""
+    significant = _significant(step.steps, step.ratio)
+    if not significant or not step_stability(step, duration).changed:
         return None
-    step = max(jumps, key=_certain_size)
+    severity = Severity.INCONSISTENT if _is_material(step, quantities) else Severity.NOTE
+    return Finding("change", severity, {"since_s": step.since_s, "time_s": step.time_s, "steps": significant})
+
+
+def _jump(step: StepEstimate) -> Finding:
+    """The finding that vision jumped: from a size on that no healthy reference has it keeps from `calibrated`."""
     severity = Severity.WEAK if _certain_size(step) > _USUAL_JUMP else Severity.NOTE
-    when = {"since_s": step.since_s, "time_s": step.time_s}
-    return Finding("jump", severity, {**when, "size": step.size, "sigma": step.ratio * step.sigma})
+    sizes = {"size": step.size, "sigma": step.ratio * step.sigma}
+    return Finding("jump", severity, {"since_s": step.since_s, "time_s": step.time_s, **sizes})
 
 
 def _certain_size(step: StepEstimate) -> float:

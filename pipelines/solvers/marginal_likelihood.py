@@ -40,9 +40,9 @@ Outliers = Mapping[int, NDArray[np.bool_]]
 OUTLIER_GATES = 3.0
 # Keyframes that are enough to tell levels: of a longer recording half of them are the liveliest.
 ENOUGH_KEYFRAMES = 6000
-# Newton steps, none longer than this in the logarithm of a level; one that lowers -2 log L by less is the last: levels are
-# then within .2 of their sigmas, as random signs have them.
-_MOST_STEPS, _LONGEST_STEP, _SETTLED = 25, 1.5, 0.05
+# Newton steps, none longer than this in the logarithm of a level; one that lowers -2 log L by less is the last: levels
+# are then within .2 of their sigmas, as random signs have them.
+_MOST_STEPS, _LONGEST_STEP, _SETTLED = 12, 1.5, 0.05
 # A step may be shortened so often, and raise -2 log L by so much: rounding.
 _HALVINGS, _FINE = 6, 1e-3
 # s, within which errors may be correlated however they are.
@@ -468,7 +468,7 @@ def _maximum(
         gradient, information = solution.score([_parts(chain, tried, i) for i in free], signs)
         gradient, information = gradient + u / known**2, information + np.diag(known**-2.0)
         move = -np.linalg.solve(information, gradient)
-        foreseen = -float(gradient @ move)
+        foreseen, before = -float(gradient @ move), value
         move *= min(1.0, _LONGEST_STEP / max(float(np.abs(move).max()), 1e-300))
         for _ in range(_HALVINGS):
             ahead = at(u + move)
@@ -480,7 +480,7 @@ def _maximum(
         u = u + move
         value, tried, solution = ahead
         assert solution is not None
-        if foreseen < _SETTLED:
+        if min(foreseen, before - value) < _SETTLED:
             break
     return LevelEstimate(_known(tried, free, np.sqrt(np.diag(np.linalg.inv(information)))), value)
 
