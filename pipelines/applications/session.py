@@ -23,7 +23,14 @@ from alidade.pipelines.applications.discovery import empty, idle, nearest_sugges
 from alidade.pipelines.applications.sharing import device_belief, walks
 from alidade.pipelines.applications.table_discovery import propose_columns, with_columns
 from alidade.pipelines.config import configured, load_config
-from alidade.pipelines.diagnostics.change_test import Stability, change_finding, stability, step_finding, with_change
+from alidade.pipelines.diagnostics.change_test import (
+    Stability,
+    change_finding,
+    stability,
+    step_finding,
+    step_stability,
+    with_change,
+)
 from alidade.pipelines.diagnostics.cross_validation import SplitHalf, solve_segments, split_halves
 from alidade.pipelines.diagnostics.diagnose import diagnose, is_suspect
 from alidade.pipelines.diagnostics.fault_models import FaultModel
@@ -338,7 +345,7 @@ class Session:
             elif report and estimate.solver == "incremental" and published is None:
                 published = self._published()
             stable, change = self._change(estimate, quantities)
-            if change is not None and change.severity == Severity.NOTE:
+            if change is not None and change.kind == "change" and change.severity == Severity.NOTE:
                 estimate = with_change(estimate, change)
             tables = self.method.findings(self.data, self.config, estimate) if report else {}
             estimate, carried = self._at_gyro_rate(problem, estimate)
@@ -429,13 +436,11 @@ class Session:
             return None, None
         ratios = [] if estimate.sandwich is None else estimate.sandwich[[q.judged for q in quantities]].tolist()
         ratio = max(ratios, default=1.0)
+        if estimate.steps is not None:
+            span = float(np.ptp(np.concatenate([r.time for r in estimate.residuals.values()])))
+            found = step_finding(estimate.steps, span, quantities)
+            return (step_stability(estimate.steps[0], span) if estimate.steps else None), found
         stable = stability(estimate, quantities)
-        times = [r.time for r in estimate.residuals.values()]
-        if estimate.step is not None and times:
-            span = float(np.ptp(np.concatenate(times)))
-            slipped = step_finding(estimate.step, span, quantities)
-            if slipped is not None:
-                return stable, slipped
         if stable is None or not stable.changed:
             return stable, None
         parts: Mapping[str, SplitHalf] = {}

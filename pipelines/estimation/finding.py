@@ -21,7 +21,8 @@ KINDS: Mapping[str, tuple[str, ...]] = {
     "prior_conflict": ("parameter", "value", "sigma", "z", "inseparable", "effect"),
     # A number that the config fixes, what it is stated to be and what it is freed alone; effect: parameter -> shift.
     "contradiction": ("parameter", "unit", "stated", "value", "sigma", "z", "inseparable", "effect"),
-    "change": ("time_s", "steps"),  # parameter -> (step, sigma)
+    "change": ("since_s", "time_s", "steps"),  # between both times; parameter -> (step, sigma)
+    "jump": ("since_s", "time_s", "size", "sigma"),  # of vision, by the mount or by the reference, rad
     "device_change": ("parameter", "step", "sigma", "recordings", "dates"),  # between two recordings
     "rejection": ("family", "share", "noise_factor"),  # with noise_factor times the noise all of it would fit
     "noise": (

@@ -155,13 +155,15 @@ def _stability(calibration: Calibration) -> str:
     found = calibration.stability
     if found is None:
         return ""
-    changes = [sentences.sentence(f, calibration.quantities) for f in calibration.findings if f.kind == "change"]
+    changes = [
+        sentences.sentence(f, calibration.quantities) for f in calibration.findings if f.kind in ("change", "jump")
+    ]
     if changes:
         return changes[0]
     name = next(iter(found.departures), "")
     return (
-        f"No significant change: the largest difference of the estimate until some moment from the final one is at "
-        f"{found.time_s:.0f} s, mostly of {name} (p = {min(found.level, 1.0):.2g})."
+        f"No significant change: the largest is at {found.time_s:.0f} s, mostly of {name} "
+        f"(p = {min(found.level, 1.0):.2g})."
     )
 
 

@@ -186,7 +186,18 @@ def _fixed(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> tuple[s
 def _change(e: Mapping[str, Any], severity: Severity, quantities: Quantities) -> str:
     steps = [f"{name} by {_number(quantities[name], *step)}" for name, step in list(e["steps"].items())[:_MAX_NAMED]]
     small = " Immaterial; included in the sigmas." if severity == Severity.NOTE else ""
-    return f"Change at {e['time_s']:.0f} s{': ' if steps else ''}{', '.join(steps)}.{small}"
+    return f"Change {_when(e)}{': ' if steps else ''}{', '.join(steps)}.{small}"
+
+
+def _jump(e: Mapping[str, Any], _: Severity, __: Quantities) -> str:
+    size, sigma = (to_digits_of(math.degrees(e[name]), math.degrees(e["sigma"])) for name in ("size", "sigma"))
+    return f"Vision jumped by {size} ± {sigma} deg {_when(e)}: mount or reference, the motion does not tell."
+
+
+def _when(e: Mapping[str, Any]) -> str:
+    """Where measurements are more than a second apart, between which."""
+    since, until = e["since_s"], e["time_s"]
+    return f"between {since:.0f} and {until:.0f} s" if until - since > 1.0 else f"at {until:.0f} s"
 
 
 def _device_change(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> str:
@@ -278,6 +289,7 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any], Severity, Quantities], str]] =
     "prior_conflict": _prior_conflict,
     "contradiction": _contradiction,
     "change": _change,
+    "jump": _jump,
     "device_change": _device_change,
     "rejection": _rejection,
     "noise": _noise,

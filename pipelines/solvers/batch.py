@@ -45,11 +45,12 @@ from alidade.pipelines.solvers.error_budget import (
 from alidade.pipelines.solvers.layout import Layout, Values
 from alidade.pipelines.solvers.levenberg import Engine, LevenbergConfig, Solution, minimize, without_rejected
 from alidade.pipelines.solvers.linearization import Linearization
-from alidade.pipelines.solvers.marginal_likelihood import largest_step, sandwich_of, solve_likelihood
+from alidade.pipelines.solvers.marginal_likelihood import sandwich_of, solve_likelihood
 from alidade.pipelines.solvers.noise_estimation import apply_levels, estimate_noise
 from alidade.pipelines.solvers.posterior import Reported, chi_square, expected_squares, leverages, sqrt_information
 from alidade.pipelines.solvers.posterior_history import posterior_history, smoothed_bias
 from alidade.pipelines.solvers.robust import RobustConfig, solve_robust
+from alidade.pipelines.solvers.step_test import largest_steps
 from alidade.pipelines.solvers.weak_directions import Posterior, constrained_solution
 
 
@@ -216,10 +217,10 @@ def _estimate(solved: Solved, config: BatchConfig, budget: bool, changed: Iterab
         influence = Influence.of(posterior.reported, posterior.directions, engine, found, values)
         added = added_variance(influence, correlations)
     by = inflation(names, posterior.covariance, influence.names if influence else (), added)
-    sandwich, step, wide = None, None, by
+    sandwich, steps, wide = None, None, by
     if problem.marginal_likelihood and isinstance(engine, Linearization) and solved.solution.converged:
         sandwich = sandwich_of(compiled, solved.levels, solved.solution)
-        step = largest_step(compiled, solved.levels, solved.solution)
+        steps = largest_steps(compiled, solved.levels, solved.solution)
         wide = by * np.where(sandwich > SLOW_ERROR, sandwich, 1.0)
     covariance = posterior.covariance * np.outer(wide, wide)
     system, course = posterior.system, None
@@ -234,7 +235,7 @@ def _estimate(solved: Solved, config: BatchConfig, budget: bool, changed: Iterab
         covariance=covariance,
         inflation=by,
         sandwich=sandwich,
-        step=step,
+        steps=steps,
         colours={family: 1.0 + 2.0 * float(lags.sum()) for family, lags in correlations.items()},
         converged=solved.solution.converged,
         message=solved.solution.message,

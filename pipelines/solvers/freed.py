@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from alidade.pipelines.solvers.layout import Tangent, Values
 from alidade.pipelines.solvers.levenberg import Engine
 from alidade.pipelines.solvers.linearization import Group, Linearization
 from alidade.pipelines.solvers.marginal_likelihood import LinearChain, estimate_levels
-from alidade.pipelines.solvers.noise_estimation import apply_levels, group_weights
+from alidade.pipelines.solvers.noise_estimation import apply_levels
 from alidade.pipelines.solvers.posterior import Reported, sqrt_information
 
 # Steps to the states that are optimal for given parameters; first values are near them.
@@ -67,12 +66,7 @@ def _used(groups: Sequence[Group], estimate: Estimate) -> list[NDArray[np.bool_]
 
 def _without_rejected(engine: Engine, used: Sequence[NDArray[np.bool_]]) -> Engine:
     """The engine with measurements that count in full or not at all."""
-    return engine.with_groups(
-        [
-            group if group.loss is None else replace(group, loss=None, weights=group_weights(group) * own[:, None])
-            for group, own in zip(engine.groups, used, strict=True)
-        ]
-    )
+    return engine.with_groups([group.counting(own) for group, own in zip(engine.groups, used, strict=True)])
 
 
 def _at(compiled: Compiled, estimate: Estimate) -> Values:

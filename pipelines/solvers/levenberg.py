@@ -17,7 +17,7 @@ Limits: a minimum is a local one. A cost is a sum of squares, in units of square
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol, Self
 
@@ -258,14 +258,8 @@ def _reached(
 
 def without_rejected(engine: Engine, values: Values) -> Engine:
     """The measurements that count at some values, in full, whatever they are elsewhere."""
-    return engine.with_groups([_counting(group, values) for group in engine.groups])
-
-
-def _counting(group: Group, values: Values) -> Group:
-    if group.loss is None:
-        return group
-    used = group.used(group.evaluate(values)[0]) > 0.5
-    return replace(group, loss=None, weights=group.all_weights * used[:, None])
+    groups = [g if g.loss is None else g.counting(g.used(g.evaluate(values)[0]) > 0.5) for g in engine.groups]
+    return engine.with_groups(groups)
 
 
 def _lengthened(engine: Engine, values: Values, step: Tangent, cost: float) -> _Point:

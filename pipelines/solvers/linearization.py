@@ -130,6 +130,10 @@ class Group:
         shape = len(self.model.time), self.model.rows
         return np.ones(shape) if self.weights is None else self.weights.copy()
 
+    def counting(self, used: NDArray[np.bool_]) -> Group:
+        """Without its loss: those of its n measurements that are used in full, the others not at all."""
+        return self if self.loss is None else replace(self, loss=None, weights=self.all_weights * used[:, None])
+
     def weighted(self, residuals: Array) -> Array:
         """Residuals with the noise weights."""
         return residuals if self.weights is None else self.weights * residuals

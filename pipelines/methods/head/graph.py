@@ -102,7 +102,7 @@ def _problem(config: Config, data: HeadData, model: _Model) -> Problem:
         keyframes=Keyframes(model.clock, _NEAR),
         layout=LAYOUT,
         marginal_likelihood=True,
-        may_step=model.parameters.helmet.key,
+        may_step=(model.parameters.helmet.key,),
         finer=partial(_finer, config, data, model),
     )
 
