@@ -208,27 +208,35 @@ def minimize(
         if step is not None:
             there, corrections = _reached(engine, here, step, predicted, damping, config)
             iteration += corrections
-            decrease, full = here.cost - there.cost, damping == 0.0
-            near = full and min(predicted, abs(decrease)) < _enough(config, here.cost)
-            near &= predicted < config.curved_tolerance
-            near |= full and decrease <= 0.0 and predicted < config.curved_tolerance
-            determined = damping <= config.initial_damping and predicted < config.determined_tolerance
-            near |= determined and (decrease <= 0.0 or damping == config.initial_damping)
-            as_predicted = full and predicted < 1.0 and abs(decrease - predicted) < config.prediction_tolerance
+            decrease = here.cost - there.cost
+            is_minimum = _is_minimum(config, here.cost, damping, predicted, decrease)
             if decrease > 0.0:
                 here = there
-            if near or (decrease > 0.0 and as_predicted):
+            if is_minimum:
                 return solution(True, f"converged after {iteration} iterations")
             if decrease > 0.0:
                 served = damping or served
                 ratio = decrease / predicted if predicted > 0.0 else 1.0
                 damping *= max(1.0 / 3.0, 1.0 - (2.0 * ratio - 1.0) ** 3)
-                damping, growth = (0.0 if damping < config.min_damping or determined else damping), 2.0
+                damping, growth = (
+                    (0.0 if damping < config.min_damping or predicted < config.determined_tolerance else damping),
+                    2.0,
+                )
                 continue
         damping, growth = (damping * growth if damping > 0.0 else served), 2.0 * growth
         if damping > config.max_damping:
             return solution(False, f"no step lowers chi-square of {here.cost:.6g}")
     return solution(False, f"not converged after {iteration} iterations")
+
+
+def _is_minimum(config: LevenbergConfig, cost: float, damping: float, predicted: float, decrease: float) -> bool:
+    """Whether a step, by its damping and the decrease of the cost, shows that where it ends is a minimum."""
+    enough = _enough(config, cost)
+    if damping > 0.0:
+        determined = damping <= config.initial_damping and predicted < config.determined_tolerance
+        return determined and (decrease <= 0.0 or damping == config.initial_damping)
+    as_predicted = predicted < 1.0 and abs(decrease - predicted) < config.prediction_tolerance
+    return predicted < enough or (predicted < config.curved_tolerance and decrease < enough) or as_predicted
 
 
 def _reached(
