@@ -31,6 +31,8 @@ _TOGETHER, _FEWEST_BLOCKS, _TINY = 8, 4, np.finfo(float).tiny
 # by less than so many times what they differ by from one to the next, over sqrt(2): 1 for white noise, beyond 5 where
 # a hand turns back.
 _BRIEF, _WHITE = 0.5, 2.0
+# Of a triad, nine numbers at rest, fewer static poses than this tell too little for brief ones to be left out.
+_FEWEST_POSES = 9
 # The noise is what the quietest twentieth of the recording shows, between these multiples of the stated one.
 _FLOOR_SHARE, _FLOOR_LIMITS = 0.05, (0.2, 10.0)
 # A steady turn is as quiet; its mean rate departs from that of the static intervals by more than this, rad/s, when what
@@ -58,10 +60,10 @@ def find_static_intervals(t: Array, gyro: Array, accel: Array, gyro_sigma: float
     Raises:
         InputError: there is none.
     """
-    runs, scatter, floor = _quiet_runs(t, [(gyro, gyro_sigma), (accel, accel_sigma)])
+    (runs, scatter, floor), share = _runs_or_brief_ones(t, [(gyro, gyro_sigma), (accel, accel_sigma)], _FEWEST_POSES)
     interval = float(np.median(np.diff(t)))
     ends = [_unmoved(run, [(gyro, float(floor[0])), (accel, float(floor[1]))], interval) for run in runs]
-    runs = np.array([run for run in ends if t[run[1]] - t[run[0]] >= _SHORTEST], dtype=np.intp).reshape(-1, 2)
+    runs = np.array([run for run in ends if t[run[1]] - t[run[0]] >= share * _SHORTEST], dtype=np.intp).reshape(-1, 2)
     means, forces = (
         np.array([values[a : b + 1].mean(axis=0) for a, b in runs]).reshape(-1, 3) for values in (gyro, accel)
     )
@@ -88,11 +90,20 @@ def quiet_intervals(t: Array, streams: Sequence[tuple[Array, float]], fewest: in
     For a device without a gyro: a steady turn about what a sensor feels does not show in it. Where that finds fewer
     than `fewest`, brief ones count in which the first vectors scatter by white noise: at turning points they do not.
     """
-    runs = _quiet_runs(t, streams)[0]
-    if len(runs) >= fewest:
-        return np.asarray(t[runs])
-    brief = _quiet_runs(t, streams, _BRIEF)[0]
-    return np.asarray(t[brief if len(brief) >= fewest and _is_white(streams[0][0], brief) else runs])
+    return np.asarray(t[_runs_or_brief_ones(t, streams, fewest)[0][0]])
+
+
+def _runs_or_brief_ones(
+    t: Array, streams: Sequence[tuple[Array, float]], fewest: int
+) -> tuple[tuple[NDArray[np.intp], Array, Array], float]:
+    """Quiet runs as `_quiet_runs` has them and their share of what is usual: brief ones where others are too few."""
+    usual = _quiet_runs(t, streams)
+    if len(usual[0]) >= fewest:
+        return usual, 1.0
+    brief = _quiet_runs(t, streams, _BRIEF)
+    if len(brief[0]) >= fewest and _is_white(streams[0][0], brief[0]):
+        return brief, _BRIEF
+    return usual, 1.0
 
 
 def _is_white(values: Array, runs: NDArray[np.intp]) -> bool:

@@ -22,6 +22,10 @@ _FROZEN, _FROZEN_SAMPLES = 0.1, 10
 _JUMP, _SPIKE = 10.0, 10.0
 # A reading at the end of the range for so many samples is clipped, if the range is more than so many quanta.
 _CLIPPED, _QUANTA = 3, 20.0
+# The end of a range may wander, as a gyro's from 7.2346 to 7.2653 rad/s: readings this near to the largest, as a share,
+# for no longer than so many s (rests and steady turns are longer) are a plateau if readings fall by so many times its
+# height within its length before and after. Off a smooth top they fall by 8 times.
+_NEAR_END, _BRIEFLY, _FALL = 0.02, 1.0, 24.0
 # Readings of two devices in turn: one differs from the next by so many times what it does from the next but one. Of
 # noise both are alike, of motion the second is larger.
 _ALTERNATE, _ALTERNATE_SAMPLES = 3.0, 100
@@ -152,7 +156,37 @@ def _frozen(t: Array, x: Array, most: float = _MOST_REPEATED) -> Mask:
     return out if out.mean() < most else np.zeros(len(x), dtype=bool)
 
 
-def _clipped(_: Array, x: Array) -> Mask:
+def _clipped(t: Array, x: Array) -> Mask:
+    """Samples at the end of the range: runs of its very reading, and plateaus that wander."""
+    out = _at_end(x)
+    return out | _on_plateau(t, x, out) | _on_plateau(t, -x, out)
+
+
+def _on_plateau(t: Array, x: Array, known: Mask) -> Mask:
+    """Plateaus near the largest reading, entered and left steeply for how flat they are; none where one is known."""
+    out = np.zeros(len(x), dtype=bool)
+    above = x - np.nanmedian(x)
+    edges = np.diff(np.concatenate([[False], above > (1.0 - _NEAR_END) * np.nanmax(above), [False]]).astype(int))
+    for first, stop in np.flatnonzero(edges).reshape(-1, 2).tolist():
+        count = stop - first
+        if (
+            known[first:stop].any()
+            or count < _CLIPPED
+            or t[stop - 1] - t[first] > _BRIEFLY
+            or first < count
+            or stop + count > len(x)
+        ):
+            continue
+        low, middle = np.quantile(above[first:stop], [0.25, 0.5])
+        level = middle - 3.0 * (middle - low)  # what is on its way there is not on the plateau
+        flat = np.flatnonzero(above[first:stop] >= level) + first
+        fall = above[flat].min() - np.fmax(above[first - count], above[stop - 1 + count])
+        if fall > _FALL * np.ptp(above[flat]) and fall > 0.0:
+            out[flat] = True
+    return out
+
+
+def _at_end(x: Array) -> Mask:
     """Runs at the largest or the smallest reading of the stream."""
     starts, stops = _runs(x)
     step = np.abs(np.diff(x))

@@ -196,6 +196,15 @@ def test_a_rest_ends_where_a_slow_motion_begins() -> None:
     assert (np.abs(still.mean(axis=0)) < 4.0 * noise / np.sqrt(len(still))).all()
 
 
+@pytest.mark.parametrize("rest_s", [1.0, 1.2, pytest.param(1.5, marks=pytest.mark.slow)])
+def test_rests_of_a_second_are_found(rest_s: float) -> None:
+    data, truth, config = _simulated(2, poses=12, static_s=rest_s)
+    assert len(static_intervals(data, config)) >= 12
+    _, estimate, judged = _solved(data, config)
+    assert judged.status in ("calibrated", "weak")
+    assert max(abs(z) for z in _sigmas_off(estimate, truth).values()) < 4.0
+
+
 @pytest.mark.parametrize(("length", "cut"), [(2.0, 0.5), (3.7, 0.57), (8.0, 0.65)])
 def test_more_is_cut_off_a_long_rest(length: float, cut: float) -> None:
     """A quarter of a second that the test looks at, another, and more where a rest is long enough to spare it."""
