@@ -37,8 +37,9 @@ def load_config(attachment: bytes | None, override: Path | Config | None = None)
     """The config in a recording's attachment, overridden key by key by a file or another config. Raises InputError."""
     base = _read(attachment, f"attachment {ATTACHMENT}") if attachment is not None else {}
     more: dict[Any, Any] = {}
+    belief = None
     if isinstance(override, Config):
-        more, override = override.model_dump(exclude_unset=True), Path("config")
+        belief, more, override = override.belief, override.model_dump(exclude_unset=True), Path("config")
     elif override is not None:
         more = _read(read_bytes(override, MAX_YAML_BYTES), str(override))
     try:
@@ -54,7 +55,7 @@ def load_config(attachment: bytes | None, override: Path | Config | None = None)
     for key in config.topics.keys() - known:
         where = str(override) if _has(more, ("topics", key)) else f"attachment {ATTACHMENT}"
         raise InputError(f"{where}: unknown key topics.{key}{nearest(key, sorted(known))}")
-    return config
+    return config if belief is None else config.believing(belief)
 
 
 @cache

@@ -331,6 +331,11 @@ class Config(Section):
         given = self.priors.get(name, default)
         return given.sigma if isinstance(given, KnownPrior) else given
 
+    @property
+    def belief(self) -> Belief | None:
+        """Prior means and covariance from elsewhere than the config, as an earlier calibration."""
+        return self._belief
+
     def believing(self, belief: Belief) -> Config:
         """The same config with what is known from elsewhere; what it says of priors itself goes before that."""
         out = self.model_copy()

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import takewhile
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
@@ -72,3 +73,15 @@ def _keys(model: type[BaseModel]) -> list[str]:
     """The keys of the model and of the models inside it."""
     schema = model.model_json_schema()
     return [key for part in (schema, *schema.get("$defs", {}).values()) for key in part.get("properties", {})]
+
+
+def sways(
+    motion: Mapping[str, Sequence[Any]] | None, sway: Mapping[str, float]
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """A motion with one more sway about each axis."""
+    for i, axis in enumerate(("yaw", "pitch", "roll")):
+        # Sways of one frequency on two axes would be one sway about an axis between them.
+        more = {**sway, "frequency_hz": round(sway["frequency_hz"] + 0.04 * i, 3)}
+        now: dict[str, Sequence[Any]] = {"yaw": [], "pitch": [], "roll": [], **(motion or {})}
+        words = f"sway by {more['amplitude_deg']:g} deg at {more['frequency_hz']:g} Hz in {axis}"
+        yield words, {**now, axis: [*now[axis], more]}

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from alidade.pipelines.belief import independent
 from alidade.pipelines.config import load_config
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.methods.cube.topics import CubeConfig, field_date
@@ -30,6 +31,14 @@ cube: {tag_family: 36h11, tags: {16: {size: 0.12, rotation: [1, 0, 0, 0], positi
        camera_rotation: [1, 0, 0, 0], raw: {accel: {scale: 2.41e-3, offset: 33000}}}
 head: {board: {tag_family: 36h11, tags: {0: {size: 0.04, rotation: [1, 0, 0, 0], position: [0, 0, 0]}}}}
 """
+
+
+def test_a_config_as_override_keeps_what_an_earlier_calibration_knows() -> None:
+    known = load_config(b"method: los").believing(independent(["delta_px"], [0.01], [1e-3], "earlier"))
+    (_, belief) = load_config(FULL, known).beliefs
+    assert (belief.names, belief.source) == ((), "earlier"), "priors of the config win"
+    (_, belief) = load_config(b"latitude_deg: 40.0", known).beliefs
+    assert (belief.names, belief.mean.tolist()) == (("delta_px",), [0.01])
 
 
 def test_every_key_of_the_format() -> None:

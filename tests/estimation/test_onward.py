@@ -13,7 +13,7 @@ from alidade.pipelines.estimation.problem import Problem, Step
 from alidade.pipelines.methods import method
 from alidade.pipelines.recording.streams import Temperature
 from alidade.pipelines.settings import Config
-from alidade.pipelines.simulation.temperature import Warming
+from alidade.pipelines.simulation.sensors import Warming
 
 # Between two temperatures, s: until the next one is there it is not known what it is.
 WARMED = 0.5

@@ -47,9 +47,8 @@ from alidade.pipelines.methods.place import FIELD
 from alidade.pipelines.settings import Config, Sensors
 from alidade.pipelines.simulation.motion import sample_times
 from alidade.pipelines.simulation.rendering import Quad, Renderer, encode, expose, tag_quad
-from alidade.pipelines.simulation.sensors import true_values
+from alidade.pipelines.simulation.sensors import drift, known, measured, true_values
 from alidade.pipelines.simulation.simulated import Simulated
-from alidade.pipelines.simulation.temperature import drift, known, measured
 from alidade.pipelines.vision.camera import Camera
 
 Array = NDArray[np.float64]

@@ -26,9 +26,8 @@ from alidade.pipelines.recording import series
 from alidade.pipelines.recording.checks import nanoseconds
 from alidade.pipelines.settings import SensorSheets
 from alidade.pipelines.simulation.motion import EulerMotion, Swing, sample_times
-from alidade.pipelines.simulation.sensors import read_by, true_values
+from alidade.pipelines.simulation.sensors import Warming, drift, known, measured, read_by, true_values
 from alidade.pipelines.simulation.simulated import Simulated
-from alidade.pipelines.simulation.temperature import Warming, drift, known, measured
 
 Array = NDArray[np.float64]
 

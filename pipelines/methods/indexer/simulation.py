@@ -24,9 +24,8 @@ from alidade.pipelines.methods.indexer.recording import IndexerData
 from alidade.pipelines.methods.indexer.topics import JOINTS
 from alidade.pipelines.settings import SensorSheets
 from alidade.pipelines.simulation.motion import sample_times
-from alidade.pipelines.simulation.sensors import read_by, true_values
+from alidade.pipelines.simulation.sensors import Warming, drift, known, measured, read_by, true_values
 from alidade.pipelines.simulation.simulated import Simulated
-from alidade.pipelines.simulation.temperature import Warming, drift, known, measured
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from alidade.pipelines.methods import Scenario
-from alidade.pipelines.simulation.sways import sways
+from alidade.pipelines.simulation.scenario import sways
 
 # The sway added.
 _SWAY = {"amplitude_deg": 5.0, "frequency_hz": 0.29}

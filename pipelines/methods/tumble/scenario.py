@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from alidade.pipelines.files import dump_yaml
-from alidade.pipelines.simulation.temperature import Warming
+from alidade.pipelines.simulation.sensors import Warming
 
 # 2026-11-20 12:00 UTC: simulated sessions start here; and the year of that day for the field model.
 EPOCH_NS, YEAR = 1_795_176_000_000_000_000, 2026.8849315068493

@@ -23,8 +23,8 @@ from alidade.pipelines.methods.tumble.scenario import (
     tumble_config,
 )
 from alidade.pipelines.simulation.motion import sample_times
+from alidade.pipelines.simulation.sensors import drift, measured
 from alidade.pipelines.simulation.simulated import Simulated
-from alidade.pipelines.simulation.temperature import drift, measured
 
 Array = NDArray[np.float64]
 

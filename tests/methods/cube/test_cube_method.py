@@ -40,7 +40,7 @@ from alidade.pipelines.methods.cube.validation import validate
 from alidade.pipelines.methods.static_intervals import find_static_intervals
 from alidade.pipelines.recording.recording import open_recording
 from alidade.pipelines.settings import Config
-from alidade.pipelines.simulation.temperature import Warming
+from alidade.pipelines.simulation.sensors import Warming
 from alidade.pipelines.solvers.batch import solve_batch
 from alidade.pipelines.solvers.engines import Compiled
 from alidade.pipelines.solvers.incremental import solve_incremental

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from alidade.pipelines.methods import Scenario
-from alidade.pipelines.simulation.sways import sways
+from alidade.pipelines.simulation.scenario import sways
 
 # The sway added.
 _SWAY = {"amplitude_deg": 20.0, "frequency_hz": 0.29}
