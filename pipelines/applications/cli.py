@@ -256,6 +256,7 @@ def compare(
     strict: _Strict = False,
     auto_topics: _AutoTopics = False,
     jobs: _OwnJobs = None,
+    time_limit: _TimeLimit = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -265,16 +266,16 @@ def compare(
     """
     import time
 
-    from alidade.pipelines import parallel, progress
+    from alidade.pipelines import deadline, parallel, progress
     from alidade.pipelines.applications.session import Session
     from alidade.pipelines.recording.reading import open_recording
     from alidade.pipelines.reports import terminal
-    from alidade.pipelines.reports.compare import write_compare
+    from alidade.pipelines.reports.comparison_report import write_compare
     from alidade.pipelines.reports.whole import require_room
 
     require_room(out)
     kept, start = parse_window(window), time.perf_counter()
-    with progress.shown(quiet or as_json), parallel.processes(jobs):
+    with progress.shown(quiet or as_json), parallel.processes(jobs), deadline.within(time_limit):
         with progress.doing("reading"):
             opened = Session.read(open_recording(session, strict), method, config, auto_topics, prior)
         seconds = {"read": time.perf_counter() - start}
@@ -282,10 +283,12 @@ def compare(
     if as_json:
         terminal.show_json(calibrations)
     else:
-        terminal.show(calibrations)
+        terminal.print_calibrations(calibrations)
     if out is not None:
-        with progress.shown(quiet), parallel.processes(jobs), progress.doing("solving parts of the recording"):
-            written = write_compare(out, calibrations, *opened.cross_validate())
+        with progress.shown(quiet or as_json), parallel.processes(jobs), deadline.within(time_limit):
+            with progress.doing("solving parts of the recording"):
+                tested = opened.cross_validate()
+            written = write_compare(out, calibrations, *tested)
         if not as_json:
             terminal.say(f"Comparison in {written}")
 
@@ -352,6 +355,7 @@ def validate(
     out: Annotated[Path | None, typer.Option(help="Folder for the page [default: RECORDING-validation].")] = None,
     strict: _Strict = False,
     jobs: _OwnJobs = None,
+    time_limit: _TimeLimit = None,
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
@@ -359,22 +363,20 @@ def validate(
 
     Has the device changed, and what error remains? Exit code 0 valid, 2 unusable input, 3 not observable, 4 changed.
     """
-    from alidade.pipelines import parallel, progress
-    from alidade.pipelines.applications.validate import table, write_validation
+    from alidade.pipelines import deadline, parallel, progress
     from alidade.pipelines.applications.validate import validate as run
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.plain_json import validation_json
+    from alidade.pipelines.reports.validation_report import validation_report, write_validation
 
-    with progress.shown(quiet or as_json), parallel.processes(jobs), progress.doing("validating"):
-        validated = run(session, calibration, method, config, strict)
+    with progress.shown(quiet or as_json), parallel.processes(jobs), deadline.within(time_limit):
+        with progress.doing("validating"):
+            validated = run(session, calibration, method, config, strict)
         written = write_validation(out or _beside(session, "validation"), validated)
     if as_json:
         print(validation_json(validated))
     else:
-        for line in table(validated):
-            terminal.say(line)
-        for note in validated.notes:
-            terminal.say(f"  note: {note}")
+        terminal.print_report(validation_report(validated))
         terminal.say(f"Plots in {written}")
     raise typer.Exit(exit_codes.OF_VALIDATION[validated.verdict])
 
@@ -414,6 +416,7 @@ def scenarios(
     `simulate`, `plan` and `montecarlo` find them by name.
     """
     from alidade.pipelines import methods
+    from alidade.pipelines.display.table import Column, Table
     from alidade.pipelines.errors import InputError, nearest_three
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.plain_json import plain_json
@@ -435,7 +438,8 @@ def scenarios(
     if as_json:
         print(plain_json("scenarios", {"scenarios": listed}))
     else:
-        terminal.show_scenarios(listed)
+        rows = tuple((scenario["name"], scenario["summary"]) for scenario in listed)
+        terminal.print_table(Table("", "", ("scenario", Column("what it shows", "prose")), rows))
 
 
 @app.command()
@@ -456,8 +460,9 @@ def plan(
     from alidade.pipelines import progress
     from alidade.pipelines.applications.planning import make_plan, requirements, write_scenario
     from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.html import render_html
     from alidade.pipelines.reports.plain_json import plan_json
-    from alidade.pipelines.reports.plan import plan_html
+    from alidade.pipelines.reports.plan_report import plan_report
     from alidade.pipelines.reports.whole import write_file
 
     with progress.shown(quiet or as_json):
@@ -465,11 +470,11 @@ def plan(
     if out is not None:
         write_scenario(out, planned)
     if page is not None:
-        write_file(page, plan_html(planned))
+        write_file(page, render_html(plan_report(planned)))
     if as_json:
         print(plan_json(planned))
     else:
-        terminal.show_plan(planned)
+        terminal.print_report(plan_report(planned))
         if out is not None:
             terminal.say(f"The better motion is in {out}")
         if page is not None:
@@ -496,6 +501,7 @@ def info(
     from alidade.pipelines.config import recorded_config
     from alidade.pipelines.recording.reading import open_recording
     from alidade.pipelines.reports import terminal
+    from alidade.pipelines.reports.plain_json import facts_json
 
     with progress.shown(quiet), progress.doing("reading"):
         recording = open_recording(session, strict)
@@ -506,9 +512,9 @@ def info(
         facts = checked_facts(recording, settings)
         found, left = suggestions(recording, settings), unused(recording, settings)
     if as_json:
-        print(terminal.facts_json(facts, found, left, columns))
+        print(facts_json(facts, found, left, columns))
     else:
-        terminal.show_facts(session.name, facts, found, left, columns)
+        terminal.print_facts(session.name, facts, found, left, columns)
 
 
 @app.command()
@@ -519,24 +525,25 @@ def noise(
     as_json: Annotated[bool, typer.Option("--json", help="Print noise.json only.")] = False,
     strict: _Strict = False,
     auto_columns: _AutoColumns = False,
+    time_limit: _TimeLimit = None,
     quiet: Quiet = False,
 ) -> None:
     """Measure sensor noise at rest (Allan deviation).
 
     Gyros, accelerometers, magnetometers; prints the section `noise` of the config.
     """
-    from alidade.pipelines import progress
+    from alidade.pipelines import deadline, progress
     from alidade.pipelines.applications.noise import noise_of
     from alidade.pipelines.reports import terminal
-    from alidade.pipelines.reports.noise import noise_json, write_noise
+    from alidade.pipelines.reports.noise_report import noise_json, noise_report, write_noise
 
-    with progress.shown(quiet):
+    with progress.shown(quiet), deadline.within(time_limit):
         study = noise_of(session, strict, config, auto_columns)
     written = () if out is None else write_noise(out, study)
     if as_json:
         print(noise_json(study), end="")
         return
-    terminal.show_noise(study)
+    terminal.print_report(noise_report(study))
     if out is not None:
         terminal.say(f"Results in {out}: {', '.join(p.name for p in written)}")
 
@@ -566,7 +573,7 @@ def demo(
         calibrations = run(session, ["published", "batch", "incremental"])
         for calibration in progress.track(calibrations, "writing", len(calibrations)):
             write_results(out / calibration.estimate.solver, calibration)
-    terminal.show(calibrations)
+    terminal.print_calibrations(calibrations)
     terminal.say(f"Report: {(out / 'batch' / 'report.html').resolve()}")
 
 
@@ -733,7 +740,7 @@ def _tell(calibration: "Calibration", folder: Path, written: Sequence[Path], as_
     if as_json:
         terminal.show_json([calibration])
     else:
-        terminal.show([calibration])
+        terminal.print_calibrations([calibration])
         terminal.say(f"Results in {folder}: {', '.join(p.name for p in written)}")
     raise typer.Exit(exit_codes.OF_STATUS[calibration.status])
 

@@ -50,8 +50,9 @@ from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.info import SessionFacts
 from alidade.pipelines.recording.opening import Where
 from alidade.pipelines.recording.reading import open_recording
-from alidade.pipelines.reports.over_time import recordings_shown
-from alidade.pipelines.reports.result import Calibration, PartParameter, PartResult
+from alidade.pipelines.reports.joint_report import recordings_shown
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.reports.result_json import PartParameter, PartResult
 from alidade.pipelines.solvers.joint import Joined, grown, join, tell
 
 # The joint estimate stays when other linearisations move it by less than this, in sigmas (what is left is about the

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines import methods, progress
+from alidade.pipelines import deadline, methods, progress
 from alidade.pipelines.applications.table_discovery import with_columns
 from alidade.pipelines.config import load_config
 from alidade.pipelines.diagnostics.noise_spectrum import AxisNoise, axis_noise
@@ -112,11 +112,14 @@ def noise_of(path: Path, strict: bool = False, config: Path | None = None, auto_
     found: list[SensorNoise] = []
     troubles: list[str] = []
     notes: list[str] = []
-    for name in progress.track(names, "noise", len(names)):
-        try:
-            found += _topic_noise(recording, name, notes)
-        except InputError as error:
-            troubles.append(str(error))
+    with deadline.usual(recording.duration_s):
+        some = deadline.until_passed(names, "the noise of {} and of what follows it".format, 1)
+        for name in progress.track(some, "noise", len(names)):
+            try:
+                found += _topic_noise(recording, name, notes)
+            except InputError as error:
+                troubles.append(str(error))
+        notes += filter(None, [deadline.stopped()])
     if not found:
         raise InputError(
             "; ".join([*troubles, *notes]) or f"{path}: {', '.join(names)}: no sensor, all values are zero or NaN"

@@ -62,11 +62,13 @@ SOLVERS = ("batch", "incremental", "published")
 # Steps that a run takes whatever time it has: of fewer there may be no solution at all.
 _LEAST_STEPS = 20
 # What ends for want of time, in this order.
-_HYPOTHESES, _SEGMENTS, _COMPARISON, _SENSITIVITY = (
+_HYPOTHESES, _SEGMENTS, _COMPARISON, _SENSITIVITY, _HALVES, _HELD_OUT = (
     "the test of hypotheses",
     "the solution of both sides of a change",
     "the comparison with batch",
     "the sensitivity to fixed inputs",
+    "the split-half test",
+    "the prediction of held-out measurements",
 )
 # What an online run ends with where noise levels maximise the marginal likelihood.
 _CONCLUDED = "at the end all measurements were solved together, at the noise levels of their marginal likelihood"
@@ -381,10 +383,16 @@ class Session:
         """What can be wrong with the data."""
         return self.method.hypotheses()
 
-    def cross_validate(self) -> tuple[dict[str, SplitHalf], dict[str, float]]:
-        """The parameters of either half of the recording, and held-out measurements' residuals by family."""
-        halves = split_halves(self.method.graph, self.faults, self.data, self.config)
-        return halves, held_out_residuals(self.problem())
+    def cross_validate(self) -> tuple[dict[str, SplitHalf], dict[str, float], str]:
+        """Parameters of either half of the recording, held-out residuals by family, and what the time limit stopped."""
+        with self.usual_time():
+            halves, predicted = {}, {}
+            if not deadline.passed(_HALVES):
+                halves = split_halves(self.method.graph, self.faults, self.data, self.config)
+                deadline.passed(_HALVES)
+            if not deadline.passed(_HELD_OUT):
+                predicted = held_out_residuals(self.problem())
+            return halves, predicted, deadline.stopped()
 
     def _findings(
         self, problem: Problem, estimate: Estimate, quantities: Sequence[Quantity], change: Finding | None

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from alidade.pipelines import progress
+from alidade.pipelines import deadline, progress
 from alidade.pipelines.applications.session import Recorded, Session, resolve_method
 from alidade.pipelines.applications.sharing import device_belief, walks
 from alidade.pipelines.config import recorded_config
@@ -17,10 +17,6 @@ from alidade.pipelines.methods import method
 from alidade.pipelines.recording.reading import open_recording
 from alidade.pipelines.reports.calibration import SavedCalibration
 from alidade.pipelines.reports.known import Known, load_known, saved_of, with_covariance
-from alidade.pipelines.reports.validation import validation_html, validation_rows
-from alidade.pipelines.reports.whole import write_page
-
-FILE = "validation.html"
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,13 +107,16 @@ def validate(
     validations = chosen.validate(data, config, values)
     if known.sha256 == recording.sha256():
         return Validated(calibration, path.name, validations, True, recording.notes)
-    held, own = _held(Session(chosen, data, config, Recorded(recording)), with_covariance(known, calibration_file))
+    session = Session(chosen, data, config, Recorded(recording))
+    with session.usual_time():
+        held, own = _held(session, with_covariance(known, calibration_file))
+        lost = (*recording.notes, *filter(None, [deadline.stopped()]))
     if held is None:
-        return Validated(calibration, path.name, validations, False, recording.notes)
+        return Validated(calibration, path.name, validations, False, lost)
     of_device = walks(chosen, config, [name for name in own if name in calibration.parameters])
     mixed = {**own, **{name: value for name, value in values.items() if name in of_device}}
     device, best = (chosen.validate(data, config, each) for each in (mixed, own))
-    return Validated(calibration, path.name, validations, False, recording.notes, held, device, best)
+    return Validated(calibration, path.name, validations, False, lost, held, device, best)
 
 
 def _held(session: Session, known: Known) -> tuple[CalibrationCheck | None, dict[str, float]]:
@@ -137,6 +136,7 @@ def _held(session: Session, known: Known) -> tuple[CalibrationCheck | None, dict
         return None, {}
     own = problem.numbers(estimate)
     if not estimate.converged or estimate.told is None:
+        deadline.passed("the solution of this recording")
         return None, {}
     inflations = dict(zip(estimate.names, estimate.inflations.tolist(), strict=True))
     return check_calibration(belief, estimate.told, problem.quantities, inflations), own
@@ -147,50 +147,3 @@ def _stepped(step: Change, held: CalibrationCheck) -> str:
     unit, factor = human_unit(held.quantities[step.name])
     size, sigma = (to_digits_of(factor * x, factor * step.sigma) for x in (step.size, step.sigma))
     return f"{step.name} changed by {size} ± {sigma} {unit}".strip()
-
-
-def parameter_rows(validated: Validated) -> list[tuple[str, str, str, str, str]]:
-    """For each parameter that is compared: name, change, its sigma, from what on it would be noticed, unit."""
-    if validated.held is None:
-        return []
-    held, rows = validated.held, []
-    for step in held.steps:
-        unit, factor = human_unit(held.quantities[step.name])
-        numbers = (step.size, step.sigma, held.changes.limit * step.sigma)
-        size, sigma, least = (to_digits_of(factor * x, factor * step.sigma) for x in numbers)
-        rows.append((step.name, size, sigma, least, unit))
-    return rows
-
-
-def table(validated: Validated) -> list[str]:
-    """Lines of text: for each error RMS and peak before and after, then what each parameter changed by."""
-    rows = validation_rows(validated.validations, validated.device, validated.best)
-    width = max(len(row[0]) for row in rows)
-    lines = [
-        f"{'':{width}}  {'RMS':>9} {'':>9} {'':>9} {'':>9}  {'peak':>9}",
-        f"{'error':{width}}  {'before':>9} {'after':>9} {'device':>9} {'expected':>9}  {'before':>9} {'after':>9}",
-        *(
-            f"{row[0]:{width}}  {' '.join(f'{x:>9}' for x in row[1:5])}  {row[5]:>9} {row[6]:>9}  {row[7]}"
-            for row in rows
-        ),
-    ]
-    compared = parameter_rows(validated)
-    if compared:
-        width = max(len(row[0]) for row in compared)
-        lines.append(f"{'parameter':{width}}  {'change':>9} {'sigma':>9} {'noticed':>9}")
-        lines += [f"{name:{width}}  {a:>9} {b:>9} {c:>9}  {unit}" for name, a, b, c, unit in compared]
-    return [*lines, validated.sentence]
-
-
-def write_validation(out_dir: Path, validated: Validated) -> Path:
-    """Write validation.html; returns its path. Raises InputError when it cannot be written."""
-    page = validation_html(
-        validation_rows(validated.validations, validated.device, validated.best),
-        validated.validations,
-        validated.calibration,
-        validated.recording,
-        validated.verdict,
-        validated.sentence,
-        parameter_rows(validated),
-    )
-    return write_page(out_dir, FILE, page)

@@ -12,13 +12,16 @@ from alidade.pipelines.diagnostics.cross_validation import peak, rms
 from alidade.pipelines.reports.sentences import label
 
 if TYPE_CHECKING:
+    from alidade.pipelines.applications.discovery import Suggestion
     from alidade.pipelines.applications.fleet.analysis import Population
     from alidade.pipelines.applications.fleet.fleet import Outcome
     from alidade.pipelines.applications.fleet.histories import History
     from alidade.pipelines.applications.fleet.montecarlo import Study
     from alidade.pipelines.applications.fleet.statistics import Component
     from alidade.pipelines.applications.planning import Plan
+    from alidade.pipelines.applications.table_discovery import Columns
     from alidade.pipelines.applications.validate import Validated
+    from alidade.pipelines.recording.info import SessionFacts
 
 
 def plain_json(kind: str, content: Mapping[str, Any]) -> str:
@@ -135,6 +138,32 @@ def study_json(study: Study) -> str:
             "interrupted": study.interrupted,
         },
     )
+
+
+def facts_json(
+    facts: SessionFacts, found: Sequence[Suggestion], unused: Sequence[str], columns: Columns | None = None
+) -> str:
+    """Of `info`: the facts, and what each method has, lacks and could use."""
+    suggested = {suggestion.method: suggestion for suggestion in found}
+    content = asdict(facts)
+    proposed = content.pop("proposed")
+    content["methods"] = {
+        name: {
+            "served": not missing,
+            "missing": missing,
+            "proposed": proposed.get(name, ()),
+            "suggested": {key: source.model_dump() for key, source in suggested[name].topics.items()}
+            if name in suggested
+            else {},
+            "reasons": suggested[name].reasons if name in suggested else (),
+            "still_missing": suggested[name].missing if name in suggested else missing,
+        }
+        for name, missing in content.pop("missing").items()
+    }
+    if columns is not None:
+        tables = {topic: table.model_dump(exclude_defaults=True) for topic, table in columns.columns.items()}
+        content["columns"] = {"columns": tables, "reasons": list(columns.reasons), "doubts": list(columns.doubts)}
+    return plain_json("info", content | {"unused": list(unused)})
 
 
 def _finite(value: Any) -> Any:

@@ -9,10 +9,10 @@ from itertools import cycle
 import numpy as np
 from numpy.typing import NDArray
 
-from alidade.pipelines.display.figure import COLORS, PALE, REJECTED, Figure
+from alidade.pipelines.display.figure import COLORS, PALE, REJECTED, Figure, Plot
 from alidade.pipelines.display.units import human_unit
 from alidade.pipelines.estimation.problem import Array, History, Quantity, Residuals
-from alidade.pipelines.reports.result import Calibration, Plot, quantities_of
+from alidade.pipelines.reports.result import Calibration, quantities_of
 
 # What tells the numbers of one variable apart: an axis, an element, a harmonic.
 _AXIS = re.compile(r"_([xyzenu]{1,2}|sin|cos)$|_?\d+$")

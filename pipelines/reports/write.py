@@ -8,10 +8,11 @@ from pathlib import Path
 
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.reports.calibration import calibration_yaml
+from alidade.pipelines.reports.calibration_report import report_html
 from alidade.pipelines.reports.estimates import write_estimates
 from alidade.pipelines.reports.foxglove import foxglove_layout
-from alidade.pipelines.reports.html import report_html
-from alidade.pipelines.reports.result import Calibration, result_json
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.reports.result_json import result_json
 from alidade.pipelines.reports.trajectory import tum
 from alidade.pipelines.reports.whole import write_whole
 

@@ -24,12 +24,13 @@ from alidade.pipelines.applications.joint import calibrate_together
 from alidade.pipelines.applications.session import Session
 from alidade.pipelines.applications.sharing import walks
 from alidade.pipelines.config import load_config
+from alidade.pipelines.display.figure import Plot
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Severity
 from alidade.pipelines.estimation.problem import Array, Told
 from alidade.pipelines.recording.opening import recordings_of
-from alidade.pipelines.reports.over_time import forecasts, recordings_shown
-from alidade.pipelines.reports.result import Calibration, Plot
+from alidade.pipelines.reports.joint_report import forecasts, recordings_shown
+from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.solvers.joint import join
 from tests.support.broad_trials import TRIALS, converted
 from tests.support.one_graph import one_graph, solved

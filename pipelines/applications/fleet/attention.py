@@ -17,7 +17,7 @@ from alidade.pipelines.applications.fleet.store import Result
 from alidade.pipelines.diagnostics.device_changes import Change
 from alidade.pipelines.display.units import human_unit, to_digits_of
 from alidade.pipelines.estimation.problem import Quantity
-from alidade.pipelines.reports.over_time import what
+from alidade.pipelines.reports.joint_report import what
 
 Kind = Literal["changed", "outlying", "failed", "inconsistent", "unobservable", "weak"]
 # In the order of how much they matter.

@@ -238,7 +238,7 @@ def _first(method: Method, scenario: BaseModel, seed: int) -> tuple[str, str, st
 
 def _numbers(calibration: Calibration) -> Result:
     """Errors against sigmas, of what was estimated and whose truth is known."""
-    from alidade.pipelines.reports.result import truth_errors
+    from alidade.pipelines.reports.result_json import truth_errors
 
     errors = truth_errors(calibration)
     judged = [p for p in calibration.parameters.values() if p.name in errors and p.sigma > 0.0]

@@ -9,11 +9,13 @@ from itertools import cycle
 import numpy as np
 
 from alidade.pipelines.diagnostics.device_changes import Change
-from alidade.pipelines.display.figure import COLORS, Figure, milliseconds
+from alidade.pipelines.display.figure import COLORS, Figure, Plot, milliseconds
+from alidade.pipelines.display.table import Table
 from alidade.pipelines.display.units import human_unit, rounded, to_digits_of
 from alidade.pipelines.estimation.assumptions import kind
 from alidade.pipelines.estimation.problem import Quantity
-from alidade.pipelines.reports.result import Calibration, PartResult, Plot, Table
+from alidade.pipelines.reports.result import Calibration
+from alidade.pipelines.reports.result_json import PartResult
 from alidade.pipelines.reports.sentences import between
 
 # Beyond so many days a forecast says nothing.
