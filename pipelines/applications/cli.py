@@ -8,6 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from enum import StrEnum
 from functools import cache, partial
 from pathlib import Path
@@ -21,7 +22,8 @@ from alidade.pipelines.applications.options import ConfigFile, Json, Quiet, Reco
 from alidade.pipelines.solvers.window import parse_window
 
 if TYPE_CHECKING:
-    from alidade.pipelines.estimation.problem import AttitudeRate
+    from alidade.pipelines.applications.session import Session
+    from alidade.pipelines.recording.opening import Where
     from alidade.pipelines.reports.result import Calibration
 
 # Errors that are told in one line, by name: to import the second takes gtsam's quarter of a second.
@@ -195,15 +197,19 @@ def calibrate(
     from tempfile import TemporaryDirectory
 
     from alidade.pipelines import deadline, parallel, progress
-    from alidade.pipelines.applications.joint import calibrate_device
-    from alidade.pipelines.applications.session import calibrate as run
+    from alidade.pipelines.applications.joint import calibrate_together
+    from alidade.pipelines.applications.session import OpenOptions
     from alidade.pipelines.errors import InputError
     from alidade.pipelines.recording.opening import recordings_of, told
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.whole import require_room
     from alidade.pipelines.reports.write import adopt_parts, write_part, write_results
 
-    rate: AttitudeRate = attitude_rate.value
+    options = OpenOptions(method, config, strict, auto_topics, auto_columns, prior)
+
+    def read(where: "Where") -> "Session":
+        return replace(options.read(where), engine=engine.value, attitude_rate=attitude_rate.value)
+
     recordings, folder = recordings_of(sessions), out or _beside(sessions[0], solver.value)
     if len(recordings) > 1:
         if solver != Solver.batch:
@@ -222,22 +228,10 @@ def calibrate(
     ):
         if len(recordings) > 1:
             by_itself = partial(write_part, Path(parts))
-            calibration = calibrate_device(recordings, method, config, strict, auto_topics, prior, by_itself, rate)
+            calibration = calibrate_together([partial(read, each) for each in recordings], by_itself)
         else:
-            (calibration,) = run(
-                recordings[0],
-                [solver.value],
-                method,
-                config,
-                parse_window(window),
-                strict,
-                auto_topics,
-                not no_check,
-                prior,
-                engine=engine.value,
-                auto_columns=auto_columns,
-                attitude_rate=rate,
-            )
+            session = read(recordings[0])
+            (calibration,) = session.calibrations([solver.value], parse_window(window), check=not no_check)
         with progress.doing("writing"):
             if len(recordings) > 1:
                 adopt_parts(folder, Path(parts))
@@ -264,22 +258,17 @@ def compare(
 
     With errors where the truth is known, and a split-half test with --out.
     """
-    import time
-
     from alidade.pipelines import deadline, parallel, progress
-    from alidade.pipelines.applications.session import Session
-    from alidade.pipelines.recording.reading import open_recording
+    from alidade.pipelines.applications.session import OpenOptions
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.comparison_report import write_compare
     from alidade.pipelines.reports.whole import require_room
 
     require_room(out)
-    kept, start = parse_window(window), time.perf_counter()
+    kept = parse_window(window)
     with progress.shown(quiet or as_json), parallel.processes(jobs), deadline.within(time_limit):
-        with progress.doing("reading"):
-            opened = Session.read(open_recording(session, strict), method, config, auto_topics, prior)
-        seconds = {"read": time.perf_counter() - start}
-        calibrations = opened.calibrations(["published", "batch", "incremental"], kept, seconds)
+        opened = OpenOptions(method, config, strict, auto_topics, prior=prior).read(session)
+        calibrations = opened.calibrations(["published", "batch", "incremental"], kept)
     if as_json:
         terminal.show_json(calibrations)
     else:

@@ -177,6 +177,7 @@ class Session:
         engine: that eliminates batch's linear systems.
         near: numbers that rotations are reported near of, as another recording of the device has them.
         attitude_rate: of the trajectory that is reported.
+        read_s: wall time of reading, s; None: nothing was read.
     """
 
     method: Method
@@ -186,6 +187,7 @@ class Session:
     engine: EngineName = "auto"
     near: Mapping[str, float] = field(default_factory=dict)
     attitude_rate: AttitudeRate = "vision"
+    read_s: float | None = None
 
     @classmethod
     def read(
@@ -197,7 +199,7 @@ class Session:
         prior: Path | None = None,
         auto_columns: bool = False,
     ) -> Session:
-        """Read and check a recording (arguments and exceptions as `calibrate` has them)."""
+        """Read and check a recording (arguments and exceptions as `OpenOptions` has them)."""
         config = recorded_config(recording, config_file)
         if auto_columns:
             config = with_columns(recording, config)
@@ -274,11 +276,10 @@ class Session:
         self,
         solvers: Sequence[str],
         window: float | None = 1.0,
-        seconds: Mapping[str, float] | None = None,
         check: bool = False,
         report: bool = True,
     ) -> list[Calibration]:
-        """One calibration a solver; `seconds` is what came before (phase -> s). For the rest see `calibrate`."""
+        """One calibration a solver; for the rest see `calibrate`."""
         if isinstance(solvers, str):
             raise InputError(f"solvers: a list of names is needed, not the text {solvers!r}")
         for solver in solvers:
@@ -287,7 +288,7 @@ class Session:
         check_window(window)
         solved = (self._solve(solver, window, report=report) for solver in solvers)
         with self.usual_time("incremental" in solvers):
-            return self.judged(solved, seconds or {}, check, report)
+            return self.judged(solved, {} if self.read_s is None else {"read": self.read_s}, check, report)
 
     def calibrated_beside(self, others: Callable[[Told], Mapping[str, float]]) -> Calibration:
         """The calibration by batch, what it says of its numbers linear where others have them. Raises as `calibrate`.
@@ -496,48 +497,50 @@ class Session:
             return None
 
 
-def calibrate(
-    path: Where,
-    solvers: Sequence[str],
-    method_name: str | None = None,
-    config_file: Path | None = None,
-    window: float | None = 1.0,
-    strict: bool = False,
-    auto_topics: bool = False,
-    check: bool = False,
-    prior: Path | None = None,
-    report: bool = True,
-    engine: EngineName = "auto",
-    auto_columns: bool = False,
-    attitude_rate: AttitudeRate = "vision",
-) -> list[Calibration]:
-    """One calibration a solver, from one reading of the recording.
+@dataclass(frozen=True)
+class OpenOptions:
+    """How a recording is read.
 
-    Args:
-        path: the recording: a file, a folder of parts, a pattern, or a list of parts.
-        solvers: of SOLVERS.
-        method_name: overrides the config's.
-        config_file: overrides the recording's own config key by key.
-        window: s, of the incremental solver; None keeps the whole history.
+    Attributes:
+        method: its name; None: the config's, or the only one that the recording can serve.
+        config: overrides the recording's own config key by key; a YAML file or a Config.
         strict: refuse a recording of which anything is lost.
-        auto_topics: take the topics that `alidade info` suggests where those of the method are not there.
-        auto_columns: take what `alidade info` concludes of the columns of tables where the config describes none.
-        check: hold an incremental calibration against batch.
-        prior: an earlier calibration of the device to begin from, result.json or calibration.yaml.
-        report: with what only a report tells, see `Session.calibrate`.
-        engine: that eliminates batch's linear systems: "chain", "gtsam", or "auto".
-        attitude_rate: of the trajectory that is reported: "vision", or "gyro" for one at each sample of the gyro.
-
-    Raises:
-        InputError: recording or config cannot be used, or there is no such solver.
-        IndeterminateError: states other than the parameters are not determined.
+        auto_topics: use the topics that `alidade info` proposes where those of the method are absent.
+        auto_columns: use the columns of tables that `alidade info` proposes where the config describes none.
+        prior: an earlier calibration of the device, result.json or calibration.yaml.
     """
-    start = time.perf_counter()
-    with progress.doing("reading"):
-        session = Session.read(open_recording(path, strict), method_name, config_file, auto_topics, prior, auto_columns)
-    seconds = {"read": time.perf_counter() - start}
-    session = replace(session, engine=engine, attitude_rate=attitude_rate)
-    return session.calibrations(solvers, window, seconds, check, report)
+
+    method: str | None = None
+    config: Path | Config | None = None
+    strict: bool = False
+    auto_topics: bool = False
+    auto_columns: bool = False
+    prior: Path | None = None
+
+    def read(self, path: Where) -> Session:
+        """Read a recording: a file, a folder of parts, a pattern, or a list of parts.
+
+        Raises:
+            InputError: recording, config or prior cannot be used.
+        """
+        start = time.perf_counter()
+        with progress.doing("reading"):
+            session = Session.read(
+                open_recording(path, self.strict),
+                self.method,
+                self.config,
+                self.auto_topics,
+                self.prior,
+                self.auto_columns,
+            )
+        return replace(session, read_s=time.perf_counter() - start)
+
+
+def calibrate(
+    path: Where, solvers: Sequence[str], method: str | None = None, config: Path | Config | None = None
+) -> list[Calibration]:
+    """One calibration a solver, from one reading of a recording (exceptions as of `Session.calibrate`)."""
+    return OpenOptions(method, config).read(path).calibrations(solvers)
 
 
 def session_facts(recording: Recording, config: Config) -> SessionFacts:

@@ -231,12 +231,10 @@ def _calibrated(path: Path, settings: Settings, prior: Path | None) -> Result:
 
 
 def _calibration(path: Path, settings: Settings, config: Path | None, prior: Path | None) -> Calibration:
-    from alidade.pipelines.applications.session import calibrate
+    from alidade.pipelines.applications.session import OpenOptions
 
-    (calibration,) = calibrate(
-        path, [settings.solver], settings.method, config, settings.window, prior=prior, report=False
-    )
-    return calibration
+    session = OpenOptions(settings.method, config, prior=prior).read(path)
+    return session.calibrate(settings.solver, settings.window, report=False)
 
 
 def _summary(calibration: Calibration) -> Result:
