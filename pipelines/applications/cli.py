@@ -669,7 +669,7 @@ def export(
     """
     from alidade.pipelines.reports import terminal
     from alidade.pipelines.reports.calibration import load_calibration
-    from alidade.pipelines.reports.export import exported
+    from alidade.pipelines.reports.export_formats import exported
     from alidade.pipelines.reports.plain_json import plain_json
     from alidade.pipelines.reports.whole import write_file
 

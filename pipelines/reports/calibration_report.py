@@ -16,6 +16,7 @@ from alidade.pipelines.methods.meanings import NOISES, meaning
 from alidade.pipelines.reports import sentences
 from alidade.pipelines.reports.budget import Limit, limits
 from alidade.pipelines.reports.calibration import SavedCalibration, saved
+from alidade.pipelines.reports.export_formats import ros_parameters
 from alidade.pipelines.reports.html import render_fragment, render_html
 from alidade.pipelines.reports.plots import common_plots
 from alidade.pipelines.reports.report import (
@@ -35,7 +36,6 @@ from alidade.pipelines.reports.report import (
 )
 from alidade.pipelines.reports.result import Calibration, quantities_of
 from alidade.pipelines.reports.result_json import ParameterResult, truth_errors
-from alidade.pipelines.reports.ros import ros_parameters
 from alidade.pipelines.reports.sketch import enlarged, sketch_with, told
 from alidade.pipelines.reports.snippets import c_code, python_code
 

@@ -19,9 +19,8 @@ from alidade.pipelines.applications import exit_codes
 from alidade.pipelines.applications.fleet import require_extra
 from alidade.pipelines.applications.fleet.engine import Killed, cluster, completed, source_version
 from alidade.pipelines.applications.fleet.histories import packed
-from alidade.pipelines.applications.fleet.isolated import failure, quarantined, run_isolated
 from alidade.pipelines.applications.fleet.recordings import Recording, as_date, from_metadata, from_name, local
-from alidade.pipelines.applications.fleet.store import Result, Store, settings_key
+from alidade.pipelines.applications.fleet.store import Result, Store, failure, quarantined, run_isolated, settings_key
 from alidade.pipelines.applications.sharing import walks
 from alidade.pipelines.belief import Belief
 from alidade.pipelines.config import load_config

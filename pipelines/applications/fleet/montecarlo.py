@@ -21,8 +21,7 @@ import numpy as np
 from alidade.pipelines import methods, progress
 from alidade.pipelines.applications.fleet import require_extra, statistics
 from alidade.pipelines.applications.fleet.engine import Killed, cluster, completed, source_version
-from alidade.pipelines.applications.fleet.isolated import quarantined, run_isolated
-from alidade.pipelines.applications.fleet.store import Result, Store, settings_key
+from alidade.pipelines.applications.fleet.store import Result, Store, quarantined, run_isolated, settings_key
 from alidade.pipelines.applications.fleet.tables import Cell, Row
 from alidade.pipelines.errors import InputError
 

@@ -1,6 +1,7 @@
-"""What is finished, kept as it comes: a line of JSON a result, so that an interrupted run goes on where it stopped.
+"""Results of many calibrations, kept as they come, and a calibration whose failure is a result.
 
-A line that is none, whatever it holds, is passed over: that result is made again.
+A line of JSON is a result: an interrupted run continues where it stopped. A line that is no result, whatever it holds,
+is passed over, and that result is made again.
 """
 
 from __future__ import annotations
@@ -11,12 +12,17 @@ import json
 import os
 import re
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from alidade.pipelines.applications import exit_codes
 from alidade.pipelines.errors import InputError
+
+if TYPE_CHECKING:
+    from alidade.pipelines.reports.result import Calibration
 
 FILE = "results.jsonl"
 
@@ -92,3 +98,34 @@ def require_writable(folder: Path) -> None:
             pass
     except OSError as error:
         raise InputError(f"{folder}: no folder to write results to ({os.strerror(error.errno or 0)})") from error
+
+
+def run_isolated(summarise: Callable[[Calibration], Result], calibrate: Callable[[], Calibration]) -> Result:
+    """Status, exit code, reason, seconds of wall time, and what `summarise` takes of the calibration. Never raises."""
+    from alidade.pipelines.solvers.chain import IndeterminateError
+
+    try:
+        calibration = calibrate()
+        return {
+            "status": calibration.status,
+            "exit_code": exit_codes.OF_STATUS[calibration.status],
+            "reason": "" if calibration.status == "calibrated" else calibration.headline,
+            "seconds": sum(calibration.timing.values()),
+            **summarise(calibration),
+        }
+    except InputError as error:
+        return failure(exit_codes.BAD_INPUT, str(error))
+    except IndeterminateError as error:
+        return failure(exit_codes.UNDETERMINED, str(error))
+    except Exception as error:
+        return failure(exit_codes.CRASHED, f"{type(error).__name__}: {error}")
+
+
+def failure(exit_code: int, reason: str) -> Result:
+    """The result of what came to no estimate."""
+    return {"status": "failed", "exit_code": exit_code, "reason": " ".join(reason.split()), "parameters": {}}
+
+
+def quarantined() -> Result:
+    """The result of what killed its workers."""
+    return failure(exit_codes.KILLED, "killed its worker each time it was tried, at last alone; quarantined")
