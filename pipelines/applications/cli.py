@@ -49,13 +49,18 @@ class _WithMethods(TyperGroup):
 
 @cache
 def _of_methods() -> Mapping[str, Any]:
+    import logging
+
     from alidade.pipelines import methods
 
     own = typer.Typer(rich_markup_mode=None)
     own.callback()(lambda: None)
     for name in methods.names():
-        for word, command in methods.method(name).commands.items():
-            own.command(word)(command)
+        try:
+            for word, command in methods.method(name).commands.items():
+                own.command(word)(command)
+        except Exception as error:
+            logging.getLogger("alidade").warning("method %s: its commands cannot be loaded: %s", name, error)
     return typer.main.get_group(own).commands
 
 

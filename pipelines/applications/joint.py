@@ -47,7 +47,7 @@ from alidade.pipelines.estimation.problem import (
 )
 from alidade.pipelines.methods import Method
 from alidade.pipelines.recording.info import SessionFacts
-from alidade.pipelines.reports.joint_report import recordings_shown
+from alidade.pipelines.reports.joint_report import recording_blocks
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import PartParameter, PartResult
 from alidade.pipelines.solvers.joint import Joined, grown, join, tell
@@ -336,7 +336,7 @@ def _calibration(
         config=alone[last].calibration.config,
         recordings=parts,
         changes=changed,
-        plots=recordings_shown,
+        plots=recording_blocks,
     )
 
 

@@ -261,9 +261,9 @@ class Session:
     ) -> Calibration:
         """The calibration by one of SOLVERS; `window` in s is the incremental one's, None keeps the whole history.
 
-        With `check` the incremental one is held against batch. Without `report` there are values, sigmas and verdicts,
+        With `check` the incremental one is compared with batch. Without `report` there are values, sigmas and verdicts,
         the same to the last digit, and nothing of what else a report explains: where the variances come from, which
-        measurements move a number most, what inputs taken for exact would do to it, the method's own findings.
+        measurements move a number most, the effect of fixed inputs on it, the method's own findings.
 
         Raises:
             InputError: no such solver, no such window, or the data cannot be used.
@@ -476,7 +476,7 @@ class Session:
             return estimate, problem
 
     def _changed(self) -> Iterator[tuple[str, Problem]]:
-        """Each input that the graph takes for exact, and the graph with that input off by its step."""
+        """Each fixed input of the graph, and the graph with that input off by its step."""
         for exact in self.method.hypotheses().exact:
             if deadline.passed(_SENSITIVITY):
                 return

@@ -11,8 +11,8 @@ from alidade.pipelines.applications.session import Recorded, Session, resolve_me
 from alidade.pipelines.applications.sharing import device_belief, walks
 from alidade.pipelines.config import recorded_config
 from alidade.pipelines.diagnostics.cross_validation import Validation
-from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Change, Verdict, check_calibration
-from alidade.pipelines.display.units import human_unit, to_digits_of
+from alidade.pipelines.diagnostics.device_changes import CalibrationCheck, Verdict, check_calibration
+from alidade.pipelines.display.units import format_estimate
 from alidade.pipelines.methods import method
 from alidade.pipelines.recording.reading import open_recording
 from alidade.pipelines.reports.calibration import SavedCalibration
@@ -21,7 +21,7 @@ from alidade.pipelines.reports.known import Known, load_known, saved_of, with_co
 
 @dataclass(frozen=True, eq=False)
 class Validated:
-    """A calibration held against a recording.
+    """A calibration tested on a recording.
 
     Attributes:
         calibration: the one validated.
@@ -60,7 +60,11 @@ class Validated:
         steps = self.held.steps
         if self.verdict == "holds":
             return f"The calibration holds: none of {len(steps)} parameters differs by more than chance."
-        found = [_stepped(step, self.held) for step in steps if step in self.held.changes.found]
+        found = [
+            f"{step.name} changed by {format_estimate(self.held.quantities[step.name], step.size, step.sigma)}"
+            for step in steps
+            if step in self.held.changes.found
+        ]
         what = "; ".join(found) or "all parameters together, none by more than chance for itself"
         small = "" if self.held.matters or not found else " That is less than what is required of them."
         return f"The calibration does not hold: {what}.{small}"
@@ -140,10 +144,3 @@ def _held(session: Session, known: Known) -> tuple[CalibrationCheck | None, dict
         return None, {}
     inflations = dict(zip(estimate.names, estimate.inflations.tolist(), strict=True))
     return check_calibration(belief, estimate.told, problem.quantities, inflations), own
-
-
-def _stepped(step: Change, held: CalibrationCheck) -> str:
-    """A parameter that changed, in the unit people read."""
-    unit, factor = human_unit(held.quantities[step.name])
-    size, sigma = (to_digits_of(factor * x, factor * step.sigma) for x in (step.size, step.sigma))
-    return f"{step.name} changed by {size} ± {sigma} {unit}".strip()

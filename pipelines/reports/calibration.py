@@ -124,9 +124,9 @@ class SavedCalibration(_Record):
         """
         from alidade.pipelines.methods import method
 
-        told = "\n".join(self.formulas)
+        text = "\n".join(self.formulas)
         # A formula names a parameter, or the vector that it is a component of.
-        applied = [name for name in self.parameters if re.search(rf"\b({name}|{name[:-2]})\b", told)]
+        applied = [name for name in self.parameters if re.search(rf"\b({name}|{name[:-2]})\b", text)]
         formulas = method(self.method).formulas(applied, self._config)
         if [formula.text for formula in formulas] != self.formulas:
             raise InputError("apply: the formulas in the calibration are not those of its parameters and this config")

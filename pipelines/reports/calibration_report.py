@@ -36,7 +36,7 @@ from alidade.pipelines.reports.report import (
 )
 from alidade.pipelines.reports.result import Calibration, quantities_of
 from alidade.pipelines.reports.result_json import ParameterResult, truth_errors
-from alidade.pipelines.reports.sketch import enlarged, sketch_with, told
+from alidade.pipelines.reports.sketch import enlarged, rotation_text, sketch_with
 from alidade.pipelines.reports.snippets import c_code, python_code
 
 # A value whose sigma exceeds so many sigmas of its prior is not shown.
@@ -133,7 +133,8 @@ def _frames(c: Calibration, file: SavedCalibration) -> tuple[Block, ...]:
     if not shown:
         return (Card((drawing,), style="sketch"),)
     lines = tuple(
-        f"{name}, {each.child} to {each.parent}: {told(each)}{'; drawn ten times as large' if enlarged(each) else ''}"
+        f"{name}, {each.child} to {each.parent}: {rotation_text(each)}"
+        f"{'; drawn ten times as large' if enlarged(each) else ''}"
         for name, each in shown.items()
     )
     return (Card((drawing, Bullets(lines), Text("Dashed: the axes as estimated.")), style="sketch"),)

@@ -47,7 +47,7 @@ class _Fields(BaseModel):
 
 
 class Limits(_Fields):
-    """What a parameter is held against, SI."""
+    """Limits that a parameter is compared with, SI."""
 
     nominal: float = 0.0
     tolerance: Annotated[float, Field(gt=0.0)]
@@ -200,7 +200,7 @@ def _rows(result: Result, stated: Fields, earlier: Mapping[str, float]) -> list[
 
 
 def _effective(result: Result, shares: Mapping[str, float]) -> float | None:
-    """Welch and Satterthwaite: what a family of measurements adds is known as well as its residuals tell its noise.
+    """Welch and Satterthwaite: the share of a family of measurements has the degrees of freedom of its residuals.
 
     Noise that was stated and not asked of the recording, and priors, count as known.
     """
@@ -387,6 +387,6 @@ def _printed(page: str) -> bytes:
             "--pdf needs WeasyPrint, pip install 'alidade[pdf]', and Pango of the system (Debian: apt install "
             "libpango-1.0-0 libpangoft2-1.0-0 libharfbuzz-subset0); or print certificate.html by a browser"
         ) from error
-    logging.getLogger("weasyprint").setLevel(logging.ERROR)  # else it tells of every style that is for screens
+    logging.getLogger("weasyprint").setLevel(logging.ERROR)  # else it warns of every style for screens
     out: bytes = HTML(string=page).write_pdf()
     return out

@@ -16,7 +16,7 @@ from alidade.pipelines.display.units import human_unit, signed, to_digits_of
 from alidade.pipelines.estimation.problem import Quantity
 from alidade.pipelines.methods.meanings import meaning
 from alidade.pipelines.reports.html import render_html
-from alidade.pipelines.reports.report import Block, Plots, Report, Section, Summary, Text
+from alidade.pipelines.reports.report import Block, Plots, Report, Section, Summary
 from alidade.pipelines.reports.result import Calibration
 from alidade.pipelines.reports.result_json import TruthResult, truth_errors
 from alidade.pipelines.reports.whole import write_page
@@ -57,9 +57,9 @@ def comparison_report(
         sections=(
             Section("Solvers", (_comparison_table(calibrations, quantities),)),
             Section("First and second half", _halves(first, quantities, halves)),
-            Section("Held-out measurements", _held_out(predicted)),
             Section("Plots", (Plots(plots),)),
         ),
+        style="wide",
     )
 
 
@@ -162,7 +162,7 @@ def _split_half_test(halves: Mapping[str, SplitHalf], predicted: Mapping[str, fl
     """Whether the estimates from both halves agree."""
     question = "Do both halves of the recording agree?"
     held_out = ", ".join(f"{size:.2f} ({family})" for family, size in predicted.items())
-    said = f" Held-out measurements are predicted to {held_out} of their sigmas." if held_out else ""
+    said = f" Held-out measurements are predicted to {held_out} of their sigmas; 1 is expected." if held_out else ""
     if not halves:
         text = "Neither half determines a parameter by itself: they cannot be compared."
         return Summary(question, "cannot say", "fixed", text + said, (), ("Record about twice as long.",))
@@ -205,13 +205,6 @@ def _halves(c: Calibration, quantities: Sequence[Quantity], halves: Mapping[str,
         "means that something changed, or that the model lacks something."
     )
     return (Table("", caption, columns, tuple(rows), "halves", most_rows=None),) if rows else ()
-
-
-def _held_out(predicted: Mapping[str, float]) -> tuple[Block, ...]:
-    if not predicted:
-        return ()
-    sizes = ", ".join(f"{size:.2f} sigmas ({family})" for family, size in predicted.items())
-    return (Text(f"Held-out measurements are predicted to {sizes}; 1 is as good as their noise allows."),)
 
 
 def _differences(calibrations: Sequence[Calibration], quantities: Sequence[Quantity]) -> list[Plot]:

@@ -62,7 +62,7 @@ def title(sensor: SensorNoise) -> str:
     rests = (
         f"at rest from {sensor.rests[0, 0]:.1f} to {sensor.rests[0, 1]:.1f} s"
         if count == 1
-        else f"{count} stretches at rest, {length(sensor.length_s)} in all, the longest {length(longest)}"
+        else f"{count} static intervals, {length(sensor.length_s)} in all, the longest {length(longest)}"
     )
     return f"{sensor.topic} {_TITLES[sensor.kind]}, {sensor.rate_hz:.4g} Hz, {rests}"
 
@@ -104,7 +104,7 @@ def section(study: NoiseStudy) -> tuple[dict[str, float], str]:
     """The config's keys with their values, and the `noise:` section to paste, with comments.
 
     A value is the root mean square over the axes. The first topic of a kind gives the keys, that of the platform its
-    own; what no key is for, or is not told, stands as a comment.
+    own; what has no key, or is not determined, stands as a comment.
     """
     values: dict[str, float] = {}
     lines = ["noise:"]
@@ -119,7 +119,7 @@ def section(study: NoiseStudy) -> tuple[dict[str, float], str]:
 
 
 def noise_json(study: NoiseStudy) -> str:
-    """noise.json: everything, SI; null where something is not told or has no bound."""
+    """noise.json: everything, SI; null where a number is not determined or has no bound."""
     values, text = section(study)
     content = {
         "schema": "alidade.noise/1",
@@ -236,12 +236,12 @@ def _needed(silent: Sequence[Coefficient]) -> str:
 def _line(sensor: SensorNoise, name: str, key: str, values: dict[str, float] | None) -> str:
     """A line of the section; the value goes into `values`, None: it stands as a comment."""
     found = {axis: _of(sensor, axis, name) for axis in sensor.axes}
-    told = [c.value for c in found.values() if c.value is not None]
+    known = [c.value for c in found.values() if c.value is not None]
     each = ", ".join(f"{axis} {_scientific(c)}" for axis, c in found.items())
     comment = f"{_UNITS[sensor.kind][name][0]}, {sensor.topic}: {each}"
-    if not told:
+    if not known:
         return f"  # {key}: {comment}"
-    value = float(f"{math.sqrt(sum(x * x for x in told) / len(told)):.3g}")
+    value = float(f"{math.sqrt(sum(x * x for x in known) / len(known)):.3g}")
     mantissa, exponent = f"{value:.2e}".split("e")
     text = f"{key}: {mantissa}e{int(exponent)}"
     if values is None:

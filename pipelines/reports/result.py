@@ -45,7 +45,7 @@ _PACKAGES = ("alidade", "gtsam", "numpy", "opencv-contrib-python-headless", "pyc
 
 @dataclass(frozen=True, repr=False)
 class Calibration:
-    """Everything the reports tell about one calibration.
+    """A calibration with its findings and provenance.
 
     Attributes:
         method: that was calibrated.

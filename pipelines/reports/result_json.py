@@ -419,15 +419,15 @@ def _changes(c: Calibration) -> ChangesResult | None:
     found = {(step.name, step.after): step for step in c.changes.found}
     steps = []
     for step in c.changes.steps:
-        told = found.get((step.name, step.after), step)
+        shown = found.get((step.name, step.after), step)
         names = [c.recordings[i].recording for i in (step.after, step.after + 1)]
         steps.append(
             ChangeResult(
                 parameter=step.name,
                 before=names[0],
                 after=names[1],
-                step=told.size,
-                sigma=told.sigma,
+                step=shown.size,
+                sigma=shown.sigma,
                 found=(step.name, step.after) in found,
             )
         )

@@ -13,7 +13,7 @@ from itertools import groupby
 from typing import Any
 
 from alidade.pipelines.diagnostics.goodness_of_fit import Fit
-from alidade.pipelines.display.units import human_unit, noise_unit, rounded, to_digits_of
+from alidade.pipelines.display.units import format_estimate, human_unit, noise_unit, rounded
 from alidade.pipelines.estimation.finding import Finding, Severity, status
 from alidade.pipelines.estimation.problem import Quantity
 
@@ -149,7 +149,7 @@ def _conflict(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> tupl
     q = quantities[e["parameter"]]
     unit, factor = human_unit(q)
     prior = f"prior {factor * q.prior_mean:.3g} ± {rounded(factor * q.scale)} {unit}".rstrip()
-    numbers = f"{_number(q, e['value'], e['sigma'])}, {prior} (z = {e['z']:.1f})"
+    numbers = f"{format_estimate(q, e['value'], e['sigma'])}, {prior} (z = {e['z']:.1f})"
     if not q.assumed:
         return f"{q.name} is far from its prior", f"{numbers}; {_FAR}"
     inseparable = f" (or {', '.join(e['inseparable'])}, inseparable from it)" if e["inseparable"] else ""
@@ -165,13 +165,15 @@ def _conflict(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> tupl
 
 
 def _change(e: Mapping[str, Any], severity: Severity, quantities: Quantities) -> str:
-    steps = [f"{name} by {_number(quantities[name], *step)}" for name, step in list(e["steps"].items())[:_MAX_NAMED]]
+    steps = [
+        f"{name} by {format_estimate(quantities[name], *step)}" for name, step in list(e["steps"].items())[:_MAX_NAMED]
+    ]
     small = " Immaterial; included in the sigmas." if severity == Severity.NOTE else ""
     return f"Change at {e['time_s']:.0f} s{': ' if steps else ''}{', '.join(steps)}.{small}"
 
 
 def _device_change(e: Mapping[str, Any], _: Severity, quantities: Quantities) -> str:
-    step = _number(quantities[e["parameter"]], e["step"], e["sigma"])
+    step = format_estimate(quantities[e["parameter"]], e["step"], e["sigma"])
     return f"Change of the device {between(e['recordings'], e['dates'])}: {e['parameter']} by {step}."
 
 
@@ -274,13 +276,6 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any], Severity, Quantities], str]] =
 
 
 _CAUSES = {"hypothesis": _corrected, "prior_conflict": _conflict}
-
-
-def _number(q: Quantity, value: float, sigma: float) -> str:
-    """Value and sigma, SI, in the unit and with the digits that people read."""
-    unit, factor = human_unit(q)
-    number, spread = (to_digits_of(factor * each, factor * sigma) for each in (value, sigma))
-    return f"{number} ± {spread} {unit}".strip()
 
 
 def between(recordings: Sequence[str], dates: Sequence[str]) -> str:

@@ -47,7 +47,7 @@ def test_truth_halves_and_held_out_measurements_are_told() -> None:
     assert "error of batch, σ" in page.text
     assert "Do both halves of the recording agree? yes Its two halves" in page.text
     assert "10.0 ± 3.0 20.0 ± 4.0 +2.0" in page.text
-    assert "1.06 sigmas (vision)" in page.text
+    assert "predicted to 1.06 (vision) of their sigmas" in page.text
 
 
 def test_halves_that_differ_by_more_than_chance_are_told() -> None:

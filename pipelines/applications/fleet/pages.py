@@ -190,10 +190,10 @@ def _population_plot(p: Population) -> Plot:
     good = np.flatnonzero(~flagged)
     _add_recordings(out, p, good[thin(len(good))], factor, "recording", COLORS[0])
     edges = np.histogram_bin_edges(factor * p.values, bins=int(np.clip(2.0 * math.sqrt(len(p.values)), 10, _MOST_BARS)))
-    told = _add_counts(counts, factor * p.values[good], edges, "recording", COLORS[0])
+    ends = _add_counts(counts, factor * p.values[good], edges, "recording", COLORS[0])
     if flagged.any():
         _add_recordings(out, p, np.flatnonzero(flagged), factor, "outlying or changed", REJECTED)
-        _add_counts(counts, factor * p.values[flagged], edges, "outlying or changed", REJECTED, told)
+        _add_counts(counts, factor * p.values[flagged], edges, "outlying or changed", REJECTED, ends)
     if p.spread and p.control:
         out.levels(factor * p.spread.centre, dash="solid")
         out.levels(factor * np.array(p.control), dash="dashed")
@@ -305,7 +305,7 @@ def _nees_plot(study: Study, solver: str) -> Plot:
     found = study.estimates(solver)
     values = np.array([result["nees"] for result in found])
     dof = study.nees(solver).dof
-    # What lies far out is told by the table.
+    # Outliers are in the table.
     top = 1.5 * max(float(np.quantile(values, 0.95)), dof + 3.0 * math.sqrt(2.0 * dof))
     out = Figure("runs", "NEES")
     _histogram(out, np.minimum(values, top), 0.0, top, lambda x: _chi_square_density(x, dof), f"chi-square of {dof:g}")

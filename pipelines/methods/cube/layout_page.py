@@ -60,7 +60,7 @@ def advice(layout: Layout) -> list[str]:
 
 
 def layout_json(layout: Layout) -> str:
-    """What the terminal tells, in SI and pixels: every tag placed with its sigmas, and why others are not."""
+    """Every tag placed with its sigmas, SI and pixels, and why others are not."""
     sigmas = np.sqrt(np.diag(layout.covariance)).reshape(-1, 6).tolist()
     body = layout.body
     return plain_json(
