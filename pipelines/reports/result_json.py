@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import (
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     SerializerFunctionWrapHandler,
@@ -22,21 +22,26 @@ from pydantic import (
     model_serializer,
 )
 
-from alidade.pipelines.diagnostics.change_test import Stability
-from alidade.pipelines.diagnostics.goodness_of_fit import Fit, SolverDifference
 from alidade.pipelines.diagnostics.observability import Verdict
 from alidade.pipelines.errors import InputError
 from alidade.pipelines.estimation.finding import Finding, Severity, Status
 from alidade.pipelines.estimation.noise import Source
-from alidade.pipelines.estimation.problem import Estimate
 from alidade.pipelines.files import MAX_RESULT_BYTES, read_bytes
 
 if TYPE_CHECKING:
     from alidade.pipelines.reports.result import Calibration
 
 
+# A number, null where it is not finite.
+_Finite = Annotated[
+    float | None, BeforeValidator(lambda x: None if isinstance(x, float) and not math.isfinite(x) else x)
+]
+
+
 class _Record(BaseModel):
-    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False, populate_by_name=True)
+    model_config = ConfigDict(
+        extra="ignore", frozen=True, allow_inf_nan=False, populate_by_name=True, from_attributes=True
+    )
 
 
 class ParameterResult(_Record):
@@ -96,10 +101,10 @@ class DirectionResult(_Record):
 class FitResult(_Record):
     """Chi-square of a family with its 99.9 % interval; null where there is none."""
 
-    value: float | None  # chi-square
-    dof: float | None  # degrees of freedom
-    low: float | None  # of the interval
-    high: float | None  # of the interval
+    value: _Finite  # chi-square
+    dof: _Finite  # degrees of freedom
+    low: _Finite  # of the interval
+    high: _Finite  # of the interval
 
 
 class ChiSquareResult(FitResult):
@@ -239,7 +244,7 @@ class RateResult(_Record):
     """How far numbers of a kind walk in the root of a day, SI; `upper` is the 95 % bound, null: there is none."""
 
     rate: float  # SI in the root of a day
-    upper: float | None  # 95 % bound; null: there is none
+    upper: _Finite  # 95 % bound; null: there is none
 
 
 class ChangesResult(_Record):
@@ -315,38 +320,53 @@ def invalid(path: Path, what: str, error: ValidationError) -> InputError:
 
 def result(calibration: Calibration) -> Result:
     """result.json as a model. Raises pydantic's ValidationError if a number is not finite."""
-    c = calibration
-    return Result(
-        method=c.problem.method,
-        solver=c.estimate.solver,
-        status=c.status,
-        parameters=list(c.parameters.values()),
-        covariance=CovarianceResult(order=list(c.estimate.names), matrix=c.covariance.tolist()),
-        null_directions=[DirectionResult(**direction.evidence) for direction in c.directions],
-        chi_square=_chi_square(c),
-        noise=c.noises,
-        session=SessionResult(
-            sha256=c.sha256, start=c.start, duration_s=c.facts.duration_s, counts=c.counts, dropped=c.dropped
-        ),
-        software=dict(c.software),
-        timing_s=c.timing,
-        headline=c.headline,
-        notes=list(c.notes),
-        causes=[CauseResult(label=label, evidence=evidence) for label, evidence in c.causes],
-        innovations={family: InnovationsResult(**asdict(found)) for family, found in c.innovations.items()},
-        learning={name: LearningResult(**asdict(found)) for name, found in c.learning.items()},
-        stability=_stability(c.stability),
-        self_check=_self_check(c.solver_difference),
-        budget=None if c.budget is None else {name: dict(shares) for name, shares in c.budget.items()},
-        sensitivity=c.sensitivity,
-        measurements=c.measurements,
-        findings=[finding_json(finding) for finding in c.findings],
-        tables={name: [dict(row) for row in rows] for name, rows in c.tables.items()},
-        second_best=_second(c.estimate),
-        constants=dict(c.problem.constants) or None,
-        recordings=list(c.recordings) or None,
-        changes=_changes(c),
-        truth=truth_errors(c) if c.truth is not None else None,
+    c, second = calibration, calibration.estimate.second
+    return Result.model_validate(
+        {
+            "schema": "alidade.result/1",
+            "method": c.problem.method,
+            "solver": c.estimate.solver,
+            "status": c.status,
+            "parameters": list(c.parameters.values()),
+            "covariance": {"order": c.estimate.names, "matrix": c.covariance.tolist()},
+            "null_directions": [direction.evidence for direction in c.directions],
+            "chi_square": {
+                **(vars(c.fit) if c.fit else dict.fromkeys(FitResult.model_fields)),
+                "families": c.family_fits,
+            },
+            "noise": c.noises,
+            "session": {
+                "sha256": c.sha256,
+                "start": c.start,
+                "duration_s": c.facts.duration_s,
+                "counts": c.counts,
+                "dropped": c.dropped,
+            },
+            "software": c.software,
+            "timing_s": c.timing,
+            "headline": c.headline,
+            "notes": c.notes,
+            "causes": [{"label": label, "evidence": evidence} for label, evidence in c.causes],
+            "innovations": c.innovations,
+            "learning": c.learning,
+            "stability": c.stability
+            and {**vars(c.stability), "change": c.stability.departures if c.stability.changed else {}},
+            "self_check": c.solver_difference and {**vars(c.solver_difference), "difference": c.solver_difference.z},
+            "budget": c.budget,
+            "sensitivity": c.sensitivity,
+            "measurements": c.measurements,
+            "findings": [finding_json(finding) for finding in c.findings],
+            "tables": c.tables,
+            "second_best": second
+            and {
+                "chi_square": second.chi_square,
+                "parameters": dict(zip(c.estimate.names, second.values.tolist(), strict=True)),
+            },
+            "constants": c.problem.constants or None,
+            "recordings": c.recordings or None,
+            "changes": c.changes and {"level": c.changes.level, "steps": _steps(c), "rates": c.changes.rates},
+            "truth": None if c.truth is None else truth_errors(c),
+        }
     )
 
 
@@ -368,19 +388,6 @@ def _json(value: Any) -> object:
     if isinstance(value, (list, tuple)):
         return [_json(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _self_check(found: SolverDifference | None) -> SelfCheckResult | None:
-    if found is None:
-        return None
-    return SelfCheckResult(parameter=found.parameter, difference=found.z, sigma_ratio=found.sigma_ratio)
-
-
-def _second(estimate: Estimate) -> SecondResult | None:
-    if estimate.second is None:
-        return None
-    values = dict(zip(estimate.names, estimate.second.values.tolist(), strict=True))
-    return SecondResult(chi_square=estimate.second.chi_square, parameters=values)
 
 
 def result_json(calibration: Calibration) -> str:
@@ -405,46 +412,20 @@ def truth_errors(calibration: Calibration) -> dict[str, TruthResult]:
     return found
 
 
-def _stability(found: Stability | None) -> StabilityResult | None:
-    if found is None:
-        return None
-    change = found.departures if found.changed else {}
-    return StabilityResult(statistic=found.statistic, level=found.level, time_s=found.time_s, change=change)
-
-
-def _changes(c: Calibration) -> ChangesResult | None:
+def _steps(c: Calibration) -> list[ChangeResult]:
     """Every step as it is with nothing else changed; those found as they are with all found."""
     if c.changes is None:
-        return None
+        return []
     found = {(step.name, step.after): step for step in c.changes.found}
-    steps = []
-    for step in c.changes.steps:
-        shown = found.get((step.name, step.after), step)
-        names = [c.recordings[i].recording for i in (step.after, step.after + 1)]
-        steps.append(
-            ChangeResult(
-                parameter=step.name,
-                before=names[0],
-                after=names[1],
-                step=shown.size,
-                sigma=shown.sigma,
-                found=(step.name, step.after) in found,
-            )
+    names = [part.recording for part in c.recordings]
+    return [
+        ChangeResult(
+            parameter=step.name,
+            before=names[step.after],
+            after=names[step.after + 1],
+            step=found.get((step.name, step.after), step).size,
+            sigma=found.get((step.name, step.after), step).sigma,
+            found=(step.name, step.after) in found,
         )
-    rates = {
-        name: RateResult(rate=rate.rate, upper=rate.upper if math.isfinite(rate.upper) else None)
-        for name, rate in c.changes.rates.items()
-    }
-    return ChangesResult(level=c.changes.level, steps=steps, rates=rates)
-
-
-def _chi_square(c: Calibration) -> ChiSquareResult:
-    if c.fit is None:
-        return ChiSquareResult(value=None, dof=None, low=None, high=None, families={})
-    families = {family: FitResult(**_numbers(fit)) for family, fit in c.family_fits.items()}
-    return ChiSquareResult(**_numbers(c.fit), families=families)
-
-
-def _numbers(fit: Fit) -> dict[str, float | None]:
-    numbers = {"value": fit.value, "dof": fit.dof, "low": fit.low, "high": fit.high}
-    return {name: number if math.isfinite(number) else None for name, number in numbers.items()}
+        for step in c.changes.steps
+    ]
