@@ -10,7 +10,7 @@ import datetime
 import json
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -242,15 +242,7 @@ def certificate_report(
 ) -> Report:
     """The certificate as a report."""
     text = {name: "not stated" if value is None else str(value) for name, value in stated.model_dump().items()}
-    shown = [_Shown.of(row, result, stated) for row in rows]
-    probability = f"{100.0 * stated.coverage_probability:.4g}"
-    uncertainty = (
-        "U is the expanded uncertainty: the standard uncertainty multiplied by the coverage factor k, which for "
-        "Student's t with the effective degrees of freedom corresponds to a coverage probability of about "
-        f"{probability} %. The status of the calibration is {result.status}."
-    )
-    columns = ("parameter", "value", "U", _UNIT, "k", "eff. d.o.f.")
-    table = tuple((Cell(r.row.name, r.meaning), r.value, r.expanded, r.unit, r.coverage, r.degrees) for r in shown)
+    readable = [_readable(row, result) for row in rows]
     shares = ((row.name, [f"{each} {100.0 * x:.1f} %" for each, x in row.budget.items() if x >= 5e-4]) for row in rows)
     budgets = tuple(f"{name}: {', '.join(sources)}" for name, sources in shares)
     adjustment = Text(f"Adjustment: {text['adjustment']}", soft=False)
@@ -261,9 +253,9 @@ def certificate_report(
         summary=_summary(result, rows, missing),
         sections=(
             Section("Item and calibration", (Pairs(_identity(result, text)),)),
-            Section("Results", (Table("", uncertainty, columns, table, "results", "", None),)),
-            Section("Conformity", _conformity_table(shown)),
-            Section("As found, as left", (*_found_table(shown, before), adjustment)),
+            Section("Results", (_result_table(rows, readable, result, stated),)),
+            Section("Conformity", _conformity_table(rows, readable, stated)),
+            Section("As found, as left", (*_found_table(rows, readable, before), adjustment)),
             Section("Uncertainty budget", (Bullets(budgets), Text("Shares of the variance of each parameter."))),
             Section("Remarks", (Text(text["remarks"], False), Text(_RESERVATION), Signature(text["signatory"]))),
         ),
@@ -272,6 +264,7 @@ def certificate_report(
 
 
 _UNIT = Column("unit", "text")
+_Readable = tuple[str, Callable[[float], str]]
 _RESERVATION = (
     "The results relate only to the item calibrated, as it was then. This certificate may be reproduced only in full, "
     "unless the laboratory has approved of it in writing."
@@ -306,22 +299,47 @@ def _minute(date: str) -> str:
     return date[:16].replace("T", " ")
 
 
-def _conformity_table(shown: Sequence[_Shown]) -> tuple[Block, ...]:
+def _result_table(rows: Sequence[Row], readable: Sequence[_Readable], result: Result, stated: Fields) -> Table:
+    columns = ("parameter", "value", "U", _UNIT, "k", "eff. d.o.f.")
+    cells = tuple(
+        (
+            *(Cell(row.name, _meaning(result, row.name)), shown(row.value), shown(row.expanded), unit),
+            *(f"{row.coverage:.2f}", "∞" if row.degrees is None else f"{row.degrees:.0f}"),
+        )
+        for row, (unit, shown) in zip(rows, readable, strict=True)
+    )
+    caption = (
+        "U is the expanded uncertainty: the standard uncertainty multiplied by the coverage factor k, which for "
+        "Student's t with the effective degrees of freedom corresponds to a coverage probability of about "
+        f"{100.0 * stated.coverage_probability:.4g} %. The status of the calibration is {result.status}."
+    )
+    return Table("", caption, columns, cells, "results", "", None)
+
+
+def _conformity_table(rows: Sequence[Row], readable: Sequence[_Readable], stated: Fields) -> tuple[Block, ...]:
     columns = ("parameter", "limits", _UNIT, Column("statement", "text"))
-    rows = tuple((r.row.name, r.limits, r.unit, r.row.conformity) for r in shown if r.row.conformity)
+    cells = tuple(
+        (row.name, f"{shown(limits.nominal)} ± {shown(limits.tolerance)}", unit, row.conformity)
+        for row, (unit, shown) in zip(rows, readable, strict=True)
+        if row.conformity and (limits := stated.limits[row.name])
+    )
     rule = (
         "Decision rule: guard band of U on either side of each limit. It conforms where the value with U lies within "
         "the limits, it does not where the value with U lies outside them, and in between there is no statement."
     )
-    return (Table("", rule, columns, rows, "conformity", "", None),) if rows else ()
+    return (Table("", rule, columns, cells, "conformity", "", None),) if cells else ()
 
 
-def _found_table(shown: Sequence[_Shown], before: Path | None) -> tuple[Block, ...]:
+def _found_table(rows: Sequence[Row], readable: Sequence[_Readable], before: Path | None) -> tuple[Block, ...]:
     if before is None:
         return ()
     columns = ("parameter", "earlier", "as found", "change", _UNIT)
-    rows = tuple((r.row.name, r.before, r.value, r.change, r.unit) for r in shown if r.before)
-    return (Table("", f"Earlier values are those of {before.name}.", columns, rows, "found", "", None),)
+    cells = tuple(
+        (row.name, shown(row.before), shown(row.value), shown(row.value - row.before), unit)
+        for row, (unit, shown) in zip(rows, readable, strict=True)
+        if row.before is not None
+    )
+    return (Table("", f"Earlier values are those of {before.name}.", columns, cells, "found", "", None),)
 
 
 def _summary(result: Result, rows: Sequence[Row], missing: Sequence[str]) -> Summary:
@@ -338,44 +356,18 @@ def _summary(result: Result, rows: Sequence[Row], missing: Sequence[str]) -> Sum
     return Summary("Is the item within its limits?", answer, tone if answer == "yes" else "bad", text, (), steps)
 
 
-@dataclass(frozen=True)
-class _Shown:
-    """A row in the unit people read, with as many digits as U warrants; empty where there is nothing."""
+def _readable(row: Row, result: Result) -> _Readable:
+    """The unit people read a row in, and what formats its SI values with as many digits as U warrants."""
+    require = next((p.require for p in result.parameters if p.name == row.name), None)
+    unit, factor = human_unit(Quantity(row.name, row.unit, None, 1.0, require or math.inf))
+    return unit, lambda value: to_digits_of(factor * value, factor * row.expanded)
 
-    row: Row
-    meaning: str
-    unit: str
-    value: str
-    expanded: str
-    coverage: str
-    degrees: str
-    before: str
-    change: str
-    limits: str
 
-    @classmethod
-    def of(cls, row: Row, result: Result, stated: Fields) -> _Shown:
-        require = next((p.require for p in result.parameters if p.name == row.name), None)
-        unit, factor = human_unit(Quantity(row.name, row.unit, None, 1.0, require or math.inf))
-
-        def shown(value: float) -> str:
-            return to_digits_of(factor * value, factor * row.expanded)
-
-        limits, what = stated.limits.get(row.name), ""
-        with suppress(InputError):  # a method that is not installed here
-            what = meaning(method(result.method), row.name)
-        return cls(
-            row=row,
-            meaning=what,
-            unit=unit,
-            value=shown(row.value),
-            expanded=shown(row.expanded),
-            coverage=f"{row.coverage:.2f}",
-            degrees="∞" if row.degrees is None else f"{row.degrees:.0f}",
-            before="" if row.before is None else shown(row.before),
-            change="" if row.before is None else shown(row.value - row.before),
-            limits="" if limits is None else f"{shown(limits.nominal)} ± {shown(limits.tolerance)}",
-        )
+def _meaning(result: Result, name: str) -> str:
+    """Meaning of a parameter; empty for a method that is not installed here."""
+    with suppress(InputError):
+        return meaning(method(result.method), name)
+    return ""
 
 
 def _printed(page: str) -> bytes:
